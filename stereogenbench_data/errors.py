@@ -1,0 +1,45 @@
+"""Every error this package raises on purpose.
+
+StereoGenBenchError
+├── SchemaError    (ValueError)   a metadata file does not follow the format
+├── GeometryError  (ValueError)   a camera, a pose or a map that no formula holds for
+├── MediaError     (ValueError)   a video or a depth map does not decode to what its metadata says
+├── StorageError   (OSError)      a folder, a file or an index is missing, unreadable or altered
+├── SelectionError (LookupError)  a filter, a pair or a window that no sample can satisfy
+├── FieldError     (ValueError)   fields or transforms that cannot be had together
+└── SynthesisError (ValueError)   a scene that cannot be drawn as asked
+
+Each takes one message: so a DataLoader worker's error is rebuilt as itself in the main process.
+"""
+
+
+class StereoGenBenchError(Exception):
+    """The base of every error that this package raises on purpose."""
+
+
+class SchemaError(StereoGenBenchError, ValueError):
+    """A metadata file does not follow the release's format."""
+
+
+class GeometryError(StereoGenBenchError, ValueError):
+    """A camera, a pose or a map that no formula holds for."""
+
+
+class MediaError(StereoGenBenchError, ValueError):
+    """A video or a depth map does not decode to what its metadata says."""
+
+
+class StorageError(StereoGenBenchError, OSError):
+    """A folder, a file or an index is missing, unreadable or altered."""
+
+
+class SelectionError(StereoGenBenchError, LookupError):
+    """A filter, a pair or a window that no sample can satisfy."""
+
+
+class FieldError(StereoGenBenchError, ValueError):
+    """Fields or transforms that cannot be had together."""
+
+
+class SynthesisError(StereoGenBenchError, ValueError):
+    """A scene that cannot be drawn as asked."""

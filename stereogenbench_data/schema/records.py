@@ -1,0 +1,200 @@
+"""The typed, frozen records that the rest of the package works on.
+
+A record holds what a file says, with units in the names and nothing derived: poses stay in the
+world axes and the rotation representation in which they were recorded, so that relative poses
+can be formed before anything is rounded.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.schema.release import CAMERA_PAIRS, DEFAULT_DEPTH_UNIT_M, Split, Subset
+
+RotationKind = Literal["rotator_deg", "quaternion_xyzw", "matrix"]
+DepthKind = Literal["planar", "ray"]
+DepthForm = Literal["depth", "inverse"]
+DepthRisk = Literal["8-bit", "lossy", "chroma"]
+
+
+@dataclass(frozen=True, slots=True)
+class SceneId:
+    """Where a scene stands in the release; ``key`` is its whole path, unique and stable.
+
+    ``subset`` is None for train, and for an eval folder whose name tells no subset.
+    """
+
+    key: str
+    split: Split
+    subset: Subset | None
+    family: str
+    map_name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Six equal pinhole cameras on a lateral rig, from ``baseline.json``.
+
+    ``principal_point_px`` is (x, y) in pixels of the recorded image, None for the image centre.
+    ``baselines_cm`` has one entry for each pair of `CAMERA_PAIRS`, in that order.
+    """
+
+    focal_mm: float
+    sensor_width_mm: float
+    sensor_height_mm: float
+    image_width_px: int
+    image_height_px: int
+    principal_point_px: tuple[float, float] | None
+    baselines_cm: tuple[float, ...]
+    primary_pair: tuple[int, int]
+
+    def baseline_cm(self, camera_a: int, camera_b: int) -> float:
+        """Return the recorded distance in cm between two cameras, in either order."""
+        pair = (min(camera_a, camera_b), max(camera_a, camera_b))
+        return self.baselines_cm[CAMERA_PAIRS.index(pair)]
+
+
+@dataclass(frozen=True, slots=True)
+class SceneLabels:
+    """The identifiers that ``baseline.json`` and ``_scene_complete.json`` record, where present."""
+
+    scene_label: str | None = None
+    scene_index: int | None = None
+    map_name: str | None = None
+    map_path: str | None = None
+    character: str | None = None
+    animation: str | None = None
+    aperture_fstop: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """A scene's machine-written description (not verified by people); absent texts are empty."""
+
+    short_caption: str = ""
+    detailed_caption: str = ""
+    scene_type: str = ""
+    setting: str = ""
+    tags: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """The poses of six cameras over the frames of a scene, as ``trajectory.json`` records them.
+
+    World axes are Unreal's: left-handed, x forward, y right, z up. A rotation takes camera axes
+    (x forward, y right, z up) to world axes.
+
+    Attributes:
+        locations: (frames, 6, 3) float64, camera centres in the recorded unit.
+        unit_m: Metres in one recorded unit (0.01 for centimetres).
+        rotations: (frames, 6, 3) pitch, yaw, roll in degrees; or (frames, 6, 4) unit
+            quaternions x, y, z, w; or (frames, 6, 3, 3) matrices whose columns are the
+            camera's forward, right and up axes in the world.
+        rotation_kind: Which of the three ``rotations`` is.
+    """
+
+    locations: Float64[np.ndarray, "frames 6 3"]
+    unit_m: float
+    rotations: Float64[np.ndarray, "frames 6 ..."]
+    rotation_kind: RotationKind
+
+    @property
+    def frame_count(self) -> int:
+        """The number of frames that have poses."""
+        return len(self.locations)
+
+
+@dataclass(frozen=True, slots=True)
+class DepthEncoding:
+    """The depth contract: how a number stored in a depth video becomes metres.
+
+    Attributes:
+        unit_m: Metres in one stored unit. With ``form="inverse"``, the depth in metres that
+            the stored number 1 stands for: depth = unit_m / stored.
+        kind: "planar" is depth along the optical axis (z); "ray" is the distance from the
+            camera's centre, turned into z by the intrinsics.
+        form: "depth" or "inverse".
+        frame_lag: RGB frame t shows what depth frame t + frame_lag measured. Where that frame
+            does not exist, depth counts as not measured.
+        no_depth: Stored numbers that mean "not measured"; "max" is the pixel format's largest.
+        accept: Streams that are refused unless named here: "8-bit", "lossy" (a codec that
+            does not return what it was given) or "chroma" (only the luma plane is read).
+        source: Where ``unit_m`` comes from: a tag of the file, the release's default, the user.
+
+    Raises:
+        SchemaError: If a value is out of its range.
+
+    Source: the paper's appendix on the file schema; a missing tag means 0.1 m a unit.
+    """
+
+    unit_m: float = DEFAULT_DEPTH_UNIT_M
+    kind: DepthKind = "planar"
+    form: DepthForm = "depth"
+    frame_lag: int = 0
+    no_depth: tuple[int | Literal["max"], ...] = (0, "max")
+    accept: frozenset[DepthRisk] = frozenset()
+    source: Literal["tag", "default", "user"] = "user"
+
+    def __post_init__(self) -> None:
+        """Refuse a contract that no stream can follow."""
+        if not (math.isfinite(self.unit_m) and self.unit_m > 0):
+            raise SchemaError(f"unit_m must be a positive number of metres, got {self.unit_m!r}.")
+        for name, value, choices in (
+            ("kind", self.kind, ("planar", "ray")),
+            ("form", self.form, ("depth", "inverse")),
+        ):
+            if value not in choices:
+                raise SchemaError(f"{name} must be one of {choices}, got {value!r}.")
+        unknown = set(self.accept) - {"8-bit", "lossy", "chroma"}
+        if unknown:
+            raise SchemaError(
+                f"accept may hold '8-bit', 'lossy' and 'chroma', got {sorted(unknown)}."
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """Where the bytes of one of a scene's files lie: ``size`` bytes from ``offset`` of ``path``.
+
+    ``path`` is relative to the data's root, with forward slashes. Of a released folder each file
+    is its own path at offset 0; of a shard all members share the path.
+    """
+
+    path: str
+    offset: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """One row of the index: all that a sample needs to know before a video is opened.
+
+    Attributes:
+        lateral_m: How far each camera stands to the right of camera 0, in metres along camera
+            0's x axis, from the poses; None where the index was made without them.
+        rig_residual_px: The largest distance between the closed form of a rectified rig and
+            the pose chain, in pixels of the recorded image.
+        depth_unit_m: Metres in a stored unit for each camera's depth, as tagged or by default.
+        depth_unit_source: "tag" or "default", for each camera.
+        frames: Frames that every video and the trajectory have.
+        members: File name to the place of its bytes.
+    """
+
+    id: SceneId
+    labels: SceneLabels
+    caption: str
+    rig: Rig
+    frames: int
+    frame_rate_hz: float
+    lateral_m: tuple[float, ...]
+    rig_residual_px: float
+    depth_unit_m: tuple[float, ...]
+    depth_unit_source: tuple[str, ...]
+    valid_depth_ratio: float | None
+    members: Mapping[str, Member] = field(hash=False)

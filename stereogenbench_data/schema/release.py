@@ -1,0 +1,119 @@
+"""What the release fixes by name: cameras, files, folders, families, maps, baseline bins.
+
+Source: the StereoGenBench paper, section 3 and its appendices on the file schema, the per-map
+counts and the baseline bins.
+"""
+
+import itertools
+import re
+from typing import Final, Literal
+
+Split = Literal["train", "eval"]
+Subset = Literal["seen_map", "unseen_map"]
+
+CAMERA_COUNT: Final = 6
+CAMERA_PAIRS: Final[tuple[tuple[int, int], ...]] = tuple(
+    itertools.combinations(range(CAMERA_COUNT), 2)
+)
+"""The 15 pairs (left, right), left < right, in the order in which baselines are kept."""
+
+ADJACENT_PAIRS: Final = tuple((left, left + 1) for left in range(CAMERA_COUNT - 1))
+
+FRAME_COUNT: Final = 81
+FRAME_RATE_HZ: Final = 15.0
+IMAGE_SIZE_PX: Final = 1280
+DEFAULT_DEPTH_UNIT_M: Final = 0.1
+
+FAMILIES: Final = ("IPD_Gaussian", "Uniform", "Pairwise_Uniform")
+
+BASELINE_JSON: Final = "baseline.json"
+TRAJECTORY_JSON: Final = "trajectory.json"
+COMPLETE_JSON: Final = "_scene_complete.json"
+DESCRIPTION_JSON: Final = "scene_description_qwen_dataset_level.json"
+DESCRIPTION_TXT: Final = "scene_description_qwen_dataset_level.txt"
+METADATA_FILES: Final = (
+    BASELINE_JSON,
+    TRAJECTORY_JSON,
+    COMPLETE_JSON,
+    DESCRIPTION_JSON,
+    DESCRIPTION_TXT,
+)
+
+SEEN_MAP_FOLDER: Final = "MapSeenInTrain"
+_UNSEEN_MAP_FOLDER: Final = re.compile(r"unseen|not_?seen", re.IGNORECASE)
+
+TRAIN_MAPS: Final = frozenset(
+    {
+        "AbandonedPowerPlant",
+        "AssetsvilleTown",
+        "Car_Dealer",
+        "Downtown_West",
+        "GangnyeongieonComplex",
+        "GeunjeongjeonComplex",
+        "JapaneseStyleRoom",
+        "JesuhabComplex",
+        "Light_Foliage",
+        "Modular_Scifi_Mechanic_Base",
+        "OWD_Yucca_Pack",
+        "ProceduralBuildingGenerator",
+        "ProceduralNtr_vol2",
+        "RestaurantScene",
+        "ROCKY_SAND_PACK",
+        "Scene_Bazaar_Vol1",
+        "Scene_Saloon",
+        "Scene_UnfinishedBuilding",
+        "Scene_Warehouse",
+        "SeyeonjeongPavilion",
+        "Stylized_Egypt",
+        "UndergroundSciFi",
+        "UtopianCity",
+    }
+)
+UNSEEN_MAPS: Final = frozenset({"DeepWaterStation_DemoMapScalabilityEpic", "STF_TestMap"})
+
+INFINITY: Final = float("inf")
+BASELINE_BINS: Final[dict[str, tuple[float, float]]] = {
+    "[0,1)": (0.0, 1.0),
+    "[1,10)": (1.0, 10.0),
+    "[10,30)": (10.0, 30.0),
+    "[30,60)": (30.0, 60.0),
+    "[60,100)": (60.0, 100.0),
+    "[100,150]": (100.0, 150.0),
+    "(150,inf)": (150.0, INFINITY),
+}
+"""Baseline bins in cm. The five in the middle are the paper's; the outer two hold what it leaves
+out (all pairs of a Pairwise_Uniform rig reach 200 cm, of a Uniform rig 750 cm). Half-open, but for
+150 cm itself, which is the last value of the paper's last bin."""
+
+
+def rgb_name(camera: int) -> str:
+    """Return the file name of a camera's RGB video: ``cam_00_rgb.mp4`` for camera 0."""
+    return f"cam_{camera:02d}_rgb.mp4"
+
+
+def depth_name(camera: int) -> str:
+    """Return the file name of a camera's depth video: ``cam_00_depth.mkv`` for camera 0."""
+    return f"cam_{camera:02d}_depth.mkv"
+
+
+VIDEO_FILES: Final = tuple(
+    name(camera) for name in (rgb_name, depth_name) for camera in range(CAMERA_COUNT)
+)
+
+
+def baseline_bin(baseline_cm: float) -> str:
+    """Return the name of the bin that holds a baseline in cm.
+
+    >>> baseline_bin(9.99), baseline_bin(10.0), baseline_bin(150.0), baseline_bin(150.1)
+    ('[1,10)', '[10,30)', '[100,150]', '(150,inf)')
+    """
+    if baseline_cm == 150.0:
+        return "[100,150]"
+    return next(name for name, (low, high) in BASELINE_BINS.items() if low <= baseline_cm < high)
+
+
+def subset_of_folder(folder: str) -> Subset | None:
+    """Return the subset that a folder under ``eval/`` names, None where it names none."""
+    if folder == SEEN_MAP_FOLDER:
+        return "seen_map"
+    return "unseen_map" if _UNSEEN_MAP_FOLDER.search(folder) else None
