@@ -1,0 +1,111 @@
+"""Train and evaluate on StereoGenBench: every stereo pair of six-camera scenes, right to the pixel.
+
+Names are imported when first used, so that what does not need torch starts without it.
+"""
+
+from importlib import import_module
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stereogenbench_data.datasets.adapters import to_raft_stereo, to_torchvision
+    from stereogenbench_data.datasets.mapped import SceneViews, StereoPairs
+    from stereogenbench_data.datasets.tensors import collate
+    from stereogenbench_data.errors import (
+        FieldError,
+        GeometryError,
+        MediaError,
+        SchemaError,
+        SelectionError,
+        StereoGenBenchError,
+        StorageError,
+        SynthesisError,
+    )
+    from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS
+    from stereogenbench_data.samples.transforms import (
+        ColorJitter,
+        Compose,
+        Crop,
+        Eraser,
+        HorizontalFlip,
+        Letterbox,
+        RandomCrop,
+        RandomScale,
+        Resize,
+    )
+    from stereogenbench_data.schema.records import DepthEncoding
+    from stereogenbench_data.storage.index import SceneIndex
+
+__version__ = version("stereogenbench-data")
+
+_HOMES = {
+    "datasets.adapters": ("to_raft_stereo", "to_torchvision"),
+    "datasets.mapped": ("SceneViews", "StereoPairs"),
+    "datasets.tensors": ("collate",),
+    "errors": (
+        "FieldError",
+        "GeometryError",
+        "MediaError",
+        "SchemaError",
+        "SelectionError",
+        "StereoGenBenchError",
+        "StorageError",
+        "SynthesisError",
+    ),
+    "samples.fields": ("PAIR_FIELDS", "VIEW_FIELDS"),
+    "samples.transforms": (
+        "ColorJitter",
+        "Compose",
+        "Crop",
+        "Eraser",
+        "HorizontalFlip",
+        "Letterbox",
+        "RandomCrop",
+        "RandomScale",
+        "Resize",
+    ),
+    "schema.records": ("DepthEncoding",),
+    "storage.index": ("SceneIndex",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "PAIR_FIELDS",
+    "VIEW_FIELDS",
+    "ColorJitter",
+    "Compose",
+    "Crop",
+    "DepthEncoding",
+    "Eraser",
+    "FieldError",
+    "GeometryError",
+    "HorizontalFlip",
+    "Letterbox",
+    "MediaError",
+    "RandomCrop",
+    "RandomScale",
+    "Resize",
+    "SceneIndex",
+    "SceneViews",
+    "SchemaError",
+    "SelectionError",
+    "StereoGenBenchError",
+    "StereoPairs",
+    "StorageError",
+    "SynthesisError",
+    "collate",
+    "to_raft_stereo",
+    "to_torchvision",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from the module that holds it."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted([*__all__, "__version__"])

@@ -42,6 +42,7 @@ class Rig:
 
     ``principal_point_px`` is (x, y) in pixels of the recorded image, None for the image centre.
     ``baselines_cm`` has one entry for each pair of `CAMERA_PAIRS`, in that order.
+    ``image_size_source`` is "default" where the file records no image size.
     """
 
     focal_mm: float
@@ -52,6 +53,7 @@ class Rig:
     principal_point_px: tuple[float, float] | None
     baselines_cm: tuple[float, ...]
     primary_pair: tuple[int, int]
+    image_size_source: Literal["recorded", "default"] = "recorded"
 
     def baseline_cm(self, camera_a: int, camera_b: int) -> float:
         """Return the recorded distance in cm between two cameras, in either order."""

@@ -1,0 +1,46 @@
+"""From arrays to tensors, and from samples to a batch."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils.data import default_collate
+
+from stereogenbench_data.errors import FieldError
+from stereogenbench_data.samples.load import Sample
+
+
+def to_tensors(sample: Sample) -> Sample:
+    """Return a sample whose arrays and numbers are tensors of the same dtype; texts stay."""
+    return {
+        name: value
+        if isinstance(value, str)
+        else torch.from_numpy(np.require(value, requirements="CW"))
+        for name, value in sample.items()
+    }
+
+
+def collate(samples: Sequence[Sample]) -> dict[str, Any]:
+    """Stack samples into a batch: what torch's own ``default_collate`` does, with a named reason.
+
+    Args:
+        samples: Samples of one dataset, with the same fields.
+
+    Returns:
+        Tensors with a batch axis in front; texts as lists.
+
+    Raises:
+        FieldError: If a field has another shape in one sample than in the first, as where scenes
+            of several sizes, or sweeps with several numbers of views, are put in one batch.
+    """
+    first = samples[0]
+    for sample in samples[1:]:
+        for name, value in sample.items():
+            if isinstance(value, torch.Tensor) and value.shape != first[name].shape:
+                raise FieldError(
+                    f"{name} is {tuple(value.shape)} in {sample.get('__key__', 'one sample')} and "
+                    f"{tuple(first[name].shape)} in {first.get('__key__', 'the first')}: give "
+                    "size=(height, width), or batch sweeps one by one."
+                )
+    return default_collate(list(samples))  # type: ignore[no-any-return]

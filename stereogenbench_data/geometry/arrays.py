@@ -1,0 +1,72 @@
+"""What numpy and torch do not spell alike: everything here takes and returns arrays of either.
+
+The rest of the layer is written once, against the array API standard. A function's arrays must
+be of one library and on one device.
+"""
+
+import math
+from typing import Any
+
+from array_api_compat import array_namespace, device, is_torch_array
+
+Array = Any
+"""A numpy array or a torch tensor; jaxtyping checks its shape and dtype under test."""
+
+
+def pixel_centres(like: Array, *, dtype: Any) -> tuple[Array, Array]:
+    """Return u (w,) and v (h, 1) of the pixel centres of maps shaped (..., h, w)."""
+    xp = array_namespace(like)
+    height, width = like.shape[-2:]
+    place = {"dtype": dtype, "device": device(like)}
+    return xp.arange(width, **place) + 0.5, (xp.arange(height, **place) + 0.5)[:, None]
+
+
+def as_float64(values: Array) -> Array:
+    """Return an array's values as float64."""
+    xp = array_namespace(values)
+    return xp.astype(values, xp.float64, copy=False)
+
+
+def quotient(number: float, divisor: Array) -> Array:
+    """Return number / divisor, rounded once: torch multiplies a plain number by the reciprocal."""
+    xp = array_namespace(divisor)
+    return xp.asarray(number, dtype=divisor.dtype, device=device(divisor)) / divisor
+
+
+def take_flat(values: Array, index: Array) -> Array:
+    """Return ``values`` (any shape, read in row-major order) at ``index``, in the index's shape."""
+    xp = array_namespace(values, index)
+    taken = xp.take(xp.reshape(values, (-1,)), xp.reshape(index, (-1,)), axis=0)
+    return xp.reshape(taken, index.shape)
+
+
+def take_pixels(image: Array, index: Array) -> Array:
+    """Return (..., c, rows, columns) of an image (..., c, h, w) at an index (..., rows, columns).
+
+    The index is into maps (..., h, w) laid out flat: one pixel for all channels.
+    """
+    xp = array_namespace(image, index)
+    channels = image.shape[-3]
+    flat = xp.reshape(xp.moveaxis(image, -3, 0), (channels, -1))
+    taken = xp.take(flat, xp.reshape(index, (-1,)), axis=1)
+    return xp.moveaxis(xp.reshape(taken, (channels, *index.shape)), 0, -3)
+
+
+def scatter_max(values: Array, index: Array, *, size: int, empty: int) -> Array:
+    """Return ``size`` cells, each the largest of ``values`` sent to it by ``index``, or ``empty``.
+
+    Both arrays are flat. The outcome does not depend on the order in which cells are written.
+    """
+    xp = array_namespace(values, index)
+    cells = xp.full((size,), empty, dtype=values.dtype, device=device(values))
+    if is_torch_array(values):
+        return cells.scatter_reduce(0, index, values, reduce="amax")
+    xp.maximum.at(cells, index, values)
+    return cells
+
+
+def leading_offsets(shape: tuple[int, ...], *, step: int, like: Array) -> Array:
+    """Return 0, step, 2 step ... for each index of ``shape``, int64, on the device of ``like``."""
+    xp = array_namespace(like)
+    offsets = xp.arange(math.prod(shape), dtype=xp.int64, device=device(like))
+    return xp.reshape(offsets * step, shape)

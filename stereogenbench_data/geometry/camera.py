@@ -1,0 +1,159 @@
+"""A pinhole camera's intrinsics in pixels, and how resizing, cropping and flipping change them.
+
+Pixel (u, v) is column, row; the centre of the top-left pixel is (0.5, 0.5), so the middle of an
+image w wide is u = w / 2. Camera axes are x right, y down, z forward: u = fx x / z + cx.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+
+from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.schema.records import Rig
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """Focal lengths and principal point of an image, in pixels of that image.
+
+    Raises:
+        GeometryError: If a focal length is not positive and finite, the principal point is not
+            finite, or a size is below 1.
+    """
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    width_px: int
+    height_px: int
+
+    def __post_init__(self) -> None:
+        """Refuse a camera that sees nothing."""
+        for name in ("width_px", "height_px"):
+            if getattr(self, name) < 1:
+                raise GeometryError(
+                    f"{name} must be at least 1, got {getattr(self, name)!r}: "
+                    "ask for an image of one pixel or more."
+                )
+        for name in ("fx_px", "fy_px"):
+            require_positive(getattr(self, name), name=name)
+        for name in ("cx_px", "cy_px"):
+            if not math.isfinite(getattr(self, name)):
+                raise GeometryError(
+                    f"{name} must be finite, got {getattr(self, name)!r}: "
+                    "give the principal point in pixels of the image."
+                )
+
+    @classmethod
+    def from_mm(
+        cls,
+        *,
+        focal_mm: float,
+        sensor_mm: tuple[float, float],
+        size_px: tuple[int, int],
+        principal_point_px: tuple[float, float] | None = None,
+    ) -> "Intrinsics":
+        """Return the intrinsics of a lens in front of a film.
+
+        Args:
+            focal_mm: Focal length in mm.
+            sensor_mm: (width, height) of the film in mm.
+            size_px: (width, height) of the image in pixels.
+            principal_point_px: (x, y) in pixels of the image; None is the image's centre.
+
+        Raises:
+            GeometryError: If a length or a size is not positive and finite.
+
+        Source: the StereoGenBench paper, fx = f_mm / sensor_width_mm * width_px.
+
+        >>> Intrinsics.from_mm(focal_mm=32.6, sensor_mm=(23.76, 23.76), size_px=(1280, 1280)).fx_px
+        1756.2289562289561
+        """
+        require_positive(focal_mm, name="focal_mm")
+        for name, length_mm in zip(("sensor width", "sensor height"), sensor_mm, strict=True):
+            require_positive(length_mm, name=f"{name} in mm")
+        width_px, height_px = size_px
+        cx_px, cy_px = principal_point_px or (width_px / 2, height_px / 2)
+        return cls(
+            fx_px=focal_mm / sensor_mm[0] * width_px,
+            fy_px=focal_mm / sensor_mm[1] * height_px,
+            cx_px=float(cx_px),
+            cy_px=float(cy_px),
+            width_px=width_px,
+            height_px=height_px,
+        )
+
+    def resized(self, *, width_px: int, height_px: int) -> "Intrinsics":
+        """Return the intrinsics of the image stretched to exactly this size.
+
+        Disparity in the resized image is the old one times ``width_px / self.width_px``,
+        whatever the height does.
+        """
+        sx, sy = width_px / self.width_px, height_px / self.height_px
+        return replace(
+            self,
+            fx_px=self.fx_px * sx,
+            fy_px=self.fy_px * sy,
+            cx_px=self.cx_px * sx,
+            cy_px=self.cy_px * sy,
+            width_px=width_px,
+            height_px=height_px,
+        )
+
+    def cropped(self, *, left_px: int, top_px: int, width_px: int, height_px: int) -> "Intrinsics":
+        """Return the intrinsics of a window whose top-left pixel is (left_px, top_px).
+
+        The window may reach beyond the image on any side (padding), so offsets may be negative.
+        """
+        return replace(
+            self,
+            cx_px=self.cx_px - left_px,
+            cy_px=self.cy_px - top_px,
+            width_px=width_px,
+            height_px=height_px,
+        )
+
+    def flipped(self) -> "Intrinsics":
+        """Return the intrinsics of the image mirrored left to right: cx becomes width - cx.
+
+        Of a stereo pair the views swap too: the mirrored right view is the new left one.
+        """
+        return replace(self, cx_px=self.width_px - self.cx_px)
+
+    def matrix(self) -> Float64[np.ndarray, "3 3"]:
+        """Return K, which takes camera axes (x, y, z) to homogeneous pixels (u, v, 1) z."""
+        return np.array(
+            [[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]]
+        )
+
+
+def rig_intrinsics(rig: Rig) -> Intrinsics:
+    """Return the intrinsics that all six cameras of a rig share, at the recorded image size."""
+    return Intrinsics.from_mm(
+        focal_mm=rig.focal_mm,
+        sensor_mm=(rig.sensor_width_mm, rig.sensor_height_mm),
+        size_px=(rig.image_width_px, rig.image_height_px),
+        principal_point_px=rig.principal_point_px,
+    )
+
+
+def require_positive(value: float, *, name: str) -> None:
+    """Raise GeometryError unless a quantity is positive and finite."""
+    if not (math.isfinite(value) and value > 0):
+        raise GeometryError(
+            f"{name} must be a positive finite number, got {value!r}: "
+            "correct it where the camera is recorded or given."
+        )
+
+
+def require_size(shape: tuple[int, ...], intrinsics: Intrinsics, *, name: str) -> None:
+    """Raise GeometryError unless a map (..., h, w) has the size that the intrinsics are for."""
+    height_px, width_px = shape[-2:]
+    if (height_px, width_px) != (intrinsics.height_px, intrinsics.width_px):
+        raise GeometryError(
+            f"{name} is {width_px}x{height_px} px but its intrinsics are for "
+            f"{intrinsics.width_px}x{intrinsics.height_px} px: resize or crop both together."
+        )

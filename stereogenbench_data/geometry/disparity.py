@@ -1,0 +1,208 @@
+"""Depth to disparity and back, and what the rounding of stored depth does to disparity.
+
+A point at depth z along the optical axis moves by d = u_source - u_target = B fx / z pixels
+between two rectified cameras. B, the baseline in metres, is positive for a target to the right
+of the source and negative for one to the left; d takes its sign. Pixels are those of the image
+that focal_px is for. In a depth map inf is sky and 0 is "not measured" (so are nan and negative
+values); the disparity of all of these is 0, so a map goes with the mask of what was measured.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace
+from jaxtyping import Float, Float32, Integer
+
+from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.geometry.arrays import as_float64, pixel_centres, quotient
+from stereogenbench_data.geometry.camera import Intrinsics, require_positive, require_size
+from stereogenbench_data.schema.records import DepthForm
+
+_EXACT_FACTORS = np.arange(1.0, 256.0)
+"""Whole numbers whose product with a 16-bit number is exact in float32's 24 bits."""
+
+
+def disparity_from_depth(
+    depth_m: Float[Any, "*batch h w"], *, focal_px: float, baseline_m: float
+) -> Float[Any, "*batch h w"]:
+    """Return how far left each source pixel moves in the target image, in pixels.
+
+    Args:
+        depth_m: Depth along the optical axis (not the length of the ray), in metres.
+        focal_px: Horizontal focal length in pixels of this image: rescale it with the image.
+        baseline_m: Signed baseline in metres, positive for a target to the right.
+
+    Returns:
+        Disparity in pixels, in the depth's dtype, rounded once from the float64 result;
+        0 for sky and where depth was not measured.
+
+    Raises:
+        GeometryError: If focal_px is not positive and finite, or baseline_m is 0 or not finite.
+
+    Source: Szeliski, Computer Vision: Algorithms and Applications, 2nd ed., ch. 12.
+
+    >>> disparity_from_depth(np.array([[2.0, np.inf, 0.0]]), focal_px=800.0, baseline_m=0.1)
+    array([[40.,  0.,  0.]])
+    """
+    _require_pair(focal_px, baseline_m)
+    xp = array_namespace(depth_m)
+    disparity_px = quotient(focal_px * baseline_m, as_float64(_inf_where_not_positive(depth_m)))
+    return xp.astype(disparity_px, depth_m.dtype, copy=False)
+
+
+def depth_from_disparity(
+    disparity_px: Float[Any, "*batch h w"], *, focal_px: float, baseline_m: float
+) -> Float[Any, "*batch h w"]:
+    """Return depth along the optical axis in metres, in the disparity's dtype.
+
+    0 ("not measured") where disparity is 0, nan, or of the sign that the baseline rules out:
+    disparity 0 does not tell sky from what was not measured.
+
+    Raises:
+        GeometryError: If focal_px is not positive and finite, or baseline_m is 0 or not finite.
+
+    >>> depth_from_disparity(np.array([[40.0, 0.0]]), focal_px=800.0, baseline_m=0.1)
+    array([[2., 0.]])
+    """
+    _require_pair(focal_px, baseline_m)
+    xp = array_namespace(disparity_px)
+    size_px = disparity_px if baseline_m > 0 else -disparity_px
+    depth_m = quotient(focal_px * abs(baseline_m), as_float64(_inf_where_not_positive(size_px)))
+    return xp.astype(depth_m, disparity_px.dtype, copy=False)
+
+
+def disparity_from_units(
+    units: Integer[Any, "*batch h w"],
+    *,
+    focal_px: float,
+    baseline_m: float,
+    unit_m: float,
+    form: DepthForm = "depth",
+) -> Float32[Any, "*batch h w"]:
+    """Return the disparity in pixels of stored 16-bit depth, without a depth map in between.
+
+    The result is within 0.51 ulp of the float64 one, at float32's speed: B fx / unit_m is
+    multiplied by the j of 1 to 255 that brings the product nearest to a float32, and units * j
+    is exact.
+
+    Args:
+        units: Stored numbers below 2 ** 16, as decoded.
+        focal_px: Horizontal focal length in pixels of this image.
+        baseline_m: Signed baseline in metres, positive for a target to the right.
+        unit_m: Metres in one stored unit; with ``form="inverse"``, the depth that 1 stands for.
+        form: Whether a stored number is proportional to depth or to its inverse.
+
+    Returns:
+        Disparity in pixels, 0 where the stored number is 0.
+
+    Raises:
+        GeometryError: If a length is not positive and finite, or the baseline is 0.
+
+    >>> disparity_from_units(np.array([[20, 0]]), focal_px=800.0, baseline_m=0.1, unit_m=0.1)
+    array([[40.,  0.]], dtype=float32)
+    """
+    _require_pair(focal_px, baseline_m)
+    require_positive(unit_m, name="unit_m")
+    xp = array_namespace(units)
+    shift_units = focal_px * baseline_m / unit_m
+    if form == "inverse":
+        return xp.astype(xp.astype(units, xp.float64) * shift_units, xp.float32)
+    products = shift_units * _EXACT_FACTORS
+    best = np.abs(products.astype(np.float32) / products - 1.0).argmin()
+    divisor = xp.astype(units, xp.float32) * float(_EXACT_FACTORS[best])
+    divisor[divisor == 0] = math.inf
+    return quotient(float(products[best]), divisor)
+
+
+def disparity_error_px(
+    depth_m: Float[Any, "*batch h w"], *, focal_px: float, baseline_m: float, quantum_m: float
+) -> Float[Any, "*batch h w"]:
+    """Return how far disparity can be from the truth because depth was stored in steps.
+
+    True depth lies within half a step of the stored one, so disparity is off by at most
+    |d| (q / 2) / (z - q / 2). The bound also covers the rounding of depth, of disparity and of
+    itself to the map's dtype (a few eps of |d|), which shows where steps are fine and things far.
+
+    Args:
+        depth_m: Stored depth along the optical axis, in metres.
+        focal_px: Horizontal focal length in pixels of this image.
+        baseline_m: Signed baseline in metres.
+        quantum_m: The step q between neighbouring depths in metres; 0 for exact depth.
+
+    Returns:
+        The bound in pixels, never negative, in the depth's dtype: inf where depth is half a
+        step or less (the truth may be arbitrarily near), 0 where disparity is 0 because of sky
+        or because nothing was measured.
+
+    Raises:
+        GeometryError: If a number is out of its range.
+
+    >>> depth_m = np.array([[10.0, np.inf, 0.0]])
+    >>> error_px = disparity_error_px(depth_m, focal_px=800.0, baseline_m=0.1, quantum_m=0.1)
+    >>> error_px.round(4)
+    array([[0.0402, 0.    , 0.    ]])
+    """
+    _require_pair(focal_px, baseline_m)
+    if not (math.isfinite(quantum_m) and quantum_m >= 0):
+        raise GeometryError(
+            f"quantum_m must be a finite number of metres, 0 or more, got {quantum_m!r}: "
+            "give the depth encoding's unit."
+        )
+    xp = array_namespace(depth_m)
+    eps = float(xp.finfo(depth_m.dtype).eps)
+    stored_m = _inf_where_not_positive(depth_m)
+    nearest_m = stored_m * (1.0 - 2.0 * eps) - quantum_m / 2
+    relative = quotient(quantum_m / 2, stored_m) + 2.0 * eps
+    bounded = nearest_m > 0
+    shift_px_m = focal_px * abs(baseline_m) * (1.0 + 8.0 * eps)
+    bound_px = shift_px_m * relative / xp.where(bounded, nearest_m, 1.0)
+    return xp.where(bounded, bound_px, math.inf)
+
+
+def planar_from_ray(
+    ray_m: Float[Any, "*batch h w"], intrinsics: Intrinsics
+) -> Float[Any, "*batch h w"]:
+    """Return depth along the optical axis of distances from the camera's centre, both in metres.
+
+    Raises:
+        GeometryError: If the map is not of the size that the intrinsics are for.
+
+    Source: Roberts et al., Hypersim, 2021, whose depth_meters is the length of the ray.
+    """
+    return ray_m / _ray_per_planar(ray_m, intrinsics)
+
+
+def ray_from_planar(
+    depth_m: Float[Any, "*batch h w"], intrinsics: Intrinsics
+) -> Float[Any, "*batch h w"]:
+    """Return distances from the camera's centre of depth along the optical axis, in metres.
+
+    Raises:
+        GeometryError: If the map is not of the size that the intrinsics are for.
+    """
+    return depth_m * _ray_per_planar(depth_m, intrinsics)
+
+
+def _ray_per_planar(like: Float[Any, "*batch h w"], intrinsics: Intrinsics) -> Float[Any, "h w"]:
+    """Return |(x, y, 1)| of the ray through each pixel's centre, in the dtype of ``like``."""
+    require_size(like.shape, intrinsics, name="the depth map")
+    xp = array_namespace(like)
+    u_px, v_px = pixel_centres(like, dtype=xp.float64)
+    x = (u_px - intrinsics.cx_px) / intrinsics.fx_px
+    y = (v_px - intrinsics.cy_px) / intrinsics.fy_px
+    return xp.astype(xp.sqrt(x * x + (y * y + 1.0)), like.dtype, copy=False)
+
+
+def _inf_where_not_positive(values: Float[Any, "*batch h w"]) -> Float[Any, "*batch h w"]:
+    xp = array_namespace(values)
+    return xp.where(values > 0, values, math.inf)
+
+
+def _require_pair(focal_px: float, baseline_m: float) -> None:
+    require_positive(focal_px, name="focal_px")
+    if not (math.isfinite(baseline_m) and baseline_m != 0):
+        raise GeometryError(
+            f"baseline_m must be finite and not 0, got {baseline_m!r}: "
+            "give the signed distance between two different cameras in metres."
+        )

@@ -1,0 +1,142 @@
+"""Where the pixels of a source view land in a target view.
+
+Pixel (u, v) is column, row; the centre of the top-left pixel is (0.5, 0.5), so u falls into
+column floor(u). Camera axes are x right, y down, z forward; lengths are metres.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace
+from jaxtyping import Bool, Float, Float64, Int64
+
+from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.geometry.arrays import as_float64, leading_offsets, pixel_centres
+from stereogenbench_data.geometry.camera import Intrinsics, require_size
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Projection:
+    """Where each source pixel's point lands in the target image, and how deep it is there.
+
+    Attributes:
+        u_px: Column coordinate in the target image; nan where the point has none.
+        v_px: Row coordinate, or None where rows do not change (a rectified pair).
+        depth_m: Depth along the target's optical axis, in metres.
+    """
+
+    u_px: Float[Any, "*batch h w"]
+    v_px: Float[Any, "*batch h w"] | None
+    depth_m: Float[Any, "*batch h w"]
+
+
+def project_rectified(
+    depth_m: Float[Any, "*batch h w"], disparity_px: Float[Any, "*batch h w"]
+) -> Projection:
+    """Return the projection into a rectified target: u - d, the same row, the same depth."""
+    u_px, _ = pixel_centres(disparity_px, dtype=disparity_px.dtype)
+    return Projection(u_px=u_px - disparity_px, v_px=None, depth_m=depth_m)
+
+
+def project_through_poses(
+    depth_m: Float[Any, "*batch h w"],
+    *,
+    intrinsics: Intrinsics,
+    target_intrinsics: Intrinsics,
+    target_from_source: Float64[np.ndarray, "4 4"],
+) -> Projection:
+    """Return the projection into any target: K_t (R K_s^-1 (u, v, 1) z + t).
+
+    Computed in float64 and returned in the depth's dtype. u and v are nan where the point is on
+    or behind the target's plane, or where depth is nan or inf.
+
+    Args:
+        depth_m: Source depth along the optical axis, in metres.
+        intrinsics: Of the source image, whose size the map has.
+        target_intrinsics: Of the target image.
+        target_from_source: Rigid motion from source to target camera axes, in metres.
+
+    Raises:
+        GeometryError: If the map is not of the size that the intrinsics are for.
+
+    Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., ch. 6.
+    """
+    require_size(depth_m.shape, intrinsics, name="the depth map")
+    xp = array_namespace(depth_m)
+    dtype = depth_m.dtype
+    camera_matrix = target_intrinsics.matrix()
+    homography = camera_matrix @ target_from_source[:3, :3] @ np.linalg.inv(intrinsics.matrix())
+    step = camera_matrix @ target_from_source[:3, 3]
+
+    u_px, v_px = pixel_centres(depth_m, dtype=xp.float64)
+    source_m = as_float64(depth_m)
+    x, y, z = (
+        source_m * (float(row[0]) * u_px + (float(row[1]) * v_px + float(row[2]))) + float(shift)
+        for row, shift in zip(homography, step, strict=True)
+    )
+    in_front = xp.where((z > 0) & xp.isfinite(z), z, xp.nan)
+    return Projection(
+        u_px=xp.astype(x / in_front, dtype, copy=False),
+        v_px=xp.astype(y / in_front, dtype, copy=False),
+        depth_m=xp.astype(z, dtype, copy=False),
+    )
+
+
+def lands_inside(
+    projection: Projection, *, height_px: int, width_px: int
+) -> Bool[Any, "*batch h w"]:
+    """Return which source pixels land inside a target image of this size.
+
+    Raises:
+        GeometryError: If rows do not change but the two images differ in height.
+    """
+    u_px, v_px = projection.u_px, projection.v_px
+    inside = (u_px >= 0) & (u_px < width_px)
+    if v_px is not None:
+        inside &= (v_px >= 0) & (v_px < height_px)
+    elif u_px.shape[-2] != height_px:
+        raise GeometryError(
+            f"a rectified projection of {u_px.shape[-2]} rows cannot land in an image of "
+            f"{height_px} rows: resize or crop both views alike."
+        )
+    return inside
+
+
+def landing_pixels(
+    projection: Projection, *, height_px: int, width_px: int
+) -> tuple[Bool[Any, "*batch h w"], Int64[Any, "*batch h w"]]:
+    """Return which source pixels land inside a target image, and on which of its pixels.
+
+    The pixel is an index into target maps (..., height_px, width_px) laid out flat; of a
+    source pixel that lands outside it is some pixel that means nothing.
+
+    Raises:
+        GeometryError: If rows do not change but the two images differ in height.
+    """
+    xp = array_namespace(projection.u_px)
+    inside = lands_inside(projection, height_px=height_px, width_px=width_px)
+    pixel = xp.astype(xp.where(inside, projection.u_px, 0.0), xp.int64)
+    if projection.v_px is None:
+        pixel += row_starts(projection, height_px=height_px, width_px=width_px)
+    else:
+        row = xp.astype(xp.where(inside, projection.v_px, 0.0), xp.int64)
+        pixel += row * width_px
+        pixel += image_starts(projection, height_px=height_px, width_px=width_px)
+    return inside, pixel
+
+
+def image_starts(
+    projection: Projection, *, height_px: int, width_px: int
+) -> Int64[Any, "*batch 1 1"]:
+    """Return where each target map of a batch starts in the flat layout."""
+    batch = projection.u_px.shape[:-2]
+    return leading_offsets((*batch, 1, 1), step=height_px * width_px, like=projection.u_px)
+
+
+def row_starts(
+    projection: Projection, *, height_px: int, width_px: int
+) -> Int64[Any, "*batch h 1"]:
+    """Return where each row of each target map of a batch starts in the flat layout."""
+    batch = projection.u_px.shape[:-2]
+    return leading_offsets((*batch, height_px, 1), step=width_px, like=projection.u_px)

@@ -1,0 +1,79 @@
+"""How far a lateral rig's recorded poses are from the rectified rig that the closed form assumes.
+
+Camera axes are x right, y down, z forward, in metres; pixels as in `camera`. In a rectified rig
+all cameras look the same way and stand on camera 0's x axis, so that a point at depth z moves
+from u to u - B fx / z, and no row changes.
+"""
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float64
+
+from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.geometry.pose import OPENCV_FROM_UNREAL, CameraPoses
+from stereogenbench_data.schema.records import Rig
+from stereogenbench_data.schema.release import CAMERA_PAIRS
+
+_LEFT, _RIGHT = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
+
+
+def lateral_offsets_m(poses: CameraPoses) -> Float64[np.ndarray, "6"]:
+    """Return how far each camera stands to the right of camera 0 in frame 0, in metres.
+
+    The signed baseline of a pair is the target's offset less the source's.
+    """
+    right_axis = poses.world_from_cam_rotations[0, 0, :, 0]
+    steps = (poses.centres[0] - poses.centres[0, 0]) @ OPENCV_FROM_UNREAL.T
+    return np.asarray(steps @ right_axis * poses.unit_m)
+
+
+def baseline_deviation_cm(poses: CameraPoses, rig: Rig) -> float:
+    """Return the largest difference between a recorded baseline and the poses' distance, in cm.
+
+    Over all 15 pairs and all frames.
+    """
+    steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
+    distances_cm = np.linalg.norm(steps, axis=-1) * (poses.unit_m * 100)
+    return float(np.abs(distances_cm - np.array(rig.baselines_cm)).max())
+
+
+def rectification_residual_px(poses: CameraPoses, intrinsics: Intrinsics) -> float:
+    """Return the largest distance in pixels between the closed form and the pose chain.
+
+    Both take points of the left camera's image to the right camera's, for all frames and all 15
+    pairs: the image's four corners and its centre, each infinitely far and as near as matters,
+    which is 1 m or, for a wide pair, where disparity is the image's width. Wrong rotations show
+    at every depth, wrong places most at the nearest. The closed form is (u - B fx / z, v), with
+    B the difference of `lateral_offsets_m`: one number a pair, for all frames. The result is inf
+    where a point falls on or behind the right camera's plane.
+    """
+    width_px, height_px = float(intrinsics.width_px), float(intrinsics.height_px)
+    corners = itertools.product((0.0, width_px), (0.0, height_px))
+    pixels = np.array([(u, v, 1.0) for u, v in [*corners, (width_px / 2, height_px / 2)]])
+    offsets_m = lateral_offsets_m(poses)
+    shift_px_m = intrinsics.fx_px * (offsets_m[_RIGHT] - offsets_m[_LEFT])
+    nearest_m = np.maximum(1.0, np.abs(shift_px_m) / width_px)
+
+    far, step = _homography_and_step(poses, intrinsics.matrix())
+    landed_far = pixels @ np.swapaxes(far, -1, -2)
+    landed_near = landed_far + (step / nearest_m[:, None])[..., None, :]
+    expected_near = pixels - np.outer(shift_px_m / nearest_m, (1.0, 0.0, 0.0))[:, None, :]
+    largest_px = 0.0
+    for landed, expected in ((landed_far, pixels), (landed_near, expected_near)):
+        if not (landed[..., 2] > 0).all():
+            return float("inf")
+        away_px = landed[..., :2] / landed[..., 2:] - expected[..., :2]
+        largest_px = max(largest_px, float(np.linalg.norm(away_px, axis=-1).max()))
+    return largest_px
+
+
+def _homography_and_step(
+    poses: CameraPoses, camera_matrix: Float64[np.ndarray, "3 3"]
+) -> tuple[Float64[np.ndarray, "frames 15 3 3"], Float64[np.ndarray, "frames 15 3"]]:
+    """Return K R K^-1 and K t of right_from_left, for all frames and pairs."""
+    rotations = poses.world_from_cam_rotations
+    image_from_world = camera_matrix @ np.swapaxes(rotations[:, _RIGHT], -1, -2)
+    steps = (poses.centres[:, _LEFT] - poses.centres[:, _RIGHT]) @ OPENCV_FROM_UNREAL.T
+    homography = image_from_world @ rotations[:, _LEFT] @ np.linalg.inv(camera_matrix)
+    return homography, (image_from_world @ steps[..., None])[..., 0] * poses.unit_m

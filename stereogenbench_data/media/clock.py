@@ -1,0 +1,129 @@
+"""Which frame a presentation time stands for: its place in the order of presentation.
+
+`SteadyClock` needs only the header and holds for a constant frame rate; `TableClock` knows the
+time of every frame. Times are integers in ticks of the stream's time base.
+"""
+
+import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise
+
+import av
+from av.container import InputContainer
+
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.container import frames_by_duration
+
+
+@dataclass(frozen=True, slots=True)
+class SteadyClock:
+    """Frames at one rate: frame i is shown at start + i * step ticks, give or take a rounding."""
+
+    start: int
+    step: Fraction
+
+    @property
+    def _tolerance(self) -> Fraction:
+        return min(Fraction(1), self.step / 4)
+
+    def index(self, pts: int) -> int | None:
+        """Return the frame that is shown at a time, None where the time fits no frame."""
+        index = round((pts - self.start) / self.step)
+        off = abs(pts - self.start - index * self.step)
+        return index if off <= self._tolerance else None
+
+    def earliest(self, index: int) -> int:
+        """Return the least time that counts as a frame's."""
+        return math.ceil(self.start + index * self.step - self._tolerance)
+
+    def latest(self, index: int) -> int:
+        """Return the greatest time that counts as a frame's."""
+        return math.floor(self.start + index * self.step + self._tolerance)
+
+
+@dataclass(frozen=True, slots=True)
+class TableClock:
+    """Frames at any times, in ascending order."""
+
+    times: Sequence[int]
+
+    def index(self, pts: int) -> int | None:
+        """Return the frame that is shown at a time, None where no frame is."""
+        index = bisect_left(self.times, pts)
+        return index if index < len(self.times) and self.times[index] == pts else None
+
+    def earliest(self, index: int) -> int:
+        """Return a frame's time."""
+        return self.times[index]
+
+    latest = earliest
+
+
+Clock = SteadyClock | TableClock
+
+
+def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | None:
+    """Return the clock that the header tells, None where it contradicts itself or ``frames``.
+
+    An MP4 header lists every sample: their number and their decoding times must be those of
+    ``frames`` frames at one rate. Of Matroska only the duration can be compared.
+    """
+    stream = container.streams.video[0]
+    if stream.start_time is None or not stream.average_rate or not stream.time_base:
+        return None
+    step = 1 / (stream.average_rate * stream.time_base)
+    if stream.frames == 0:
+        agrees = frames_by_duration(container) == frames
+    else:
+        agrees = stream.frames == frames and _is_steady(container, step=step)
+    return SteadyClock(stream.start_time, step) if agrees else None
+
+
+def _is_steady(container: InputContainer, *, step: Fraction) -> bool:
+    stream = container.streams.video[0]
+    entries = list(stream.index_entries)
+    return (
+        len(entries) == stream.frames
+        and not any(entry.is_discard for entry in entries)
+        and all(abs(b.timestamp - a.timestamp - step) <= 1 for a, b in pairwise(entries))
+    )
+
+
+def table_clock(container: InputContainer, *, name: str) -> TableClock:
+    """Return the times of all frames, read by going through all packets from where they stand.
+
+    Raises:
+        MediaError: If a packet is cut short, or carries no time or another packet's time.
+    """
+    times: list[int] = []
+    try:
+        for packet in container.demux(container.streams.video[0]):
+            if packet.size == 0 or packet.is_discard:
+                continue
+            if packet.is_corrupt:
+                raise MediaError(
+                    f"{name}: is cut short within its frame number {len(times)} as stored: "
+                    f"fetch it again."
+                )
+            if packet.pts is None:
+                raise MediaError(
+                    f"{name}: its frame number {len(times)} as stored carries no presentation "
+                    f"time, so no frame can be found by number: store it as MP4 or Matroska anew."
+                )
+            times.append(packet.pts)
+    except av.FFmpegError as error:
+        raise MediaError(
+            f"{name}: cannot be read past its frame number {len(times)} as stored "
+            f"({error.strerror}): fetch it again."
+        ) from error
+    times.sort()
+    twice = next((a for a, b in pairwise(times) if a == b), None)
+    if twice is not None:
+        raise MediaError(
+            f"{name}: two frames are shown at the same time ({twice} ticks), so their order is "
+            f"not defined: store it anew with one time a frame."
+        )
+    return TableClock(times)

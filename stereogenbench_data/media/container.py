@@ -1,0 +1,154 @@
+"""Opening an MP4 or Matroska file: what its header says, and nothing that leads out of the file.
+
+FFmpeg knows playlist and script formats that open further files and addresses. Only the two
+containers of the release are let in, and a path is never read as an address.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import BinaryIO
+
+import av
+from av.container import InputContainer
+
+from stereogenbench_data.errors import MediaError, StorageError
+
+VideoFile = str | Path | BinaryIO
+
+_OPTIONS = {"format_whitelist": "mov,matroska"}
+_MICROSECONDS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class StreamFacts:
+    """What a video file is.
+
+    Attributes:
+        codec: FFmpeg's name of the codec, such as "h264" or "ffv1".
+        pixel_format: FFmpeg's name of the stored pixel format, such as "yuv420p" or "gray16le".
+        width_px: Width of every picture.
+        height_px: Height of every picture.
+        frames: Number of pictures.
+        frame_rate_hz: Average rate; 0.0 where the file does not tell.
+        tags: Metadata of the container and of the stream, keys in lower case. A key that both
+            have, with another value, is kept as ``stream.<key>`` too.
+    """
+
+    codec: str
+    pixel_format: str
+    width_px: int
+    height_px: int
+    frames: int
+    frame_rate_hz: float
+    tags: Mapping[str, str]
+
+
+def open_container(file: VideoFile, *, name: str) -> InputContainer:
+    """Open a video file for reading.
+
+    Args:
+        file: A path, or a seekable binary file; the latter stays the caller's to close.
+        name: What messages call the file.
+
+    Raises:
+        StorageError: If a path is missing, not a file or not readable.
+        MediaError: If the content is not an MP4 or Matroska file with at least one video stream.
+    """
+    if isinstance(file, str | Path):
+        _require_file(Path(file), name=name)
+        target: str | BinaryIO = f"file:{file}"
+    else:
+        file.seek(0)
+        target = file
+    try:
+        container = av.open(target, mode="r", options=_OPTIONS, metadata_errors="replace")
+    except PermissionError as error:
+        raise StorageError(f"{name}: may not be read: give read permission.") from error
+    except av.FFmpegError as error:
+        raise MediaError(
+            f"{name}: cannot be opened as MP4 or Matroska ({error.strerror}). The file is cut "
+            f"short, damaged or something else: fetch it again."
+        ) from error
+    if not container.streams.video:
+        found = ", ".join(stream.type for stream in container.streams) or "nothing"
+        container.close()
+        raise MediaError(f"{name}: holds no video stream (it holds {found}): fetch it again.")
+    return container
+
+
+def _require_file(path: Path, *, name: str) -> None:
+    if path.is_dir():
+        raise StorageError(f"{name}: is a folder, not a video file: pass the file's path.")
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise StorageError(
+            f"{name}: cannot be read at {path} ({error.strerror}): fetch it, or correct the path."
+        ) from error
+    if size == 0:
+        raise MediaError(f"{name}: is empty (0 bytes at {path}): fetch it again.")
+
+
+def stream_facts(container: InputContainer, *, name: str, frames: int) -> StreamFacts:
+    """Return the header's facts; ``frames`` is what the caller knows of the number of pictures.
+
+    Raises:
+        MediaError: If the codec cannot be decoded or the header lacks size or pixel format.
+    """
+    stream = container.streams.video[0]
+    context = stream.codec_context
+    if context is None:
+        raise MediaError(
+            f"{name}: its video codec is unknown to this FFmpeg: store it with another codec."
+        )
+    if context.pix_fmt is None or not (context.width > 0 and context.height > 0):
+        raise MediaError(
+            f"{name}: its header tells no picture (codec {context.name}, pixel format "
+            f"{context.pix_fmt}, {context.width}x{context.height}). The file is cut short or "
+            f"damaged: fetch it again."
+        )
+    return StreamFacts(
+        codec=context.codec.canonical_name,
+        pixel_format=context.pix_fmt,
+        width_px=context.width,
+        height_px=context.height,
+        frames=frames,
+        frame_rate_hz=float(stream.average_rate or 0),
+        tags=_merged_tags(container.metadata, stream.metadata),
+    )
+
+
+def _merged_tags(container: Mapping[str, str], stream: Mapping[str, str]) -> dict[str, str]:
+    tags = {key.lower(): value for key, value in container.items()}
+    for key, value in stream.items():
+        known = tags.setdefault(key.lower(), value)
+        if known != value:
+            tags[f"stream.{key.lower()}"] = value
+    return tags
+
+
+def frames_by_duration(container: InputContainer) -> int | None:
+    """Return how many frames fill the container's duration, None where that is no whole number."""
+    rate = container.streams.video[0].average_rate
+    if container.duration is None or not rate:
+        return None
+    count = rate * Fraction(container.duration, _MICROSECONDS)
+    whole = round(count)
+    return whole if whole > 0 and abs(count - whole) <= Fraction(1, 10) else None
+
+
+def require_whole_payload(container: InputContainer, *, name: str) -> None:
+    """Raise where the header's own table of samples (MP4) reaches beyond the end of the file.
+
+    Raises:
+        MediaError: If so; the message tells how many bytes are missing.
+    """
+    entries = container.streams.video[0].index_entries
+    end = max((entry.pos + entry.size for entry in entries), default=0)
+    if 0 < container.size < end:
+        raise MediaError(
+            f"{name}: is cut short: its header places frames up to byte {end}, the file ends at "
+            f"{container.size}: fetch it again."
+        )

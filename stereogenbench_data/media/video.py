@@ -1,0 +1,283 @@
+"""Frames of a video by number, exact: frame i is the i-th in the order of presentation.
+
+Nothing is guessed: where the pictures of a file are not those that its header and its caller
+expect (a gap, a cut, a damaged packet), reading is an error, never a neighbouring frame.
+"""
+
+from dataclasses import replace
+from types import TracebackType
+from typing import Final, NoReturn, Self
+
+import av
+import numpy as np
+from av.container import InputContainer
+from av.video.frame import VideoFrame
+from av.video.reformatter import Interpolation, VideoReformatter
+from jaxtyping import UInt8
+
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.clock import Clock, TableClock, steady_clock, table_clock
+from stereogenbench_data.media.container import (
+    StreamFacts,
+    VideoFile,
+    frames_by_duration,
+    open_container,
+    require_whole_payload,
+    stream_facts,
+)
+from stereogenbench_data.media.decoder import Astray, Decoder
+from stereogenbench_data.media.planes import plane_numbers
+
+_RED_GREEN_BLUE: Final = (2, 0, 1)
+"""Where the planes of FFmpeg's gbrp are."""
+
+
+def probe(file: VideoFile, *, name: str) -> StreamFacts:
+    """Return what a video file is, from its header where the header can be trusted.
+
+    Frames are counted by the header of an MP4 file, and by duration and rate of a Matroska file
+    if its last frame is found where they place it. Else all packets are counted.
+
+    Args:
+        file: A path, or a seekable binary file; the latter stays the caller's to close.
+        name: What messages call the file.
+
+    Raises:
+        StorageError: If the file cannot be read.
+        MediaError: If it is no MP4 or Matroska video, is cut short or holds no frame.
+    """
+    with open_container(file, name=name) as container:
+        require_whole_payload(container, name=name)
+        frames = _told_frames(container)
+        facts = stream_facts(container, name=name, frames=frames)
+    if frames:
+        return facts
+    with open_container(file, name=name) as container:
+        frames = len(table_clock(container, name=name).times)
+    if frames == 0:
+        raise MediaError(f"{name}: holds no frame (0 packets): fetch it again.")
+    return replace(facts, frames=frames)
+
+
+def _told_frames(container: InputContainer) -> int:
+    """Return how many frames the header tells, 0 where it does not tell or cannot be trusted."""
+    stream = container.streams.video[0]
+    if stream.frames:
+        is_cut = any(entry.is_discard for entry in stream.index_entries)
+        return 0 if is_cut else stream.frames
+    frames = frames_by_duration(container) or 0
+    clock = steady_clock(container, frames=frames)
+    if clock is None:
+        return 0
+    try:
+        container.seek(clock.latest(frames - 1), stream=stream)
+        shown = [packet.pts for packet in container.demux(stream) if packet.pts is not None]
+    except av.FFmpegError:
+        return 0
+    return frames if shown and clock.index(max(shown)) == frames - 1 else 0
+
+
+class VideoReader:
+    """An open video whose frames are read by number, fastest in ascending order.
+
+    A frame ahead within the same group of pictures is reached by decoding on; any other by
+    seeking to the key frame before it. On the way, pictures that no other is predicted from are
+    skipped. The last frame is kept, so that asking for it again costs nothing.
+
+    A reader belongs to the thread and the process that opened it.
+
+    Attributes:
+        name: What messages call the file.
+        facts: What the header says, with ``frames`` as they were asked for.
+        scaler: The scaler, whose tables are kept from frame to frame.
+    """
+
+    def __init__(self, file: VideoFile, *, name: str, frames: int, threads: int = 1) -> None:
+        """Open a video that must hold so many frames.
+
+        Args:
+            file: A path, or a seekable binary file; the latter stays the caller's to close.
+            name: What messages call the file.
+            frames: How many frames the video must have.
+            threads: How many slices of one picture to decode at once.
+
+        Raises:
+            StorageError: If the file cannot be read.
+            MediaError: If it is no video, is cut short or has another number of frames, as far as
+                the header tells. What the header does not tell, the frames concerned raise.
+        """
+        for what, value in (("frames", frames), ("threads", threads)):
+            if value < 1:
+                raise MediaError(f"{name}: {what} must be at least 1, got {value}.")
+        self.name = name
+        self.scaler = VideoReformatter()
+        self._file = file
+        self._threads = threads
+        self._decoder: Decoder | None = None
+        self._current: tuple[int, VideoFrame] | None = None
+        self._is_closed = False
+        container = open_container(file, name=name)
+        try:
+            require_whole_payload(container, name=name)
+            self.facts = stream_facts(container, name=name, frames=frames)
+            steady = steady_clock(container, frames=frames)
+            self._clock: Clock = steady or self._survey(container)
+        except MediaError:
+            container.close()
+            raise
+        if steady is None:
+            container.close()
+            container = open_container(file, name=name)
+        self._decoder = Decoder(container, clock=self._clock, threads=threads)
+
+    def frame(self, index: int) -> VideoFrame:
+        """Return the frame that is the ``index``-th in the order of presentation, from 0.
+
+        Raises:
+            MediaError: If there is no such frame, or it does not decode to what was stored.
+        """
+        if self._is_closed:
+            raise MediaError(f"{self.name}: is closed, so frame {index} cannot be read: reopen it.")
+        if not 0 <= index < self.facts.frames:
+            raise MediaError(
+                f"{self.name}: has no frame {index}: ask for one of 0 to {self.facts.frames - 1}."
+            )
+        if self._current is None or self._current[0] != index:
+            self._current = None
+            frame = self._reach(index)
+            self._require_same_picture(index, frame)
+            self._current = (index, frame)
+        return self._current[1]
+
+    def close(self) -> None:
+        """Close the file and the decoder; closing twice does nothing."""
+        self._is_closed = True
+        self._current = None
+        self._drop_decoder()
+
+    def __enter__(self) -> Self:
+        """Return the reader itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the reader."""
+        self.close()
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse to be pickled: a decoder belongs to its process."""
+        raise TypeError(
+            f"{self.name}: an open VideoReader cannot be pickled: "
+            f"pass the path to the other process and open it there."
+        )
+
+    def _reach(self, index: int) -> VideoFrame:
+        if self._decoder is not None:
+            try:
+                return self._decoder.reach(index)
+            except (Astray, av.FFmpegError):
+                self._drop_decoder()
+        return self._reach_from_start(index)
+
+    def _reach_from_start(self, index: int) -> VideoFrame:
+        """Decode a frame by the long way, by the exact times of all frames, skipping nothing."""
+        if not isinstance(self._clock, TableClock):
+            with open_container(self._file, name=self.name) as container:
+                self._clock = self._survey(container)
+        container = open_container(self._file, name=self.name)
+        decoder = Decoder(container, clock=self._clock, threads=self._threads)
+        try:
+            frame = decoder.decode_to(index)
+        except (Astray, av.FFmpegError) as error:
+            decoder.close()
+            reason = error.strerror if isinstance(error, av.FFmpegError) else error
+            raise MediaError(
+                f"{self.name}: frame {index} cannot be decoded ({self.facts.codec}: {reason}). "
+                f"The file is damaged: compare it with its checksum, or fetch it again."
+            ) from error
+        self._decoder = decoder
+        return frame
+
+    def _survey(self, container: InputContainer) -> TableClock:
+        clock = table_clock(container, name=self.name)
+        found, expected = len(clock.times), self.facts.frames
+        if found != expected:
+            raise MediaError(
+                f"{self.name}: holds {found} frames where {expected} are expected. It is cut "
+                f"short, or belongs to another scene: fetch it again."
+            )
+        return clock
+
+    def _require_same_picture(self, index: int, frame: VideoFrame) -> None:
+        facts = self.facts
+        found = (frame.format.name, frame.width, frame.height)
+        expected = (facts.pixel_format, facts.width_px, facts.height_px)
+        if found != expected:
+            raise MediaError(
+                f"{self.name}: frame {index} is {found[0]} {found[1]}x{found[2]} where the header "
+                f"says {expected[0]} {expected[1]}x{expected[2]}: store the file anew."
+            )
+
+    def _drop_decoder(self) -> None:
+        if self._decoder is not None:
+            self._decoder.close()
+            self._decoder = None
+
+
+def read_rgb(
+    reader: VideoReader,
+    index: int,
+    *,
+    size: tuple[int, int] | None = None,
+    out: UInt8[np.ndarray, "3 h w"] | None = None,
+) -> UInt8[np.ndarray, "3 h w"]:
+    """Return a frame as red, green and blue planes.
+
+    At the stored size the numbers equal those of ``ffmpeg -pix_fmt rgb24``, for 8-bit video bit
+    for bit, its colour matrix and range as the file tells them. At another size they are scaled
+    before the conversion, antialiased, with pixel centres kept (u' + 0.5 = s (u + 0.5)): by area
+    where the picture shrinks, else bicubic. The scaled conversion rounds, where ffmpeg's unscaled
+    one cuts off: it is 1.1 grey levels brighter on average.
+
+    Args:
+        reader: An open video.
+        index: Which frame, from 0.
+        size: (height, width) to scale to; None for the stored size.
+        out: Where to write, uint8 (3, h, w); None for a new array.
+
+    Returns:
+        uint8 (3, h, w), C-contiguous where ``out`` is; ``out`` itself if given.
+
+    Raises:
+        MediaError: If the frame cannot be decoded, or size or ``out`` does not fit.
+    """
+    frame = reader.frame(index)
+    height, width = size or (frame.height, frame.width)
+    if height < 1 or width < 1:
+        raise MediaError(
+            f"{reader.name}: a picture of {height}x{width} pixels (height x width) cannot be made: "
+            f"ask for a size of at least 1x1."
+        )
+    if out is None:
+        out = np.empty((3, height, width), dtype=np.uint8)
+    elif out.shape != (3, height, width) or out.dtype != np.uint8:
+        raise MediaError(
+            f"{reader.name}: frame {index} needs room of uint8 (3, {height}, {width}), got "
+            f"{out.dtype} {out.shape}: pass a fitting array or none."
+        )
+    shrinks = height * width < frame.height * frame.width
+    planes = reader.scaler.reformat(
+        frame,
+        width=width,
+        height=height,
+        format="gbrp",
+        interpolation=Interpolation.AREA if shrinks else Interpolation.BICUBIC,
+        threads=1,
+    )
+    for channel, plane in enumerate(_RED_GREEN_BLUE):
+        out[channel] = plane_numbers(planes, plane, dtype="u1")
+    return out

@@ -1,0 +1,282 @@
+"""From decoded views to the fields of a sample: each is worked out once, and only if asked for."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.geometry.disparity import (
+    disparity_error_px,
+    disparity_from_depth,
+    disparity_from_units,
+)
+from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.projection import (
+    Projection,
+    project_rectified,
+    project_through_poses,
+)
+from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
+from stereogenbench_data.geometry.warp import splat
+from stereogenbench_data.media.depth import depth_m_from_units
+from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.schema.records import DepthEncoding, Scene
+
+RECTIFIED_PX: Final = 0.05
+"""A rig whose residual is at most this is rectified: disparity is B fx / z. Beyond it every pixel
+goes through the poses."""
+
+MIRROR_X: Final = np.diag([-1.0, 1.0, 1.0, 1.0])
+
+MapF32 = Float32[np.ndarray, "t h w"]
+MapBool = Bool[np.ndarray, "t h w"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneFacts:
+    """What a sample needs of its scene beside the pictures.
+
+    Attributes:
+        scene: The row of the index.
+        encodings: The depth contract of each camera.
+        poses: The poses, or None where nothing needs them.
+        url: The file or folder that holds the scene.
+    """
+
+    scene: Scene
+    encodings: dict[int, DepthEncoding]
+    poses: CameraPoses | None
+    url: str
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether the closed form of disparity holds for this rig."""
+        return self.scene.rig_residual_px <= RECTIFIED_PX
+
+    def camera_poses(self) -> CameraPoses:
+        """Return the poses, which must have been loaded."""
+        if self.poses is None:
+            raise GeometryError(f"{self.scene.id.key}: a field needs poses that were not loaded.")
+        return self.poses
+
+
+class PairGeometry:
+    """What follows from the depth of one camera (the source) for another (the target).
+
+    Maps are (t, h, w). Disparity is u_source - u_target in pixels.
+    """
+
+    def __init__(self, views: Views, facts: SceneFacts, *, source: int, target: int) -> None:
+        """Take the views of both cameras; nothing is computed yet."""
+        self._views = views
+        self._facts = facts
+        self._source = source
+        self._target = target
+        self._encoding = facts.encodings[source]
+
+    @property
+    def stored(self) -> StoredDepth:
+        """The source camera's depth as it is stored."""
+        return self._views.depths[self._source]
+
+    @cached_property
+    def baseline_m(self) -> float:
+        """The recorded baseline, negative where the target stands to the left."""
+        lateral_m = self._facts.scene.lateral_m
+        to_the_right = lateral_m[self._target] > lateral_m[self._source]
+        if self._views.world == "mirrored":
+            to_the_right = not to_the_right
+        recorded_m = self._facts.scene.rig.baseline_cm(self._source, self._target) / 100
+        return recorded_m if to_the_right else -recorded_m
+
+    @cached_property
+    def depth_m(self) -> MapF32:
+        """Depth along the optical axis, 0 where not measured."""
+        return depth_m_from_units(
+            self.stored.units,
+            measured=self.stored.measured,
+            encoding=self._encoding,
+            intrinsics=self._views.intrinsics,
+        )
+
+    @cached_property
+    def disparity(self) -> MapF32:
+        """Disparity in pixels, 0 where depth was not measured."""
+        if not self._facts.is_rectified:
+            u_px = np.arange(self.depth_m.shape[-1]) + 0.5
+            moved = np.where(self.stored.measured, u_px - self.projection.u_px, 0)
+            return moved.astype(np.float32)
+        rig = {"focal_px": self._views.intrinsics.fx_px, "baseline_m": self.baseline_m}
+        if self._encoding.kind == "ray":
+            return disparity_from_depth(self.depth_m, **rig)
+        disparity = disparity_from_units(
+            self.stored.units, **rig, unit_m=self._encoding.unit_m, form=self._encoding.form
+        )
+        return np.multiply(disparity, self.stored.measured, out=disparity)
+
+    @cached_property
+    def projection(self) -> Projection:
+        """Where each source pixel lands in the target."""
+        if self._facts.is_rectified:
+            return project_rectified(self.depth_m, self.disparity)
+        target_from_source = self.target_from_source
+        parts = [
+            project_through_poses(
+                depth_m,
+                intrinsics=self._views.intrinsics,
+                target_intrinsics=self._views.intrinsics,
+                target_from_source=transform,
+            )
+            for depth_m, transform in zip(self.depth_m, target_from_source, strict=True)
+        ]
+        return Projection(
+            u_px=np.stack([part.u_px for part in parts]),
+            v_px=np.stack([part.v_px for part in parts]),
+            depth_m=np.stack([part.depth_m for part in parts]),
+        )
+
+    @cached_property
+    def target_from_source(self) -> Float64[np.ndarray, "t 4 4"]:
+        """Source camera's coordinates to the target camera's, in metres."""
+        poses = self._facts.camera_poses()
+        transforms = np.stack(
+            [
+                poses.cam_from_cam(frame, target=self._target, source=self._source)
+                for frame in self._views.frames
+            ]
+        )
+        if self._views.world == "mirrored":
+            return MIRROR_X @ transforms @ MIRROR_X
+        return transforms
+
+    @cached_property
+    def quantum_m(self) -> float | MapF32:
+        """The step between neighbouring depths that can be stored."""
+        if self._encoding.form == "depth":
+            return self._encoding.unit_m
+        return self.depth_m**2 / np.float32(self._encoding.unit_m)
+
+    @cached_property
+    def disparity_error(self) -> MapF32:
+        """How far quantised depth can put disparity off, in pixels; 0 where not measured."""
+        focal_px = self._views.intrinsics.fx_px
+        if self._encoding.form == "inverse":
+            half_step_px = focal_px * abs(self.baseline_m) / self._encoding.unit_m / 2
+            return self.stored.measured * np.float32(half_step_px)
+        return disparity_error_px(
+            self.depth_m,
+            focal_px=focal_px,
+            baseline_m=self.baseline_m,
+            quantum_m=self._encoding.unit_m,
+        )
+
+    @cached_property
+    def visible_from_source(self) -> MapBool:
+        """Visible in the target, as far as the source's own depth can tell."""
+        return visible_from_source(
+            self.projection, measured=self.stored.measured, quantum_m=self.quantum_m
+        )
+
+    def visible(self, target: "PairGeometry") -> MapBool:
+        """Return what is visible in the target, by the depth of the target's own geometry."""
+        return visible_in_target(
+            self.projection,
+            measured=self.stored.measured,
+            target_depth_m=target.depth_m,
+            target_measured=target.stored.measured,
+            quantum_m=np.maximum(self.quantum_m, target.quantum_m),
+        )
+
+    @cached_property
+    def splatted(self) -> tuple[Any, MapBool]:
+        """The source picture in the target's view, and the holes in it."""
+        pictures = self._views.pictures[self._source]
+        return splat(pictures, self.projection, measured=self.stored.measured)
+
+    @cached_property
+    def hole(self) -> MapBool:
+        """Target pixels on which no source pixel lands."""
+        if self._source in self._views.pictures:
+            return self.splatted[1]
+        blank = np.zeros((len(self.depth_m), 1, *self.depth_m.shape[-2:]), dtype=np.uint8)
+        return splat(blank, self.projection, measured=self.stored.measured)[1]
+
+
+class PairSample:
+    """One source and one target of a sample, with the way there and the way back."""
+
+    def __init__(self, views: Views, facts: SceneFacts, *, target: int) -> None:
+        """Take the views of both cameras; nothing is computed yet."""
+        self.views = views
+        self.facts = facts
+        self.target = target
+
+    @cached_property
+    def ahead(self) -> PairGeometry:
+        """From the source to the target."""
+        return PairGeometry(self.views, self.facts, source=self.views.source, target=self.target)
+
+    @cached_property
+    def back(self) -> PairGeometry:
+        """From the target to the source."""
+        return PairGeometry(self.views, self.facts, source=self.target, target=self.views.source)
+
+    def world_from(self, camera: int) -> Float64[np.ndarray, "t 4 4"]:
+        """Return a camera's poses at the sample's frames."""
+        poses = self.facts.camera_poses()
+        transforms = np.stack([poses.world_from_cam(frame, camera) for frame in self.views.frames])
+        if self.views.world == "mirrored":
+            return MIRROR_X @ transforms @ MIRROR_X
+        return transforms
+
+
+Builder = Callable[[PairSample], Any]
+
+PAIR_BUILDERS: Final[dict[str, Builder]] = {
+    "left": lambda s: s.views.pictures[s.views.source],
+    "right": lambda s: s.views.pictures[s.target],
+    "disparity": lambda s: s.ahead.disparity[:, None],
+    "valid": lambda s: s.ahead.stored.measured[:, None],
+    "visible": lambda s: s.ahead.visible(s.back)[:, None],
+    "visible_from_left": lambda s: s.ahead.visible_from_source[:, None],
+    "disparity_error": lambda s: s.ahead.disparity_error[:, None],
+    "depth": lambda s: s.ahead.depth_m[:, None],
+    "depth_right": lambda s: s.back.depth_m[:, None],
+    "disparity_right": lambda s: 0 - s.back.disparity[:, None],
+    "valid_right": lambda s: s.back.stored.measured[:, None],
+    "visible_right": lambda s: s.back.visible(s.ahead)[:, None],
+    "warped_right": lambda s: s.ahead.splatted[0],
+    "hole": lambda s: s.ahead.hole[:, None],
+    "intrinsics": lambda s: s.views.intrinsics.matrix(),
+    "baseline_m": lambda s: np.float64(s.ahead.baseline_m),
+    "right_from_left": lambda s: s.ahead.target_from_source,
+    "world_from_left": lambda s: s.world_from(s.views.source),
+    "frame_index": lambda s: np.array(s.views.frames, dtype=np.int64),
+    "pair": lambda s: np.array([s.views.source, s.target], dtype=np.int64),
+}
+
+VIEW_BUILDERS: Final[dict[str, Builder]] = {
+    "image": lambda s: s.views.pictures[s.target],
+    "depth": PAIR_BUILDERS["depth_right"],
+    "valid": PAIR_BUILDERS["valid_right"],
+    "intrinsics": PAIR_BUILDERS["intrinsics"],
+    "focal_mm": lambda s: np.float64(s.facts.scene.rig.focal_mm),
+    "world_from_cam": lambda s: s.world_from(s.target),
+    "first_from_cam": lambda s: s.back.target_from_source,
+    "camera": lambda s: np.int64(s.target),
+    "frame_index": PAIR_BUILDERS["frame_index"],
+}
+
+TEXT_BUILDERS: Final[dict[str, Callable[[SceneFacts], str]]] = {
+    "scene": lambda facts: facts.scene.id.key,
+    "family": lambda facts: facts.scene.id.family,
+    "map": lambda facts: facts.scene.id.map_name,
+    "split": lambda facts: facts.scene.id.split,
+    "subset": lambda facts: facts.scene.id.subset or "",
+    "caption": lambda facts: facts.scene.caption,
+    "__url__": lambda facts: facts.url,
+}

@@ -1,0 +1,117 @@
+"""Samples as pictures, for people who would rather look than read."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from stereogenbench_data.errors import FieldError
+from stereogenbench_data.samples.load import Sample
+
+Picture = UInt8[np.ndarray, "h w 3"]
+
+COLOUR_STOPS: Final = np.array(
+    [(18, 10, 60), (40, 70, 160), (20, 150, 160), (90, 200, 90), (240, 220, 60), (220, 60, 30)],
+    dtype=np.float64,
+)
+"""From far (dark blue) to near (red), each lighter than the one before but for the last."""
+NOT_MEASURED: Final = (96, 96, 96)
+_CAPTION_PX: Final = 20
+_GAP_PX: Final = 4
+
+
+def coloured(
+    values: Float[np.ndarray, "h w"], *, measured: Bool[np.ndarray, "h w"], largest: float
+) -> Picture:
+    """Return a map in colours from 0 (dark blue) to ``largest`` (red), grey where not measured."""
+    place = np.clip(np.abs(values) / max(largest, 1e-12), 0, 1) * (len(COLOUR_STOPS) - 1)
+    channels = [
+        np.interp(place, np.arange(len(COLOUR_STOPS)), COLOUR_STOPS[:, channel])
+        for channel in range(3)
+    ]
+    picture = np.stack(channels, axis=-1).round().astype(np.uint8)
+    picture[~measured] = NOT_MEASURED
+    return picture
+
+
+def contact_sheet(samples: Sequence[Sample]) -> Picture:
+    """Return one row of captioned tiles for each sample: every picture and map that it has.
+
+    Args:
+        samples: Samples of `StereoPairs` in which left, right, disparity, valid, visible, depth,
+            warped_right or hole are tiles where present; single pairs, not clips or sweeps.
+
+    Returns:
+        (h, w, 3) uint8. Disparity and depth are coloured up to their 98th percentile, which the
+        caption says.
+
+    Raises:
+        FieldError: If the samples have nothing to show, or have a time axis.
+    """
+    rows = [_row(sample) for sample in samples]
+    if not rows or not rows[0]:
+        raise FieldError(f"a contact sheet needs one of the fields {', '.join(_TILES)}.")
+    height = max(tile.shape[0] for row in rows for _, tile in row) + _CAPTION_PX
+    width = max(tile.shape[1] for row in rows for _, tile in row)
+    columns = max(map(len, rows))
+    sheet = Image.new(
+        "RGB", (columns * (width + _GAP_PX), len(rows) * (height + _GAP_PX)), (255, 255, 255)
+    )
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(size=13)
+    for place, row in enumerate(rows):
+        for column, (caption, tile) in enumerate(row):
+            corner = (column * (width + _GAP_PX), place * (height + _GAP_PX))
+            sheet.paste(Image.fromarray(tile), (corner[0], corner[1] + _CAPTION_PX))
+            draw.text((corner[0] + 2, corner[1] + 2), caption, fill=(0, 0, 0), font=font)
+    return np.asarray(sheet)
+
+
+def write_png(path: Path, picture: Picture) -> None:
+    """Write an (h, w, 3) uint8 picture as PNG."""
+    Image.fromarray(picture).save(path, format="PNG")
+
+
+def _row(sample: Sample) -> list[tuple[str, Picture]]:
+    arrays = {name: np.asarray(value) for name, value in sample.items()}
+    timed = [name for name in _TILES if name in arrays and arrays[name].ndim != 3]
+    if timed:
+        raise FieldError(f"{timed[0]} is {arrays[timed[0]].shape}: show one pair of one frame.")
+    return [tile(name, arrays) for name, tile in _TILES.items() if name in arrays]
+
+
+def _rgb(name: str, sample: dict[str, Any]) -> tuple[str, Picture]:
+    caption = name
+    if "pair" in sample and name in ("left", "right"):
+        caption += f" (cam {int(sample['pair'][name == 'right'])})"
+    if "baseline_m" in sample and name == "right":
+        caption += f", {float(sample['baseline_m']) * 100:.1f} cm"
+    return caption, np.ascontiguousarray(sample[name].transpose(1, 2, 0))
+
+
+def _scaled(name: str, sample: dict[str, Any], *, unit: str) -> tuple[str, Picture]:
+    values = sample[name][0]
+    measured = sample["valid"][0] if "valid" in sample else values != 0
+    largest = float(np.percentile(np.abs(values[measured]), 98)) if measured.any() else 0.0
+    caption = f"{name}, 0 to {largest:.3g} {unit}"
+    return caption, coloured(values, measured=measured, largest=largest)
+
+
+def _yes_no(name: str, sample: dict[str, Any]) -> tuple[str, Picture]:
+    yes = sample[name][0]
+    return f"{name}, {yes.mean():.0%}", np.repeat(yes[..., None] * np.uint8(255), 3, axis=-1)
+
+
+_TILES: Final[dict[str, Callable[[str, dict[str, Any]], tuple[str, Picture]]]] = {
+    "left": _rgb,
+    "right": _rgb,
+    "disparity": lambda name, sample: _scaled(name, sample, unit="px"),
+    "depth": lambda name, sample: _scaled(name, sample, unit="m"),
+    "valid": _yes_no,
+    "visible": _yes_no,
+    "warped_right": _rgb,
+    "hole": _yes_no,
+}

@@ -1,0 +1,390 @@
+"""Transforms that move pictures, stored depth and cameras together.
+
+Each maps `Views` to `Views` with the random numbers of one sample, so the same seed gives the same
+sample in whatever process it is made. Pictures are averaged when they shrink; stored depth takes
+the nearest pixel centre, never a mixture of two depths. Every frame and camera of a sample is
+treated alike, but where a docstring says otherwise.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from stereogenbench_data.errors import FieldError
+from stereogenbench_data.samples.load import Transform, resized_nearest
+from stereogenbench_data.samples.views import StoredDepth, Views
+
+Generator = np.random.Generator
+
+
+@dataclass(frozen=True, slots=True)
+class Compose:
+    """Transforms one after the other.
+
+    Raises:
+        FieldError: If an `Eraser` stands before a `HorizontalFlip`: the erased patch would land in
+            the first view, whose disparity is taken for good.
+    """
+
+    transforms: Sequence[Transform]
+
+    def __post_init__(self) -> None:
+        """Refuse an order that would give wrong samples."""
+        erased = False
+        for transform in self._steps():
+            if erased and transform.swaps_views:
+                raise FieldError(
+                    "Eraser stands before a flip, which would carry its patches into the first "
+                    "view: put Eraser last."
+                )
+            erased = erased or isinstance(transform, Eraser)
+
+    def _steps(self) -> Iterator[Transform]:
+        """Walk through the transforms, also through those of a Compose within."""
+        for transform in self.transforms:
+            if isinstance(transform, Compose):
+                yield from transform._steps()
+            else:
+                yield transform
+
+    @property
+    def swaps_views(self) -> bool:
+        """Whether any of them does."""
+        return any(transform.swaps_views for transform in self.transforms)
+
+    def __call__(self, views: Views, generator: Generator) -> Views:
+        """Apply each in turn."""
+        for transform in self.transforms:
+            views = transform(views, generator)
+        return views
+
+
+@dataclass(frozen=True, slots=True)
+class Resize:
+    """Stretch to a size in pixels; fx, cx and fy, cy scale by the realised factors."""
+
+    height: int
+    width: int
+    swaps_views: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Refuse a size of nothing."""
+        _require_size(self.height, self.width)
+
+    def __call__(self, views: Views, generator: Generator) -> Views:
+        """Return resized views."""
+        return _resized(views, height=self.height, width=self.width)
+
+
+@dataclass(frozen=True, slots=True)
+class Letterbox:
+    """Scale to fit a size in pixels without stretching, centred; the rest is black, unmeasured."""
+
+    height: int
+    width: int
+    swaps_views: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Refuse a size of nothing."""
+        _require_size(self.height, self.width)
+
+    def __call__(self, views: Views, generator: Generator) -> Views:
+        """Return scaled and padded views."""
+        old = views.intrinsics
+        scale = min(self.height / old.height_px, self.width / old.width_px)
+        height = max(1, min(self.height, round(old.height_px * scale)))
+        width = max(1, min(self.width, round(old.width_px * scale)))
+        return _windowed(
+            _resized(views, height=height, width=width),
+            top=(height - self.height) // 2,
+            left=(width - self.width) // 2,
+            size=(self.height, self.width),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Crop:
+    """Cut a window, the same in every view; where it reaches beyond the picture, refuse."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+    swaps_views: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Refuse a size of nothing."""
+        _require_size(self.height, self.width)
+
+    def __call__(self, views: Views, generator: Generator) -> Views:
+        """Return cropped views."""
+        old = views.intrinsics
+        if (
+            min(self.top, self.left) < 0
+            or self.top + self.height > old.height_px
+            or self.left + self.width > old.width_px
+        ):
+            raise FieldError(
+                f"{self} reaches beyond a picture of {old.width_px} x {old.height_px} pixels."
+            )
+        return _windowed(views, top=self.top, left=self.left, size=(self.height, self.width))
+
+
+@dataclass(frozen=True, slots=True)
+class RandomCrop:
+    """Cut a window of a size in pixels, anywhere inside the picture."""
+
+    height: int
+    width: int
+    swaps_views: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Refuse a size of nothing."""
+        _require_size(self.height, self.width)
+
+    def __call__(self, views: Views, generator: Generator) -> Views:
+        """Return cropped views."""
+        spare = (views.intrinsics.height_px - self.height, views.intrinsics.width_px - self.width)
+        if min(spare) < 0:
+            raise FieldError(
+                f"{self} is larger than a picture of {views.intrinsics.width_px} x "
+                f"{views.intrinsics.height_px} pixels; scale it up first."
+            )
+        top, left = (int(generator.integers(room + 1)) for room in spare)
+        return _windowed(views, top=top, left=left, size=(self.height, self.width))
+
+
+@dataclass(frozen=True, slots=True)
+class RandomScale:
+    """Scale by 2^U(low, high), and with a probability stretch x and y apart by up to 2^stretch.
+
+    Never below ``at_least`` (height, width), so that a crop of that size still fits. The default
+    range is the one that RAFT-Stereo trains with.
+    """
+
+    low: float = -0.2
+    high: float = 0.5
+    stretch: float = 0.2
+    stretch_probability: float = 0.8
+    at_least: tuple[int, int] = (1, 1)
+    swaps_views: ClassVar[bool] = False
+
+    def __call__(self, views: Views, generator: Generator) -> Views:
+        """Return scaled views."""
+        exponents = np.full(2, generator.uniform(self.low, self.high))
+        if generator.random() < self.stretch_probability:
+            exponents += generator.uniform(-self.stretch, self.stretch, size=2)
+        old = (views.intrinsics.height_px, views.intrinsics.width_px)
+        height, width = (
+            max(least, round(size * 2.0**exponent))
+            for size, exponent, least in zip(old, exponents, self.at_least, strict=True)
+        )
+        return _resized(views, height=height, width=width)
+
+
+@dataclass(frozen=True, slots=True)
+class HorizontalFlip:
+    """Mirror pictures, depth and cameras, and swap the two views, with a probability.
+
+    A mirrored pair is a pair again, left of right, only when its views change places; its
+    disparity then comes from the depth of what was the right view.
+    """
+
+    probability: float = 0.5
+    swaps_views: ClassVar[bool] = True
+
+    def __call__(self, views: Views, generator: Generator) -> Views:
+        """Return the views, or their mirror image."""
+        if generator.random() >= self.probability:
+            return views
+        if len(views.targets) != 1:
+            raise FieldError(
+                f"HorizontalFlip swaps the two views of a pair; this sample has one view and "
+                f"{len(views.targets)} others. Use it with single pairs."
+            )
+        return replace(
+            views,
+            source=views.targets[0],
+            targets=(views.source,),
+            pictures={
+                camera: np.ascontiguousarray(pictures[..., ::-1])
+                for camera, pictures in views.pictures.items()
+            },
+            depths={
+                camera: StoredDepth(
+                    np.ascontiguousarray(depth.units[..., ::-1]),
+                    np.ascontiguousarray(depth.measured[..., ::-1]),
+                )
+                for camera, depth in views.depths.items()
+            },
+            intrinsics=views.intrinsics.flipped(),
+            world="mirrored" if views.world == "as filmed" else "as filmed",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ColorJitter:
+    """Change brightness, contrast, saturation and hue: alike in all views, or each view by itself.
+
+    Factors are drawn from [1 - x, 1 + x]; hue turns by up to x of a full circle. With
+    ``asymmetric_probability`` every view draws its own, as two real cameras differ; the frames of
+    a clip always share theirs.
+    """
+
+    brightness: float = 0.4
+    contrast: float = 0.4
+    saturation: float = 0.4
+    hue: float = 0.16
+    asymmetric_probability: float = 0.2
+    swaps_views: ClassVar[bool] = False
+
+    def __call__(self, views: Views, generator: Generator) -> Views:
+        """Return views with other colours."""
+        common = self._draw(generator)
+        apart = generator.random() < self.asymmetric_probability
+        grey = float(np.mean([_luma(pictures).mean() for pictures in views.pictures.values()]))
+        pictures = {
+            camera: _recoloured(pictures, self._draw(generator) if apart else common, grey=grey)
+            for camera, pictures in sorted(views.pictures.items())
+        }
+        return replace(views, pictures=pictures)
+
+    def _draw(self, generator: Generator) -> tuple[float, float, float, float]:
+        low = np.array([1 - self.brightness, 1 - self.contrast, 1 - self.saturation, -self.hue])
+        high = np.array([1 + self.brightness, 1 + self.contrast, 1 + self.saturation, self.hue])
+        brightness, contrast, saturation, hue = generator.uniform(low, high)
+        return float(brightness), float(contrast), float(saturation), float(hue)
+
+
+@dataclass(frozen=True, slots=True)
+class Eraser:
+    """Paint boxes of the target views over with their mean colour: what the source sees is hidden.
+
+    The source view, depth and disparity stay. Boxes have sides of ``low`` to ``high`` pixels.
+    """
+
+    probability: float = 0.5
+    most_boxes: int = 2
+    low: int = 50
+    high: int = 100
+    swaps_views: ClassVar[bool] = False
+
+    def __call__(self, views: Views, generator: Generator) -> Views:
+        """Return views with boxes erased."""
+        if generator.random() >= self.probability:
+            return views
+        height, width = views.intrinsics.height_px, views.intrinsics.width_px
+        boxes = []
+        for _ in range(int(generator.integers(1, self.most_boxes + 1))):
+            top, left = int(generator.integers(height)), int(generator.integers(width))
+            tall, wide = (int(side) for side in generator.integers(self.low, self.high + 1, 2))
+            boxes.append((slice(top, top + tall), slice(left, left + wide)))
+        pictures = dict(views.pictures)
+        for camera in set(views.targets) & set(pictures):
+            erased = pictures[camera].copy()
+            mean = erased.mean(axis=(-2, -1), keepdims=True).round().astype(np.uint8)
+            for rows, columns in boxes:
+                erased[..., rows, columns] = mean
+            pictures[camera] = erased
+        return replace(views, pictures=pictures)
+
+
+def _require_size(height: int, width: int) -> None:
+    if min(height, width) < 1:
+        raise FieldError(f"a picture of {width} x {height} pixels cannot be: sizes start at 1.")
+
+
+def _resized(views: Views, *, height: int, width: int) -> Views:
+    size = (height, width)
+    return replace(
+        views,
+        pictures={
+            camera: _resized_pictures(pictures, size=size)
+            for camera, pictures in views.pictures.items()
+        },
+        depths={
+            camera: StoredDepth(
+                resized_nearest(depth.units, size=size),
+                resized_nearest(depth.measured, size=size),
+            )
+            for camera, depth in views.depths.items()
+        },
+        intrinsics=views.intrinsics.resized(width_px=width, height_px=height),
+    )
+
+
+def _resized_pictures(pictures: Any, *, size: tuple[int, int]) -> Any:
+    resized = torch.nn.functional.interpolate(
+        torch.from_numpy(np.ascontiguousarray(pictures)),
+        size=size,
+        mode="bilinear",
+        antialias=True,
+    )
+    return resized.numpy()
+
+
+def _windowed(views: Views, *, top: int, left: int, size: tuple[int, int]) -> Views:
+    height, width = size
+    return replace(
+        views,
+        pictures={
+            camera: _window(pictures, top=top, left=left, size=size)
+            for camera, pictures in views.pictures.items()
+        },
+        depths={
+            camera: StoredDepth(
+                _window(depth.units, top=top, left=left, size=size),
+                _window(depth.measured, top=top, left=left, size=size),
+            )
+            for camera, depth in views.depths.items()
+        },
+        intrinsics=views.intrinsics.cropped(
+            left_px=left, top_px=top, width_px=width, height_px=height
+        ),
+    )
+
+
+def _window(maps: Any, *, top: int, left: int, size: tuple[int, int]) -> Any:
+    """Return a window of maps; beyond their border it is 0, or False."""
+    height, width = size
+    window = np.zeros((*maps.shape[:-2], height, width), dtype=maps.dtype)
+    rows = slice(max(0, top), min(maps.shape[-2], top + height))
+    columns = slice(max(0, left), min(maps.shape[-1], left + width))
+    window[..., rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = (
+        maps[..., rows, columns]
+    )
+    return window
+
+
+def _luma(pictures: Any) -> Any:
+    """Return the BT.601 luma of (t, 3, h, w) pictures, (t, 1, h, w) float32."""
+    weights = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+    return np.einsum("c,tchw->thw", weights, pictures, dtype=np.float32)[:, None]
+
+
+def _recoloured(pictures: Any, factors: tuple[float, float, float, float], *, grey: float) -> Any:
+    """Return (t, 3, h, w) uint8 pictures of another brightness, contrast, saturation and hue.
+
+    Contrast stretches about ``grey``, the mean luma, which all views share.
+    """
+    brightness, contrast, saturation, hue = (np.float32(factor) for factor in factors)
+    middle = np.float32(grey) * brightness
+    colours = middle + (pictures * brightness - middle) * contrast
+    luma = _luma(colours)
+    turned = np.einsum("ij,tjhw->tihw", _hue_rotation(float(hue)), colours - luma)
+    return np.clip(np.rint(luma + turned * saturation), 0, 255).astype(np.uint8)
+
+
+def _hue_rotation(turns: float) -> Any:
+    """Return the matrix that turns colours about the grey axis by a part of a full circle.
+
+    Source: Rodrigues' formula for the axis (1, 1, 1).
+    """
+    cosine, sine = np.cos(2 * np.pi * turns), np.sin(2 * np.pi * turns)
+    axis = np.full(3, 1 / np.sqrt(3))
+    cross = np.cross(np.eye(3), axis)
+    matrix = cosine * np.eye(3) + sine * cross + (1 - cosine) * np.outer(axis, axis)
+    return matrix.astype(np.float32)

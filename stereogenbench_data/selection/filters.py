@@ -1,0 +1,159 @@
+"""Which scenes: filters on the index, each of which names itself where it leaves nothing."""
+
+import difflib
+from collections.abc import Callable, Sequence
+from typing import Any, TypedDict
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.storage.index import SceneIndex
+
+Range = tuple[float, float]
+
+
+class SceneFilters(TypedDict, total=False):
+    """What a scene must be. A filter that is left out, or None, lets every scene pass.
+
+    Text filters take one value or several, of which one must match exactly. Ranges are closed:
+    both ends belong to them.
+
+    Attributes:
+        split: "train" or "eval".
+        subset: "seen_map" or "unseen_map" (of eval scenes).
+        family: Such as "Uniform".
+        map: Such as "Stylized_Egypt".
+        character: The identifier of the character's mesh.
+        animation: The identifier of the animation.
+        scenes: Keys, such as "train/Uniform/Stylized_Egypt/scene_000041".
+        focal_mm: Range of focal lengths in mm.
+        valid_depth_ratio: Range of the share of measured depth pixels, known only for an index
+            that was made with it.
+        caption: Words that must all occur in the caption, in any case and order.
+    """
+
+    split: str | Sequence[str] | None
+    subset: str | Sequence[str] | None
+    family: str | Sequence[str] | None
+    map: str | Sequence[str] | None
+    character: str | Sequence[str] | None
+    animation: str | Sequence[str] | None
+    scenes: str | Sequence[str] | None
+    focal_mm: Range | None
+    valid_depth_ratio: Range | None
+    caption: str | None
+
+
+_TEXT_COLUMNS = {
+    "split": "split",
+    "subset": "subset",
+    "family": "family",
+    "map": "map_name",
+    "character": "character",
+    "animation": "animation",
+    "scenes": "key",
+}
+_RANGE_COLUMNS = {"focal_mm": "focal_mm", "valid_depth_ratio": "valid_depth_ratio"}
+_MOST_VALUES = 12
+
+
+def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray, " n"]:
+    """Return the rows of the index that pass every filter, ascending, never none.
+
+    Raises:
+        SelectionError: If no scene passes, naming the filter that left nothing, what it was
+            asked for and what exists there; or if a filter cannot be understood.
+    """
+    rows = np.arange(len(index), dtype=np.int64)
+    applied: list[str] = []
+    for name, wanted in filters.items():
+        if wanted is None:
+            continue
+        keep, there = _apply(index, name, wanted, rows=rows)
+        if not keep.any():
+            before = f" of those left by {', '.join(applied)}" if applied else ""
+            raise SelectionError(
+                f"{name}={wanted!r} matches none of {len(rows)} scenes{before}; "
+                f"{name} there is {there()}."
+            )
+        rows = rows[keep]
+        applied.append(f"{name}={wanted!r}")
+    if len(rows) == 0:
+        raise SelectionError(f"{index.root}: the index holds no scene at all.")
+    return rows
+
+
+def _apply(
+    index: SceneIndex, name: str, wanted: Any, *, rows: Int64[np.ndarray, " n"]
+) -> tuple[Bool[np.ndarray, " n"], Callable[[], str]]:
+    """Return which rows one filter keeps, and a way to say what values they have."""
+    if name in _TEXT_COLUMNS:
+        values = index.column(_TEXT_COLUMNS[name])[rows]
+        names = _texts(name, wanted)
+        return np.isin(values.astype(str), names), lambda: _listed(values, near=names)
+    if name in _RANGE_COLUMNS:
+        numbers = index.column(_RANGE_COLUMNS[name])[rows].astype(np.float64)
+        low, high = require_range(name, wanted)
+        if np.isnan(numbers).all():
+            raise SelectionError(
+                f"{name}={wanted!r}: the index does not know it for any of {len(rows)} scenes. "
+                "Make the index with `stereogenbench index ROOT --valid-depth`."
+            )
+        return (numbers >= low) & (numbers <= high), lambda: _spanned(numbers)
+    if name == "caption":
+        return _caption_filter(index, wanted, rows=rows)
+    known = [*_TEXT_COLUMNS, *_RANGE_COLUMNS, "caption"]
+    near = difflib.get_close_matches(name, known, n=1)
+    raise SelectionError(
+        f"there is no filter {name!r}"
+        + (f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(known)}.")
+    )
+
+
+def _caption_filter(
+    index: SceneIndex, wanted: Any, *, rows: Int64[np.ndarray, " n"]
+) -> tuple[Bool[np.ndarray, " n"], Callable[[], str]]:
+    if not isinstance(wanted, str) or not wanted.split():
+        raise SelectionError(f"caption must be one or more words, got {wanted!r}.")
+    words = wanted.lower().split()
+    captions = [str(caption).lower() for caption in index.column("caption")[rows]]
+    keep = np.array([all(word in caption for word in words) for caption in captions], dtype=bool)
+    written = sum(map(bool, captions))
+    return keep, lambda: f"written for {written} scenes, without all of {words}"
+
+
+def require_range(name: str, wanted: Any) -> Range:
+    """Return a (low, high) pair of numbers as floats.
+
+    Raises:
+        SelectionError: If it is not two numbers in ascending order.
+    """
+    try:
+        low, high = (float(number) for number in wanted)
+    except (TypeError, ValueError):
+        raise SelectionError(f"{name} must be a pair (low, high), got {wanted!r}.") from None
+    if not low <= high:
+        raise SelectionError(f"{name} must be (low, high) with low <= high, got {wanted!r}.")
+    return low, high
+
+
+def _texts(name: str, wanted: Any) -> list[str]:
+    names = [wanted] if isinstance(wanted, str) else list(wanted)
+    if not names or not all(isinstance(value, str) for value in names):
+        raise SelectionError(f"{name} must be a text or a sequence of texts, got {wanted!r}.")
+    return names
+
+
+def _listed(values: Any, *, near: list[str]) -> str:
+    found = sorted({str(value) for value in values if value is not None and str(value)})
+    if not found:
+        return "not recorded for any"
+    close = [match for name in near for match in difflib.get_close_matches(name, found, n=2)]
+    first = list(dict.fromkeys([*close, *found]))[:_MOST_VALUES]
+    more = f" and {len(found) - len(first)} more" if len(found) > len(first) else ""
+    return ", ".join(map(repr, first)) + more
+
+
+def _spanned(numbers: Any) -> str:
+    return f"{np.nanmin(numbers):g} to {np.nanmax(numbers):g}"

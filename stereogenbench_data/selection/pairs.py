@@ -1,0 +1,196 @@
+"""Which cameras: the ordered pairs of each scene, by name, by index and by baseline."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int8, Int64
+
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.schema.release import (
+    ADJACENT_PAIRS,
+    BASELINE_BINS,
+    CAMERA_COUNT,
+    CAMERA_PAIRS,
+    baseline_bin,
+)
+from stereogenbench_data.selection.filters import Range, require_range
+from stereogenbench_data.storage.index import SceneIndex
+
+PairsSpec = Literal["primary", "adjacent", "all", "sweep"] | Sequence[tuple[int, int]]
+Direction = Literal["left_to_right", "right_to_left"]
+BaselineSpec = Range | str | Sequence[str]
+
+PAIR_NUMBER: Int64[np.ndarray, "6 6"] = np.full((CAMERA_COUNT, CAMERA_COUNT), -1, dtype=np.int64)
+"""[a, b]: the place of cameras a and b among `CAMERA_PAIRS`, in either order; -1 for a == b."""
+for _number, (_a, _b) in enumerate(CAMERA_PAIRS):
+    PAIR_NUMBER[_a, _b] = PAIR_NUMBER[_b, _a] = _number
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairList:
+    """The chosen pairs of the chosen scenes, scene after scene.
+
+    Attributes:
+        row: (n,) int64, the scene's row in the index, ascending.
+        source: (n,) int8, the camera whose pixels have the disparity.
+        targets: (n, k) int8, the cameras that it is paired with: one, or for a sweep several,
+            filled up with -1.
+    """
+
+    row: Int64[np.ndarray, " n"]
+    source: Int8[np.ndarray, " n"]
+    targets: Int8[np.ndarray, "n k"]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def __getitem__(self, keep: Any) -> "PairList":
+        """Return the entries that a mask or an array of places keeps."""
+        return PairList(self.row[keep], self.source[keep], self.targets[keep])
+
+
+def choose_pairs(
+    index: SceneIndex,
+    rows: Int64[np.ndarray, " s"],
+    *,
+    pairs: PairsSpec = "primary",
+    direction: Direction = "left_to_right",
+    baseline_cm: BaselineSpec | None = None,
+) -> PairList:
+    """Return the pairs of the given scenes.
+
+    Args:
+        index: The index that the rows belong to.
+        rows: Rows of scenes, ascending.
+        pairs: "primary" (one a scene), "adjacent" (5), "all" (15), explicit pairs
+            (left, right) with left < right, or "sweep": the primary pair's first view together
+            with every camera on its other side, as one entry.
+        direction: "left_to_right": the left camera's pixels have the disparity.
+            "right_to_left": the right camera's, with negative disparity and baseline.
+        baseline_cm: A closed range in cm, or names of the paper's bins.
+
+    Raises:
+        SelectionError: If a pair does not exist or no baseline falls into the range.
+    """
+    if direction not in ("left_to_right", "right_to_left"):
+        raise SelectionError(
+            f"direction must be 'left_to_right' or 'right_to_left', got {direction!r}."
+        )
+    primary = np.stack(
+        [index.column("primary_left")[rows], index.column("primary_right")[rows]], axis=1
+    ).astype(np.int8)
+    if isinstance(pairs, str) and pairs == "sweep":
+        chosen = _sweeps(rows, primary, direction=direction)
+    else:
+        chosen = _plain(rows, primary, pairs=pairs, direction=direction)
+    return chosen if baseline_cm is None else _within(index, chosen, baseline_cm)
+
+
+def baselines_cm(index: SceneIndex, pairs: PairList) -> Float64[np.ndarray, "n k"]:
+    """Return the recorded baseline of every pair in cm, nan where a sweep has no target."""
+    number = PAIR_NUMBER[pairs.source[:, None], pairs.targets]
+    recorded: Float64[np.ndarray, "n k"] = np.take_along_axis(
+        index.column("baselines_cm")[pairs.row], number, axis=1
+    )
+    return np.where(pairs.targets >= 0, recorded, np.nan)
+
+
+def require_pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
+    """Return explicit camera pairs as a tuple of (left, right).
+
+    Raises:
+        SelectionError: If one is not two cameras of 0 to 5, the left before the right, or if one
+            is given twice.
+    """
+    if isinstance(pairs, str):
+        raise SelectionError(
+            f"pairs must be 'primary', 'adjacent', 'all', 'sweep' or camera pairs, got {pairs!r}."
+        )
+    found = []
+    for pair in pairs:
+        try:
+            left, right = (int(camera) for camera in pair)
+        except (TypeError, ValueError):
+            raise SelectionError(f"a pair is (left, right) camera numbers, got {pair!r}.") from None
+        if (left, right) not in CAMERA_PAIRS:
+            raise SelectionError(
+                f"there is no pair {(left, right)}: cameras are 0 to {CAMERA_COUNT - 1}, the left "
+                "one first (for the other way round use direction='right_to_left')."
+            )
+        found.append((left, right))
+    if not found or len(set(found)) < len(found):
+        raise SelectionError(f"pairs must be at least one and each only once, got {pairs!r}.")
+    return tuple(found)
+
+
+def _plain(
+    rows: Int64[np.ndarray, " s"],
+    primary: Int8[np.ndarray, "s 2"],
+    *,
+    pairs: PairsSpec,
+    direction: Direction,
+) -> PairList:
+    if isinstance(pairs, str) and pairs == "primary":
+        per_scene = primary[:, None, :]
+    else:
+        fixed = {"adjacent": ADJACENT_PAIRS, "all": CAMERA_PAIRS}.get(
+            pairs if isinstance(pairs, str) else ""
+        ) or require_pairs(pairs)
+        per_scene = np.broadcast_to(np.array(fixed, dtype=np.int8), (len(rows), len(fixed), 2))
+    flat = per_scene.reshape(-1, 2)
+    if direction == "right_to_left":
+        flat = flat[:, ::-1]
+    return PairList(
+        row=np.repeat(rows, per_scene.shape[1]),
+        source=np.ascontiguousarray(flat[:, 0]),
+        targets=np.ascontiguousarray(flat[:, 1:]),
+    )
+
+
+def _sweeps(
+    rows: Int64[np.ndarray, " s"], primary: Int8[np.ndarray, "s 2"], *, direction: Direction
+) -> PairList:
+    source = primary[:, 0] if direction == "left_to_right" else primary[:, 1]
+    cameras = np.broadcast_to(np.arange(CAMERA_COUNT, dtype=np.int8), (len(rows), CAMERA_COUNT))
+    ahead = cameras > source[:, None] if direction == "left_to_right" else cameras < source[:, None]
+    return PairList(row=rows, source=source, targets=_packed(cameras, ahead))
+
+
+def _packed(cameras: Int8[np.ndarray, "n m"], keep: Bool[np.ndarray, "n m"]) -> Any:
+    """Move the kept cameras of each row to its front, fill up with -1, cut to the longest."""
+    order = np.argsort(~keep, axis=1, kind="stable")
+    packed = np.take_along_axis(np.where(keep, cameras, np.int8(-1)), order, axis=1)
+    return packed[:, : max(1, int(keep.sum(axis=1).max(initial=0)))]
+
+
+def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairList:
+    """Keep what lies in a range or in bins; a sweep keeps those of its targets that do."""
+    found = baselines_cm(index, pairs)
+    if isinstance(wanted, str) or (len(wanted) > 0 and isinstance(wanted[0], str)):
+        keep = np.zeros(found.shape, dtype=bool)
+        for name in [wanted] if isinstance(wanted, str) else wanted:
+            keep |= _in_bin(found, str(name))
+    else:
+        low, high = require_range("baseline_cm", wanted)
+        keep = (found >= low) & (found <= high)
+    if not keep.any():
+        bins = sorted({baseline_bin(value) for value in found[~np.isnan(found)]})
+        raise SelectionError(
+            f"baseline_cm={wanted!r} matches none of {len(pairs)} pairs; baselines there are "
+            f"{np.nanmin(found):g} to {np.nanmax(found):g} cm, in the bins {', '.join(bins)}."
+        )
+    kept = PairList(pairs.row, pairs.source, _packed(pairs.targets, keep))
+    return kept[keep.any(axis=1)]
+
+
+def _in_bin(found: Float64[np.ndarray, "n k"], name: str) -> Bool[np.ndarray, "n k"]:
+    if name not in BASELINE_BINS:
+        raise SelectionError(
+            f"there is no baseline bin {name!r}; the bins are {', '.join(BASELINE_BINS)}."
+        )
+    low, high = BASELINE_BINS[name]
+    last = "[100,150]"
+    above = found > low if name == "(150,inf)" else found >= low
+    return above & (found <= high if name == last else found < high)

@@ -1,0 +1,184 @@
+"""The plan of a dataset: from a sample's number to its scene, cameras and frames, and nothing more.
+
+Samples are numbered scene by scene; within a scene window by window, so that reading in order
+decodes every stream once; within a window pair by pair, so that pairs share their frames.
+"""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, TypedDict, Unpack
+
+import numpy as np
+from jaxtyping import Int64
+
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.selection.balance import Balance, balanced
+from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.selection.pairs import (
+    BaselineSpec,
+    Direction,
+    PairList,
+    PairsSpec,
+    baselines_cm,
+    choose_pairs,
+)
+from stereogenbench_data.selection.windows import FramesSpec, Windows, parse_frames
+from stereogenbench_data.storage.index import SceneIndex
+
+
+class PairOptions(TypedDict, total=False):
+    """Which pairs of a scene: see `choose_pairs`, and `balanced` for balance and limit."""
+
+    pairs: PairsSpec
+    direction: Direction
+    baseline_cm: BaselineSpec | None
+    balance: Balance | None
+    limit: int | None
+
+
+class Selection(SceneFilters, PairOptions, total=False):
+    """Everything that a selection of pair samples can ask for."""
+
+    frames: FramesSpec
+
+
+class Address(NamedTuple):
+    """Where one sample comes from."""
+
+    row: int
+    source: int
+    targets: tuple[int, ...]
+    frames: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """The samples of a selection, as arithmetic: `len` and `locate`.
+
+    Attributes:
+        pairs: The chosen pairs, scene after scene.
+        windows: The rule that gives a scene's windows.
+        scene_rows: (s,) int64, rows of the scenes, ascending.
+        first_pair: (s + 1,) int64, where each scene's pairs begin in ``pairs``.
+        first_sample: (s + 1,) int64, the number of each scene's first sample.
+        frame_counts: (s,) int64, the frames of each scene.
+        scene_seeds: (s,) int64, a number for each scene that depends on its key alone.
+        seed: The seed of what is drawn at random.
+    """
+
+    pairs: PairList
+    windows: Windows
+    scene_rows: Int64[np.ndarray, " s"]
+    first_pair: Int64[np.ndarray, " s1"]
+    first_sample: Int64[np.ndarray, " s1"]
+    frame_counts: Int64[np.ndarray, " s"]
+    scene_seeds: Int64[np.ndarray, " s"]
+    seed: int
+
+    def __len__(self) -> int:
+        return int(self.first_sample[-1])
+
+    def locate(self, number: int, *, epoch: int) -> Address:
+        """Return where a sample comes from; only random frames depend on the epoch.
+
+        Raises:
+            IndexError: If there is no such sample.
+        """
+        if not 0 <= number < len(self):
+            raise IndexError(f"no sample {number}: there are {len(self)}")
+        scene = int(np.searchsorted(self.first_sample, number, side="right")) - 1
+        first, last = int(self.first_pair[scene]), int(self.first_pair[scene + 1])
+        window, pair = divmod(number - int(self.first_sample[scene]), last - first)
+        frames = self.windows.window(
+            window,
+            frames=int(self.frame_counts[scene]),
+            draw=(self.seed, epoch, int(self.scene_seeds[scene])),
+        )
+        targets = self.pairs.targets[first + pair]
+        return Address(
+            row=int(self.scene_rows[scene]),
+            source=int(self.pairs.source[first + pair]),
+            targets=tuple(int(target) for target in targets if target >= 0),
+            frames=frames,
+        )
+
+
+def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selection]) -> Plan:
+    """Return the plan of a selection of pair samples.
+
+    Raises:
+        SelectionError: If nothing matches, naming what left nothing and what there is.
+    """
+    options: dict[str, Any] = dict(selection)
+    windows = parse_frames(options.pop("frames", "first"))
+    balance, limit = options.pop("balance", None), options.pop("limit", None)
+    chosen = {
+        name: options.pop(name) for name in ("pairs", "direction", "baseline_cm") if name in options
+    }
+    rows = filter_scenes(index, SceneFilters(**options))  # type: ignore[typeddict-item]
+    pairs = choose_pairs(index, rows, **chosen)
+    if balance is not None:
+        if pairs.targets.shape[1] != 1:
+            raise SelectionError(f"balance={balance!r} needs single pairs, not a sweep.")
+        found = baselines_cm(index, pairs)[:, 0]
+        pairs = pairs[balanced(found, by=balance, limit=limit, seed=seed)]
+    elif limit is not None:
+        raise SelectionError(
+            f"limit={limit} is the size of a balanced subsample: give balance too."
+        )
+    return _plan(index, pairs, windows=windows, seed=seed)
+
+
+def plan_views(
+    index: SceneIndex,
+    *,
+    cameras: Sequence[int] | Literal["each"],
+    frames: FramesSpec,
+    seed: int,
+    filters: SceneFilters,
+) -> Plan:
+    """Return the plan of samples of several cameras at once, or of each camera by itself.
+
+    The first of ``cameras`` is a sample's source, the others are its targets; with "each" a
+    sample has a source and no target.
+
+    Raises:
+        SelectionError: If nothing matches, naming what left nothing and what there is.
+    """
+    rows = filter_scenes(index, filters)
+    if isinstance(cameras, str):
+        views = np.arange(CAMERA_COUNT, dtype=np.int8)[:, None]
+    else:
+        views = np.array([cameras], dtype=np.int8)
+    views = np.tile(views, (len(rows), 1))
+    pairs = PairList(
+        row=np.repeat(rows, len(views) // len(rows)), source=views[:, 0], targets=views[:, 1:]
+    )
+    return _plan(index, pairs, windows=parse_frames(frames), seed=seed)
+
+
+def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) -> Plan:
+    scene_rows, starts = np.unique(pairs.row, return_index=True)
+    first_pair = np.append(starts, len(pairs)).astype(np.int64)
+    frame_counts = index.column("frames")[scene_rows].astype(np.int64)
+    keys = index.column("key")[scene_rows]
+    per_scene = np.empty(len(scene_rows), dtype=np.int64)
+    for frames in np.unique(frame_counts):
+        same = frame_counts == frames
+        try:
+            per_scene[same] = windows.count(int(frames))
+        except SelectionError as error:
+            raise SelectionError(f"{keys[same][0]} (and {same.sum() - 1} more): {error}") from error
+    samples = np.concatenate([[0], np.cumsum(np.diff(first_pair) * per_scene)])
+    return Plan(
+        pairs=pairs,
+        windows=windows,
+        scene_rows=scene_rows,
+        first_pair=first_pair,
+        first_sample=samples.astype(np.int64),
+        frame_counts=frame_counts,
+        scene_seeds=np.array([zlib.crc32(str(key).encode()) for key in keys], dtype=np.int64),
+        seed=seed,
+    )

@@ -1,0 +1,169 @@
+"""Which frames: windows on a scene's frames, as arithmetic on integers.
+
+A window is the frames of one sample: one frame, or a clip of several.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from stereogenbench_data.errors import SelectionError
+
+FramesSpec = (
+    Literal["first", "all"]
+    | int
+    | Sequence[int]
+    | tuple[Literal["every"], int]
+    | tuple[Literal["random"], int]
+    | tuple[Literal["clips"], int, int, int]
+)
+
+
+class Windows(Protocol):
+    """A rule that gives the windows of a scene with a known number of frames."""
+
+    @property
+    def is_clip(self) -> bool:
+        """Whether a sample holds a time axis."""
+        ...
+
+    def count(self, frames: int) -> int:
+        """Return how many windows a scene of so many frames has."""
+        ...
+
+    def window(self, number: int, *, frames: int, draw: Sequence[int]) -> tuple[int, ...]:
+        """Return the frames of one window; ``draw`` seeds what is drawn at random."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """The named frames, one a window."""
+
+    frames: tuple[int, ...]
+    is_clip: bool = False
+
+    def count(self, frames: int) -> int:
+        """Return the number of named frames, all of which the scene must have."""
+        if max(self.frames) >= frames:
+            raise SelectionError(
+                f"frame {max(self.frames)} is asked for of a scene with {frames} frames, "
+                f"0 to {frames - 1}."
+            )
+        return len(self.frames)
+
+    def window(self, number: int, *, frames: int, draw: Sequence[int]) -> tuple[int, ...]:
+        """Return one named frame."""
+        return (self.frames[number],)
+
+
+@dataclass(frozen=True, slots=True)
+class Every:
+    """Every k-th frame from frame 0, one a window."""
+
+    step: int
+    is_clip: bool = False
+
+    def count(self, frames: int) -> int:
+        """Return the number of k-th frames."""
+        return -(-frames // self.step)
+
+    def window(self, number: int, *, frames: int, draw: Sequence[int]) -> tuple[int, ...]:
+        """Return one frame."""
+        return (number * self.step,)
+
+
+@dataclass(frozen=True, slots=True)
+class Random:
+    """n different frames of each scene, drawn anew for every epoch, ascending, one a window."""
+
+    n: int
+    is_clip: bool = False
+
+    def count(self, frames: int) -> int:
+        """Return n, which a scene must have frames for."""
+        if self.n > frames:
+            raise SelectionError(
+                f"('random', {self.n}) asks for more frames than the {frames} of a scene."
+            )
+        return self.n
+
+    def window(self, number: int, *, frames: int, draw: Sequence[int]) -> tuple[int, ...]:
+        """Return one of the frames drawn."""
+        generator = np.random.default_rng(np.random.SeedSequence(tuple(draw)))
+        return (int(np.sort(generator.choice(frames, size=self.n, replace=False))[number]),)
+
+
+@dataclass(frozen=True, slots=True)
+class Clips:
+    """Clips of ``length`` frames, ``stride`` frames apart, a clip starting every ``step`` frames.
+
+    A clip that would reach beyond the last frame is not taken.
+    """
+
+    length: int
+    stride: int = 1
+    step: int = 1
+    is_clip: bool = True
+
+    def count(self, frames: int) -> int:
+        """Return how many clips fit; a scene in which none fits is refused."""
+        span = (self.length - 1) * self.stride + 1
+        if span > frames:
+            raise SelectionError(
+                f"a clip of {self.length} frames with stride {self.stride} spans {span} frames; "
+                f"a scene has {frames}."
+            )
+        return (frames - span) // self.step + 1
+
+    def window(self, number: int, *, frames: int, draw: Sequence[int]) -> tuple[int, ...]:
+        """Return the frames of one clip."""
+        start = number * self.step
+        return tuple(range(start, start + self.length * self.stride, self.stride))
+
+
+def parse_frames(spec: Any) -> Windows:
+    """Return the windows that a user's ``frames=`` asks for.
+
+    Args:
+        spec: "first", "all", a frame number, a sequence of them, ("every", k), ("random", n),
+            ("clips", length), ("clips", length, stride) or ("clips", length, stride, step);
+            stride is 1 and step is the clip's span where left out, so that clips do not overlap.
+            Or any `Windows`.
+
+    Raises:
+        SelectionError: If it is none of these, or a number in it is out of range.
+    """
+    if isinstance(spec, Chosen | Every | Random | Clips):
+        return spec
+    if isinstance(spec, str):
+        named: dict[str, Windows] = {"first": Chosen((0,)), "all": Every(1)}
+        if spec in named:
+            return named[spec]
+    elif isinstance(spec, int | np.integer):
+        return Chosen((_whole(spec, least=0),))
+    elif isinstance(spec, Sequence) and len(spec) > 0 and isinstance(spec[0], str):
+        numbers = [_whole(number, least=1) for number in spec[1:]]
+        if spec[0] in ("every", "random") and len(numbers) == 1:
+            return Every(numbers[0]) if spec[0] == "every" else Random(numbers[0])
+        if spec[0] == "clips" and 1 <= len(numbers) <= 3:
+            length, stride = numbers[0], (numbers[1:] or [1])[0]
+            step = numbers[2] if len(numbers) == 3 else (length - 1) * stride + 1
+            return Clips(length, stride, step)
+    elif isinstance(spec, Sequence | np.ndarray) and len(spec) > 0:
+        frames = tuple(_whole(number, least=0) for number in spec)
+        if len(set(frames)) < len(frames):
+            raise SelectionError(f"frames={spec!r} names a frame twice.")
+        return Chosen(tuple(sorted(frames)))
+    raise SelectionError(
+        f"frames={spec!r} is not understood; use 'first', 'all', a frame number, a list of them, "
+        "('every', k), ('random', n) or ('clips', length, stride, step)."
+    )
+
+
+def _whole(number: Any, *, least: int) -> int:
+    if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < least:
+        raise SelectionError(f"frames must be whole numbers of at least {least}, got {number!r}.")
+    return int(number)

@@ -1,0 +1,111 @@
+"""A journal of described scenes, so that a walk that was killed goes on where it stopped.
+
+One JSON object a line: the first says what the walk is, each further one holds a scene's row and
+a stamp of its files. A line that a kill cut short is passed over, and so its scene read again.
+"""
+
+import json
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, TextIO
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.schema.records import Scene
+from stereogenbench_data.storage.rows import SCHEMA, row_of, scene_of
+
+_FORMAT: Final = 1
+
+
+class Journal:
+    """Scenes described so far, on disk; `close` keeps the file, `delete` ends its use."""
+
+    def __init__(self, path: Path, *, walk: str) -> None:
+        """Open a journal and read what it holds; one of another walk is begun anew.
+
+        Raises:
+            StorageError: If the file cannot be read or written.
+        """
+        self._path = path
+        head = json.dumps({"journal": _FORMAT, "walk": walk, "columns": SCHEMA.names})
+        try:
+            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+            is_same = bool(lines) and lines[0] == head
+            self._known = _known(lines[1:]) if is_same else {}
+            self._file: TextIO = path.open("a" if is_same else "w", encoding="utf-8")
+            self._file.write("\n" if is_same else f"{head}\n")
+            self._file.flush()
+        except FileNotFoundError:
+            self._known = {}
+            self._file = _created(path, head)
+        except OSError as error:
+            raise _unwritable(path, error) from error
+
+    def __len__(self) -> int:
+        """The number of scenes that were described before this walk."""
+        return len(self._known)
+
+    def find(self, key: str, *, stamp: str) -> Scene | None:
+        """Return a scene described before, None if it was not or its files have changed."""
+        known = self._known.get(key)
+        return known[1] if known is not None and known[0] == stamp else None
+
+    def add(self, scene: Scene, *, stamp: str) -> None:
+        """Note a scene, so that it outlives this process.
+
+        Raises:
+            StorageError: If the file cannot be written.
+        """
+        line = json.dumps({"stamp": stamp, "row": row_of(scene)})
+        try:
+            self._file.write(f"{line}\n")
+            self._file.flush()
+        except OSError as error:
+            raise _unwritable(self._path, error) from error
+
+    def delete(self) -> None:
+        """Remove the file: what it holds was written elsewhere."""
+        self._file.close()
+        self._path.unlink(missing_ok=True)
+
+    def __enter__(self) -> "Journal":
+        """Return the journal itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file, and keep it."""
+        self._file.close()
+
+
+def _created(path: Path, head: str) -> TextIO:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("w", encoding="utf-8")
+        file.write(f"{head}\n")
+        file.flush()
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    return file
+
+
+def _unwritable(path: Path, error: OSError) -> StorageError:
+    return StorageError(
+        f"{path}: the journal cannot be written ({error.strerror}). "
+        f"Give write permission there, or write the index to another folder."
+    )
+
+
+def _known(lines: list[str]) -> dict[str, tuple[str, Scene]]:
+    known: dict[str, tuple[str, Scene]] = {}
+    for line in lines:
+        try:
+            entry: Any = json.loads(line)
+            scene = scene_of(entry["row"])
+            known[scene.id.key] = (entry["stamp"], scene)
+        except (ValueError, KeyError, TypeError, IndexError, AttributeError):
+            continue
+    return known

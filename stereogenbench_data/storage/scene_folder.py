@@ -1,0 +1,254 @@
+"""One scene's folder: whether it is finished, whole and true to itself, and its index row.
+
+All that an index says about a scene is found here, from its JSON files and the headers of its
+videos; no picture is decoded, unless the share of measured depth is asked for.
+"""
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, Literal, Protocol, TypeVar
+
+import numpy as np
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.geometry.rig import (
+    baseline_deviation_cm,
+    lateral_offsets_m,
+    rectification_residual_px,
+)
+from stereogenbench_data.media.container import StreamFacts
+from stereogenbench_data.media.depth import (
+    measured,
+    read_depth_units,
+    resolve_encoding,
+)
+from stereogenbench_data.media.video import VideoReader, probe
+from stereogenbench_data.schema.document import parse_text
+from stereogenbench_data.schema.parse import (
+    parse_complete,
+    parse_description,
+    parse_rig,
+    parse_scene_key,
+    parse_trajectory,
+)
+from stereogenbench_data.schema.records import (
+    DepthEncoding,
+    Member,
+    Rig,
+    Scene,
+    SceneLabels,
+    Trajectory,
+)
+from stereogenbench_data.schema.release import (
+    BASELINE_JSON,
+    CAMERA_COUNT,
+    CAMERA_PAIRS,
+    COMPLETE_JSON,
+    DESCRIPTION_JSON,
+    DESCRIPTION_TXT,
+    METADATA_FILES,
+    TRAJECTORY_JSON,
+    VIDEO_FILES,
+    depth_name,
+    rgb_name,
+)
+from stereogenbench_data.storage.source import read_text_file
+
+T = TypeVar("T", covariant=True)
+ValidDepth = Literal["skip", "sample"]
+
+_NEEDED: Final = (COMPLETE_JSON, BASELINE_JSON, TRAJECTORY_JSON, *VIDEO_FILES)
+_DEVIATION_CM: Final = 0.1
+_DEVIATION_SHARE: Final = 0.001
+
+
+class IncompleteScene(StorageError):
+    """A scene that is not finished, or of which only the metadata were fetched."""
+
+
+def scene_files(root: str | Path, key: str) -> dict[str, tuple[int, int]]:
+    """Return the size in bytes and the time of change in ns of each of a scene's files.
+
+    Raises:
+        StorageError: If the folder cannot be read.
+    """
+    folder = Path(root, key)
+    wanted = {*METADATA_FILES, *VIDEO_FILES}
+    try:
+        with os.scandir(folder) as entries:
+            found = {entry.name: entry.stat() for entry in entries if entry.name in wanted}
+    except OSError as error:
+        raise StorageError(
+            f"{folder}: cannot be read ({error.strerror}). Give read permission, or fetch the "
+            f"scene again."
+        ) from error
+    return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
+
+
+def stamp_of(files: Mapping[str, tuple[int, int]]) -> str:
+    """Return a short text that changes when one of a scene's files does."""
+    return hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:32]
+
+
+def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "skip") -> Scene:
+    """Return the index row of a finished scene.
+
+    Args:
+        root: The folder that holds ``train`` and ``eval``.
+        key: The scene's path below it.
+        valid_depth: "sample" decodes the first, the middle and the last depth picture of each
+            camera, to tell the share of pixels that have a depth.
+
+    Raises:
+        IncompleteScene: If the scene is not marked as complete or has no video at all.
+        StorageError: If files are missing, unreadable or contradict each other.
+        SchemaError: If a metadata file does not follow the format.
+        MediaError: If a video is not what its header says.
+    """
+    files = scene_files(root, key)
+    _require_finished(key, files)
+    folder = Path(root, key)
+    rig, labels = _parsed(parse_rig, folder, key, BASELINE_JSON)
+    marked = _parsed(parse_complete, folder, key, COMPLETE_JSON)
+    trajectory = _parsed(parse_trajectory, folder, key, TRAJECTORY_JSON)
+    caption = _caption(folder, key, files)
+    facts = {name: probe(folder / name, name=f"{key}/{name}") for name in VIDEO_FILES}
+    frames = _common_frames(key, facts, trajectory)
+    rig = _sized_as_videos(key, rig, facts)
+    poses = CameraPoses.from_trajectory(trajectory)
+    _require_recorded_baselines(key, rig, poses)
+    encodings = [
+        resolve_encoding(facts[name], name=f"{key}/{name}")
+        for name in map(depth_name, range(CAMERA_COUNT))
+    ]
+    ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames, encodings)
+    return Scene(
+        id=parse_scene_key(key),
+        labels=_merged(labels, marked),
+        caption=caption,
+        rig=rig,
+        frames=frames,
+        frame_rate_hz=facts[rgb_name(0)].frame_rate_hz,
+        lateral_m=tuple(map(float, lateral_offsets_m(poses))),
+        rig_residual_px=rectification_residual_px(poses, rig_intrinsics(rig)),
+        depth_unit_m=tuple(encoding.unit_m for encoding in encodings),
+        depth_unit_source=tuple(encoding.source for encoding in encodings),
+        valid_depth_ratio=ratio,
+        members={name: Member(f"{key}/{name}", 0, size) for name, (size, _) in files.items()},
+    )
+
+
+class _Parser(Protocol[T]):
+    def __call__(self, text: bytes, *, where: str) -> T: ...
+
+
+def _parsed(parse: _Parser[T], folder: Path, key: str, name: str) -> T:
+    where = f"{key}/{name}"
+    return parse(read_text_file(folder / name, where=where), where=where)
+
+
+def _require_finished(key: str, files: Mapping[str, object]) -> None:
+    if not files:
+        raise IncompleteScene(f"{key}: the folder is empty")
+    if COMPLETE_JSON not in files:
+        raise IncompleteScene(f"{key}: has no {COMPLETE_JSON}, so it was never finished")
+    if not any(name in files for name in VIDEO_FILES):
+        raise IncompleteScene(f"{key}: has metadata only, and none of its 12 videos")
+    missing = [name for name in _NEEDED if name not in files]
+    if missing:
+        raise StorageError(
+            f"{key}: is marked as complete and has no {', '.join(missing)} "
+            f"(it has {', '.join(files)}). Fetch what is missing."
+        )
+
+
+def _caption(folder: Path, key: str, files: Mapping[str, object]) -> str:
+    """Return the detailed caption, or the short one where there is no detailed one."""
+    if DESCRIPTION_JSON in files:
+        description = _parsed(parse_description, folder, key, DESCRIPTION_JSON)
+        written = description.detailed_caption or description.short_caption
+        if written:
+            return written
+    if DESCRIPTION_TXT in files:
+        return _parsed(parse_text, folder, key, DESCRIPTION_TXT).strip()
+    return ""
+
+
+def _merged(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
+    """Return the labels of baseline.json, and for those it lacks the ones of the mark."""
+    missing = {
+        name: getattr(marked, name)
+        for name in SceneLabels.__slots__
+        if getattr(labels, name) is None
+    }
+    return replace(labels, **missing)
+
+
+def _common_frames(key: str, facts: Mapping[str, StreamFacts], trajectory: Trajectory) -> int:
+    counts = {name: fact.frames for name, fact in facts.items()}
+    counts[TRAJECTORY_JSON] = trajectory.frame_count
+    common = Counter(counts.values()).most_common(1)[0][0]
+    _require_equal(key, counts, common, what="number of frames", unit="frames")
+    return common
+
+
+def _require_equal(
+    key: str, found: Mapping[str, object], common: object, *, what: str, unit: str
+) -> None:
+    others = [f"{name} has {value}" for name, value in found.items() if value != common]
+    if others:
+        raise StorageError(
+            f"{key}: its files must have one {what}: {len(found) - len(others)} have {common} "
+            f"{unit}, but {', '.join(others)}. Fetch those again."
+        )
+
+
+def _sized_as_videos(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> Rig:
+    """Return the rig for pictures of the videos' size, where baseline.json records no size."""
+    sizes = {name: f"{fact.width_px}x{fact.height_px}" for name, fact in facts.items()}
+    common = Counter(sizes.values()).most_common(1)[0][0]
+    _require_equal(key, sizes, common, what="picture size", unit="pixels")
+    width_px, height_px = facts[rgb_name(0)].width_px, facts[rgb_name(0)].height_px
+    if (width_px, height_px) == (rig.image_width_px, rig.image_height_px):
+        return rig
+    if rig.image_size_source == "recorded" or rig.principal_point_px is not None:
+        raise StorageError(
+            f"{key}: {BASELINE_JSON} is for pictures of {rig.image_width_px}x"
+            f"{rig.image_height_px} pixels, and all videos have {common}. Correct image_width "
+            f"and image_height, or fetch the videos again."
+        )
+    return replace(rig, image_width_px=width_px, image_height_px=height_px)
+
+
+def _require_recorded_baselines(key: str, rig: Rig, poses: CameraPoses) -> None:
+    if baseline_deviation_cm(poses, rig) <= _DEVIATION_CM:
+        return
+    for (camera_a, camera_b), recorded_cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True):
+        for frame in range(poses.frame_count):
+            posed_cm = poses.baseline_m(frame, camera_a, camera_b) * 100
+            allowed_cm = _DEVIATION_CM + _DEVIATION_SHARE * recorded_cm
+            if not abs(posed_cm - recorded_cm) <= allowed_cm:
+                raise StorageError(
+                    f"{key}: {BASELINE_JSON} says that cameras {camera_a} and {camera_b} are "
+                    f"{recorded_cm:.6g} cm apart, and by the poses of {TRAJECTORY_JSON} they are "
+                    f"{posed_cm:.6g} cm apart in frame {frame} (allowed: {allowed_cm:.3g} cm). "
+                    f"Is one of the files another scene's, or the unit wrong?"
+                )
+
+
+def _valid_ratio(folder: Path, key: str, frames: int, encodings: list[DepthEncoding]) -> float:
+    shares = []
+    for camera, encoding in enumerate(encodings):
+        name = depth_name(camera)
+        with VideoReader(folder / name, name=f"{key}/{name}", frames=frames) as reader:
+            for frame in sorted({0, frames // 2, frames - 1}):
+                units = read_depth_units(reader, frame, encoding=encoding)
+                known = measured(units, encoding=encoding, pixel_format=reader.facts.pixel_format)
+                shares.append(float(np.mean(known)))
+    return float(np.mean(shares))

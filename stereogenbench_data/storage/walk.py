@@ -1,0 +1,188 @@
+"""From a released tree to its scenes: all described, in parallel, none left out in silence."""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal
+
+from stereogenbench_data.errors import StereoGenBenchError, StorageError
+from stereogenbench_data.schema.parse import parse_scene_key
+from stereogenbench_data.schema.records import Scene, SceneId
+from stereogenbench_data.schema.release import TRAIN_MAPS
+from stereogenbench_data.storage.journal import Journal
+from stereogenbench_data.storage.release_tree import SceneFolders, find_scene_folders
+from stereogenbench_data.storage.scene_folder import (
+    IncompleteScene,
+    ValidDepth,
+    describe_scene,
+    scene_files,
+    stamp_of,
+)
+
+Progress = Callable[[int, int], None]
+
+POOL_FROM: Final = 64
+"""How many scenes there must be for worker processes to be worth their start."""
+
+
+@dataclass(frozen=True, slots=True)
+class TreeReport:
+    """What a walk found.
+
+    Attributes:
+        root: The folder that was walked.
+        scenes: Every whole scene, by key.
+        incomplete: Key to reason, for scenes without their mark or without any video.
+        broken: Key (or path below the root) to what is wrong and what to do.
+        notes: What was decided where the tree does not say.
+    """
+
+    root: str
+    scenes: tuple[Scene, ...]
+    incomplete: dict[str, str]
+    broken: dict[str, str]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """What became of one scene's folder: a scene and the stamp of its files, or why not."""
+
+    key: str
+    kind: Literal["whole", "incomplete", "broken"]
+    scene: Scene | None = None
+    stamp: str = ""
+    reason: str = ""
+
+
+def walk(
+    root: str | Path,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    journal: Journal | None = None,
+    valid_depth: ValidDepth = "skip",
+) -> TreeReport:
+    """Return every scene of a tree in the released layout, and what is wrong with the others.
+
+    Args:
+        root: The folder that holds ``train`` and ``eval``.
+        workers: Processes that read at the same time; None is one a core. With few scenes this
+            process reads them all.
+        progress: Called with the number of scenes done and that of all, after each.
+        journal: Where described scenes are kept, and found again by a later walk.
+        valid_depth: "sample" decodes some depth pictures of each scene, to tell the share of
+            pixels that have a depth.
+
+    Raises:
+        StorageError: If there is no scene below the root, or a worker process died.
+    """
+    if workers is not None and workers < 1:
+        raise StorageError(f"workers must be at least 1, got {workers}.")
+    folders = find_scene_folders(root)
+    outcomes = _reused(root, folders.keys, journal)
+    total = len(folders.keys)
+    if progress is not None:
+        progress(len(outcomes), total)
+    pending = [key for key in folders.keys if key not in outcomes]
+    task = _Task(str(root), valid_depth)
+    for outcome in _described(task, pending, workers or os.cpu_count() or 1):
+        outcomes[outcome.key] = outcome
+        if journal is not None and outcome.scene is not None:
+            journal.add(outcome.scene, stamp=outcome.stamp)
+        if progress is not None:
+            progress(len(outcomes), total)
+    return _report(root, folders, [outcomes[key] for key in folders.keys])
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Describes a scene by its key; travels to worker processes."""
+
+    root: str
+    valid_depth: ValidDepth
+
+    def __call__(self, key: str) -> _Outcome:
+        try:
+            stamp = stamp_of(scene_files(self.root, key))
+            scene = describe_scene(self.root, key, valid_depth=self.valid_depth)
+        except IncompleteScene as error:
+            return _Outcome(key, "incomplete", reason=str(error))
+        except StereoGenBenchError as error:
+            return _Outcome(key, "broken", reason=str(error))
+        return _Outcome(key, "whole", scene, stamp)
+
+
+def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> dict[str, _Outcome]:
+    outcomes: dict[str, _Outcome] = {}
+    for key in keys if journal is not None and len(journal) else ():
+        try:
+            stamp = stamp_of(scene_files(root, key))
+        except StorageError:
+            continue
+        scene = journal.find(key, stamp=stamp) if journal is not None else None
+        if scene is not None:
+            outcomes[key] = _Outcome(key, "whole", scene, stamp)
+    return outcomes
+
+
+def _described(task: _Task, keys: list[str], workers: int) -> Iterator[_Outcome]:
+    if workers == 1 or len(keys) < POOL_FROM:
+        yield from map(task, keys)
+        return
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(min(workers, len(keys)), mp_context=context)
+    try:
+        for future in as_completed([pool.submit(task, key) for key in keys]):
+            yield future.result()
+    except BrokenProcessPool as error:
+        raise StorageError(
+            f"{task.root}: a process that reads scenes died before {len(keys)} were done. It was "
+            f"killed (is memory short?), or the calling script starts work without "
+            f"`if __name__ == '__main__':`. Run it again, or with workers=1."
+        ) from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _report(root: str | Path, folders: SceneFolders, outcomes: list[_Outcome]) -> TreeReport:
+    ids = [parse_scene_key(key) for key in folders.keys]
+    maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
+    found = [outcome.scene for outcome in outcomes if outcome.scene is not None]
+    scenes = tuple(replace(scene, id=_with_subset(scene.id, maps)) for scene in found)
+    broken = {out.key: out.reason for out in outcomes if out.kind == "broken"}
+    return TreeReport(
+        root=str(root),
+        scenes=scenes,
+        incomplete={out.key: out.reason for out in outcomes if out.kind == "incomplete"},
+        broken=dict(sorted((folders.refused | broken).items())),
+        notes=(*_subset_notes(found), *_label_notes(found)),
+    )
+
+
+def _with_subset(scene: SceneId, train_maps: frozenset[str] | set[str]) -> SceneId:
+    if scene.split == "train" or scene.subset is not None:
+        return scene
+    return replace(scene, subset="seen_map" if scene.map_name in train_maps else "unseen_map")
+
+
+def _subset_notes(scenes: list[Scene]) -> list[str]:
+    unnamed = [s.id.key.split("/")[1] for s in scenes if s.id.split == "eval" and not s.id.subset]
+    return [
+        f"eval/{folder} names no subset; a scene there counts as seen_map if its map occurs in "
+        f"train, of this tree or of the release, else as unseen_map"
+        for folder in sorted(set(unnamed))
+    ]
+
+
+def _label_notes(scenes: list[Scene]) -> list[str]:
+    return [
+        f"{scene.id.key}: its files call the map {scene.labels.map_name!r}; the folder's name is "
+        f"used"
+        for scene in scenes
+        if scene.labels.map_name not in (None, scene.id.map_name)
+    ]

@@ -1,0 +1,133 @@
+"""Scenes on disk: what `stereogenbench synth` does.
+
+A scene is drawn in a hidden folder beside the splits and moved under its name when all of it is
+there, the completion marker written last. A run that was stopped leaves nothing that looks like
+a scene, and the next run of the same request goes on with the scenes that are missing.
+"""
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
+from stereogenbench_data.synthesis.crew import Job, run_jobs
+from stereogenbench_data.synthesis.export import completion_text, metadata_texts
+from stereogenbench_data.synthesis.plan import ScenePlan, plan_scene
+from stereogenbench_data.synthesis.request import SynthRequest
+
+Progress = Callable[[int, int], None]
+
+_UNFINISHED: Final = ".unfinished"
+
+
+def synthesise(
+    out: Path, request: SynthRequest, *, workers: int = 1, progress: Progress | None = None
+) -> list[str]:
+    """Write scenes in the released layout, and keep those that the same request wrote before.
+
+    Args:
+        out: Root of the tree, made if need be.
+        request: Which scenes; scene i does not depend on their number or on ``workers``.
+        workers: Processes to draw with, one camera of one scene each. 1 draws in this process;
+            more are spawned, so a script must start them below ``if __name__ == "__main__"``.
+        progress: Called now and then with the camera frames drawn so far, and all there are.
+
+    Returns:
+        The scenes' keys, from scene 0 on.
+
+    Raises:
+        SynthesisError: If ``workers`` is below 1, a scene's folder holds something else, a file
+            cannot be written, or a worker process dies.
+    """
+    if workers < 1:
+        raise SynthesisError(f"workers must be at least 1, got {workers}.")
+    missing = [index for index in range(request.scenes) if _is_missing(out, request, index=index)]
+    per_scene = CAMERA_COUNT * request.frames
+    drawn = (request.scenes - len(missing)) * per_scene
+
+    def after_frames(count: int) -> None:
+        nonlocal drawn
+        drawn += count
+        if progress is not None:
+            progress(drawn, request.scenes * per_scene)
+
+    left = dict.fromkeys(missing, CAMERA_COUNT)
+    jobs = _jobs(out, request, missing=missing)
+    after_frames(0)
+    try:
+        for job in run_jobs(
+            jobs,
+            workers=min(workers, max(1, len(missing) * CAMERA_COUNT)),
+            after_frames=after_frames,
+        ):
+            left[job.index] -= 1
+            if not left[job.index]:
+                _finish(out, plan_scene(request, index=job.index), drawn_in=job.folder)
+    finally:
+        _clear(out, request, missing=missing)
+    return [request.key(index) for index in range(request.scenes)]
+
+
+def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
+    """Tell whether a scene is to be drawn, and refuse a folder that another request wrote."""
+    folder = out / request.key(index)
+    if not folder.exists():
+        return True
+    marker = folder / COMPLETE_JSON
+    expected = completion_text(plan_scene(request, index=index))
+    try:
+        found = marker.read_text()
+    except OSError as error:
+        raise SynthesisError(
+            f"{folder}: stands where a scene is to be written, and its {COMPLETE_JSON} could not "
+            f"be read ({error}). Move it away or choose another folder."
+        ) from error
+    if found != expected:
+        raise SynthesisError(
+            f"{folder}: is a scene that another request wrote (its {COMPLETE_JSON} differs). "
+            f"Choose another folder, map or seed's folder, or remove it."
+        )
+    return False
+
+
+def _jobs(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[Job]:
+    for index in missing:
+        folder = out / _UNFINISHED / request.key(index)
+        try:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+        except OSError as error:
+            raise SynthesisError(
+                f"{out}: no folder could be made in it ({error}). Choose one that you may write to."
+            ) from error
+        for camera in range(CAMERA_COUNT):
+            yield Job(request=request, index=index, camera=camera, folder=folder)
+
+
+def _finish(out: Path, plan: ScenePlan, *, drawn_in: Path) -> None:
+    """Write the metadata, the completion marker last, and move the scene under its name."""
+    folder = out / plan.key
+    try:
+        for name, text in metadata_texts(plan).items():
+            (drawn_in / name).write_text(text)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        drawn_in.rename(folder)
+    except OSError as error:
+        raise SynthesisError(
+            f"{plan.key}: could not be finished in {out}: {error}. See that the disk has room and "
+            f"may be written to, then run again: finished scenes are kept."
+        ) from error
+
+
+def _clear(out: Path, request: SynthRequest, *, missing: list[int]) -> None:
+    """Remove what was drawn of scenes that are not whole, and folders that are empty then."""
+    for index in missing:
+        shutil.rmtree(out / _UNFINISHED / request.key(index), ignore_errors=True)
+    folder = out / _UNFINISHED / request.folder
+    while folder != out:
+        with suppress(OSError):
+            folder.rmdir()
+        folder = folder.parent

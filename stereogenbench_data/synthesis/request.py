@@ -1,0 +1,169 @@
+"""What is asked for: which scenes, and how their files are written."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Final, Literal, get_args
+
+from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.schema.records import DepthKind
+from stereogenbench_data.schema.release import (
+    CAMERA_COUNT,
+    FAMILIES,
+    FRAME_COUNT,
+    IMAGE_SIZE_PX,
+    SEEN_MAP_FOLDER,
+    Split,
+    Subset,
+)
+from stereogenbench_data.synthesis.trajectory import OFFSET_RANGE_CM
+
+RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
+PairForm = Literal["names", "indices"]
+DepthFormat = Literal["gray16le", "gray12le", "gray10le"]
+
+SENSOR_MM: Final = (23.76, 23.76)
+_UNSEEN_MAP_FOLDER: Final = "MapUnseenInTrain"
+_LARGEST_PX: Final = 8192
+
+
+@dataclass(frozen=True, slots=True)
+class ExportContract:
+    """How scenes are written; the defaults are the spelling of the scene that stands beside us.
+
+    Attributes:
+        rotation: How ``trajectory.json`` records rotations.
+        pair_form: The primary pair as camera names, or in the older form as two integers.
+        primary_pair: Left and right camera of that pair.
+        depth_unit_m: Metres in one stored unit of depth.
+        depth_tag: Container tag that tells the unit; None writes no tag.
+        depth_kind: Depth along the optical axis, or along the ray.
+        depth_format: FFV1's pixel format. Depth beyond its largest number is stored as that
+            number, which means "no depth", as it is for the sky.
+        frame_lag: Depth frame t + frame_lag is of the moment that RGB frame t shows.
+        sensor_mm: Width and height of the sensor.
+        principal_point_px: Where the optical axis meets the picture, None for its centre.
+
+    Raises:
+        SynthesisError: If a value is not one of those, or out of its range.
+    """
+
+    rotation: RotationForm = "rotator"
+    pair_form: PairForm = "names"
+    primary_pair: tuple[int, int] = (0, 1)
+    depth_unit_m: float = 0.001
+    depth_tag: str | None = "DEPTH_SCALE"
+    depth_kind: DepthKind = "planar"
+    depth_format: DepthFormat = "gray16le"
+    frame_lag: int = 0
+    sensor_mm: tuple[float, float] = SENSOR_MM
+    principal_point_px: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be written."""
+        _require_choice("rotation", self.rotation, choices=get_args(RotationForm))
+        _require_choice("pair_form", self.pair_form, choices=get_args(PairForm))
+        _require_choice("depth_kind", self.depth_kind, choices=get_args(DepthKind))
+        _require_choice("depth_format", self.depth_format, choices=get_args(DepthFormat))
+        _require_positive("depth_unit_m", self.depth_unit_m)
+        for side_mm in self.sensor_mm:
+            _require_positive("sensor_mm", side_mm)
+        if not 0 <= self.primary_pair[0] < self.primary_pair[1] < CAMERA_COUNT:
+            raise SynthesisError(
+                f"primary_pair must be two different cameras of 0..{CAMERA_COUNT - 1}, the left "
+                f"one first, got {self.primary_pair}."
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class SynthRequest:
+    """Scenes to draw. Scene i is the same whatever ``scenes`` is.
+
+    Attributes:
+        family: ``IPD_Gaussian``, ``Uniform`` or ``Pairwise_Uniform`` (in train only).
+        scenes: How many, numbered from 0.
+        size_px: Width of the pictures, even; ``height_px`` is the same where it is None.
+        frames: Frames at 15 Hz.
+        seed: With the scene's number and folder, all that chance decides follows from it.
+        split: ``train`` or ``eval``; ``subset`` (of maps) counts for eval alone.
+        map_name: Folder of the scenes.
+        focal_mm: The focal length, None to draw one of 18..85 mm for each scene.
+        world_offset_cm: How far from the world's origin a stage may lie, along each axis.
+        contract: How the files are written.
+
+    Raises:
+        SynthesisError: If no scene can be drawn so; the message says which value and why.
+    """
+
+    family: str = "IPD_Gaussian"
+    scenes: int = 1
+    size_px: int = IMAGE_SIZE_PX
+    height_px: int | None = None
+    frames: int = FRAME_COUNT
+    seed: int = 0
+    split: Split = "train"
+    subset: Subset = "seen_map"
+    map_name: str = "SynthStage"
+    focal_mm: float | None = None
+    world_offset_cm: float = OFFSET_RANGE_CM
+    contract: ExportContract = field(default_factory=ExportContract)
+
+    def __post_init__(self) -> None:
+        """Refuse a request that no scene can meet."""
+        _require_choice("family", self.family, choices=FAMILIES)
+        _require_choice("split", self.split, choices=get_args(Split))
+        _require_choice("subset", self.subset, choices=get_args(Subset))
+        if self.split == "eval" and self.family == "Pairwise_Uniform":
+            raise SynthesisError(
+                "family Pairwise_Uniform is in the train split only: ask for split train, "
+                "or for IPD_Gaussian or Uniform."
+            )
+        for name, value in (("scenes", self.scenes), ("frames", self.frames)):
+            if value < 1:
+                raise SynthesisError(f"{name} must be at least 1, got {value}.")
+        if self.seed < 0:
+            raise SynthesisError(f"seed must be 0 or more, got {self.seed}.")
+        for name, value in zip(("size_px", "height_px"), self.picture_px, strict=True):
+            if not 2 <= value <= _LARGEST_PX or value % 2:
+                raise SynthesisError(
+                    f"{name} must be an even number of pixels in 2..{_LARGEST_PX} (yuv420p "
+                    f"halves the colour), got {value}."
+                )
+        if not (self.map_name.isascii() and self.map_name.replace("_", "").isalnum()):
+            raise SynthesisError(
+                f"map_name must be letters, digits and underscores, got {self.map_name!r}."
+            )
+        if self.focal_mm is not None:
+            _require_positive("focal_mm", self.focal_mm)
+        if not 0 <= self.world_offset_cm <= OFFSET_RANGE_CM:
+            raise SynthesisError(
+                f"world_offset_cm must be in 0..{OFFSET_RANGE_CM:g}, got {self.world_offset_cm}."
+            )
+
+    @property
+    def picture_px(self) -> tuple[int, int]:
+        """Width and height of the pictures."""
+        return self.size_px, self.size_px if self.height_px is None else self.height_px
+
+    @property
+    def folder(self) -> str:
+        """The folder of the scenes below the root, with forward slashes."""
+        if self.split == "train":
+            return f"train/{self.family}/{self.map_name}"
+        subset = SEEN_MAP_FOLDER if self.subset == "seen_map" else _UNSEEN_MAP_FOLDER
+        return f"eval/{subset}/{self.family}/{self.map_name}"
+
+    def key(self, index: int) -> str:
+        """Return the key of a scene: its whole path below the root."""
+        return f"{self.folder}/scene_{index:06d}"
+
+
+def _require_choice(name: str, value: object, *, choices: tuple[object, ...]) -> None:
+    if value not in choices:
+        raise SynthesisError(
+            f"{name} must be one of {', '.join(map(str, choices))}, got {value!r}."
+        )
+
+
+def _require_positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise SynthesisError(f"{name} must be a positive number, got {value!r}.")

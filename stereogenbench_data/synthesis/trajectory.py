@@ -1,0 +1,121 @@
+"""A smooth camera path around the subject, and the poses of the six cameras along it.
+
+World axes are Unreal's: left-handed, x forward, y right, z up. A rotator (pitch, yaw, roll) in
+degrees turns camera axes (forward, right, up) into world axes by Rz(yaw) Ry(-pitch) Rx(-roll).
+The stage has its own origin and heading: the subject at (0, 0), the camera at negative x, metres.
+The world's origin and heading differ from them by an offset and a yaw that only poses know of.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from stereogenbench_data.schema.release import CAMERA_COUNT
+
+OFFSET_RANGE_CM: Final = 1e6
+LOOK_HEIGHT_M: Final = 0.95
+
+Vector = Float64[np.ndarray, "3"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPath:
+    """Where the middle of the rig is at any moment, and where it looks.
+
+    Attributes:
+        distance_m: Distance between the rig and the middle of the subject's walk.
+        amplitudes: Largest swing of azimuth (deg), distance (part of it), height (m),
+            roll (deg), sideways look (m) and upward look (m).
+        periods_s: Period of each of the six.
+        phases: Phase of each of the six, in radians.
+        height_m: Mean height above the subject's feet.
+        follow_m_s: How fast the look follows the subject to the right.
+    """
+
+    distance_m: float
+    amplitudes: Float64[np.ndarray, "6"]
+    periods_s: Float64[np.ndarray, "6"]
+    phases: Float64[np.ndarray, "6"]
+    height_m: float
+    follow_m_s: float
+
+    def rotator_deg(self, moment_s: float) -> Vector:
+        """Return pitch, yaw and roll in stage axes."""
+        _, _, _, roll_deg, aside_m, up_m = self._swings(moment_s)
+        target = np.array([0.0, aside_m + self.follow_m_s * moment_s, LOOK_HEIGHT_M + up_m])
+        x, y, z = target - self.centre_m(moment_s)
+        return np.array([*np.degrees([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)]), roll_deg])
+
+    def centre_m(self, moment_s: float) -> Vector:
+        """Return the middle of the rig in stage axes."""
+        azimuth_deg, stretch, up_m, *_ = self._swings(moment_s)
+        azimuth, distance_m = np.radians(azimuth_deg), self.distance_m * (1 + stretch)
+        return np.array(
+            [
+                -distance_m * np.cos(azimuth),
+                distance_m * np.sin(azimuth),
+                self.height_m + up_m,
+            ]
+        )
+
+    def _swings(self, moment_s: float) -> Float64[np.ndarray, "6"]:
+        angles = 2 * np.pi * moment_s / self.periods_s + self.phases
+        return self.amplitudes * np.sin(angles)
+
+
+def draw_path(rng: np.random.Generator, *, distance_m: float, follow_m_s: float) -> CameraPath:
+    """Draw a path that turns in yaw, pitch and roll and keeps the subject in the picture."""
+    largest = np.array([9.0, 0.05, 0.035 * distance_m, 3.5, 0.03 * distance_m, 0.02 * distance_m])
+    return CameraPath(
+        distance_m=distance_m,
+        amplitudes=largest * rng.uniform(0.6, 1.0, 6),
+        periods_s=rng.uniform(4.0, 9.0, 6),
+        phases=rng.uniform(0, 2 * np.pi, 6),
+        height_m=LOOK_HEIGHT_M + distance_m * rng.uniform(0.06, 0.2),
+        follow_m_s=follow_m_s,
+    )
+
+
+def rotation_from_rotator(rotator_deg: Vector) -> Float64[np.ndarray, "3 3"]:
+    """Return world-from-camera: its columns are the camera's forward, right and up axes."""
+    (sp, sy, sr), (cp, cy, cr) = np.sin(np.radians(rotator_deg)), np.cos(np.radians(rotator_deg))
+    return np.array(
+        [
+            [cp * cy, sr * sp * cy - cr * sy, -(cr * sp * cy + sr * sy)],
+            [cp * sy, sr * sp * sy + cr * cy, cy * sr - cr * sp * sy],
+            [sp, -sr * cp, cr * cp],
+        ]
+    )
+
+
+def quaternion_from_rotator(rotator_deg: Vector) -> Float64[np.ndarray, "4"]:
+    """Return the unit quaternion x, y, z, w of the same rotation."""
+    half = np.radians(rotator_deg) / 2
+    (sp, sy, sr), (cp, cy, cr) = np.sin(half), np.cos(half)
+    return np.array(
+        [
+            cr * sp * sy - sr * cp * cy,
+            -cr * sp * cy - sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
+    )
+
+
+def rig_locations_cm(
+    *,
+    centre_cm: Vector,
+    rotator_deg: Vector,
+    places_cm: Float64[np.ndarray, "6"],
+    offset_cm: Vector,
+) -> Float64[np.ndarray, "6 3"]:
+    """Return the six camera centres, along the rig's right axis around its middle.
+
+    The world's offset is added last, so that the distances between the centres are wrong by
+    no more than the rounding of a coordinate that large (1.2e-10 cm at 1e6 cm).
+    """
+    right = rotation_from_rotator(rotator_deg)[:, 1]
+    lateral_cm = places_cm - places_cm[CAMERA_COUNT - 1] / 2
+    return (centre_cm + lateral_cm[:, None] * right) + offset_cm

@@ -1,0 +1,124 @@
+"""A camera's two videos: H.264 pictures and FFV1 depth.
+
+One thread encodes, and nothing but frames and options goes in, so that the same frames make the
+same bytes on any number of processors.
+"""
+
+from fractions import Fraction
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+import av
+import numpy as np
+from jaxtyping import Float64, Shaped, UInt8, UInt16
+
+from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_name
+from stereogenbench_data.synthesis.casting import View
+from stereogenbench_data.synthesis.request import ExportContract
+
+_LARGEST: Final = {"gray16le": 65535, "gray12le": 4095, "gray10le": 1023}
+_RATE_HZ: Final = int(FRAME_RATE_HZ)
+_X264_OPTIONS: Final = {"crf": "18"}
+_FFV1_OPTIONS: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
+
+
+class VideoFile:
+    """A video that is being written; a context manager, whole when it was left without error."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        size_px: tuple[int, int],
+        codec: str,
+        pixel_format: str,
+        tags: dict[str, str],
+    ) -> None:
+        self._container = av.open(path, "w", container_options={"fflags": "+bitexact"})
+        self._container.metadata.update(tags)
+        options = _X264_OPTIONS if codec == "libx264" else _FFV1_OPTIONS
+        self._stream = self._container.add_stream(codec, rate=_RATE_HZ, options=options)
+        self._stream.width, self._stream.height = size_px
+        self._stream.pix_fmt = pixel_format
+        self._stream.codec_context.thread_count = 1
+        self._frames = 0
+
+    def write(self, frame: av.VideoFrame) -> None:
+        """Append a frame."""
+        frame.pts, frame.time_base = self._frames, Fraction(1, _RATE_HZ)
+        self._frames += 1
+        self._container.mux(self._stream.encode(frame))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if error is None:
+                self._container.mux(self._stream.encode(None))
+        finally:
+            self._container.close()
+
+
+def open_rgb(folder: Path, *, camera: int, view: View) -> VideoFile:
+    """Start a camera's pictures: yuv420p, x264's defaults at constant rate factor 18."""
+    return VideoFile(
+        folder / rgb_name(camera),
+        size_px=view.size_px,
+        codec="libx264",
+        pixel_format="yuv420p",
+        tags={},
+    )
+
+
+def open_depth(folder: Path, *, camera: int, view: View, contract: ExportContract) -> VideoFile:
+    """Start a camera's depth, with the container's tag where the contract has one."""
+    tag = contract.depth_tag
+    return VideoFile(
+        folder / depth_name(camera),
+        size_px=view.size_px,
+        codec="ffv1",
+        pixel_format=contract.depth_format,
+        tags={} if tag is None else {tag: repr(contract.depth_unit_m)},
+    )
+
+
+def rgb_frame(picture: UInt8[np.ndarray, "h w 3"]) -> av.VideoFrame:
+    """Return a picture as a frame that the encoder takes."""
+    return av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p")
+
+
+def depth_frame(
+    depth_m: Float64[np.ndarray, "h w"], *, view: View, contract: ExportContract
+) -> av.VideoFrame:
+    """Return depth as a frame in the contract's pixel format."""
+    units = depth_units(depth_m, view=view, contract=contract)
+    frame = av.VideoFrame(*view.size_px, contract.depth_format)
+    _fill_plane(frame.planes[0], units)
+    return frame
+
+
+def depth_units(
+    depth_m: Float64[np.ndarray, "h w"], *, view: View, contract: ExportContract
+) -> UInt16[np.ndarray, "h w"]:
+    """Return depth as it is stored: rounded to the unit, the largest number where it is beyond."""
+    if contract.depth_kind == "ray":
+        width_px, height_px = view.size_px
+        right = view.right_of_axis(np.arange(width_px) + 0.5)
+        below = view.below_axis(np.arange(height_px)[:, None] + 0.5)
+        depth_m = depth_m * np.sqrt(1 + right**2 + below**2)
+    largest = _LARGEST[contract.depth_format]
+    return np.minimum(np.rint(depth_m / contract.depth_unit_m), largest).astype(np.uint16)
+
+
+def _fill_plane(plane: av.video.plane.VideoPlane, rows: Shaped[np.ndarray, "h w"]) -> None:
+    """Copy an array into a plane, whose lines may be longer than the array's."""
+    padded = np.zeros((rows.shape[0], plane.line_size // rows.itemsize), rows.dtype)
+    padded[:, : rows.shape[1]] = rows
+    plane.update(padded)

@@ -1,0 +1,316 @@
+"""StereoPairs and SceneViews as torch sees them."""
+
+import os
+import pickle
+import signal
+from contextlib import closing
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from stereogenbench_data import (
+    PAIR_FIELDS,
+    VIEW_FIELDS,
+    ColorJitter,
+    Compose,
+    DepthEncoding,
+    Eraser,
+    FieldError,
+    HorizontalFlip,
+    MediaError,
+    RandomCrop,
+    SceneIndex,
+    SceneViews,
+    SelectionError,
+    StereoPairs,
+    collate,
+)
+
+EVERY_FIELD = tuple(PAIR_FIELDS)
+
+
+def same(one, other):
+    """Return whether two samples are equal, bit for bit."""
+    assert one.keys() == other.keys()
+    return all(
+        torch.equal(one[name], other[name])
+        if isinstance(one[name], torch.Tensor)
+        else one[name] == other[name]
+        for name in one
+    )
+
+
+def shape_of(field, *, height, width):
+    words = field.shape.strip("()").split(",")
+    return tuple({"H": height, "W": width}.get(word) or int(word) for word in words if word)
+
+
+@pytest.mark.parametrize("name", EVERY_FIELD)
+def test_a_pair_field_alone_is_as_its_table_says(small_release, name):
+    field = PAIR_FIELDS[name]
+    value = StereoPairs(small_release, fields=[name], size=(40, 48))[0][name]
+
+    if field.dtype == "str":
+        assert isinstance(value, str)
+    else:
+        assert str(value.dtype) == f"torch.{field.dtype}"
+        assert tuple(value.shape) == shape_of(field, height=40, width=48)
+
+
+@pytest.mark.parametrize("name", VIEW_FIELDS)
+def test_a_view_field_is_as_its_table_says_with_the_views_in_front(small_release, name):
+    field = VIEW_FIELDS[name]
+    stacked = SceneViews(small_release, cameras=(0, 3, 5), fields=[name], size=(40, 48))[0][name]
+    alone = SceneViews(small_release, cameras="each", fields=[name], size=(40, 48))[2][name]
+
+    if field.dtype == "str":
+        assert isinstance(stacked, str)
+    else:
+        shape = shape_of(field, height=40, width=48)
+        assert tuple(alone.shape) == shape
+        assert tuple(stacked.shape) == ((3, *shape) if field.per_target else shape)
+        assert str(stacked.dtype) == f"torch.{field.dtype}"
+
+
+@pytest.mark.parametrize("name", EVERY_FIELD)
+def test_clips_have_a_time_axis_and_sweeps_an_axis_of_targets(small_release, name):
+    field = PAIR_FIELDS[name]
+    clip = StereoPairs(small_release, fields=[name], frames=("clips", 4))[0][name]
+    sweep = StereoPairs(small_release, fields=[name], pairs="sweep", frames=("clips", 4))[0][name]
+
+    if field.dtype != "str":
+        shape = shape_of(field, height=64, width=64)
+        timed = (4, *shape) if field.per_frame else shape
+        assert tuple(clip.shape) == timed
+        assert tuple(sweep.shape) == ((5, *timed) if field.per_target else timed)
+
+
+def test_a_clip_holds_the_frames_that_single_samples_hold(small_release):
+    options = {"fields": EVERY_FIELD[:-2], "pairs": [(1, 4)]}
+    clip = StereoPairs(small_release, frames=("clips", 3, 2), **options)[0]
+    singles = [StereoPairs(small_release, frames=frame, **options)[0] for frame in (0, 2, 4)]
+
+    for name, field in PAIR_FIELDS.items():
+        if name in clip and field.dtype != "str" and field.per_frame:
+            expected = torch.stack([single[name] for single in singles])
+            assert torch.equal(clip[name], expected), name
+
+
+def test_a_sweep_holds_the_pairs_that_single_samples_hold(small_release):
+    sweep = StereoPairs(small_release, fields=EVERY_FIELD, pairs="sweep")[0]
+    for place, right in enumerate(range(1, 6)):
+        single = StereoPairs(small_release, fields=EVERY_FIELD, pairs=[(0, right)])[0]
+        for name, field in PAIR_FIELDS.items():
+            if field.per_target:
+                assert torch.equal(sweep[name][place], single[name]), name
+
+
+def test_the_primary_pair_of_the_first_frame_is_the_default(small_release):
+    pairs = StereoPairs(small_release)
+
+    assert len(pairs) == 4
+    assert [pairs[number]["pair"].tolist() for number in range(4)] == [[0, 1]] * 4
+    assert pairs[-1]["__key__"] == pairs[3]["__key__"]
+    assert pairs[0]["__key__"].startswith("eval/MapSeenInTrain/Uniform/")
+    assert pairs[0]["__key__"].endswith("/00-01/000")
+
+
+def test_torchs_own_collate_takes_every_field(small_release):
+    pairs = StereoPairs(small_release, fields=EVERY_FIELD, pairs="adjacent")
+    batch = next(iter(DataLoader(pairs, batch_size=3)))
+
+    assert batch["left"].shape == (3, 3, 64, 64)
+    assert batch["baseline_m"].dtype == torch.float64
+    assert len(batch["scene"]) == 3
+
+
+@pytest.mark.parametrize("context", ["fork", "spawn", "forkserver"])
+def test_workers_of_every_kind_give_what_the_main_process_gives(small_release, context):
+    pairs = StereoPairs(
+        small_release,
+        pairs="adjacent",
+        frames=("every", 3),
+        transform=Compose([HorizontalFlip(), RandomCrop(32, 48), ColorJitter(), Eraser(1.0)]),
+    )
+    alone = [pairs[number] for number in range(12)]
+    loader = DataLoader(
+        pairs,
+        sampler=range(12),
+        batch_size=None,
+        num_workers=2,
+        multiprocessing_context=context,
+    )
+
+    assert all(same(one, other) for one, other in zip(alone, loader, strict=True))
+    pairs.close()
+
+
+def test_random_access_gives_what_reading_in_order_gives(small_release):
+    pairs = StereoPairs(small_release, pairs="all", frames="all", fields=("left", "depth_right"))
+    order = np.random.default_rng(0).permutation(len(pairs))[:60]
+    forwards = {int(number): pairs[int(number)] for number in sorted(order)}
+
+    with closing(StereoPairs(small_release, pairs="all", frames="all",
+                             fields=("left", "depth_right"))) as again:  # fmt: skip
+        assert all(same(again[int(number)], forwards[int(number)]) for number in order)
+
+
+def test_a_batch_comes_in_the_order_asked_though_it_is_read_forwards(small_release):
+    pairs = StereoPairs(small_release, frames="all", fields=("frame_index", "__key__"))
+    numbers = [9, 2, 20, 2, 0]
+
+    found = [sample["__key__"] for sample in pairs.__getitems__(numbers)]
+
+    assert found == [pairs[number]["__key__"] for number in numbers]
+
+
+def test_workers_that_persist_follow_set_epoch(small_release):
+    pairs = StereoPairs(small_release, frames=("random", 2), fields=("frame_index",), seed=5)
+    loader = DataLoader(pairs, batch_size=None, num_workers=2, persistent_workers=True)
+    epochs = []
+    for epoch in range(3):
+        pairs.set_epoch(epoch)
+        epochs.append([int(sample["frame_index"]) for sample in loader])
+
+    pairs.set_epoch(1)
+    assert epochs[1] == [int(pairs[number]["frame_index"]) for number in range(len(pairs))]
+    assert epochs[0] != epochs[1] != epochs[2]
+
+
+def test_transforms_draw_anew_each_epoch_and_the_same_for_the_same_seed(small_release):
+    def crops(seed, epoch):
+        pairs = StereoPairs(
+            small_release, fields=("intrinsics",), transform=RandomCrop(8, 8), seed=seed
+        )
+        pairs.set_epoch(epoch)
+        return [tuple(pairs[number]["intrinsics"][:2, 2].tolist()) for number in range(4)]
+
+    assert crops(0, 0) == crops(0, 0)
+    assert crops(0, 0) != crops(0, 1)
+    assert crops(0, 0) != crops(1, 0)
+
+
+def test_a_dataset_survives_pickling_with_videos_open(small_release):
+    pairs = StereoPairs(small_release, fields=EVERY_FIELD)
+    first = pairs[0]
+
+    assert same(pickle.loads(pickle.dumps(pairs))[0], first)
+
+
+def test_what_a_user_writes_into_a_sample_stays_there(small_release):
+    pairs = StereoPairs(small_release, fields=EVERY_FIELD)
+    untouched = pairs[0]
+    for value in pairs[0].values():
+        if isinstance(value, torch.Tensor):
+            value.zero_()
+
+    assert same(pairs[0], untouched)
+
+
+def test_a_forked_child_reads_on_without_disturbing_its_parent(small_release):
+    pairs = StereoPairs(small_release, frames="all", fields=("left",))
+    expected = [pairs[number]["left"] for number in range(7)]
+    pairs[0]
+    child = os.fork()
+    if child == 0:
+        right = all(torch.equal(pairs[number]["left"], expected[number]) for number in (3, 1, 6))
+        os._exit(0 if right else 1)
+    parent_right = all(torch.equal(pairs[n]["left"], expected[n]) for n in range(7))
+
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert parent_right
+
+
+def test_an_error_in_a_worker_keeps_its_class_and_its_words(small_release, tmp_path):
+    broken = _copied(small_release, tmp_path)
+    index = SceneIndex.open(broken)
+    victim = next(broken.glob("train/IPD_Gaussian/*/*/cam_01_rgb.mp4"))
+    victim.write_bytes(victim.read_bytes()[:-900] + bytes(900))
+    pairs = StereoPairs(index, frames="all", family="IPD_Gaussian")
+
+    with pytest.raises(MediaError, match=r"cam_01_rgb.mp4"):
+        list(DataLoader(pairs, num_workers=1, batch_size=2))
+
+
+def test_a_killed_worker_ends_the_loader_with_an_error(small_release):
+    pairs = StereoPairs(small_release, frames="all")
+    batches = iter(DataLoader(pairs, num_workers=1, batch_size=1, prefetch_factor=1))
+    next(batches)
+    os.kill(batches._workers[0].pid, signal.SIGKILL)
+
+    with pytest.raises(RuntimeError, match="worker"):
+        list(batches)
+
+
+def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():
+    wide = {"left": torch.zeros(3, 4, 8), "__key__": "a"}
+    tall = {"left": torch.zeros(3, 8, 4), "__key__": "b"}
+
+    with pytest.raises(FieldError, match=r"left is \(3, 8, 4\) in b and \(3, 4, 8\) in a"):
+        collate([wide, tall])
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"fields": ["dispariti"]}, FieldError, "no field 'dispariti'; the fields are left"),
+        ({"fields": []}, FieldError, "at least one"),
+        ({"fields": ["left", "left"]}, FieldError, "only once"),
+        ({"size": (0, 5)}, FieldError, "size must be"),
+        ({"size": (5.5, 5)}, FieldError, "size must be"),
+        ({"size": 5}, FieldError, "size must be"),
+        ({"seed": -1}, SelectionError, "seed must be"),
+        ({"split": "test"}, SelectionError, "split there is 'eval', 'train'"),
+        ({"pairs": [(0, 7)]}, SelectionError, "no pair"),
+        ({"frames": 7}, SelectionError, "scene with 7 frames"),
+    ],
+    ids=str,
+)
+def test_what_cannot_be_had_is_refused_before_anything_is_read(
+    small_release, options, error, message
+):
+    with pytest.raises(error, match=message):
+        StereoPairs(small_release, **options)
+
+
+@pytest.mark.parametrize("cameras", [(), (0, 0), (6,), "some", (0, "1")])
+def test_views_of_cameras_that_do_not_exist_are_refused(small_release, cameras):
+    with pytest.raises(SelectionError, match="cameras must be"):
+        SceneViews(small_release, cameras=cameras)
+
+
+def test_views_refuse_a_flip(small_release):
+    with pytest.raises(FieldError, match="SceneViews takes no flip"):
+        SceneViews(small_release, transform=HorizontalFlip())
+
+
+def test_the_users_depth_contract_overrides_the_files(small_release):
+    stated = StereoPairs(small_release, fields=("depth", "disparity", "valid"))[0]
+    doubled = StereoPairs(
+        small_release, fields=("depth", "disparity", "valid"), depth=DepthEncoding(unit_m=0.002)
+    )[0]
+
+    assert torch.equal(stated["valid"], doubled["valid"])
+    assert torch.allclose(stated["depth"] * 2, doubled["depth"], rtol=1e-6)
+    assert torch.allclose(stated["disparity"], doubled["disparity"] * 2, rtol=1e-6)
+
+
+def test_a_frame_lag_takes_depth_from_another_frame_and_none_beyond_the_last(small_release):
+    options = {"frames": "all", "family": "IPD_Gaussian", "fields": ("left", "depth", "valid")}
+    plain = StereoPairs(small_release, **options)
+    lagged = StereoPairs(small_release, depth=DepthEncoding(0.001, frame_lag=1), **options)
+
+    assert torch.equal(lagged[2]["depth"], plain[3]["depth"])
+    assert torch.equal(lagged[2]["left"], plain[2]["left"])
+    assert not lagged[6]["valid"].any()
+    assert not lagged[6]["depth"].any()
+
+
+def _copied(root, target):
+    """Return a copy of a tree whose files may be damaged."""
+    import shutil
+
+    shutil.copytree(root, target / "copy")
+    return target / "copy"

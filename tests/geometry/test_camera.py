@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
+
+sizes_px = st.integers(1, 4000)
+
+
+def test_the_focal_length_of_a_real_scene_is_its_share_of_the_film():
+    intrinsics = Intrinsics.from_mm(
+        focal_mm=32.599998, sensor_mm=(23.76, 23.76), size_px=(1280, 1280)
+    )
+
+    assert intrinsics.fx_px == pytest.approx(1756.2288, abs=1e-4)
+    assert (intrinsics.cx_px, intrinsics.cy_px) == (640.0, 640.0)
+
+
+def test_a_film_that_is_not_square_gives_each_axis_its_own_focal_length():
+    intrinsics = Intrinsics.from_mm(
+        focal_mm=50.0, sensor_mm=(36.0, 24.0), size_px=(720, 720), principal_point_px=(300.0, 400.0)
+    )
+
+    assert intrinsics == Intrinsics(1000.0, 1500.0, 300.0, 400.0, 720, 720)
+
+
+def test_a_principal_point_in_the_corner_is_not_taken_for_none():
+    intrinsics = Intrinsics.from_mm(
+        focal_mm=50.0, sensor_mm=(36.0, 24.0), size_px=(720, 720), principal_point_px=(0.0, 0.0)
+    )
+
+    assert (intrinsics.cx_px, intrinsics.cy_px) == (0.0, 0.0)
+
+
+def test_the_cameras_of_a_rig_share_the_recorded_intrinsics(recorded_rig):
+    intrinsics = rig_intrinsics(recorded_rig(np.arange(6.0)))
+
+    assert intrinsics.fx_px == pytest.approx(45 / 23.76 * 1280, rel=1e-15)
+    assert (intrinsics.width_px, intrinsics.height_px) == (1280, 1280)
+
+
+def test_the_evaluators_resize_scales_each_axis_by_its_own_factor():
+    intrinsics = Intrinsics(1756.0, 1756.0, 640.0, 640.0, 1280, 1280)
+
+    resized = intrinsics.resized(width_px=832, height_px=480)
+
+    assert resized.fx_px == pytest.approx(1756 * 0.65, rel=1e-15)
+    assert resized.fy_px == pytest.approx(1756 * 0.375, rel=1e-15)
+    assert (resized.cx_px, resized.cy_px) == (416.0, 240.0)
+
+
+@pytest.mark.parametrize(
+    ("left_px", "top_px", "expected"),
+    [
+        pytest.param(0, 0, (21.5, 14.0), id="at the border"),
+        pytest.param(24, 20, (-2.5, -6.0), id="past the principal point"),
+        pytest.param(-8, -5, (29.5, 19.0), id="padded on the left and the top"),
+    ],
+)
+def test_a_crop_moves_the_principal_point_and_nothing_else(intrinsics, left_px, top_px, expected):
+    cropped = intrinsics.cropped(left_px=left_px, top_px=top_px, width_px=16, height_px=10)
+
+    assert (cropped.cx_px, cropped.cy_px) == expected
+    assert (cropped.fx_px, cropped.fy_px) == (intrinsics.fx_px, intrinsics.fy_px)
+    assert (cropped.width_px, cropped.height_px) == (16, 10)
+
+
+def test_a_flip_mirrors_the_principal_point_about_the_images_middle(intrinsics):
+    assert intrinsics.flipped().cx_px == 40 - 21.5
+    assert intrinsics.flipped().flipped() == intrinsics
+
+
+@given(width_px=sizes_px, height_px=sizes_px, x=st.floats(-1, 1), y=st.floats(-1, 1))
+def test_a_ray_lands_on_the_same_share_of_the_image_at_every_size(width_px, height_px, x, y):
+    intrinsics = Intrinsics(70.0, 66.0, 21.5, 14.0, 40, 30)
+    resized = intrinsics.resized(width_px=width_px, height_px=height_px)
+
+    u_px, v_px, _ = intrinsics.matrix() @ [x, y, 1.0]
+    resized_u_px, resized_v_px, _ = resized.matrix() @ [x, y, 1.0]
+
+    np.testing.assert_allclose(resized_u_px / width_px, u_px / 40, atol=1e-12)
+    np.testing.assert_allclose(resized_v_px / height_px, v_px / 30, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"width_px": 0}, r"width_px must be at least 1, got 0"),
+        ({"height_px": -3}, r"height_px must be at least 1, got -3"),
+        ({"fx_px": 0.0}, r"fx_px must be a positive finite number, got 0\.0"),
+        ({"fy_px": float("nan")}, r"fy_px must be a positive finite number, got nan"),
+        ({"cx_px": float("inf")}, r"cx_px must be finite, got inf"),
+    ],
+)
+def test_a_camera_that_sees_nothing_is_refused(changes, message):
+    numbers = {
+        "fx_px": 70.0,
+        "fy_px": 66.0,
+        "cx_px": 21.5,
+        "cy_px": 14.0,
+        "width_px": 40,
+        "height_px": 30,
+    }
+
+    with pytest.raises(GeometryError, match=message):
+        Intrinsics(**(numbers | changes))
+
+
+def test_a_resize_to_nothing_is_refused(intrinsics):
+    with pytest.raises(GeometryError, match="width_px must be at least 1, got 0"):
+        intrinsics.resized(width_px=0, height_px=10)
+
+
+def test_a_film_without_width_is_refused():
+    with pytest.raises(GeometryError, match=r"sensor width in mm must be .* got 0\.0"):
+        Intrinsics.from_mm(focal_mm=50.0, sensor_mm=(0.0, 24.0), size_px=(720, 720))

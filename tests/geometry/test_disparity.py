@@ -1,0 +1,236 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.geometry.disparity import (
+    depth_from_disparity,
+    disparity_error_px,
+    disparity_from_depth,
+    disparity_from_units,
+    planar_from_ray,
+    ray_from_planar,
+)
+
+focals_px = st.floats(900.0, 4600.0)
+baselines_m = st.floats(0.01, 7.5) | st.floats(-7.5, -0.01)
+units_m = st.sampled_from([0.1, 0.01, 0.001, 1 / 256]) | st.floats(1e-4, 0.5)
+metres = st.floats(0.05, 7000.0, width=32)
+
+ALL_UNITS = np.arange(2**16).reshape(1, 2**16)
+UNREADABLE = (0.0, -1.0, np.nan)
+
+
+def ulps_away(values: np.ndarray, exact: np.ndarray) -> float:
+    """Return the largest distance from the float64 result in ulps of float32."""
+    ulp = np.spacing(np.abs(exact).astype(np.float32)).astype(np.float64)
+    return float(np.max(np.abs(values.astype(np.float64) - exact) / ulp))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    ("depth_m", "baseline_m", "expected_px"),
+    [
+        pytest.param(2.0, 0.125, 50.0, id="800 px * 0.125 m / 2 m"),
+        pytest.param(2.0, -0.125, -50.0, id="a target to the left"),
+        pytest.param(0.0625, 8.0, 102400.0, id="beyond any image's width"),
+        pytest.param(np.inf, 0.125, 0.0, id="sky does not move"),
+        *[pytest.param(z, 0.125, 0.0, id=f"{z} is not measured") for z in UNREADABLE],
+    ],
+)
+def test_disparity_of_one_pixel(library, dtype, depth_m, baseline_m, expected_px):
+    depth = library.array(np.array([[depth_m]], dtype=dtype))
+
+    disparity_px = disparity_from_depth(depth, focal_px=800.0, baseline_m=baseline_m)
+
+    assert library.numpy(disparity_px).dtype == dtype
+    np.testing.assert_array_equal(library.numpy(disparity_px), [[expected_px]])
+
+
+@settings(deadline=None, max_examples=50)
+@given(focal_px=focals_px, baseline_m=baselines_m, unit_m=units_m)
+def test_float32_disparity_is_the_float64_one_rounded(library, focal_px, baseline_m, unit_m):
+    depth_m = (ALL_UNITS[:, 1:] * unit_m).astype(np.float32)
+    exact = focal_px * baseline_m / depth_m.astype(np.float64)
+
+    disparity_px = library.numpy(
+        disparity_from_depth(library.array(depth_m), focal_px=focal_px, baseline_m=baseline_m)
+    )
+
+    np.testing.assert_array_equal(disparity_px, exact.astype(np.float32))
+
+
+@settings(deadline=None, max_examples=50)
+@given(focal_px=focals_px, baseline_m=baselines_m, unit_m=units_m)
+@pytest.mark.parametrize("form", ["depth", "inverse"])
+def test_disparity_of_every_stored_number_is_within_an_ulp(
+    library, form, focal_px, baseline_m, unit_m
+):
+    units = ALL_UNITS.astype(np.int32)
+    depth_m = {"depth": units[:, 1:] * unit_m, "inverse": unit_m / units[:, 1:]}[form]
+
+    disparity_px = library.numpy(
+        disparity_from_units(
+            library.array(units),
+            focal_px=focal_px,
+            baseline_m=baseline_m,
+            unit_m=unit_m,
+            form=form,
+        )
+    )
+
+    assert disparity_px.dtype == np.float32
+    assert disparity_px[0, 0] == 0.0
+    assert ulps_away(disparity_px[:, 1:], focal_px * baseline_m / depth_m) < 0.51
+
+
+@pytest.mark.parametrize("stored", [np.uint8, np.uint16, np.int32, np.int64])
+def test_any_integer_that_a_decoder_returns_is_read(library, stored):
+    units = library.array(np.array([[0, 1, 20, 255]], dtype=stored))
+
+    disparity_px = disparity_from_units(units, focal_px=800.0, baseline_m=0.125, unit_m=0.5)
+
+    expected_px = np.array([[0.0, 200.0, 10.0, 200 / 255]], dtype=np.float32)
+    np.testing.assert_array_equal(library.numpy(disparity_px), expected_px)
+
+
+@given(depth_m=metres, focal_px=focals_px, baseline_m=baselines_m)
+def test_depth_survives_the_round_trip(library, depth_m, focal_px, baseline_m):
+    pair = {"focal_px": focal_px, "baseline_m": baseline_m}
+
+    back_m = depth_from_disparity(
+        disparity_from_depth(library.array(np.array([[depth_m]])), **pair), **pair
+    )
+
+    np.testing.assert_allclose(library.numpy(back_m), [[depth_m]], rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("disparity_px", "baseline_m"),
+    [
+        pytest.param(0.0, 0.1, id="sky or nothing"),
+        pytest.param(np.nan, 0.1, id="nan"),
+        pytest.param(-40.0, 0.1, id="moved to the wrong side"),
+        pytest.param(40.0, -0.1, id="moved to the wrong side of a target to the left"),
+    ],
+)
+def test_a_disparity_that_no_depth_explains_has_none(library, disparity_px, baseline_m):
+    disparity = library.array(np.array([[disparity_px]], dtype=np.float32))
+
+    depth_m = depth_from_disparity(disparity, focal_px=800.0, baseline_m=baseline_m)
+
+    np.testing.assert_array_equal(library.numpy(depth_m), np.zeros((1, 1), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("depth_m", "expected_px"),
+    [
+        pytest.param(1.0, 111.5 * 0.05 / 0.95, id="1 m"),
+        pytest.param(10.0, 11.15 * 0.05 / 9.95, id="10 m"),
+        pytest.param(0.05, np.inf, id="half a step: the truth may be arbitrarily near"),
+        pytest.param(0.04, np.inf, id="less than half a step"),
+        pytest.param(np.inf, 0.0, id="sky"),
+        *[pytest.param(z, 0.0, id=f"{z} is not measured") for z in UNREADABLE],
+    ],
+)
+def test_the_error_of_one_pixel_at_a_tenth_of_a_metre(library, depth_m, expected_px):
+    depth = library.array(np.array([[depth_m]], dtype=np.float32))
+
+    error_px = library.numpy(
+        disparity_error_px(depth, focal_px=1115.0, baseline_m=-0.1, quantum_m=0.1)
+    )
+
+    assert error_px.dtype == np.float32
+    np.testing.assert_allclose(error_px, [[expected_px]], rtol=1e-4)
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    focal_px=focals_px,
+    baseline_m=baselines_m,
+    quantum_m=units_m,
+    dtype=st.sampled_from([np.float32, np.float64]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_rounded_depth_never_moves_disparity_beyond_the_bound(
+    library, focal_px, baseline_m, quantum_m, dtype, seed
+):
+    """The truth lies anywhere in the step that was stored, its very ends included."""
+    units = np.random.default_rng(seed).integers(1, 2**16, 500)
+    units[:3] = 1, 2, 65535
+    within = np.random.default_rng(seed).uniform(-0.5, 0.5, 500)
+    within[::2] = np.sign(within[::2]) / 2
+    true_m = (units + within) * quantum_m
+    stored = library.array((units * quantum_m).astype(dtype)[None])
+    pair = {"focal_px": focal_px, "baseline_m": baseline_m}
+
+    disparity_px = library.numpy(disparity_from_depth(stored, **pair)).astype(np.float64)
+    bound_px = library.numpy(disparity_error_px(stored, quantum_m=quantum_m, **pair))
+
+    error_px = np.abs(disparity_px - focal_px * baseline_m / true_m)
+    assert (error_px <= bound_px).all()
+
+
+def test_the_bound_is_no_looser_than_the_worst_case():
+    """At the near end of the step the error reaches the bound but for float32's rounding."""
+    depth_m = np.array([[0.1, 3.0, 100.0]], dtype=np.float32)
+    pair = {"focal_px": 1756.0, "baseline_m": 0.06}
+
+    bound_px = disparity_error_px(depth_m, quantum_m=0.1, **pair)
+
+    worst_px = 1756 * 0.06 / (depth_m - 0.05) - 1756 * 0.06 / depth_m
+    np.testing.assert_allclose(bound_px, worst_px, rtol=1e-3)
+
+
+def test_the_ray_to_the_corner_is_longer_than_its_depth(library):
+    """In a 6x2 image with f = 1 the corner's centre is at x = 2.5, y = 0.5."""
+    intrinsics = Intrinsics(1.0, 1.0, 3.0, 1.0, 6, 2)
+    depth_m = library.array(np.full((2, 6), 4.0, dtype=np.float32))
+
+    ray_m = ray_from_planar(depth_m, intrinsics)
+
+    assert library.numpy(ray_m).dtype == np.float32
+    assert library.numpy(ray_m)[0, 0] == pytest.approx(4 * np.sqrt(1 + 2.5**2 + 0.5**2))
+    np.testing.assert_allclose(library.numpy(planar_from_ray(ray_m, intrinsics)), 4.0, rtol=2e-7)
+
+
+@pytest.mark.parametrize("value_m", [0.0, np.inf])
+def test_what_was_not_measured_and_sky_have_no_other_depth_along_the_axis(library, value_m):
+    intrinsics = Intrinsics(1.0, 1.0, 3.0, 1.0, 6, 2)
+    ray_m = library.array(np.full((1, 2, 6), value_m, dtype=np.float32))
+
+    np.testing.assert_array_equal(
+        library.numpy(planar_from_ray(ray_m, intrinsics)), library.numpy(ray_m)
+    )
+
+
+def test_rays_of_an_image_of_another_size_are_refused():
+    with pytest.raises(GeometryError, match="is 8x2 px but its intrinsics are for 6x2 px"):
+        planar_from_ray(np.ones((2, 8)), Intrinsics(1.0, 1.0, 3.0, 1.0, 6, 2))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"focal_px": 0.0}, r"focal_px must be a positive finite number, got 0\.0"),
+        ({"focal_px": float("nan")}, "focal_px must be a positive finite number, got nan"),
+        ({"baseline_m": 0.0}, r"baseline_m must be finite and not 0, got 0\.0"),
+        ({"baseline_m": float("nan")}, "baseline_m must be finite and not 0, got nan"),
+    ],
+)
+@pytest.mark.parametrize("formula", [disparity_from_depth, depth_from_disparity])
+def test_a_pair_without_a_focal_length_or_a_baseline_is_refused(formula, changes, message):
+    with pytest.raises(GeometryError, match=message):
+        formula(np.ones((1, 1)), **({"focal_px": 800.0, "baseline_m": 0.1} | changes))
+
+
+def test_a_unit_of_no_length_is_refused():
+    with pytest.raises(GeometryError, match=r"unit_m must be a positive finite number, got 0\.0"):
+        disparity_from_units(np.ones((1, 1), int), focal_px=1.0, baseline_m=1.0, unit_m=0.0)
+
+
+def test_a_negative_quantum_is_refused():
+    with pytest.raises(GeometryError, match=r"quantum_m must be .* 0 or more, got -0\.1"):
+        disparity_error_px(np.ones((1, 1)), focal_px=1.0, baseline_m=1.0, quantum_m=-0.1)

@@ -1,0 +1,263 @@
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.geometry.disparity import disparity_from_depth
+from stereogenbench_data.geometry.projection import (
+    landing_pixels,
+    lands_inside,
+    project_rectified,
+    project_through_poses,
+)
+
+WIDE = Intrinsics(2694.0, 2694.0, 640.0, 640.0, 1280, 1280)
+MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])
+
+
+class Case(NamedTuple):
+    """A lateral rig that is hard on the pose chain."""
+
+    baseline_cm: float = 18.5
+    rotator_deg: tuple[float, float, float] = (-12.0, 200.0, 7.0)
+    offset_cm: tuple[float, float, float] = (1000.0, -2000.0, 300.0)
+    target: int = 1
+    source: int = 0
+
+
+HARD_RIGS = {
+    "1 cm baseline, 1e6 cm from the origin": Case(1.0, offset_cm=(1e6, -1e6, 1e6)),
+    "750 cm baseline, 1e6 cm from the origin": Case(750.0, offset_cm=(-1e6, 1e6, 1e6)),
+    "looking straight up": Case(rotator_deg=(90.0, 30.0, 20.0)),
+    "looking straight down": Case(rotator_deg=(-90.0, 30.0, 20.0)),
+    "upside down": Case(rotator_deg=(3.0, -170.0, 180.0)),
+    "right to left": Case(target=0, source=1),
+}
+
+
+def poses_of(case: Case, make_rig):
+    pitch, yaw, roll = case.rotator_deg
+    rotation = Rotation.from_euler("ZYX", [yaw, -pitch, -roll], degrees=True).as_matrix()
+    lateral_cm = [0.0, *(case.baseline_cm + np.arange(5.0))]
+    return make_rig(lateral_cm, rotation=rotation, offset_cm=case.offset_cm)
+
+
+def pair_motion(case: Case, make_rig):
+    """Return target_from_source and the signed baseline in metres."""
+    motion = poses_of(case, make_rig).cam_from_cam(0, target=case.target, source=case.source)
+    sign = 1 if case.target > case.source else -1
+    return motion, sign * case.baseline_cm / 100
+
+
+def sample_depth(intrinsics: Intrinsics) -> np.ndarray:
+    shape = (intrinsics.height_px, intrinsics.width_px)
+    depth_m = np.random.default_rng(0).uniform(1.0, 200.0, shape)
+    depth_m[0, :4] = 0.001, 0.1, 6553.4, 1e6
+    return depth_m
+
+
+def require_agreement(projection, depth_m, disparity_px):
+    """Check a projection against u - d, v, z to 1e-6 px, relative where d passes 1e4 px."""
+    height, width = depth_m.shape
+    expected_u = np.arange(width) + 0.5 - disparity_px
+    tolerance_px = 1e-6 * np.maximum(1.0, np.abs(disparity_px) / 1e4)
+    assert (np.abs(projection.u_px - expected_u) < tolerance_px).all()
+    assert (np.abs(projection.v_px - (np.arange(height) + 0.5)[:, None]) < tolerance_px).all()
+    np.testing.assert_allclose(projection.depth_m, depth_m, rtol=1e-9)
+
+
+@pytest.mark.parametrize("case", HARD_RIGS.values(), ids=HARD_RIGS)
+def test_the_pose_chain_is_the_closed_form_on_a_lateral_rig(make_rig, case):
+    """Every 16th row and column of the release's image, at its longest usual focal length."""
+    intrinsics = WIDE.resized(width_px=80, height_px=80)
+    depth_m = sample_depth(intrinsics)
+    motion, baseline_m = pair_motion(case, make_rig)
+
+    projection = project_through_poses(
+        depth_m,
+        intrinsics=intrinsics,
+        target_intrinsics=intrinsics,
+        target_from_source=motion,
+    )
+
+    disparity_px = disparity_from_depth(depth_m, focal_px=intrinsics.fx_px, baseline_m=baseline_m)
+    require_agreement(projection, depth_m, disparity_px)
+
+
+@pytest.mark.parametrize(
+    "intrinsics",
+    [
+        pytest.param(WIDE.resized(width_px=52, height_px=30), id="resized unlike in x and y"),
+        pytest.param(
+            WIDE.cropped(left_px=1240, top_px=0, width_px=40, height_px=30), id="at the border"
+        ),
+        pytest.param(WIDE.cropped(left_px=-8, top_px=-5, width_px=40, height_px=30), id="padded"),
+        pytest.param(
+            WIDE.cropped(left_px=300, top_px=7, width_px=40, height_px=30).flipped(),
+            id="cropped off the middle, then flipped",
+        ),
+    ],
+)
+def test_the_chain_follows_what_was_done_to_the_picture(make_rig, intrinsics):
+    depth_m = sample_depth(intrinsics)
+    motion, baseline_m = pair_motion(Case(), make_rig)
+
+    projection = project_through_poses(
+        depth_m,
+        intrinsics=intrinsics,
+        target_intrinsics=intrinsics,
+        target_from_source=motion,
+    )
+
+    disparity_px = disparity_from_depth(depth_m, focal_px=intrinsics.fx_px, baseline_m=baseline_m)
+    require_agreement(projection, depth_m, disparity_px)
+
+
+def test_the_mirrored_right_view_is_a_left_view_with_its_own_disparity_mirrored(make_rig):
+    """u_right - u_left is negative; mirrored, the right view is the left one, and d positive."""
+    intrinsics = WIDE.cropped(left_px=300, top_px=7, width_px=40, height_px=30)
+    right_depth_m = sample_depth(intrinsics)
+    left_from_right, baseline_m = pair_motion(Case(target=0, source=1), make_rig)
+    right_disparity_px = disparity_from_depth(
+        right_depth_m, focal_px=intrinsics.fx_px, baseline_m=baseline_m
+    )
+
+    projection = project_through_poses(
+        right_depth_m[:, ::-1].copy(),
+        intrinsics=intrinsics.flipped(),
+        target_intrinsics=intrinsics.flipped(),
+        target_from_source=MIRROR_X @ left_from_right @ MIRROR_X,
+    )
+
+    assert (right_disparity_px < 0).all()
+    require_agreement(projection, right_depth_m[:, ::-1], -right_disparity_px[:, ::-1])
+
+
+@settings(deadline=None, max_examples=30)
+@given(
+    turn_deg=st.tuples(*[st.floats(-20, 20)] * 3),
+    shift_m=st.tuples(*[st.floats(-0.5, 0.5)] * 3),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_any_motion_is_that_of_the_points_in_space(library, turn_deg, shift_m, seed):
+    """Against points lifted, moved and projected one by one with scipy."""
+    source = Intrinsics(30.0, 28.0, 4.5, 2.0, 8, 6)
+    target = Intrinsics(25.0, 26.0, 4.0, 3.5, 9, 7)
+    rotation = Rotation.from_euler("xyz", turn_deg, degrees=True)
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation.as_matrix(), shift_m
+    depth_m = np.random.default_rng(seed).uniform(2.0, 50.0, (6, 8))
+
+    projection = project_through_poses(
+        library.array(depth_m),
+        intrinsics=source,
+        target_intrinsics=target,
+        target_from_source=motion,
+    )
+
+    v_px, u_px = np.mgrid[:6, :8] + 0.5
+    rays = np.stack([(u_px - 4.5) / 30, (v_px - 2) / 28, np.ones((6, 8))], axis=-1)
+    x, y, z = (rotation.apply((rays * depth_m[..., None]).reshape(-1, 3)) + shift_m).T
+    np.testing.assert_allclose(library.numpy(projection.depth_m).ravel(), z, rtol=1e-12)
+    np.testing.assert_allclose(library.numpy(projection.u_px).ravel(), 25 * x / z + 4, rtol=1e-9)
+    np.testing.assert_allclose(library.numpy(projection.v_px).ravel(), 26 * y / z + 3.5, rtol=1e-9)
+
+
+def test_float32_depth_gives_float32_maps_that_were_rounded_once(library, intrinsics, make_rig):
+    depth_m = sample_depth(intrinsics).astype(np.float32)
+    motion, _ = pair_motion(Case(), make_rig)
+    cameras = {
+        "intrinsics": intrinsics,
+        "target_intrinsics": intrinsics,
+        "target_from_source": motion,
+    }
+
+    rounded = project_through_poses(library.array(depth_m), **cameras)
+    exact = project_through_poses(depth_m.astype(np.float64), **cameras)
+
+    for name in ("u_px", "v_px", "depth_m"):
+        expected = getattr(exact, name).astype(np.float32)
+        np.testing.assert_allclose(library.numpy(getattr(rounded, name)), expected, rtol=1.2e-7)
+        assert library.numpy(getattr(rounded, name)).dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    "depth_m",
+    [
+        pytest.param(0.0, id="not measured"),
+        pytest.param(1.0, id="on the target's plane"),
+        pytest.param(0.5, id="behind the target"),
+        pytest.param(np.inf, id="sky"),
+        pytest.param(np.nan, id="nan"),
+    ],
+)
+def test_a_point_that_the_target_cannot_see_lands_nowhere(library, depth_m):
+    """The target stands 1 m in front of the source."""
+    intrinsics = Intrinsics(2.0, 2.0, 1.5, 0.5, 3, 1)
+    motion = np.eye(4)
+    motion[2, 3] = -1.0
+
+    projection = project_through_poses(
+        library.array(np.full((1, 3), depth_m, dtype=np.float32)),
+        intrinsics=intrinsics,
+        target_intrinsics=intrinsics,
+        target_from_source=motion,
+    )
+
+    assert np.isnan(library.numpy(projection.u_px)).all()
+    assert not library.numpy(lands_inside(projection, height_px=1, width_px=3)).any()
+
+
+def test_a_rectified_pixel_lands_d_to_the_left_in_its_row_at_its_depth(library):
+    depth_m = library.array(np.array([[4.0, 2.0, 1.0]], dtype=np.float32))
+    disparity_px = library.array(np.array([[0.25, -0.5, 2.0]], dtype=np.float32))
+
+    projection = project_rectified(depth_m, disparity_px)
+
+    np.testing.assert_array_equal(library.numpy(projection.u_px), [[0.25, 2.0, 0.5]])
+    assert library.numpy(projection.u_px).dtype == np.float32
+    assert projection.v_px is None
+    assert projection.depth_m is depth_m
+
+
+@pytest.mark.parametrize(
+    ("disparity_px", "column"),
+    [
+        pytest.param(0.5, 0, id="the image's left edge belongs to column 0"),
+        pytest.param(0.5 + 2**-10, None, id="just past the left edge"),
+        pytest.param(-2.5 + 2**-10, 2, id="just before the right edge"),
+        pytest.param(-2.5, None, id="the right edge is outside"),
+        pytest.param(1e30, None, id="far beyond the image's width"),
+        pytest.param(np.inf, None, id="infinitely far"),
+    ],
+)
+def test_where_the_leftmost_of_three_pixels_lands(library, disparity_px, column):
+    disparity = library.array(np.full((1, 3), disparity_px, dtype=np.float32))
+    projection = project_rectified(library.array(np.ones((1, 3), np.float32)), disparity)
+
+    inside, pixel = landing_pixels(projection, height_px=1, width_px=3)
+
+    assert library.numpy(inside)[0, 0] == (column is not None)
+    assert column is None or library.numpy(pixel)[0, 0] == column
+
+
+def test_a_rectified_projection_cannot_change_the_number_of_rows():
+    projection = project_rectified(np.ones((4, 6)), np.ones((4, 6)))
+
+    with pytest.raises(GeometryError, match="of 4 rows cannot land in an image of 3 rows"):
+        landing_pixels(projection, height_px=3, width_px=6)
+
+
+def test_depth_of_an_image_of_another_size_is_refused(intrinsics):
+    with pytest.raises(GeometryError, match="depth map is 6x4 px but its intrinsics are for 40x30"):
+        project_through_poses(
+            np.ones((4, 6)),
+            intrinsics=intrinsics,
+            target_intrinsics=intrinsics,
+            target_from_source=np.eye(4),
+        )

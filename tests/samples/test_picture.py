@@ -1,0 +1,43 @@
+"""Contact sheets."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereogenbench_data import FieldError, StereoPairs
+from stereogenbench_data.samples.picture import COLOUR_STOPS, coloured, contact_sheet, write_png
+
+
+def test_colours_run_from_zero_to_the_largest_and_grey_is_not_measured():
+    picture = coloured(
+        np.array([[0.0, 10.0, 20.0, 5.0]]),
+        measured=np.array([[True, True, True, False]]),
+        largest=10.0,
+    )
+
+    assert picture[0, 0].tolist() == COLOUR_STOPS[0].tolist()
+    assert picture[0, 1].tolist() == picture[0, 2].tolist() == COLOUR_STOPS[-1].tolist()
+    assert picture[0, 3].tolist() == [96, 96, 96]
+
+
+def test_a_sheet_has_a_row_for_each_sample_and_a_tile_for_each_picture(small_release, tmp_path):
+    pairs = StereoPairs(small_release, fields=("left", "right", "disparity", "visible", "scene"))
+    sheet = contact_sheet([pairs[0], pairs[1], pairs[2]])
+    write_png(tmp_path / "sheet.png", sheet)
+
+    assert sheet.shape == (3 * (64 + 20 + 4), 4 * (64 + 4), 3)
+    assert np.array_equal(sheet[20:84, :64], pairs[0]["left"].numpy().transpose(1, 2, 0))
+    with Image.open(tmp_path / "sheet.png") as written:
+        assert np.array_equal(np.asarray(written), sheet)
+
+
+def test_a_clip_is_not_a_row_of_tiles(small_release):
+    clip = StereoPairs(small_release, frames=("clips", 2))[0]
+
+    with pytest.raises(FieldError, match="show one pair of one frame"):
+        contact_sheet([clip])
+
+
+def test_nothing_to_show_says_what_could_be(small_release):
+    with pytest.raises(FieldError, match="needs one of the fields left, right, disparity"):
+        contact_sheet([StereoPairs(small_release, fields=["scene"])[0]])

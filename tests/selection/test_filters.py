@@ -1,0 +1,88 @@
+"""Filters keep what they say and name themselves where nothing is left."""
+
+import numpy as np
+import pytest
+
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.selection.filters import filter_scenes
+
+
+def keys(index, **filters):
+    return [str(index.column("key")[row]) for row in filter_scenes(index, filters)]
+
+
+def test_no_filter_keeps_every_scene_in_the_order_of_keys(index):
+    found = keys(index)
+
+    assert len(found) == 9
+    assert found == sorted(found)
+
+
+@pytest.mark.parametrize(
+    ("filters", "expected"),
+    [
+        ({"split": "train"}, 7),
+        ({"split": "eval"}, 2),
+        ({"subset": "seen_map"}, 1),
+        ({"subset": ["seen_map", "unseen_map"]}, 2),
+        ({"family": "Uniform"}, 5),
+        ({"family": ("Uniform", "IPD_Gaussian")}, 9),
+        ({"map": "Town"}, 4),
+        ({"character": "SK_A"}, 4),
+        ({"animation": "AN_Walk"}, 3),
+        ({"focal_mm": (21, 22)}, 2),
+        ({"caption": "COURTYARD sky"}, 4),
+        ({"scenes": "train/Uniform/Town/scene_000001"}, 1),
+        ({"split": "train", "family": "Uniform", "map": None}, 3),
+    ],
+    ids=str,
+)
+def test_a_filter_keeps_the_scenes_that_match(index, filters, expected):
+    assert len(keys(index, **filters)) == expected
+
+
+def test_the_filter_that_empties_a_selection_is_named_with_what_there_is(index):
+    with pytest.raises(SelectionError) as caught:
+        keys(index, split="train", family="IPD_Gaussian", map="Town")
+
+    assert str(caught.value) == (
+        "map='Town' matches none of 4 scenes of those left by split='train', "
+        "family='IPD_Gaussian'; map there is 'Egypt'."
+    )
+
+
+def test_a_misspelt_value_is_answered_with_the_nearest_one(index):
+    with pytest.raises(SelectionError, match="family there is 'Uniform', 'IPD_Gaussian'"):
+        keys(index, family="Unifrom")
+
+
+def test_a_misspelt_filter_is_answered_with_the_nearest_one(index):
+    with pytest.raises(SelectionError, match="no filter 'famly'; did you mean 'family'"):
+        filter_scenes(index, {"famly": "Uniform"})
+
+
+def test_a_range_that_nothing_meets_says_what_the_numbers_span(index):
+    with pytest.raises(SelectionError, match="focal_mm there is 20 to 35"):
+        keys(index, focal_mm=(80, 90))
+
+
+@pytest.mark.parametrize("focal_mm", [(30, 20), 20, ("a", "b"), (1, 2, 3), (np.nan, 2)])
+def test_a_range_that_is_none_is_refused(index, focal_mm):
+    with pytest.raises(SelectionError, match="focal_mm must be"):
+        keys(index, focal_mm=focal_mm)
+
+
+def test_a_ratio_that_nobody_measured_is_said_to_be_unknown(index):
+    with pytest.raises(SelectionError, match="does not know it .* --valid-depth"):
+        keys(index, valid_depth_ratio=(0.9, 1.0))
+
+
+@pytest.mark.parametrize("caption", ["", "   ", 3])
+def test_a_search_for_no_words_is_refused(index, caption):
+    with pytest.raises(SelectionError, match="caption must be one or more words"):
+        keys(index, caption=caption)
+
+
+def test_words_that_no_caption_holds_say_how_many_captions_there_are(index):
+    with pytest.raises(SelectionError, match="written for 7 scenes"):
+        keys(index, caption="submarine")

@@ -1,0 +1,145 @@
+"""Pairs by name, by index and by baseline."""
+
+import numpy as np
+import pytest
+
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
+from stereogenbench_data.selection.filters import filter_scenes
+from stereogenbench_data.selection.pairs import baselines_cm, choose_pairs
+
+
+def chosen(index, filters=None, **options):
+    pairs = choose_pairs(index, filter_scenes(index, filters or {}), **options)
+    return [
+        (int(row), int(source), [int(target) for target in targets if target >= 0])
+        for row, source, targets in zip(pairs.row, pairs.source, pairs.targets, strict=True)
+    ]
+
+
+def test_the_primary_pair_is_the_one_that_each_scene_records(index):
+    found = chosen(index, {"map": "Town"})
+
+    assert [pair[1:] for pair in found] == [(2, [3]), (0, [1]), (0, [1]), (0, [1])]
+
+
+@pytest.mark.parametrize(("pairs", "each"), [("adjacent", 5), ("all", 15), ([(0, 5), (1, 3)], 2)])
+def test_every_scene_gives_as_many_pairs_as_asked(index, pairs, each):
+    assert len(chosen(index, pairs=pairs)) == each * len(index)
+
+
+def test_all_pairs_are_the_fifteen_of_six_cameras_left_before_right(index):
+    found = chosen(index, {"subset": "seen_map"}, pairs="all")
+
+    assert [(source, *targets) for _, source, targets in found] == list(CAMERA_PAIRS)
+
+
+def test_right_to_left_turns_every_pair_round(index):
+    found = chosen(index, {"subset": "seen_map"}, pairs="all", direction="right_to_left")
+
+    assert [(*targets, source) for _, source, targets in found] == list(CAMERA_PAIRS)
+
+
+def test_a_sweep_groups_what_stands_to_the_right_of_the_primary_view(index):
+    assert chosen(index, {"split": "eval"}, pairs="sweep") == [
+        (0, 2, [3, 4, 5]),
+        (1, 0, [1, 2, 3, 4, 5]),
+    ]
+
+
+def test_a_sweep_from_the_right_groups_what_stands_to_the_left(index):
+    found = chosen(index, {"subset": "seen_map"}, pairs="sweep", direction="right_to_left")
+
+    assert found == [(0, 3, [0, 1, 2])]
+
+
+def test_a_baseline_range_is_closed_and_drops_pairs_not_scenes(index):
+    found = chosen(
+        index,
+        {"scenes": "train/Uniform/Town/scene_000002"},
+        pairs="all",
+        baseline_cm=(25.0, 40.0),
+    )
+
+    # gaps 5 25 40 70 120: 1-2 is 25, 0-2 is 30, 2-3 is 40
+    assert [(source, *targets) for _, source, targets in found] == [(0, 2), (1, 2), (2, 3)]
+
+
+def test_a_sweep_keeps_the_targets_in_the_baseline_range(index):
+    found = chosen(
+        index,
+        {"scenes": "train/Uniform/Town/scene_000002"},
+        pairs="sweep",
+        baseline_cm=(25.0, 80.0),
+    )
+
+    # from camera 0: 5, 30, 70, 140, 260 cm
+    assert found == [(8, 0, [2, 3])]
+
+
+@pytest.mark.parametrize("name", BASELINE_BINS)
+def test_a_bin_by_name_holds_just_the_pairs_that_the_bin_function_puts_there(wide_index, name):
+    rows = filter_scenes(wide_index, {})
+    everything = choose_pairs(wide_index, rows, pairs="all")
+    expected = sum(baseline_bin(cm) == name for cm in baselines_cm(wide_index, everything)[:, 0])
+
+    if expected == 0:
+        with pytest.raises(SelectionError, match="matches none of 900 pairs"):
+            choose_pairs(wide_index, rows, pairs="all", baseline_cm=name)
+    else:
+        assert len(choose_pairs(wide_index, rows, pairs="all", baseline_cm=name)) == expected
+
+
+def test_the_last_bin_of_the_paper_is_closed_and_the_others_are_half_open():
+    edges = [1.0, 10.0, 30.0, 60.0, 100.0, 150.0, np.nextafter(150.0, 151)]
+
+    assert [baseline_bin(edge) for edge in edges] == [
+        "[1,10)", "[10,30)", "[30,60)", "[60,100)", "[100,150]", "[100,150]", "(150,inf)",
+    ]  # fmt: skip
+
+
+def test_several_bins_are_joined(index):
+    found = chosen(
+        index, {"family": "IPD_Gaussian"}, pairs="all", baseline_cm=["[1,10)", "[30,60)"]
+    )
+
+    # gaps of 6: five pairs of 6 cm and one of 30 cm in each of four scenes
+    assert len(found) == 4 * (5 + 1)
+
+
+def test_a_baseline_that_no_pair_has_says_which_there_are(index):
+    with pytest.raises(SelectionError) as caught:
+        chosen(index, {"family": "IPD_Gaussian"}, baseline_cm=(50, 60))
+
+    assert str(caught.value) == (
+        "baseline_cm=(50, 60) matches none of 4 pairs; baselines there are 6 to 6 cm, in the "
+        "bins [1,10)."
+    )
+
+
+@pytest.mark.parametrize(
+    ("pairs", "message"),
+    [
+        ([(0, 6)], r"there is no pair \(0, 6\)"),
+        ([(2, 2)], r"there is no pair \(2, 2\)"),
+        ([(3, 1)], "use direction='right_to_left'"),
+        ([(0, 1), (0, 1)], "each only once"),
+        ([], "at least one"),
+        ("every", "must be 'primary'"),
+        ([5], "got 5"),
+        ([(0, 1, 2)], r"got \(0, 1, 2\)"),
+    ],
+)
+def test_a_pair_that_does_not_exist_is_refused(index, pairs, message):
+    with pytest.raises(SelectionError, match=message):
+        chosen(index, pairs=pairs)
+
+
+def test_an_unknown_bin_is_answered_with_the_bins(index):
+    with pytest.raises(SelectionError, match=r"no baseline bin '\[1,11\)'; the bins are \[0,1\), "):
+        chosen(index, baseline_cm="[1,11)")
+
+
+def test_an_unknown_direction_is_refused(index):
+    with pytest.raises(SelectionError, match="direction must be"):
+        chosen(index, direction="backwards")

@@ -1,0 +1,98 @@
+"""The numbering of samples: scene by scene, window by window, pair by pair."""
+
+import itertools
+
+import pytest
+
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.selection.pairs import baselines_cm
+from stereogenbench_data.selection.plan import plan_pairs, plan_views
+
+
+def test_samples_are_numbered_scene_window_pair(index):
+    plan = plan_pairs(index, family="IPD_Gaussian", pairs="adjacent", frames=[3, 7])
+    found = [plan.locate(number, epoch=0) for number in range(len(plan))]
+
+    expected = itertools.product(range(4), [(3,), (7,)], [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5)])
+    first = found[0].row
+    assert [(a.row - first, a.frames, (a.source, *a.targets)) for a in found] == list(expected)
+
+
+def test_every_sample_of_a_mixed_selection_is_somewhere_once(index):
+    plan = plan_pairs(index, split="train", pairs="all", baseline_cm=(10, 50), frames=("every", 9))
+    found = [plan.locate(number, epoch=0) for number in range(len(plan))]
+
+    assert len(set(found)) == len(found)
+    assert len({address.row for address in found}) > 3
+
+
+def test_only_random_frames_depend_on_the_epoch(index):
+    fixed = plan_pairs(index, frames=("every", 20))
+    drawn = plan_pairs(index, frames=("random", 4))
+
+    def addresses(plan, epoch):
+        return [plan.locate(number, epoch=epoch) for number in range(len(plan))]
+
+    assert addresses(fixed, 0) == addresses(fixed, 1)
+    assert addresses(drawn, 0) != addresses(drawn, 1)
+    assert addresses(drawn, 0) == addresses(drawn, 0)
+
+
+def test_pairs_of_one_moment_share_their_random_frame(index):
+    plan = plan_pairs(index, family="IPD_Gaussian", pairs="all", frames=("random", 3))
+    frames = [plan.locate(number, epoch=5).frames for number in range(45)]
+
+    assert [len(set(frames[start : start + 15])) for start in (0, 15, 30)] == [1, 1, 1]
+
+
+def test_scenes_of_other_lengths_have_their_own_windows(index):
+    plan = plan_pairs(index, split="eval", frames="all")
+
+    assert len(plan) == 81 + 40
+    assert plan.locate(80, epoch=0).frames == (80,)
+    assert plan.locate(81, epoch=0).frames == (0,)
+
+
+def test_a_frame_that_one_scene_lacks_names_the_scene(index):
+    with pytest.raises(SelectionError, match=r"eval/MapUnseenInTrain/.*frame 60 .* with 40 frames"):
+        plan_pairs(index, split="eval", frames=60)
+
+
+def test_a_balanced_plan_draws_pairs_evenly(wide_index):
+    plan = plan_pairs(
+        wide_index, pairs="all", balance="bins", limit=40, baseline_cm=["[1,10)", "[10,30)"]
+    )
+    found = baselines_cm(wide_index, plan.pairs)[:, 0]
+
+    assert len(plan) == 40
+    assert (found < 10).sum() == 20
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"limit": 5}, "give balance too"),
+        ({"balance": "bins", "pairs": "sweep"}, "needs single pairs"),
+        ({"pears": "all"}, "no filter 'pears'"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(index, options, message):
+    with pytest.raises(SelectionError, match=message):
+        plan_pairs(index, **options)
+
+
+@pytest.mark.parametrize("number", [-1, 9, 100])
+def test_a_sample_beyond_the_last_is_an_index_error(index, number):
+    with pytest.raises(IndexError, match=f"no sample {number}: there are 9"):
+        plan_pairs(index).locate(number, epoch=0)
+
+
+def test_views_are_one_sample_a_moment_or_one_a_camera(index):
+    options = {"frames": [0, 1], "seed": 0, "filters": {"split": "eval"}}
+    together = plan_views(index, cameras=(4, 0, 2), **options)
+    each = plan_views(index, cameras="each", **options)
+
+    assert len(together) == 2 * 2
+    assert together.locate(1, epoch=0)[1:] == (4, (0, 2), (1,))
+    assert len(each) == 2 * 2 * 6
+    assert [each.locate(number, epoch=0)[1:3] for number in (0, 5)] == [(0, ()), (5, ())]

@@ -1,0 +1,114 @@
+"""Windows on frames, as arithmetic."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.selection.windows import Clips, parse_frames
+
+DRAW = (3, 0, 12)
+
+
+def windows(spec, frames=81, draw=DRAW):
+    rule = parse_frames(spec)
+    return [rule.window(n, frames=frames, draw=draw) for n in range(rule.count(frames))]
+
+
+@pytest.mark.parametrize(
+    ("spec", "frames", "expected"),
+    [
+        ("first", 81, [(0,)]),
+        ("all", 3, [(0,), (1,), (2,)]),
+        (5, 81, [(5,)]),
+        ([4, 1], 81, [(1,), (4,)]),
+        (range(2), 81, [(0,), (1,)]),
+        (("every", 40), 81, [(0,), (40,), (80,)]),
+        (("every", 100), 81, [(0,)]),
+        (("clips", 2), 5, [(0, 1), (2, 3)]),
+        (("clips", 2, 2), 5, [(0, 2)]),
+        (("clips", 2, 2, 1), 5, [(0, 2), (1, 3), (2, 4)]),
+        (("clips", 81), 81, [tuple(range(81))]),
+        (Clips(3), 4, [(0, 1, 2), (1, 2, 3)]),
+    ],
+    ids=str,
+)
+def test_a_rule_gives_its_windows(spec, frames, expected):
+    assert windows(spec, frames) == expected
+
+
+@given(st.integers(1, 90), st.integers(1, 12), st.integers(1, 5), st.integers(1, 9))
+def test_clips_are_as_many_as_fit(frames, length, stride, step):
+    every_start = [
+        tuple(range(start, start + length * stride, stride)) for start in range(0, frames, step)
+    ]
+    fitting = [clip for clip in every_start if clip[-1] < frames]
+
+    if fitting:
+        assert windows(("clips", length, stride, step), frames) == fitting
+    else:
+        with pytest.raises(SelectionError, match="spans"):
+            windows(("clips", length, stride, step), frames)
+
+
+@given(st.integers(1, 40), st.integers(0, 2**31), st.integers(0, 5))
+def test_random_frames_are_different_ascending_and_within_the_scene(n, seed, epoch):
+    found = [frame for (frame,) in windows(("random", n), 40, (seed, epoch, 99))]
+
+    assert found == sorted(set(found))
+    assert len(found) == n
+    assert 0 <= found[0] <= found[-1] < 40
+
+
+def test_random_frames_change_with_epoch_seed_and_scene_and_else_stay():
+    draws = [(0, 0, 1), (0, 1, 1), (1, 0, 1), (0, 0, 2)]
+    found = [tuple(windows(("random", 8), draw=draw)) for draw in draws]
+
+    assert len(set(found)) == 4
+    assert found[0] == tuple(windows(("random", 8), draw=draws[0]))
+
+
+def test_random_frames_cover_a_scene_evenly():
+    counts = [0] * 10
+    for epoch in range(2000):
+        for (frame,) in windows(("random", 3), 10, (0, epoch, 0)):
+            counts[frame] += 1
+
+    assert min(counts) > 510
+    assert max(counts) < 690
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("last", "is not understood"),
+        (-1, "at least 0, got -1"),
+        (True, "got True"),
+        ([], "is not understood"),
+        ([1, 1], "names a frame twice"),
+        ([1.5], "got 1.5"),
+        (("every", 0), "at least 1, got 0"),
+        (("random", 2, 3), "is not understood"),
+        (("clips",), "is not understood"),
+        (("clips", 1, 1, 1, 1), "is not understood"),
+        (None, "is not understood"),
+    ],
+    ids=str,
+)
+def test_frames_that_mean_nothing_are_refused(spec, message):
+    with pytest.raises(SelectionError, match=message):
+        parse_frames(spec)
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        (81, "frame 81 is asked for of a scene with 81 frames"),
+        (("random", 82), "more frames than the 81"),
+        (("clips", 82), "spans 82 frames; a scene has 81"),
+    ],
+    ids=str,
+)
+def test_frames_that_a_scene_does_not_have_are_refused(spec, message):
+    with pytest.raises(SelectionError, match=message):
+        windows(spec)

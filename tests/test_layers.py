@@ -1,0 +1,101 @@
+"""The package's structure: imports go one way, torch comes late, names are documented."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import stereogenbench_data
+
+PACKAGE = Path(stereogenbench_data.__file__).parent
+LAYERS = (
+    "errors", "schema", "geometry", "media", "storage", "selection", "samples", "datasets",
+    "bridges", "audit", "evaluation", "synthesis", "cli",
+)  # fmt: skip
+MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
+
+
+def _layer(path: Path) -> str:
+    return path.parts[0].removesuffix(".py")
+
+
+def _imported(path: Path) -> list[str]:
+    """Return the package's own modules that a file imports anywhere, also inside functions."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse((PACKAGE / path).read_text())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            names.append(str(node.module))
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return [name for name in names if name.startswith("stereogenbench_data.")]
+
+
+@pytest.mark.parametrize(
+    "module", [path for path in MODULES if path != Path("__init__.py")], ids=str
+)
+def test_a_module_imports_from_its_own_layer_or_one_to_the_left(module):
+    own = LAYERS.index(_layer(module))
+
+    to_the_right = [name for name in _imported(module) if LAYERS.index(name.split(".")[1]) > own]
+
+    assert to_the_right == []
+
+
+def test_the_imports_have_no_cycle():
+    modules = {
+        ".".join(("stereogenbench_data", *path.with_suffix("").parts)): path for path in MODULES
+    }
+    waiting = {
+        name: {imported for imported in _imported(path) if imported in modules and imported != name}
+        for name, path in modules.items()
+        if path != Path("__init__.py")
+    }
+    while waiting:
+        free = {name for name, needs in waiting.items() if not needs & waiting.keys()}
+        assert free, f"a cycle among {sorted(waiting)}"
+        waiting = {name: needs for name, needs in waiting.items() if name not in free}
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "stereogenbench_data",
+        "stereogenbench_data.schema.parse",
+        "stereogenbench_data.geometry.camera",
+        "stereogenbench_data.geometry.visibility",
+        "stereogenbench_data.media.depth",
+        "stereogenbench_data.storage.index",
+        "stereogenbench_data.selection.plan",
+        "stereogenbench_data.cli.main",
+    ],
+)
+def test_what_does_not_need_torch_starts_without_it(module):
+    code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
+
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_every_public_name_can_be_had_and_says_what_it_is():
+    for name in stereogenbench_data.__all__:
+        public = getattr(stereogenbench_data, name)
+
+        assert isinstance(public, dict) or len(public.__doc__ or "") > 40, name
+
+
+def test_an_unknown_public_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'StereoPair'"):
+        stereogenbench_data.StereoPair  # noqa: B018
+
+
+def test_every_error_can_be_rebuilt_from_its_one_message():
+    from stereogenbench_data import errors
+
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
+    assert len(kinds) >= 6
+    for kind in kinds:
+        assert str(kind("what was found")) == "what was found"
+        assert len(kind.__mro__) > 3, f"{kind} has no second base"
