@@ -1,7 +1,9 @@
 """``stereogenbench index``: walk a released tree once, and keep what training asks of it."""
 
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -16,11 +18,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from stereogenbench_data.errors import StereoGenBenchError
-from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
-from stereogenbench_data.storage.journal import Journal
-from stereogenbench_data.storage.scene_folder import ValidDepth
-from stereogenbench_data.storage.walk import TreeReport, walk
+_INDEX_NAME = "index.parquet"
 
 
 class _RateColumn(ProgressColumn):
@@ -37,7 +35,7 @@ def index(
     *,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help=f"Index file to write [ROOT/{INDEX_NAME}]."),
+        typer.Option("--out", "-o", help=f"Index file to write [ROOT/{_INDEX_NAME}]."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that read scenes [one a core].")
@@ -56,26 +54,42 @@ def index(
     The walk goes on where it stopped if it is run again after an interruption. Incomplete scenes
     are listed and left out. Broken ones too, and then the exit status is 1.
     """
+    from stereogenbench_data.storage.index import SceneIndex
+    from stereogenbench_data.storage.journal import Journal
+    from stereogenbench_data.storage.walk import walk
+
     console = Console(stderr=True)
-    target = root / INDEX_NAME if out is None else out
-    mode: ValidDepth = "sample" if valid_depth else "skip"
+    target = root / _INDEX_NAME if out is None else out
+    mode: Literal["skip", "sample"] = "sample" if valid_depth else "skip"
+    done_before = target.with_name(f"{target.name}.journal")
     try:
-        report = _indexed(root, target=target, workers=workers, valid_depth=mode, console=console)
-    except StereoGenBenchError as error:
-        console.print(f"error: {error}", style="red", markup=False, highlight=False)
-        raise typer.Exit(1) from error
+        with (
+            Journal(done_before, walk=f"{root.resolve()} valid_depth={mode}") as journal,
+            _progress(console) as progress,
+        ):
+            report = walk(
+                root, workers=workers, progress=progress, journal=journal, valid_depth=mode
+            )
+            if report.scenes:
+                SceneIndex.from_report(report).write(target)
+                journal.delete()
     except KeyboardInterrupt:
         console.print("stopped; run the same command again to go on from here")
         raise typer.Exit(130) from None
-    _list(console, report)
+    _list(console, "incomplete, left out", report.incomplete)
+    _list(console, "broken, left out", report.broken)
+    _list(console, "to know", {note: note for note in report.notes})
+    if not report.scenes:
+        console.print(f"{root}: no scene is whole, so there is nothing to index")
+        raise typer.Exit(1)
     typer.echo(f"{target}: {len(report.scenes)} scenes")
     if report.broken:
         raise typer.Exit(1)
 
 
-def _indexed(
-    root: Path, *, target: Path, workers: int | None, valid_depth: ValidDepth, console: Console
-) -> TreeReport:
+@contextmanager
+def _progress(console: Console) -> Iterator[Callable[[int, int], None]]:
+    """Show a bar; give the function that moves it."""
     columns = (
         TextColumn("indexing"),
         BarColumn(),
@@ -83,30 +97,14 @@ def _indexed(
         _RateColumn(),
         TimeRemainingColumn(),
     )
-    notes = target.with_name(f"{target.name}.journal")
-    with (
-        Journal(notes, walk=f"{root.resolve()} valid_depth={valid_depth}") as journal,
-        Progress(*columns, console=console) as bar,
-    ):
+    with Progress(*columns, console=console) as bar:
         task = bar.add_task("indexing", total=None)
-        report = walk(
-            root,
-            workers=workers,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-            journal=journal,
-            valid_depth=valid_depth,
-        )
-        SceneIndex.from_report(report).write(target)
-        journal.delete()
-    return report
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def _list(console: Console, report: TreeReport) -> None:
-    for title, scenes in (("incomplete", report.incomplete), ("broken", report.broken)):
-        if scenes:
-            console.print(f"\n{len(scenes)} {title}, left out:", style="bold")
-        for key, reason in scenes.items():
-            text = reason if key in reason else f"{key}: {reason}"
-            console.print(f"  {text}", markup=False, highlight=False, soft_wrap=True)
-    for note in report.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+def _list(console: Console, title: str, reasons: Mapping[str, str]) -> None:
+    if reasons:
+        console.print(f"{len(reasons)} {title}:", style="bold", highlight=False)
+    for key, reason in reasons.items():
+        text = reason if key in reason else f"{key}: {reason}"
+        console.print(f"  {text}", markup=False, highlight=False, soft_wrap=True)

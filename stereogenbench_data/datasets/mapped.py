@@ -38,7 +38,7 @@ class _MappedScenes(Dataset[Sample]):
         self.plan = plan
         self._loader = SampleLoader(index, request)
         # A shared tensor, because workers that persist over epochs hold copies of the dataset.
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
 
     @property
     def epoch(self) -> int:

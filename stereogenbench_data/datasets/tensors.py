@@ -16,7 +16,7 @@ def to_tensors(sample: Sample) -> Sample:
     return {
         name: value
         if isinstance(value, str)
-        else torch.from_numpy(np.require(value, requirements="CW"))
+        else torch.from_numpy(np.require(value, requirements=("C", "W")))
         for name, value in sample.items()
     }
 

@@ -8,7 +8,7 @@ values); the disparity of all of these is 0, so a map goes with the mask of what
 """
 
 import math
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -19,8 +19,12 @@ from stereogenbench_data.geometry.arrays import as_float64, pixel_centres, quoti
 from stereogenbench_data.geometry.camera import Intrinsics, require_positive, require_size
 from stereogenbench_data.schema.records import DepthForm
 
-_EXACT_FACTORS = np.arange(1.0, 256.0)
-"""Whole numbers whose product with a 16-bit number is exact in float32's 24 bits."""
+_EXACT_FACTORS: Final = np.arange(128.0, 256.0)
+"""Whole numbers whose product with a 16-bit number is exact in float32's 24 bits. Smaller ones
+are these over a power of two, which rounds alike."""
+
+_NEARLY_EXACT: Final = 2.0**-29
+"""A relative error that is at most 1/32 ulp of a float32."""
 
 
 def disparity_from_depth(
@@ -82,9 +86,9 @@ def disparity_from_units(
 ) -> Float32[Any, "*batch h w"]:
     """Return the disparity in pixels of stored 16-bit depth, without a depth map in between.
 
-    The result is within 0.51 ulp of the float64 one, at float32's speed: B fx / unit_m is
-    multiplied by the j of 1 to 255 that brings the product nearest to a float32, and units * j
-    is exact.
+    The result is within 0.55 ulp of the float64 one, at float32's speed: B fx / unit_m is
+    multiplied by the j of 128 to 255 that brings the product nearest to a float32, and units * j
+    is exact. For the few numbers that no j brings near enough it is computed in float64.
 
     Args:
         units: Stored numbers below 2 ** 16, as decoded.
@@ -109,10 +113,16 @@ def disparity_from_units(
     if form == "inverse":
         return xp.astype(xp.astype(units, xp.float64) * shift_units, xp.float32)
     products = shift_units * _EXACT_FACTORS
-    best = np.abs(products.astype(np.float32) / products - 1.0).argmin()
-    divisor = xp.astype(units, xp.float32) * float(_EXACT_FACTORS[best])
+    misses = np.abs(products.astype(np.float32) / products - 1.0)
+    best = misses.argmin()
+    if misses[best] > _NEARLY_EXACT:
+        divisor = xp.astype(units, xp.float64)
+        product = shift_units
+    else:
+        divisor = xp.astype(units, xp.float32) * float(_EXACT_FACTORS[best])
+        product = float(products[best])
     divisor[divisor == 0] = math.inf
-    return quotient(float(products[best]), divisor)
+    return xp.astype(quotient(product, divisor), xp.float32, copy=False)
 
 
 def disparity_error_px(
@@ -121,8 +131,8 @@ def disparity_error_px(
     """Return how far disparity can be from the truth because depth was stored in steps.
 
     True depth lies within half a step of the stored one, so disparity is off by at most
-    |d| (q / 2) / (z - q / 2). The bound also covers the rounding of depth, of disparity and of
-    itself to the map's dtype (a few eps of |d|), which shows where steps are fine and things far.
+    |d| (q / 2) / (z - q / 2). The bound also covers the rounding of depth and disparity to
+    the map's dtype (2 eps of |d|), which shows where steps are fine and things far.
 
     Args:
         depth_m: Stored depth along the optical axis, in metres.
@@ -155,8 +165,7 @@ def disparity_error_px(
     nearest_m = stored_m * (1.0 - 2.0 * eps) - quantum_m / 2
     relative = quotient(quantum_m / 2, stored_m) + 2.0 * eps
     bounded = nearest_m > 0
-    shift_px_m = focal_px * abs(baseline_m) * (1.0 + 8.0 * eps)
-    bound_px = shift_px_m * relative / xp.where(bounded, nearest_m, 1.0)
+    bound_px = focal_px * abs(baseline_m) * relative / xp.where(bounded, nearest_m, 1.0)
     return xp.where(bounded, bound_px, math.inf)
 
 

@@ -22,7 +22,7 @@ def visible_in_target(
     measured: Bool[Any, "*batch h w"],
     target_depth_m: Float[Any, "*batch target_h target_w"],
     target_measured: Bool[Any, "*batch target_h target_w"],
-    quantum_m: float,
+    quantum_m: float | Float[Any, "*batch h w"],
     tolerance: float = 0.02,
 ) -> Bool[Any, "*batch h w"]:
     """Return the source pixels that the target camera sees, judged by its own depth.
@@ -36,7 +36,8 @@ def visible_in_target(
         measured: Where source depth was measured.
         target_depth_m: The target camera's depth in metres.
         target_measured: Where target depth was measured.
-        quantum_m: The step in which depth is stored, in metres (the coarser of the two views).
+        quantum_m: The step in which depth is stored, in metres (the coarser of the two views);
+            one number, or a map of the source's pixels where the step varies with depth.
         tolerance: Share of the depth by which the two may differ beside two quanta.
 
     Returns:
@@ -62,7 +63,7 @@ def visible_from_source(
     projection: Projection,
     *,
     measured: Bool[Any, "*batch h w"],
-    quantum_m: float,
+    quantum_m: float | Float[Any, "*batch h w"],
     tolerance: float = 0.02,
 ) -> Bool[Any, "*batch h w"]:
     """Return the source pixels that nothing else in the source view hides from the target.

@@ -35,10 +35,6 @@ class SteadyClock:
         off = abs(pts - self.start - index * self.step)
         return index if off <= self._tolerance else None
 
-    def earliest(self, index: int) -> int:
-        """Return the least time that counts as a frame's."""
-        return math.ceil(self.start + index * self.step - self._tolerance)
-
     def latest(self, index: int) -> int:
         """Return the greatest time that counts as a frame's."""
         return math.floor(self.start + index * self.step + self._tolerance)
@@ -55,11 +51,9 @@ class TableClock:
         index = bisect_left(self.times, pts)
         return index if index < len(self.times) and self.times[index] == pts else None
 
-    def earliest(self, index: int) -> int:
+    def latest(self, index: int) -> int:
         """Return a frame's time."""
         return self.times[index]
-
-    latest = earliest
 
 
 Clock = SteadyClock | TableClock

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Final, Literal
 
 import av
 from av.container import InputContainer
@@ -17,8 +17,11 @@ from stereogenbench_data.errors import MediaError, StorageError
 
 VideoFile = str | Path | BinaryIO
 
-_OPTIONS = {"format_whitelist": "mov,matroska"}
-_MICROSECONDS = 1_000_000
+_OPTIONS: Final = {"format_whitelist": "mov,matroska"}
+_UNDECODED: Final = {**_OPTIONS, "probesize": "32", "skip_frame": "all"}
+"""FFmpeg decodes the first picture of H.264 only to learn its pixel format: not with these."""
+
+_MICROSECONDS: Final = 1_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,12 +48,15 @@ class StreamFacts:
     tags: Mapping[str, str]
 
 
-def open_container(file: VideoFile, *, name: str) -> InputContainer:
+def open_container(
+    file: VideoFile, *, name: str, pixel_format: Literal["needed", "later"] = "needed"
+) -> InputContainer:
     """Open a video file for reading.
 
     Args:
         file: A path, or a seekable binary file; the latter stays the caller's to close.
         name: What messages call the file.
+        pixel_format: With "later", the pixel format may be missing until a picture is decoded.
 
     Raises:
         StorageError: If a path is missing, not a file or not readable.
@@ -58,12 +64,11 @@ def open_container(file: VideoFile, *, name: str) -> InputContainer:
     """
     if isinstance(file, str | Path):
         _require_file(Path(file), name=name)
-        target: str | BinaryIO = f"file:{file}"
-    else:
-        file.seek(0)
-        target = file
     try:
-        container = av.open(target, mode="r", options=_OPTIONS, metadata_errors="replace")
+        container = _open(file, options=_OPTIONS if pixel_format == "needed" else _UNDECODED)
+        if not container.streams.video or container.streams.video[0].start_time is None:
+            container.close()
+            container = _open(file, options=_OPTIONS)
     except PermissionError as error:
         raise StorageError(f"{name}: may not be read: give read permission.") from error
     except av.FFmpegError as error:
@@ -75,7 +80,19 @@ def open_container(file: VideoFile, *, name: str) -> InputContainer:
         found = ", ".join(stream.type for stream in container.streams) or "nothing"
         container.close()
         raise MediaError(f"{name}: holds no video stream (it holds {found}): fetch it again.")
+    if container.streams.video[0].codec_context is None:
+        container.close()
+        raise MediaError(
+            f"{name}: its video codec is unknown to this FFmpeg: store it with another codec."
+        )
     return container
+
+
+def _open(file: VideoFile, *, options: dict[str, str]) -> InputContainer:
+    if isinstance(file, str | Path):
+        return av.open(f"file:{file}", mode="r", options=options, metadata_errors="replace")
+    file.seek(0)
+    return av.open(file, mode="r", options=options, metadata_errors="replace")
 
 
 def _require_file(path: Path, *, name: str) -> None:
@@ -99,10 +116,6 @@ def stream_facts(container: InputContainer, *, name: str, frames: int) -> Stream
     """
     stream = container.streams.video[0]
     context = stream.codec_context
-    if context is None:
-        raise MediaError(
-            f"{name}: its video codec is unknown to this FFmpeg: store it with another codec."
-        )
     if context.pix_fmt is None or not (context.width > 0 and context.height > 0):
         raise MediaError(
             f"{name}: its header tells no picture (codec {context.name}, pixel format "
@@ -130,11 +143,15 @@ def _merged_tags(container: Mapping[str, str], stream: Mapping[str, str]) -> dic
 
 
 def frames_by_duration(container: InputContainer) -> int | None:
-    """Return how many frames fill the container's duration, None where that is no whole number."""
-    rate = container.streams.video[0].average_rate
-    if container.duration is None or not rate:
+    """Return how many frames fill the time from start to end, None where that is no number.
+
+    Matroska's duration, as FFmpeg writes it, is the time at which the last frame ends.
+    """
+    stream = container.streams.video[0]
+    rate, time_base, start = stream.average_rate, stream.time_base, stream.start_time
+    if container.duration is None or start is None or not rate or not time_base:
         return None
-    count = rate * Fraction(container.duration, _MICROSECONDS)
+    count = rate * (Fraction(container.duration, _MICROSECONDS) - start * time_base)
     whole = round(count)
     return whole if whole > 0 and abs(count - whole) <= Fraction(1, 10) else None
 

@@ -57,12 +57,13 @@ class Decoder:
         self._knows_key_frames = self._stream.frames > 0
         self._packets: Iterator[VideoPacket] = container.demux(self._stream)
         self._pending: deque[tuple[int, VideoFrame]] = deque()
-        # The frame that comes next, if no picture is skipped; None just after a seek.
-        self._next: int | None = 0
         # The frame at which decoding began: pictures shown before it are not whole.
-        self._key: int | None = 0
-        self._newest_pts = clock.latest(0)
-        self._skip_until_pts: int | None = None
+        self._key = 0
+        # The frame after the last one given, and the frames whose packets came from there on.
+        self._next = 0
+        self._fed: set[int] = set()
+        self._newest = 0
+        self._skip_until = 0
 
     def close(self) -> None:
         """Close the container."""
@@ -79,8 +80,7 @@ class Decoder:
         if self._must_seek(index):
             self._seek(index)
         if self._can_skip and self._next != index:
-            self._next = None
-            self._skip_until_pts = self._clock.earliest(index)
+            self._skip_until = index
         return self.decode_to(index)
 
     def decode_to(self, index: int) -> VideoFrame:
@@ -90,35 +90,32 @@ class Decoder:
             Astray: If other pictures come than the clock tells.
             av.FFmpegError: If a packet cannot be read or decoded.
         """
-        while True:
+        found = -1
+        while found < index:
             found, frame = self._pull()
-            if self._key is not None and found < self._key:
-                continue
-            if frame.is_corrupt:
+            if found >= self._key and frame.is_corrupt:
                 raise Astray(f"the picture of frame {found} is damaged")
-            if found > index or self._next not in (None, found):
-                due = index if self._next is None else self._next
-                raise Astray(f"frame {found} came where frame {due} was due")
-            if found == index:
-                self._next = index + 1
-                self._skip_until_pts = None
-                return frame
-            if self._next is not None:
-                self._next += 1
+        if found > index:
+            raise Astray(f"frame {found} came where frame {index} was due")
+        # All that is shown before a picture is stored before the decoder gives it.
+        missing = set(range(self._next, index)) - self._fed
+        if missing:
+            raise Astray(f"frame {min(missing)} is missing before it")
+        self._fed = {fed for fed in self._fed if fed > index}
+        self._next = index + 1
+        return frame
 
     def _must_seek(self, index: int) -> bool:
-        if self._next is None or index < self._next:
-            return True
-        if index == self._next:
-            return False
+        if index <= self._next:
+            return index < self._next
         if not self._knows_key_frames and index - self._next > _BLIND_JUMP:
             return True
         entries = self._stream.index_entries
         key = entries.search_timestamp(self._clock.latest(index))
-        return key >= 0 and entries[key].timestamp > self._newest_pts
+        return key >= 0 and entries[key].timestamp > self._clock.latest(self._newest)
 
     def _seek(self, index: int) -> None:
-        """Go to a key frame at or before a frame, in the order of presentation and of storage."""
+        """Go to a key frame that is shown, not only decoded, at or before a frame."""
         pts = self._clock.latest(index)
         first = self._seek_pts(pts)
         if first.dts is not None and first.pts is not None and first.pts > pts:
@@ -126,8 +123,10 @@ class Decoder:
             first = self._seek_pts(first.dts - 1)
         self._packets = chain([first], self._packets)
         self._pending.clear()
+        self._fed.clear()
+        self._key = self._next = self._index(first)
+        self._newest = 0
         self._knows_key_frames = True
-        self._next = self._key = None
 
     def _seek_pts(self, pts: int) -> VideoPacket:
         self._container.seek(pts, stream=self._stream)
@@ -136,6 +135,13 @@ class Decoder:
         if first is None:
             raise Astray("nothing is stored where it should be")
         return first
+
+    def _index(self, shown: VideoPacket | VideoFrame) -> int:
+        """Return the frame that a packet or picture stands for."""
+        index = None if shown.pts is None else self._clock.index(shown.pts)
+        if index is None:
+            raise Astray(f"something is shown at {shown.pts} ticks, where no frame is due")
+        return index
 
     def _pull(self) -> tuple[int, VideoFrame]:
         """Return the next picture with its number, from as many packets as it takes."""
@@ -157,25 +163,16 @@ class Decoder:
             if is_whole:
                 raise
             return
-        for frame in frames:
-            index = None if frame.pts is None else self._clock.index(frame.pts)
-            if index is None:
-                raise Astray(f"a picture is shown at {frame.pts} ticks, where no frame is due")
-            self._pending.append((index, frame))
+        self._pending.extend((self._index(frame), frame) for frame in frames)
 
     def _register(self, packet: VideoPacket) -> bool:
         """Take note of a packet; return whether its picture can be decoded whole."""
-        pts = packet.pts
-        index = None if pts is None else self._clock.index(pts)
-        if pts is None or index is None:
-            raise Astray(f"a packet is shown at {pts} ticks, where no frame is due")
+        index = self._index(packet)
         if packet.is_corrupt:
             raise Astray(f"the packet of frame {index} is cut short")
         if self._has_checksums and fails_slice_checksums(bytes(packet)):
             raise Astray(f"the packet of frame {index} fails its checksum")
-        self._newest_pts = max(self._newest_pts, pts)
-        if self._key is None:
-            self._key = index
-        skips = self._skip_until_pts is not None and pts < self._skip_until_pts
-        self._context.skip_frame = "NONREF" if skips else "DEFAULT"
+        self._fed.add(index)
+        self._newest = max(self._newest, index)
+        self._context.skip_frame = "NONREF" if index < self._skip_until else "DEFAULT"
         return index >= self._key

@@ -6,7 +6,7 @@ expect (a gap, a cut, a damaged packet), reading is an error, never a neighbouri
 
 from dataclasses import replace
 from types import TracebackType
-from typing import Final, NoReturn, Self
+from typing import Final, Literal, NoReturn, Self
 
 import av
 import numpy as np
@@ -27,6 +27,8 @@ from stereogenbench_data.media.container import (
 )
 from stereogenbench_data.media.decoder import Astray, Decoder
 from stereogenbench_data.media.planes import plane_numbers
+
+__all__ = ["StreamFacts", "VideoReader", "probe", "read_rgb"]
 
 _RED_GREEN_BLUE: Final = (2, 0, 1)
 """Where the planes of FFmpeg's gbrp are."""
@@ -88,7 +90,7 @@ class VideoReader:
 
     Attributes:
         name: What messages call the file.
-        facts: What the header says, with ``frames`` as they were asked for.
+        frames: How many frames it has.
         scaler: The scaler, whose tables are kept from frame to frame.
     """
 
@@ -110,16 +112,20 @@ class VideoReader:
             if value < 1:
                 raise MediaError(f"{name}: {what} must be at least 1, got {value}.")
         self.name = name
+        self.frames = frames
         self.scaler = VideoReformatter()
         self._file = file
         self._threads = threads
-        self._decoder: Decoder | None = None
+        self._picture: tuple[str, int, int] | None = None
         self._current: tuple[int, VideoFrame] | None = None
         self._is_closed = False
-        container = open_container(file, name=name)
+        self._facts: StreamFacts | None = None
+        self._decoder: Decoder | None = None
+        container = open_container(file, name=name, pixel_format="later")
         try:
             require_whole_payload(container, name=name)
-            self.facts = stream_facts(container, name=name, frames=frames)
+            if container.streams.video[0].codec_context.pix_fmt is not None:
+                self._facts = stream_facts(container, name=name, frames=frames)
             steady = steady_clock(container, frames=frames)
             self._clock: Clock = steady or self._survey(container)
         except MediaError:
@@ -127,8 +133,22 @@ class VideoReader:
             raise
         if steady is None:
             container.close()
-            container = open_container(file, name=name)
-        self._decoder = Decoder(container, clock=self._clock, threads=threads)
+        else:
+            self._decoder = Decoder(container, clock=steady, threads=threads)
+
+    @property
+    def facts(self) -> StreamFacts:
+        """What the header says, with ``frames`` as they were asked for.
+
+        Raises:
+            MediaError: If the header does not tell size and pixel format.
+        """
+        if self._facts is None:
+            # A file object is read from one place at a time.
+            self._drop_decoder()
+            with open_container(self._file, name=self.name) as container:
+                self._facts = stream_facts(container, name=self.name, frames=self.frames)
+        return self._facts
 
     def frame(self, index: int) -> VideoFrame:
         """Return the frame that is the ``index``-th in the order of presentation, from 0.
@@ -138,9 +158,9 @@ class VideoReader:
         """
         if self._is_closed:
             raise MediaError(f"{self.name}: is closed, so frame {index} cannot be read: reopen it.")
-        if not 0 <= index < self.facts.frames:
+        if not 0 <= index < self.frames:
             raise MediaError(
-                f"{self.name}: has no frame {index}: ask for one of 0 to {self.facts.frames - 1}."
+                f"{self.name}: has no frame {index}: ask for one of 0 to {self.frames - 1}."
             )
         if self._current is None or self._current[0] != index:
             self._current = None
@@ -176,11 +196,12 @@ class VideoReader:
         )
 
     def _reach(self, index: int) -> VideoFrame:
-        if self._decoder is not None:
-            try:
-                return self._decoder.reach(index)
-            except (Astray, av.FFmpegError):
-                self._drop_decoder()
+        if self._decoder is None:
+            self._decoder = self._opened(pixel_format="later")
+        try:
+            return self._decoder.reach(index)
+        except (Astray, av.FFmpegError):
+            self._drop_decoder()
         return self._reach_from_start(index)
 
     def _reach_from_start(self, index: int) -> VideoFrame:
@@ -188,23 +209,24 @@ class VideoReader:
         if not isinstance(self._clock, TableClock):
             with open_container(self._file, name=self.name) as container:
                 self._clock = self._survey(container)
-        container = open_container(self._file, name=self.name)
-        decoder = Decoder(container, clock=self._clock, threads=self._threads)
+        self._decoder = self._opened(pixel_format="needed")
         try:
-            frame = decoder.decode_to(index)
+            return self._decoder.decode_to(index)
         except (Astray, av.FFmpegError) as error:
-            decoder.close()
+            self._drop_decoder()
             reason = error.strerror if isinstance(error, av.FFmpegError) else error
             raise MediaError(
-                f"{self.name}: frame {index} cannot be decoded ({self.facts.codec}: {reason}). "
-                f"The file is damaged: compare it with its checksum, or fetch it again."
+                f"{self.name}: frame {index} cannot be decoded ({reason}). The file is damaged: "
+                f"compare it with its checksum, or fetch it again."
             ) from error
-        self._decoder = decoder
-        return frame
+
+    def _opened(self, *, pixel_format: Literal["needed", "later"]) -> Decoder:
+        container = open_container(self._file, name=self.name, pixel_format=pixel_format)
+        return Decoder(container, clock=self._clock, threads=self._threads)
 
     def _survey(self, container: InputContainer) -> TableClock:
         clock = table_clock(container, name=self.name)
-        found, expected = len(clock.times), self.facts.frames
+        found, expected = len(clock.times), self.frames
         if found != expected:
             raise MediaError(
                 f"{self.name}: holds {found} frames where {expected} are expected. It is cut "
@@ -213,13 +235,15 @@ class VideoReader:
         return clock
 
     def _require_same_picture(self, index: int, frame: VideoFrame) -> None:
-        facts = self.facts
         found = (frame.format.name, frame.width, frame.height)
-        expected = (facts.pixel_format, facts.width_px, facts.height_px)
+        if self._facts is not None:
+            facts = self._facts
+            self._picture = (facts.pixel_format, facts.width_px, facts.height_px)
+        expected = self._picture = self._picture or found
         if found != expected:
             raise MediaError(
-                f"{self.name}: frame {index} is {found[0]} {found[1]}x{found[2]} where the header "
-                f"says {expected[0]} {expected[1]}x{expected[2]}: store the file anew."
+                f"{self.name}: frame {index} is {found[0]} {found[1]}x{found[2]} where "
+                f"{expected[0]} {expected[1]}x{expected[2]} is expected: store the file anew."
             )
 
     def _drop_decoder(self) -> None:

@@ -34,6 +34,7 @@ MIRROR_X: Final = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 MapF32 = Float32[np.ndarray, "t h w"]
 MapBool = Bool[np.ndarray, "t h w"]
+Motions = Float64[np.ndarray, "t 4 4"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,15 +109,19 @@ class PairGeometry:
         """Disparity in pixels, 0 where depth was not measured."""
         if not self._facts.is_rectified:
             u_px = np.arange(self.depth_m.shape[-1]) + 0.5
-            moved = np.where(self.stored.measured, u_px - self.projection.u_px, 0)
-            return moved.astype(np.float32)
+            moved: MapF32 = np.where(self.stored.measured, u_px - self.projection.u_px, 0).astype(
+                np.float32
+            )
+            return moved
         rig = {"focal_px": self._views.intrinsics.fx_px, "baseline_m": self.baseline_m}
         if self._encoding.kind == "ray":
-            return disparity_from_depth(self.depth_m, **rig)
-        disparity = disparity_from_units(
+            by_depth: MapF32 = disparity_from_depth(self.depth_m, **rig)
+            return by_depth
+        disparity: MapF32 = disparity_from_units(
             self.stored.units, **rig, unit_m=self._encoding.unit_m, form=self._encoding.form
         )
-        return np.multiply(disparity, self.stored.measured, out=disparity)
+        disparity *= self.stored.measured
+        return disparity
 
     @cached_property
     def projection(self) -> Projection:
@@ -126,7 +131,7 @@ class PairGeometry:
         target_from_source = self.target_from_source
         parts = [
             project_through_poses(
-                depth_m,
+                depth_m.astype(np.float64),
                 intrinsics=self._views.intrinsics,
                 target_intrinsics=self._views.intrinsics,
                 target_from_source=transform,
@@ -135,29 +140,26 @@ class PairGeometry:
         ]
         return Projection(
             u_px=np.stack([part.u_px for part in parts]),
-            v_px=np.stack([part.v_px for part in parts]),
+            v_px=np.stack([np.asarray(part.v_px) for part in parts]),
             depth_m=np.stack([part.depth_m for part in parts]),
         )
 
     @cached_property
-    def target_from_source(self) -> Float64[np.ndarray, "t 4 4"]:
+    def target_from_source(self) -> Motions:
         """Source camera's coordinates to the target camera's, in metres."""
         poses = self._facts.camera_poses()
-        transforms = np.stack(
+        transforms: Motions = np.stack(
             [
                 poses.cam_from_cam(frame, target=self._target, source=self._source)
                 for frame in self._views.frames
             ]
         )
-        if self._views.world == "mirrored":
-            return MIRROR_X @ transforms @ MIRROR_X
-        return transforms
+        return _as_seen(transforms, self._views)
 
-    @cached_property
-    def quantum_m(self) -> float | MapF32:
-        """The step between neighbouring depths that can be stored."""
+    def quantum_m(self, target: DepthEncoding) -> float | MapF32:
+        """Return the coarser step between depths that the two cameras can store."""
         if self._encoding.form == "depth":
-            return self._encoding.unit_m
+            return max(self._encoding.unit_m, target.unit_m)
         return self.depth_m**2 / np.float32(self._encoding.unit_m)
 
     @cached_property
@@ -166,30 +168,36 @@ class PairGeometry:
         focal_px = self._views.intrinsics.fx_px
         if self._encoding.form == "inverse":
             half_step_px = focal_px * abs(self.baseline_m) / self._encoding.unit_m / 2
-            return self.stored.measured * np.float32(half_step_px)
-        return disparity_error_px(
+            bound: MapF32 = self.stored.measured * np.float32(half_step_px)
+            return bound
+        bound = disparity_error_px(
             self.depth_m,
             focal_px=focal_px,
             baseline_m=self.baseline_m,
             quantum_m=self._encoding.unit_m,
         )
+        return bound
 
     @cached_property
     def visible_from_source(self) -> MapBool:
         """Visible in the target, as far as the source's own depth can tell."""
-        return visible_from_source(
-            self.projection, measured=self.stored.measured, quantum_m=self.quantum_m
+        visible: MapBool = visible_from_source(
+            self.projection,
+            measured=self.stored.measured,
+            quantum_m=self.quantum_m(self._encoding),
         )
+        return visible
 
     def visible(self, target: "PairGeometry") -> MapBool:
         """Return what is visible in the target, by the depth of the target's own geometry."""
-        return visible_in_target(
+        visible: MapBool = visible_in_target(
             self.projection,
             measured=self.stored.measured,
             target_depth_m=target.depth_m,
             target_measured=target.stored.measured,
-            quantum_m=np.maximum(self.quantum_m, target.quantum_m),
+            quantum_m=self.quantum_m(self._facts.encodings[self._target]),
         )
+        return visible
 
     @cached_property
     def splatted(self) -> tuple[Any, MapBool]:
@@ -203,7 +211,16 @@ class PairGeometry:
         if self._source in self._views.pictures:
             return self.splatted[1]
         blank = np.zeros((len(self.depth_m), 1, *self.depth_m.shape[-2:]), dtype=np.uint8)
-        return splat(blank, self.projection, measured=self.stored.measured)[1]
+        hole: MapBool = splat(blank, self.projection, measured=self.stored.measured)[1]
+        return hole
+
+
+def _as_seen(transforms: Motions, views: Views) -> Motions:
+    """Return motions in the world that the views show, which a flip has mirrored."""
+    if views.world == "as filmed":
+        return transforms
+    mirrored: Motions = MIRROR_X @ transforms @ MIRROR_X
+    return mirrored
 
 
 class PairSample:
@@ -225,13 +242,13 @@ class PairSample:
         """From the target to the source."""
         return PairGeometry(self.views, self.facts, source=self.target, target=self.views.source)
 
-    def world_from(self, camera: int) -> Float64[np.ndarray, "t 4 4"]:
+    def world_from(self, camera: int) -> Motions:
         """Return a camera's poses at the sample's frames."""
         poses = self.facts.camera_poses()
-        transforms = np.stack([poses.world_from_cam(frame, camera) for frame in self.views.frames])
-        if self.views.world == "mirrored":
-            return MIRROR_X @ transforms @ MIRROR_X
-        return transforms
+        transforms: Motions = np.stack(
+            [poses.world_from_cam(frame, camera) for frame in self.views.frames]
+        )
+        return _as_seen(transforms, self.views)
 
 
 Builder = Callable[[PairSample], Any]

@@ -1,5 +1,6 @@
 """Samples as pictures, for people who would rather look than read."""
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -20,6 +21,7 @@ COLOUR_STOPS: Final = np.array(
 """From far (dark blue) to near (red), each lighter than the one before but for the last."""
 NOT_MEASURED: Final = (96, 96, 96)
 _CAPTION_PX: Final = 20
+_NARROWEST_PX: Final = 192
 _GAP_PX: Final = 4
 
 
@@ -46,7 +48,7 @@ def contact_sheet(samples: Sequence[Sample]) -> Picture:
 
     Returns:
         (h, w, 3) uint8. Disparity and depth are coloured up to their 98th percentile, which the
-        caption says.
+        caption says; pictures too narrow for their captions are enlarged by a whole factor.
 
     Raises:
         FieldError: If the samples have nothing to show, or have a time axis.
@@ -54,8 +56,10 @@ def contact_sheet(samples: Sequence[Sample]) -> Picture:
     rows = [_row(sample) for sample in samples]
     if not rows or not rows[0]:
         raise FieldError(f"a contact sheet needs one of the fields {', '.join(_TILES)}.")
-    height = max(tile.shape[0] for row in rows for _, tile in row) + _CAPTION_PX
     width = max(tile.shape[1] for row in rows for _, tile in row)
+    enlarge = math.ceil(_NARROWEST_PX / width)
+    width *= enlarge
+    height = enlarge * max(tile.shape[0] for row in rows for _, tile in row) + _CAPTION_PX
     columns = max(map(len, rows))
     sheet = Image.new(
         "RGB", (columns * (width + _GAP_PX), len(rows) * (height + _GAP_PX)), (255, 255, 255)
@@ -65,7 +69,8 @@ def contact_sheet(samples: Sequence[Sample]) -> Picture:
     for place, row in enumerate(rows):
         for column, (caption, tile) in enumerate(row):
             corner = (column * (width + _GAP_PX), place * (height + _GAP_PX))
-            sheet.paste(Image.fromarray(tile), (corner[0], corner[1] + _CAPTION_PX))
+            enlarged = tile.repeat(enlarge, axis=0).repeat(enlarge, axis=1)
+            sheet.paste(Image.fromarray(enlarged), (corner[0], corner[1] + _CAPTION_PX))
             draw.text((corner[0] + 2, corner[1] + 2), caption, fill=(0, 0, 0), font=font)
     return np.asarray(sheet)
 
@@ -86,7 +91,7 @@ def _row(sample: Sample) -> list[tuple[str, Picture]]:
 def _rgb(name: str, sample: dict[str, Any]) -> tuple[str, Picture]:
     caption = name
     if "pair" in sample and name in ("left", "right"):
-        caption += f" (cam {int(sample['pair'][name == 'right'])})"
+        caption += f" (cam {sample['pair'][int(name == 'right')]})"
     if "baseline_m" in sample and name == "right":
         caption += f", {float(sample['baseline_m']) * 100:.1f} cm"
     return caption, np.ascontiguousarray(sample[name].transpose(1, 2, 0))

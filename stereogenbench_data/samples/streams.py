@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
-from stereogenbench_data.media.depth import read_depth_units, require_depth_stream
+from stereogenbench_data.media.depth import read_depth_units
 from stereogenbench_data.media.video import VideoReader, read_rgb
 from stereogenbench_data.schema.records import DepthEncoding
 
@@ -53,7 +53,10 @@ class Streams:
             MediaError: If the video does not decode to so many frames.
         """
         stream = self._stream(path, frames=frames)
-        return _kept(stream, (index, size), lambda: read_rgb(stream.reader, index, size=size))
+        picture: UInt8[np.ndarray, "3 h w"] = _kept(
+            stream, (index, size), lambda: read_rgb(stream.reader, index, size=size)
+        )
+        return picture
 
     def depth_units(
         self, path: Path, index: int, *, frames: int, encoding: DepthEncoding
@@ -64,11 +67,10 @@ class Streams:
             MediaError: If the stream is not one that the encoding describes or does not decode.
         """
         stream = self._stream(path, frames=frames)
-        if not stream.last:
-            require_depth_stream(stream.reader.facts, encoding, name=str(path))
-        return _kept(
+        units: UInt16[np.ndarray, "h w"] = _kept(
             stream, index, lambda: read_depth_units(stream.reader, index, encoding=encoding)
         )
+        return units
 
     def pixel_format(self, path: Path, *, frames: int) -> str:
         """Return the pixel format of a video."""

@@ -69,7 +69,7 @@ def parse_object(text: bytes, *, where: str) -> dict[str, Any]:
             f"have six. Copy the file from the release again."
         ) from error
     except ValueError as error:
-        _raise_not_json(error, length=len(decoded), where=where)
+        _raise_not_json(error, length=len(decoded.rstrip()), where=where)
     if not isinstance(document, dict):
         raise SchemaError(
             f"{where}: $ must be an object, found {brief(document)}. "
@@ -87,7 +87,7 @@ def parse_object(text: bytes, *, where: str) -> dict[str, Any]:
 def _raise_not_json(error: ValueError, *, length: int, where: str) -> NoReturn:
     if not isinstance(error, json.JSONDecodeError):
         raise SchemaError(f"{where}: not JSON that can be read: {error}.") from error
-    cut = error.pos >= length - 1 or error.msg.startswith("Unterminated")
+    cut = error.pos >= length or error.msg.startswith("Unterminated")
     guess = "It looks cut short: c" if cut else "C"
     raise SchemaError(
         f"{where}: not JSON: {error.msg} at line {error.lineno}, column {error.colno} "

@@ -114,11 +114,10 @@ def _primary_pair(root: Node) -> Pair:
     pair = root.require("primary_pair")
     if pair is None:
         return 0, 1
+    before = len(root.problems)
     if isinstance(pair.value, dict):
         sides = [pair.require("left_camera"), pair.require("right_camera")]
         left, right = (0 if side is None else side.camera() for side in sides)
-        if None in sides:
-            return 0, 1
     elif isinstance(pair.value, list) and len(pair.value) == 2:
         left, right = pair.child(0).camera(), pair.child(1).camera()
     else:
@@ -127,7 +126,7 @@ def _primary_pair(root: Node) -> Pair:
             f"found {brief(pair.value)}"
         )
         return 0, 1
-    if left == right:
+    if left == right and len(root.problems) == before:
         pair.complain(f"names camera {left} as left and as right")
     return left, right
 

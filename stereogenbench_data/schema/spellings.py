@@ -8,6 +8,7 @@ Source: the paper's appendix on the file schema and its loading example (the fir
 row); the dataset viewer's columns; Unreal Engine's names for the same things.
 """
 
+import itertools
 from collections.abc import Iterable
 from typing import Any, Final
 
@@ -142,14 +143,16 @@ def _in_each_case(name: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys((name, first + tail, first.capitalize() + tail)))
 
 
-_STEPS: Final = {
-    quantity: tuple(tuple(map(_in_each_case, spelling.split("."))) for spelling in spellings)
+_PATHS: Final = {
+    quantity: tuple(
+        keys
+        for spelling in spellings
+        for keys in itertools.product(*map(_in_each_case, spelling.split(".")))
+    )
     for quantity, spellings in SPELLINGS.items()
 }
-
 _FIRST_KEYS: Final = {
-    quantity: frozenset(key for first, *_ in steps for key in first)
-    for quantity, steps in _STEPS.items()
+    quantity: frozenset(first for first, *_ in paths) for quantity, paths in _PATHS.items()
 }
 
 
@@ -161,22 +164,12 @@ def find(document: dict[str, Any], quantity: str) -> tuple[tuple[str, ...], Any]
     """
     if _FIRST_KEYS[quantity].isdisjoint(document):
         return None
-    for steps in _STEPS[quantity]:
-        keys: tuple[str, ...] = ()
+    for keys in _PATHS[quantity]:
         value: Any = document
-        for cases in steps:
-            key = _present(value, cases)
-            if key is None:
+        for key in keys:
+            value = value.get(key) if isinstance(value, dict) else None
+            if value is None:
                 break
-            keys, value = (*keys, key), value[key]
         else:
             return keys, value
-    return None
-
-
-def _present(value: object, cases: tuple[str, ...]) -> str | None:
-    if isinstance(value, dict):
-        for key in cases:
-            if value.get(key) is not None:
-                return key
     return None

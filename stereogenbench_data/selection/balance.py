@@ -59,7 +59,9 @@ def _strata(baselines_cm: Float64[np.ndarray, " n"], *, by: Balance) -> Int64[np
         raise SelectionError(f"balance must be 'bins' or 'log_baseline', got {by!r}.")
     logs = np.log(baselines_cm)
     width = max(float(np.ptp(logs)) / LOG_STRATA, np.finfo(np.float64).tiny)
-    return np.minimum((logs - logs.min()) // width, LOG_STRATA - 1).astype(np.int64)
+    strata: Int64[np.ndarray, " n"] = ((logs - logs.min()) // width).astype(np.int64)
+    strata[strata == LOG_STRATA] = LOG_STRATA - 1
+    return strata
 
 
 def _shares(limit: int, strata: int) -> list[int]:

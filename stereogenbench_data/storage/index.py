@@ -127,7 +127,7 @@ class SceneIndex:
                 head = _require_head(metadata, where=str(path))
                 table = file.read().replace_schema_metadata().combine_chunks()
             table.validate(full=True)
-        except (pa.ArrowException, OSError) as error:
+        except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
             if isinstance(error, StorageError):
                 raise
             raise StorageError(
@@ -135,7 +135,10 @@ class SceneIndex:
                 f"something else. {_AGAIN}"
             ) from error
         _require_sound(table, where=str(path))
-        return cls(table, root=_root_of(path, head, table), left_out=head)
+        index = cls(table, root=_root_of(path, head, table), left_out=head)
+        if index.digest != head.get("digest"):
+            raise StorageError(f"{path}: its rows are not those that were written. {_AGAIN}")
+        return index
 
     def write(self, path: str | Path) -> None:
         """Write the index as one Parquet file, whole or not at all.
@@ -150,6 +153,7 @@ class SceneIndex:
         head = {
             "format": _FORMAT,
             "root": "." if path.parent.resolve() == root.resolve() else str(root.resolve()),
+            "digest": self.digest,
             "incomplete": self.incomplete,
             "broken": self.broken,
         }
@@ -237,7 +241,7 @@ def _listed(left_out: Mapping[str, str]) -> str:
 
 def _warn_of(left_out: Mapping[str, str], *, where: str) -> None:
     if left_out:
-        warnings.warn(f"{where}: {_listed(left_out)}", IncompleteSceneWarning, stacklevel=4)
+        warnings.warn(f"{where}: {_listed(left_out)}", IncompleteSceneWarning, stacklevel=3)
 
 
 def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:

@@ -17,28 +17,30 @@ _FORMAT: Final = 1
 
 
 class Journal:
-    """Scenes described so far, on disk; `close` keeps the file, `delete` ends its use."""
+    """Scenes described so far, on disk; leaving its block keeps the file, `delete` removes it."""
 
     def __init__(self, path: Path, *, walk: str) -> None:
-        """Open a journal and read what it holds; one of another walk is begun anew.
+        """Read what a journal holds; that of another walk is begun anew.
+
+        Nothing is written before the first scene is added.
 
         Raises:
-            StorageError: If the file cannot be read or written.
+            StorageError: If the file is there and cannot be read.
         """
         self._path = path
-        head = json.dumps({"journal": _FORMAT, "walk": walk, "columns": SCHEMA.names})
+        self._file: TextIO | None = None
+        self._head = json.dumps({"journal": _FORMAT, "walk": walk, "columns": SCHEMA.names})
         try:
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-            is_same = bool(lines) and lines[0] == head
-            self._known = _known(lines[1:]) if is_same else {}
-            self._file: TextIO = path.open("a" if is_same else "w", encoding="utf-8")
-            self._file.write("\n" if is_same else f"{head}\n")
-            self._file.flush()
-        except FileNotFoundError:
-            self._known = {}
-            self._file = _created(path, head)
+        except (FileNotFoundError, NotADirectoryError):
+            lines = []
         except OSError as error:
-            raise _unwritable(path, error) from error
+            raise StorageError(
+                f"{path}: the journal of an earlier run cannot be read ({error.strerror}). "
+                f"Remove it, or write the index to another folder."
+            ) from error
+        self._is_same = bool(lines) and lines[0] == self._head
+        self._known = _known(lines[1:]) if self._is_same else {}
 
     def __len__(self) -> int:
         """The number of scenes that were described before this walk."""
@@ -57,15 +59,26 @@ class Journal:
         """
         line = json.dumps({"stamp": stamp, "row": row_of(scene)})
         try:
+            if self._file is None:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = self._path.open("a" if self._is_same else "w", encoding="utf-8")
+                self._file.write("\n" if self._is_same else f"{self._head}\n")
             self._file.write(f"{line}\n")
             self._file.flush()
         except OSError as error:
-            raise _unwritable(self._path, error) from error
+            raise StorageError(
+                f"{self._path}: the journal cannot be written ({error.strerror}). Give write "
+                f"permission there, or write the index to another folder."
+            ) from error
 
     def delete(self) -> None:
         """Remove the file: what it holds was written elsewhere."""
-        self._file.close()
+        self._close()
         self._path.unlink(missing_ok=True)
+
+    def _close(self) -> None:
+        if self._file is not None:
+            self._file.close()
 
     def __enter__(self) -> "Journal":
         """Return the journal itself."""
@@ -78,25 +91,7 @@ class Journal:
         trace: TracebackType | None,
     ) -> None:
         """Close the file, and keep it."""
-        self._file.close()
-
-
-def _created(path: Path, head: str) -> TextIO:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file = path.open("w", encoding="utf-8")
-        file.write(f"{head}\n")
-        file.flush()
-    except OSError as error:
-        raise _unwritable(path, error) from error
-    return file
-
-
-def _unwritable(path: Path, error: OSError) -> StorageError:
-    return StorageError(
-        f"{path}: the journal cannot be written ({error.strerror}). "
-        f"Give write permission there, or write the index to another folder."
-    )
+        self._close()
 
 
 def _known(lines: list[str]) -> dict[str, tuple[str, Scene]]:

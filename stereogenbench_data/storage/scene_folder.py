@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, Literal, Protocol, TypeVar
+from typing import Final, Literal
 
 import numpy as np
 
@@ -60,7 +60,6 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.storage.source import read_text_file
 
-T = TypeVar("T", covariant=True)
 ValidDepth = Literal["skip", "sample"]
 
 _NEEDED: Final = (COMPLETE_JSON, BASELINE_JSON, TRAJECTORY_JSON, *VIDEO_FILES)
@@ -114,9 +113,11 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     files = scene_files(root, key)
     _require_finished(key, files)
     folder = Path(root, key)
-    rig, labels = _parsed(parse_rig, folder, key, BASELINE_JSON)
-    marked = _parsed(parse_complete, folder, key, COMPLETE_JSON)
-    trajectory = _parsed(parse_trajectory, folder, key, TRAJECTORY_JSON)
+    rig, labels = parse_rig(_text(folder, key, BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
+    marked = parse_complete(_text(folder, key, COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
+    trajectory = parse_trajectory(
+        _text(folder, key, TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}"
+    )
     caption = _caption(folder, key, files)
     facts = {name: probe(folder / name, name=f"{key}/{name}") for name in VIDEO_FILES}
     frames = _common_frames(key, facts, trajectory)
@@ -144,13 +145,8 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     )
 
 
-class _Parser(Protocol[T]):
-    def __call__(self, text: bytes, *, where: str) -> T: ...
-
-
-def _parsed(parse: _Parser[T], folder: Path, key: str, name: str) -> T:
-    where = f"{key}/{name}"
-    return parse(read_text_file(folder / name, where=where), where=where)
+def _text(folder: Path, key: str, name: str) -> bytes:
+    return read_text_file(folder / name, where=f"{key}/{name}")
 
 
 def _require_finished(key: str, files: Mapping[str, object]) -> None:
@@ -171,12 +167,16 @@ def _require_finished(key: str, files: Mapping[str, object]) -> None:
 def _caption(folder: Path, key: str, files: Mapping[str, object]) -> str:
     """Return the detailed caption, or the short one where there is no detailed one."""
     if DESCRIPTION_JSON in files:
-        description = _parsed(parse_description, folder, key, DESCRIPTION_JSON)
+        description = parse_description(
+            _text(folder, key, DESCRIPTION_JSON), where=f"{key}/{DESCRIPTION_JSON}"
+        )
         written = description.detailed_caption or description.short_caption
         if written:
             return written
     if DESCRIPTION_TXT in files:
-        return _parsed(parse_text, folder, key, DESCRIPTION_TXT).strip()
+        return parse_text(
+            _text(folder, key, DESCRIPTION_TXT), where=f"{key}/{DESCRIPTION_TXT}"
+        ).strip()
     return ""
 
 

@@ -1,10 +1,11 @@
 """Where a scene's bytes are: checked paths of the members that an index names."""
 
 import re
+import stat
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.errors import SchemaError, StorageError
+from stereogenbench_data.errors import StorageError
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.records import Member
 
@@ -62,13 +63,12 @@ def read_text_file(path: Path, *, where: str) -> bytes:
         SchemaError: If it is too large for a metadata file.
     """
     try:
-        with path.open("rb") as file:
-            size_bytes = path.stat().st_size
-            require_text_size(size_bytes, where=where)
-            return file.read()
-    except SchemaError:
-        raise
+        status = path.stat()
+        if stat.S_ISREG(status.st_mode):
+            require_text_size(status.st_size, where=where)
+            return path.read_bytes()
     except OSError as error:
         raise StorageError(
             f"{where}: cannot be read ({error.strerror}). Fetch it again, or give read permission."
         ) from error
+    raise StorageError(f"{where}: is no file. Put the release's own file in its place.")

@@ -1,6 +1,19 @@
 """Scenes in the released layout, drawn without Unreal."""
 
-from stereogenbench_data.synthesis.produce import Progress, synthesise
+from typing import TYPE_CHECKING, Any
+
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
-__all__ = ["ExportContract", "Progress", "SynthRequest", "synthesise"]
+if TYPE_CHECKING:
+    from stereogenbench_data.synthesis.produce import synthesise
+
+__all__ = ["ExportContract", "SynthRequest", "synthesise"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what draws, and torch with it, when it is first used."""
+    if name != "synthesise":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from stereogenbench_data.synthesis.produce import synthesise
+
+    return synthesise

@@ -73,6 +73,7 @@ def run_jobs(
     """Do jobs in any order and yield each when it is done.
 
     Args:
+        jobs: The work; taken one by one, shortly before it is done.
         workers: How many processes; 1 works in this one.
         after_frames: Called now and then with how many frames were drawn since it was called.
 

@@ -14,8 +14,7 @@ def film_camera(
 ) -> None:
     """Write a camera's two videos into a folder.
 
-    Args:
-        after_frame: Called after each frame; what it raises ends the work.
+    ``after_frame`` is called after each frame; what it raises ends the work.
     """
     contract = plan.request.contract
     light = still_light(plan.stage)

@@ -88,7 +88,7 @@ def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
     if found != expected:
         raise SynthesisError(
             f"{folder}: is a scene that another request wrote (its {COMPLETE_JSON} differs). "
-            f"Choose another folder, map or seed's folder, or remove it."
+            f"Choose another folder or map_name, or move that one away."
         )
     return False
 

@@ -30,8 +30,8 @@ _AMBIENT: Final = 0.42
 _SKYLIGHT: Final = 0.1
 _SUNLIGHT: Final = 0.62
 _GRAIN_TILE_M: Final = 0.45
-_GRAIN_CONTRAST: Final = 1.2
-_BLUR_PX: Final = 1.3
+_GRAIN_CONTRAST: Final = 1.7
+_BLUR_PX: Final = 1.0
 _SLANT_POWER: Final = 0.8
 _FACE_LIGHT: Final = 0.05
 _SUBPIXELS: Final = np.array([(-1, -3), (3, -1), (1, 3), (-3, 1)]) / 8
@@ -189,7 +189,7 @@ def _painted(
     )
     colour *= light * (1 + contrast * (grain - np.float32(0.5)))
     colour *= np.stack(tint)
-    return np.clip(colour, 0, 1)
+    return np.clip(colour, 0, 1, out=colour)
 
 
 def _lit(*, sunward: Array, upward: Array, sunlight: Array) -> Array:

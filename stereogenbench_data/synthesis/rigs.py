@@ -54,7 +54,8 @@ def pair_distances_cm(gaps_cm: Gaps) -> Float64[np.ndarray, "15"]:
     """Return the distance of every pair of `CAMERA_PAIRS`, in that order."""
     places = lateral_places_cm(gaps_cm)
     left, right = np.array(CAMERA_PAIRS).T
-    return places[right] - places[left]
+    distances_cm: Float64[np.ndarray, 15] = places[right] - places[left]
+    return distances_cm
 
 
 def lateral_places_cm(gaps_cm: Gaps) -> Float64[np.ndarray, "6"]:

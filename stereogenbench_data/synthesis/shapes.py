@@ -7,12 +7,15 @@ depth along that axis.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 Array = Any
+
+_PARALLEL: Final = 1e-300
+"""Stands for 0 where a ray runs along a face: it enters and leaves the slab at infinity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +46,8 @@ class Shape:
     def corners(self) -> Float64[np.ndarray, "8 3"]:
         """Return the corners of the box that holds the solid."""
         signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
-        return self.centre + (signs * self.half_m) @ self.axes
+        corners: Float64[np.ndarray, "8 3"] = self.centre + (signs * self.half_m) @ self.axes
+        return corners
 
 
 def limb(
@@ -67,9 +71,8 @@ def limb(
 def entry(shape: Shape, *, origin: Sequence[Array], direction: Sequence[Array]) -> Array:
     """Return t where rays enter a shape from outside, infinity where they do not.
 
-    Args:
-        origin: Three arrays, the ray's origin in the unit solid's coordinates.
-        direction: Three arrays (all six broadcast together), the direction in the same.
+    ``origin`` and ``direction`` are three arrays each, that broadcast together: the rays in the
+    unit solid's coordinates.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         if shape.kind == "box":
@@ -80,7 +83,7 @@ def entry(shape: Shape, *, origin: Sequence[Array], direction: Sequence[Array]) 
 def _box_entry(origin: Sequence[Array], direction: Sequence[Array]) -> Array:
     near, far = -np.inf, np.inf
     for o, d in zip(origin, direction, strict=True):
-        inverse = 1 / d
+        inverse = 1 / np.where(d == 0, _PARALLEL, d)
         middle = -o * inverse
         reach = np.abs(inverse)
         near = np.maximum(near, middle - reach)
@@ -122,7 +125,8 @@ def surface(shape: Shape, *, point: Array, direction: Array, sun: Array) -> Surf
     An ellipsoid is textured as a box is: by the two axes that its normal points along least.
 
     Args:
-        point: (3, n) where the rays meet the shape, in the unit solid's coordinates.
+        shape: What the rays meet.
+        point: (3, n) where they meet it, in the unit solid's coordinates.
         direction: (3, n) their directions in the same coordinates.
         sun: (3,) unit direction to the sun, in the world.
     """

@@ -7,12 +7,14 @@ so that a view is full at any focal length.
 
 import colorsys
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float64
 
 from stereogenbench_data.synthesis.shapes import Material, Shape, limb
+
+Array = Any
 
 _GROUNDS: Final = ("soil", "mosaic", "bricks", "boards")
 _WALLS: Final = ("bricks", "plaster", "boards", "mosaic")
@@ -72,14 +74,14 @@ class Stage:
     def walker(self, moment_s: float) -> list[Shape]:
         """Return the walker's limbs at a moment."""
         y_m = self.walk_m_s * moment_s
-        hips = np.array([0.0, y_m, self.ground_m(0, y_m) + 0.93])
+        hips = np.array([0.0, y_m, self.ground_m(0.0, y_m) + 0.93])
         swing = 2 * np.pi * moment_s / _STRIDE_S
         return _limbs(hips, swing=swing, heading=np.sign(self.walk_m_s), clothes=self.clothes)
 
 
 def draw_stage(rng: np.random.Generator, *, lens: Lens, walk_m_s: float) -> Stage:
     """Draw a stage for a lens: everything but the cameras."""
-    slope = rng.uniform(-0.09, 0.09, 2)
+    slope = rng.uniform(-0.07, 0.07, 2)
     towards = rng.uniform(np.radians(-75), np.radians(75))
     height = rng.uniform(np.radians(32), np.radians(58))
     sun = np.array(
@@ -108,7 +110,7 @@ def draw_stage(rng: np.random.Generator, *, lens: Lens, walk_m_s: float) -> Stag
 def _material(
     rng: np.random.Generator, *, textures: tuple[str, ...], tile_m: tuple[float, float]
 ) -> Material:
-    hue, saturation, value = rng.uniform((0, 0.05, 1.1), (1, 0.5, 1.75))
+    hue, saturation, value = rng.uniform((0, 0.03, 1.15), (1, 0.4, 1.5))
     red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
     texture = textures[int(rng.integers(len(textures)))]
     return Material(texture, float(rng.uniform(*tile_m)), (red, green, blue))
@@ -120,7 +122,7 @@ def _placed(shape: Shape, *, slope: Float64[np.ndarray, "2"]) -> Shape:
     return Shape(shape.kind, lifted, shape.axes, shape.half_m, shape.material)
 
 
-def _turned(*, yaw: float, tilt: float = 0.0) -> Float64[np.ndarray, "3 3"]:
+def _turned(*, yaw: float, tilt: float = 0.0) -> Array:
     """Return a solid's axes, turned around the vertical and then tilted."""
     c, s = np.cos(yaw), np.sin(yaw)
     upright = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -230,6 +232,6 @@ def _limbs(
     return shapes
 
 
-def _lean(angle: float, ahead: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
+def _lean(angle: float, ahead: Array) -> Array:
     """Return the direction of a limb that hangs down, swung ahead by an angle."""
     return np.sin(angle) * ahead - np.cos(angle) * _UP

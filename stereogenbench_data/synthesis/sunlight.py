@@ -10,7 +10,7 @@ from stereogenbench_data.synthesis.stage import Stage
 
 Array = Any
 
-_SIDE_TEXELS: Final = 320
+_SIDE_TEXELS: Final = 512
 _SHADE: Final = 0.35
 
 

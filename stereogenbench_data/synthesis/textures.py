@@ -8,11 +8,11 @@ pixels of the picture can hold, so that two views of a surface agree.
 
 from collections.abc import Callable
 from functools import cache
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 from torch.nn.functional import grid_sample
 
 SIDE_TEXELS: Final = 512
@@ -22,7 +22,9 @@ _LEVELS: Final = SIDE_TEXELS.bit_length()
 _BORDER: Final = 2
 _ROW_TEXELS: Final = SIDE_TEXELS + _BORDER
 
-Tile = Float[np.ndarray, "side side channels"]
+Tile = Any
+"""(side, side, 3) or (side, side, 1), float64."""
+
 Draw = Callable[[np.random.Generator], Tile]
 
 
@@ -35,7 +37,7 @@ def sample_atlas(
     """Return texture colours, interpolated in the tile and between mip levels.
 
     Args:
-        tiles: (u, v) in tiles, any number; the texture repeats.
+        tiles: (u, v) in tiles; the texture repeats.
         rows: Which texture: its place in `TEXTURES`.
         footprint_tiles: How much of a tile one pixel covers; what is finer is averaged.
 
@@ -113,7 +115,7 @@ def _colour_noise(rng: np.random.Generator, *, slope: float, spread: float) -> T
 
 
 def _cells(rng: np.random.Generator, *, count: int) -> tuple[Tile, Tile]:
-    """Return random cells of a tile: each texel's cell tone (3 channels), and 1 inside, 0 on rims."""
+    """Return random cells of a tile: each texel's tone, and 1 inside, 0 on the rims."""
     sites = rng.uniform(0.1, 0.9, (count, count, 2))
     tones = rng.uniform(-1, 1, (count, count, 1)) + rng.uniform(-0.3, 0.3, (count, count, 3))
     place = (np.arange(SIDE_TEXELS) + 0.5) * count / SIDE_TEXELS

@@ -62,7 +62,8 @@ class CameraPath:
 
     def _swings(self, moment_s: float) -> Float64[np.ndarray, "6"]:
         angles = 2 * np.pi * moment_s / self.periods_s + self.phases
-        return self.amplitudes * np.sin(angles)
+        swings: Float64[np.ndarray, 6] = self.amplitudes * np.sin(angles)
+        return swings
 
 
 def draw_path(rng: np.random.Generator, *, distance_m: float, follow_m_s: float) -> CameraPath:
@@ -73,7 +74,7 @@ def draw_path(rng: np.random.Generator, *, distance_m: float, follow_m_s: float)
         amplitudes=largest * rng.uniform(0.6, 1.0, 6),
         periods_s=rng.uniform(4.0, 9.0, 6),
         phases=rng.uniform(0, 2 * np.pi, 6),
-        height_m=LOOK_HEIGHT_M + distance_m * rng.uniform(0.06, 0.2),
+        height_m=LOOK_HEIGHT_M + distance_m * rng.uniform(0.08, 0.15),
         follow_m_s=follow_m_s,
     )
 
@@ -118,4 +119,6 @@ def rig_locations_cm(
     """
     right = rotation_from_rotator(rotator_deg)[:, 1]
     lateral_cm = places_cm - places_cm[CAMERA_COUNT - 1] / 2
-    return (centre_cm + lateral_cm[:, None] * right) + offset_cm
+    near_cm = centre_cm + lateral_cm[:, None] * right
+    centres_cm: Float64[np.ndarray, "6 3"] = near_cm + offset_cm
+    return centres_cm

@@ -7,10 +7,11 @@ same bytes on any number of processors.
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Any, Final, cast
 
 import av
 import numpy as np
+from av.video.stream import VideoStream
 from jaxtyping import Float64, Shaped, UInt8, UInt16
 
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_name
@@ -19,7 +20,7 @@ from stereogenbench_data.synthesis.request import ExportContract
 
 _LARGEST: Final = {"gray16le": 65535, "gray12le": 4095, "gray10le": 1023}
 _RATE_HZ: Final = int(FRAME_RATE_HZ)
-_X264_OPTIONS: Final = {"crf": "18"}
+_X264_OPTIONS: Final = {"crf": "18", "x264-params": "cpu-independent=1"}
 _FFV1_OPTIONS: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
 
 
@@ -38,7 +39,9 @@ class VideoFile:
         self._container = av.open(path, "w", container_options={"fflags": "+bitexact"})
         self._container.metadata.update(tags)
         options = _X264_OPTIONS if codec == "libx264" else _FFV1_OPTIONS
-        self._stream = self._container.add_stream(codec, rate=_RATE_HZ, options=options)
+        self._stream = cast(
+            VideoStream, self._container.add_stream(codec, rate=_RATE_HZ, options=options)
+        )
         self._stream.width, self._stream.height = size_px
         self._stream.pix_fmt = pixel_format
         self._stream.codec_context.thread_count = 1
@@ -50,7 +53,7 @@ class VideoFile:
         self._frames += 1
         self._container.mux(self._stream.encode(frame))
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "VideoFile":
         return self
 
     def __exit__(
@@ -117,7 +120,7 @@ def depth_units(
     return np.minimum(np.rint(depth_m / contract.depth_unit_m), largest).astype(np.uint16)
 
 
-def _fill_plane(plane: av.video.plane.VideoPlane, rows: Shaped[np.ndarray, "h w"]) -> None:
+def _fill_plane(plane: Any, rows: Shaped[np.ndarray, "h w"]) -> None:
     """Copy an array into a plane, whose lines may be longer than the array's."""
     padded = np.zeros((rows.shape[0], plane.line_size // rows.itemsize), rows.dtype)
     padded[:, : rows.shape[1]] = rows

@@ -79,24 +79,26 @@ def test_ray_depth_taken_for_planar_depth_shows_too(shared_scenes):
     assert warped_psnr_db(planar) - warped_psnr_db(ray) > 1
 
 
-def test_depth_reprojected_through_the_poses_agrees_with_another_frame(shared_scenes):
-    views = SceneViews(
-        shared_scenes, cameras=(0,), frames=[0, 8],
-        fields=("depth", "valid", "intrinsics", "world_from_cam"),
-    )  # fmt: skip
-    first, later = (
-        {name: value[0].numpy() if value.ndim > 2 else value.numpy() for name, value in one.items()}
-        for one in (views[0], views[1])
+@pytest.mark.parametrize("frame", [1, 8, 40])
+def test_depth_reprojected_through_the_poses_agrees_with_another_frame(shared_scenes, frame):
+    fields = ("depth", "valid", "intrinsics", "world_from_cam")
+    here, there = (
+        {name: value.numpy() for name, value in views.items()}
+        for views in SceneViews(shared_scenes, cameras=(0,), frames=[0, frame], fields=fields)
     )
-    rows, columns = np.nonzero(first["valid"][0])
+    rows, columns = np.nonzero(here["valid"][0, 0])
     pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
-    points = np.linalg.inv(first["intrinsics"]) @ pixels * first["depth"][0][rows, columns]
-    later_from_first = np.linalg.inv(later["world_from_cam"]) @ first["world_from_cam"]
-    moved = later_from_first[:3, :3] @ points + later_from_first[:3, 3:]
-    u, v, _ = later["intrinsics"] @ moved / moved[2]
-    inside = (u > 0) & (u < 320) & (v > 0) & (v < 320)
-    seen = later["depth"][0][v[inside].astype(int), u[inside].astype(int)]
-    agree = np.abs(seen / moved[2][inside] - 1) < 0.02
+    points = np.linalg.inv(here["intrinsics"]) @ pixels * here["depth"][0, 0, rows, columns]
 
-    assert inside.mean() > 0.7
-    assert agree.mean() > 0.9
+    def median_difference(there_from_here):
+        moved = there_from_here[:3, :3] @ points + there_from_here[:3, 3:]
+        u, v, _ = there["intrinsics"] @ moved / moved[2]
+        inside = (u > 0) & (u < 320) & (v > 0) & (v < 320)
+        seen = there["depth"][0, 0, v[inside].astype(int), u[inside].astype(int)]
+        return np.median(np.abs(seen / moved[2, inside] - 1))
+
+    world_from_here, world_from_there = here["world_from_cam"][0], there["world_from_cam"][0]
+
+    # what is hidden or moves is less than half of the picture; the rest agrees to a pixel's slope
+    assert median_difference(np.linalg.inv(world_from_there) @ world_from_here) < 0.0015
+    assert median_difference(np.eye(4)) > 0.02

@@ -17,7 +17,7 @@ from stereogenbench_data.geometry.disparity import (
 focals_px = st.floats(900.0, 4600.0)
 baselines_m = st.floats(0.01, 7.5) | st.floats(-7.5, -0.01)
 units_m = st.sampled_from([0.1, 0.01, 0.001, 1 / 256]) | st.floats(1e-4, 0.5)
-metres = st.floats(0.05, 7000.0, width=32)
+metres = st.floats(0.05, 7000.0)
 
 ALL_UNITS = np.arange(2**16).reshape(1, 2**16)
 UNREADABLE = (0.0, -1.0, np.nan)
@@ -83,7 +83,19 @@ def test_disparity_of_every_stored_number_is_within_an_ulp(
 
     assert disparity_px.dtype == np.float32
     assert disparity_px[0, 0] == 0.0
-    assert ulps_away(disparity_px[:, 1:], focal_px * baseline_m / depth_m) < 0.51
+    assert ulps_away(disparity_px[:, 1:], focal_px * baseline_m / depth_m) < 0.55
+
+
+def test_a_product_that_no_factor_rounds_well_is_still_within_an_ulp(library):
+    """B fx / unit just above a power of two: every product with 128 to 255 is a quarter ulp off."""
+    shift_units = 1024 * (1 + 2.0**-25)
+
+    disparity_px = disparity_from_units(
+        library.array(ALL_UNITS), focal_px=shift_units, baseline_m=1.0, unit_m=1.0
+    )
+
+    exact = shift_units / ALL_UNITS[:, 1:]
+    assert ulps_away(library.numpy(disparity_px)[:, 1:], exact) < 0.55
 
 
 @pytest.mark.parametrize("stored", [np.uint8, np.uint16, np.int32, np.int64])

@@ -149,7 +149,7 @@ def test_pose_baselines_match_the_recorded_ones_at_any_offset(
         baseline_cm = lateral_cm[b] - lateral_cm[a]
         moved_m = np.linalg.norm(poses.cam_from_cam(0, target=b, source=a)[:3, 3])
         assert poses.baseline_m(0, a, b) * 100 == pytest.approx(baseline_cm, rel=0, abs=1e-9)
-        assert moved_m * 100 == pytest.approx(baseline_cm, rel=0, abs=1e-9)
+        assert moved_m == pytest.approx(poses.baseline_m(0, a, b), rel=1e-13)
 
 
 @given(rotator_deg=rotators_deg, shift=st.tuples(*[st.floats(-100, 100)] * 3))

@@ -57,24 +57,23 @@ def pair_motion(case: Case, make_rig):
 def sample_depth(intrinsics: Intrinsics) -> np.ndarray:
     shape = (intrinsics.height_px, intrinsics.width_px)
     depth_m = np.random.default_rng(0).uniform(1.0, 200.0, shape)
-    depth_m[0, :4] = 0.001, 0.1, 6553.4, 1e6
+    depth_m[0, :3] = 1.0, 6553.4, 1e6
     return depth_m
 
 
 def require_agreement(projection, depth_m, disparity_px):
-    """Check a projection against u - d, v, z to 1e-6 px, relative where d passes 1e4 px."""
+    """Check a projection against u - d, v and z to 1e-6 px, wherever it lands."""
     height, width = depth_m.shape
     expected_u = np.arange(width) + 0.5 - disparity_px
-    tolerance_px = 1e-6 * np.maximum(1.0, np.abs(disparity_px) / 1e4)
-    assert (np.abs(projection.u_px - expected_u) < tolerance_px).all()
-    assert (np.abs(projection.v_px - (np.arange(height) + 0.5)[:, None]) < tolerance_px).all()
+    assert (np.abs(projection.u_px - expected_u) < 1e-6).all()
+    assert (np.abs(projection.v_px - (np.arange(height) + 0.5)[:, None]) < 1e-6).all()
     np.testing.assert_allclose(projection.depth_m, depth_m, rtol=1e-9)
 
 
 @pytest.mark.parametrize("case", HARD_RIGS.values(), ids=HARD_RIGS)
 def test_the_pose_chain_is_the_closed_form_on_a_lateral_rig(make_rig, case):
-    """Every 16th row and column of the release's image, at its longest usual focal length."""
-    intrinsics = WIDE.resized(width_px=80, height_px=80)
+    """In the corner of the release's image, where rays are the most oblique."""
+    intrinsics = WIDE.cropped(left_px=0, top_px=0, width_px=80, height_px=80)
     depth_m = sample_depth(intrinsics)
     motion, baseline_m = pair_motion(case, make_rig)
 

@@ -25,8 +25,10 @@ def test_a_sheet_has_a_row_for_each_sample_and_a_tile_for_each_picture(small_rel
     sheet = contact_sheet([pairs[0], pairs[1], pairs[2]])
     write_png(tmp_path / "sheet.png", sheet)
 
-    assert sheet.shape == (3 * (64 + 20 + 4), 4 * (64 + 4), 3)
-    assert np.array_equal(sheet[20:84, :64], pairs[0]["left"].numpy().transpose(1, 2, 0))
+    # tiles of 64 px are enlarged threefold, to make room for their captions
+    assert sheet.shape == (3 * (192 + 20 + 4), 4 * (192 + 4), 3)
+    left = pairs[0]["left"].numpy().transpose(1, 2, 0)
+    assert np.array_equal(sheet[20:212, :192], np.kron(left, np.ones((3, 3, 1), dtype=np.uint8)))
     with Image.open(tmp_path / "sheet.png") as written:
         assert np.array_equal(np.asarray(written), sheet)
 

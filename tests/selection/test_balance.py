@@ -59,7 +59,7 @@ def test_the_draw_depends_on_the_seed_alone(crowded_cm):
 def test_a_limit_beyond_the_poorest_stratum_names_it(crowded_cm):
     with pytest.raises(
         SelectionError,
-        match=r"500 pairs are wanted of the bin \[30,60\) cm, which has 318; the most that balances is 785",
+        match=r"500 pairs are wanted of the bin \[30,60\) cm, which has 318; the most .* is 785",
     ):
         balanced(crowded_cm, by="bins", limit=2500, seed=0)
 

@@ -73,7 +73,7 @@ def test_a_range_that_is_none_is_refused(index, focal_mm):
 
 
 def test_a_ratio_that_nobody_measured_is_said_to_be_unknown(index):
-    with pytest.raises(SelectionError, match="does not know it .* --valid-depth"):
+    with pytest.raises(SelectionError, match=r"does not know it .* --valid-depth"):
         keys(index, valid_depth_ratio=(0.9, 1.0))
 
 

@@ -1,0 +1,251 @@
+"""Damaged data, as a user of StereoPairs meets them: each is named with its file and the cure."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from stereogenbench_data import (
+    DepthEncoding,
+    MediaError,
+    SchemaError,
+    StereoGenBenchError,
+    StereoPairs,
+    StorageError,
+)
+from stereogenbench_data.storage.index import IncompleteSceneWarning
+from stereogenbench_data.synthesis import ExportContract, SynthRequest, synthesise
+
+FIELDS = ("left", "right", "disparity", "visible", "right_from_left")
+
+
+@pytest.fixture
+def scene(small_release, tmp_path):
+    """The folder of a scene that may be damaged, in a tree of its own."""
+    source = next(small_release.glob("train/IPD_Gaussian/*/scene_000000"))
+    target = tmp_path / source.relative_to(small_release)
+    shutil.copytree(source, target)
+    return target
+
+
+def root_of(scene):
+    return scene.parents[3]
+
+
+def rewrite(path, change):
+    """Change a JSON file's document in place."""
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def damage_json(name, change):
+    return lambda scene: rewrite(scene / name, change)
+
+
+def cut(name, share):
+    def damage(scene):
+        whole = (scene / name).read_bytes()
+        (scene / name).write_bytes(whole[: int(len(whole) * share)])
+
+    return damage
+
+
+DAMAGES = {
+    "a missing camera": (
+        lambda scene: (scene / "cam_03_rgb.mp4").unlink(),
+        r"has no cam_03_rgb\.mp4.*Fetch",
+    ),
+    "an mp4 cut short": (cut("cam_01_rgb.mp4", 0.5), r"cam_01_rgb\.mp4"),
+    "an empty mkv": (cut("cam_02_depth.mkv", 0.0), r"cam_02_depth\.mkv"),
+    "a text for a video": (
+        lambda scene: (scene / "cam_05_rgb.mp4").write_text("not a video"),
+        r"cam_05_rgb\.mp4",
+    ),
+    "a NaN baseline": (
+        damage_json(
+            "baseline.json", lambda doc: doc["pairwise_pairs"][3].update(baseline_cm=float("nan"))
+        ),
+        r"baseline\.json.*\$\.pairwise_pairs\[3\]\.baseline_cm.*nan",
+    ),
+    "a pair that is there twice": (
+        damage_json(
+            "baseline.json",
+            lambda doc: doc["pairwise_pairs"].append(dict(doc["pairwise_pairs"][2])),
+        ),
+        r"baseline\.json.*pairwise_pairs\[15\]",
+    ),
+    "a pair that is missing": (
+        damage_json("baseline.json", lambda doc: doc["pairwise_pairs"].pop(4)),
+        r"baseline\.json.*0.*5",
+    ),
+    "a missing key": (
+        damage_json("baseline.json", lambda doc: doc["camera_intrinsics"].pop("focal_length_mm")),
+        r"baseline\.json.*focal_length_mm",
+    ),
+    "a wrong type": (
+        damage_json(
+            "baseline.json", lambda doc: doc["camera_intrinsics"].update(sensor_width_mm="w")
+        ),
+        r"baseline\.json.*sensor_width_mm.*'w'",
+    ),
+    "a text for a trajectory": (
+        lambda scene: (scene / "trajectory.json").write_text("{"),
+        r"trajectory\.json",
+    ),
+    "a trajectory of other frames": (
+        damage_json("trajectory.json", lambda doc: doc["frames"].pop()),
+        r"trajectory\.json has 6",
+    ),
+    "a pose without a camera": (
+        damage_json("trajectory.json", lambda doc: doc["frames"][2]["cameras"].pop(1)),
+        r"trajectory\.json.*frames\[2\]",
+    ),
+    "poses that contradict the baselines": (
+        damage_json(
+            "baseline.json",
+            lambda doc: [pair.update(baseline_cm=pair["baseline_cm"] * 2)
+                         for pair in doc["pairwise_pairs"] + doc.get("adjacent_pairs", [])],
+        ),
+        r"cameras 0 and 1 are .* cm apart, and by the poses",
+    ),
+    "a file for a folder": (
+        lambda scene: (shutil.rmtree(scene), scene.write_text("")),
+        r"no scene|holds no|found",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", DAMAGES)
+def test_a_damaged_scene_is_refused_when_the_tree_is_opened(scene, what):
+    damage, message = DAMAGES[what]
+    damage(scene)
+
+    with pytest.raises(StereoGenBenchError, match=f"(?s){message}"):
+        StereoPairs(root_of(scene), fields=FIELDS)
+
+
+def test_a_json_of_200_mb_is_refused_before_it_is_read(scene):
+    with (scene / "baseline.json").open("r+b") as file:
+        file.truncate(200 * 2**20)
+
+    with pytest.raises(StorageError, match=r"baseline\.json.*bytes"):
+        StereoPairs(root_of(scene))
+
+
+def test_all_damages_of_a_tree_are_listed_at_once(scene):
+    other = scene.with_name("scene_000001")
+    shutil.copytree(scene, other)
+    (scene / "cam_00_rgb.mp4").unlink()
+    rewrite(other / "baseline.json", lambda doc: doc.pop("primary_stereo_pair"))
+
+    with pytest.raises(StorageError, match=r"(?s)2 scenes cannot be used.*cam_00.*primary_stereo"):
+        StereoPairs(root_of(scene))
+
+
+def test_an_unfinished_scene_is_left_out_with_a_warning(scene):
+    other = scene.with_name("scene_000001")
+    shutil.copytree(scene, other)
+    (other / "_scene_complete.json").unlink()
+
+    with pytest.warns(IncompleteSceneWarning, match=r"scene_000001.*never finished"):
+        pairs = StereoPairs(root_of(scene))
+    assert len(pairs) == 1
+
+
+@pytest.mark.parametrize("name", ["cam_00_rgb.mp4", "cam_01_depth.mkv", "trajectory.json"])
+def test_a_file_that_changed_after_its_index_is_refused(scene, name):
+    pairs = StereoPairs(root_of(scene), fields=FIELDS)
+    whole = (scene / name).read_bytes()
+    (scene / name).write_bytes(whole[:-10])
+
+    with pytest.raises(StorageError, match=f"{name}.*the index says {len(whole)}"):
+        pairs[0]
+
+
+@pytest.mark.parametrize("name", ["cam_00_rgb.mp4", "cam_01_depth.mkv"])
+def test_a_payload_altered_in_place_is_an_error_and_no_sample(scene, name):
+    whole = bytearray((scene / name).read_bytes())
+    start = len(whole) // 3
+    whole[start : start + len(whole) // 3] = bytes(len(whole) // 3)
+    (scene / name).write_bytes(bytes(whole))
+
+    with pytest.raises((MediaError, StorageError), match=name.replace(".", r"\.")):
+        list(StereoPairs(root_of(scene), fields=FIELDS, frames="all"))
+
+
+def test_a_depth_stream_with_a_frame_less_is_refused(tmp_path):
+    request = SynthRequest(size_px=32, frames=4)
+    [key] = synthesise(tmp_path / "short", SynthRequest(size_px=32, frames=3), workers=1)
+    synthesise(tmp_path / "long", request, workers=1)
+    shutil.copy(tmp_path / "short" / key / "cam_04_depth.mkv", tmp_path / "long" / key)
+
+    with pytest.raises(StorageError, match=r"cam_04_depth\.mkv has 3"):
+        StereoPairs(tmp_path / "long")
+
+
+def test_a_metadata_bomb_of_brackets_is_refused(scene):
+    (scene / "baseline.json").write_text("[" * 200_000)
+
+    with pytest.raises((SchemaError, StorageError), match=r"baseline\.json.*nest"):
+        StereoPairs(root_of(scene))
+
+
+def write_depth(path, *, codec, pixel_format, frames, size):
+    """Write a depth video of noise in another codec or pixel format."""
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=15)
+        stream.width = stream.height = size
+        stream.pix_fmt = pixel_format
+        generator = np.random.default_rng(0)
+        for _ in range(frames):
+            picture = generator.integers(40, 200, (size, size)).astype(np.uint8)
+            frame = av.VideoFrame.from_ndarray(picture, format="gray").reformat(format=pixel_format)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+
+
+@pytest.mark.parametrize(
+    ("codec", "pixel_format", "risk"),
+    [("ffv1", "gray", "8-bit"), ("libx264", "yuv420p", "lossy"), ("ffv1", "yuv420p", "chroma")],
+)
+def test_depth_that_cannot_be_whole_is_refused_unless_it_is_meant(scene, codec, pixel_format, risk):
+    for camera in range(6):
+        write_depth(
+            scene / f"cam_{camera:02d}_depth.mkv",
+            codec=codec, pixel_format=pixel_format, frames=7, size=64,
+        )  # fmt: skip
+
+    with pytest.raises(MediaError, match=rf"cam_00_depth\.mkv: .*{pixel_format}.*{risk}.*accept="):
+        StereoPairs(root_of(scene), fields=("disparity",))
+    meant = DepthEncoding(0.1, accept=frozenset({"8-bit", "lossy", "chroma"}))
+    assert StereoPairs(root_of(scene), fields=("depth",), depth=meant)[0]["depth"].max() > 3
+    assert StereoPairs(root_of(scene), fields=("left",))[0]["left"].any()
+
+
+@pytest.mark.parametrize("depth_format", ["gray16le", "gray12le", "gray10le"])
+def test_ten_and_twelve_bit_depth_is_read_in_its_own_numbers(tmp_path, depth_format):
+    contract = ExportContract(depth_format=depth_format, depth_unit_m=0.1, depth_tag=None)
+    reference = ExportContract(depth_unit_m=0.1, depth_tag=None)
+    found = []
+    for name, written in (("as asked", contract), ("reference", reference)):
+        request = SynthRequest(size_px=32, frames=2, seed=8, contract=written)
+        synthesise(tmp_path / name, request, workers=1)
+        found.append(StereoPairs(tmp_path / name, fields=("depth", "valid"))[0])
+
+    both = found[0]["valid"] & found[1]["valid"]
+    assert both.float().mean() > 0.5
+    assert (found[0]["depth"][both] == found[1]["depth"][both]).all()
+
+
+def test_data_that_are_not_there_say_where_they_were_looked_for(tmp_path):
+    with pytest.raises(StorageError, match="nowhere: does not exist"):
+        StereoPairs(tmp_path / "nowhere")
+
+
+def test_a_folder_inside_the_tree_is_answered_with_the_right_one(scene):
+    with pytest.raises(StorageError, match=str(root_of(scene))):
+        StereoPairs(root_of(scene) / "train")

@@ -1,0 +1,205 @@
+"""Against measured disparities: Cones (2003), Cloth3 (2006) and Motorcycle (2014).
+
+Disparity stands for depth where two views are compared: their agreement is asked for in pixels,
+as the sets' own occlusion maps are made.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.geometry.disparity import depth_from_disparity
+from stereogenbench_data.geometry.projection import (
+    Projection,
+    lands_inside,
+    project_rectified,
+    project_through_poses,
+)
+from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
+from stereogenbench_data.geometry.warp import backward_warp
+
+
+def read(path: Path) -> np.ndarray:
+    with Image.open(path) as picture:
+        return np.asarray(picture)
+
+
+class View(NamedTuple):
+    """A picture (3, h, w) and its disparity in pixels, 0 where unknown."""
+
+    image: np.ndarray
+    disparity_px: np.ndarray
+
+    def flipped(self) -> "View":
+        return View(self.image[..., ::-1].copy(), self.disparity_px[:, ::-1].copy())
+
+
+@pytest.fixture(scope="module")
+def cloth(ground_truth) -> tuple[View, View]:
+    folder = ground_truth / "cloth3"
+    left, right = (
+        View(
+            read(folder / f"view{number}.png").transpose(2, 0, 1),
+            read(folder / f"disp{number}.png").astype(np.float32) / 2,
+        )
+        for number in (1, 5)
+    )
+    return left, right
+
+
+def visible_within_a_pixel(left_px: np.ndarray, right_px: np.ndarray) -> np.ndarray:
+    """Return where the right view's disparity is that of the left pixel that lands there."""
+    return visible_in_target(
+        Projection(project_rectified(left_px, left_px).u_px, None, left_px),
+        measured=left_px > 0,
+        target_depth_m=right_px,
+        target_measured=right_px > 0,
+        quantum_m=0.5,
+        tolerance=0.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def warped_db(psnr_db):
+    """Return the PSNR of the right view warped to the left one, where both see the same.
+
+    The warp goes ``by`` another disparity where one is given.
+    """
+
+    def measure(left: View, right: View, *, by: np.ndarray | None = None) -> float:
+        disparity_px = left.disparity_px if by is None else by
+        warped, inside = backward_warp(right.image, project_rectified(disparity_px, disparity_px))
+        visible = visible_within_a_pixel(left.disparity_px, right.disparity_px)
+        return psnr_db(warped, left.image, visible & inside)
+
+    return measure
+
+
+@pytest.mark.parametrize(
+    ("judge", "least"),
+    [
+        pytest.param("target", 0.984, id="by both views' disparity"),
+        pytest.param("source", 0.99, id="by a z-buffer of the left view"),
+    ],
+)
+def test_visibility_is_the_occlusion_map_of_cones(ground_truth, judge, least):
+    left_px, right_px = (
+        read(ground_truth / "cones" / f"disp_{side}.tif") for side in ("left", "right")
+    )
+    visible_there = read(ground_truth / "cones" / "occlusion.png").astype(bool)
+    depth = depth_from_disparity(left_px, focal_px=1.0, baseline_m=1.0)
+    known = left_px > 0
+    projection = project_rectified(depth, left_px)
+
+    if judge == "target":
+        visible = visible_in_target(
+            projection,
+            measured=known,
+            target_depth_m=depth_from_disparity(right_px, focal_px=1.0, baseline_m=1.0),
+            target_measured=right_px > 0,
+            quantum_m=0.0,
+        )
+    else:
+        visible = visible_from_source(projection, measured=known, quantum_m=0.0)
+
+    assert (visible == visible_there)[known].mean() > least
+
+
+def test_cloth_warps_back_onto_itself(cloth, warped_db):
+    assert warped_db(*cloth) == pytest.approx(34.94, abs=0.02)
+
+
+def test_a_flip_that_swaps_the_views_loses_nothing(cloth, warped_db):
+    left, right = cloth
+
+    assert warped_db(right.flipped(), left.flipped()) == pytest.approx(
+        warped_db(left, right), abs=0.02
+    )
+
+
+def test_a_flip_that_mirrors_the_disparity_of_the_wrong_view_is_far_worse(cloth, warped_db):
+    left, right = cloth
+    wrong_px = left.flipped().disparity_px
+
+    assert warped_db(right.flipped(), left.flipped(), by=wrong_px) < warped_db(left, right) - 15
+
+
+@pytest.mark.parametrize(
+    ("axis", "least_db", "most_db"),
+    [pytest.param("x", 35.0, 36.0, id="s_x"), pytest.param("y", 0.0, 16.0, id="s_y")],
+)
+def test_disparity_follows_the_width_of_a_picture_that_was_squashed(
+    cloth, warped_db, axis, least_db, most_db
+):
+    """By the evaluator's 0.65 and 0.375: disparity by the nearest pixel, pictures by area."""
+    height, width = cloth[0].disparity_px.shape
+    size = round(width * 0.65), round(height * 0.375)
+    factor = {"x": size[0] / width, "y": size[1] / height}[axis]
+    rows = ((np.arange(size[1]) + 0.5) * height / size[1]).astype(int)
+    columns = ((np.arange(size[0]) + 0.5) * width / size[0]).astype(int)
+
+    squashed = [
+        View(
+            np.asarray(
+                Image.fromarray(view.image.transpose(1, 2, 0)).resize(
+                    size, Image.Resampling.BICUBIC
+                )
+            ).transpose(2, 0, 1),
+            view.disparity_px[rows][:, columns] * np.float32(factor),
+        )
+        for view in cloth
+    ]
+
+    assert least_db < warped_db(*squashed) < most_db
+
+
+@pytest.fixture(scope="module")
+def motorcycle(ground_truth):
+    """The two pictures, disparity in pixels, and where it is known."""
+    folder = ground_truth / "motorcycle"
+    left, right = (
+        read(folder / f"motorcycle_{side}.png").transpose(2, 0, 1) for side in ("left", "right")
+    )
+    with np.load(folder / "motorcycle_disp.npz") as archive:
+        disparity_px = archive["arr_0"]
+    known = np.isfinite(disparity_px)
+    return left, right, np.where(known, disparity_px, np.float32(0)), known
+
+
+@pytest.mark.parametrize(("sign", "expected_db"), [(1, 22.4), (-1, 11.6)])
+def test_the_right_view_of_the_motorcycle_is_to_the_left(motorcycle, psnr_db, sign, expected_db):
+    left, right, disparity_px, known = motorcycle
+    projection = project_rectified(disparity_px, sign * disparity_px)
+
+    warped, inside = backward_warp(right, projection)
+
+    assert psnr_db(warped, left, known & inside) == pytest.approx(expected_db, abs=0.05)
+
+
+def test_principal_points_that_differ_are_part_of_the_disparity(motorcycle):
+    """Doffs of 31 px: the chain between the two cameras gives back the measured disparity."""
+    *_, disparity_px, known = motorcycle
+    left = Intrinsics(994.978, 994.978, 311.193, 254.877, 741, 500)
+    right = Intrinsics(994.978, 994.978, 311.193 + 31.086, 254.877, 741, 500)
+    depth_m = depth_from_disparity(
+        np.where(known, disparity_px.astype(np.float64) + 31.086, 0.0),
+        focal_px=994.978,
+        baseline_m=0.193001,
+    )
+    motion = np.eye(4)
+    motion[0, 3] = -0.193001
+
+    chain = project_through_poses(
+        depth_m, intrinsics=left, target_intrinsics=right, target_from_source=motion
+    )
+
+    assert depth_m[known].min() == pytest.approx(2.11, abs=0.005)
+    assert depth_m[known].max() == pytest.approx(5.02, abs=0.005)
+    measured_u_px = project_rectified(depth_m, disparity_px.astype(np.float64)).u_px
+    np.testing.assert_allclose(chain.u_px[known], measured_u_px[known], rtol=0, atol=1e-9)
+    inside = lands_inside(chain, height_px=500, width_px=741)
+    assert inside[known].mean() > 0.9

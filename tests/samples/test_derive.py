@@ -1,0 +1,169 @@
+"""What is derived from decoded views, against hand-worked numbers and the long way round."""
+
+import numpy as np
+import pytest
+
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.samples.derive import PairGeometry, SceneFacts
+from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.schema.records import (
+    DepthEncoding,
+    Rig,
+    Scene,
+    SceneId,
+    SceneLabels,
+    Trajectory,
+)
+from stereogenbench_data.schema.release import CAMERA_PAIRS
+from stereogenbench_data.synthesis import ExportContract, SynthRequest, synthesise
+
+GAP_CM = 20.0
+INTRINSICS = Intrinsics(100.0, 100.0, 20.0, 10.0, 40, 20)
+
+
+def facts(encoding, *, residual_px=0.0, order=1.0, yaw_deg=(0.0,) * 6):
+    """Return a scene whose cameras stand 20 cm apart, looking along Unreal's x."""
+    places = np.arange(6) * GAP_CM * order
+    centres = np.zeros((1, 6, 3))
+    centres[0, :, 1] = places
+    rotations = np.zeros((1, 6, 3))
+    rotations[0, :, 1] = yaw_deg
+    scene = Scene(
+        id=SceneId("train/Uniform/Map/scene_000000", "train", None, "Uniform", "Map"),
+        labels=SceneLabels(),
+        caption="",
+        rig=Rig(
+            focal_mm=50.0, sensor_width_mm=20.0, sensor_height_mm=10.0,
+            image_width_px=40, image_height_px=20, principal_point_px=None,
+            baselines_cm=tuple(GAP_CM * (b - a) for a, b in CAMERA_PAIRS), primary_pair=(0, 1),
+        ),
+        frames=1,
+        frame_rate_hz=15.0,
+        lateral_m=tuple(places / 100),
+        rig_residual_px=residual_px,
+        depth_unit_m=(encoding.unit_m,) * 6,
+        depth_unit_source=("tag",) * 6,
+        valid_depth_ratio=None,
+        members={},
+    )  # fmt: skip
+    poses = CameraPoses.from_trajectory(Trajectory(centres, 0.01, rotations, "rotator_deg"))
+    return SceneFacts(scene, dict.fromkeys(range(6), encoding), poses, "url")
+
+
+def geometry(units, encoding, *, source=0, target=1, world="as filmed", **scene):
+    units = np.asarray(units, dtype=np.uint16)[None]
+    stored = StoredDepth(units, units > 0)
+    views = Views(
+        source=source, targets=(target,), frames=(0,), pictures={},
+        depths={source: stored, target: stored}, intrinsics=INTRINSICS, world=world,
+    )  # fmt: skip
+    return PairGeometry(views, facts(encoding, **scene), source=source, target=target)
+
+
+def some_units(low=5, high=400):
+    units = np.random.default_rng(0).integers(low, high, (20, 40))
+    units[3, 4] = 0
+    return units
+
+
+def test_disparity_by_hand():
+    pair = geometry(np.full((20, 40), 50), DepthEncoding(0.1))
+
+    # 100 px * 0.2 m / 5 m
+    assert (pair.disparity == 4.0).all()
+    assert (pair.depth_m == 5.0).all()
+    assert pair.baseline_m == 0.2
+
+
+@pytest.mark.parametrize(
+    ("options", "sign"),
+    [
+        ({}, 1),
+        ({"source": 1, "target": 0}, -1),
+        ({"order": -1.0}, -1),
+        ({"order": -1.0, "source": 1, "target": 0}, 1),
+        ({"world": "mirrored"}, -1),
+        ({"world": "mirrored", "source": 1, "target": 0}, 1),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("residual_px", [0.0, 1.0], ids=["closed form", "pose chain"])
+def test_the_sign_follows_where_the_target_stands(options, sign, residual_px):
+    """Whether by the closed form or through the poses."""
+    pair = geometry(np.full((20, 40), 50), DepthEncoding(0.1), residual_px=residual_px, **options)
+
+    assert pair.baseline_m == pytest.approx(0.2 * sign)
+    np.testing.assert_allclose(pair.disparity, 4.0 * sign, rtol=1e-6)
+    np.testing.assert_allclose(pair.target_from_source[0, :3, 3], [-0.2 * sign, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("encoding", [
+    DepthEncoding(0.1), DepthEncoding(0.1, kind="ray"), DepthEncoding(500.0, form="inverse"),
+    DepthEncoding(500.0, form="inverse", kind="ray"),
+], ids=str)  # fmt: skip
+def test_the_pose_chain_of_a_rectified_rig_is_the_closed_form(encoding):
+    closed = geometry(some_units(), encoding)
+    chained = geometry(some_units(), encoding, residual_px=1.0)
+
+    np.testing.assert_allclose(chained.disparity, closed.disparity, rtol=2e-6)
+    assert (closed.disparity[0, 3, 4], chained.disparity[0, 3, 4]) == (0, 0)
+
+
+def test_a_turned_camera_moves_pixels_as_its_homography_says():
+    pair = geometry(
+        np.full((20, 40), 60000), DepthEncoding(1e3), residual_px=5.0,
+        yaw_deg=(0.0, 1.0, 0, 0, 0, 0),
+    )  # fmt: skip
+
+    # far away only the turn of one degree to the right counts, at the centre f tan(1 degree)
+    assert pair.disparity[0, 10, 20] == pytest.approx(100 * np.tan(np.pi / 180), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    "encoding", [DepthEncoding(0.1), DepthEncoding(500.0, form="inverse")], ids=str
+)
+def test_the_error_bound_holds_for_every_depth_that_rounds_to_the_stored_one(encoding):
+    units = some_units()
+    pair = geometry(units, encoding)
+    stored = units.astype(np.float64)[None]
+    measured = stored > 0
+    for off in (-0.4999, 0.4999):
+        ratio = (stored + off) * encoding.unit_m if encoding.form == "depth" else (
+            encoding.unit_m / np.where(measured, stored + off, 1))  # fmt: skip
+        truth = np.divide(100 * 0.2, ratio, where=measured, out=np.zeros_like(stored))
+        assert (np.abs(pair.disparity - truth) <= pair.disparity_error)[measured].all()
+    assert pair.disparity_error[0, 3, 4] == 0
+    assert pair.disparity_error.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    "contract",
+    [
+        ExportContract(depth_unit_m=0.001),
+        ExportContract(rotation="quaternion_wxyz", pair_form="indices", primary_pair=(1, 4)),
+        ExportContract(rotation="matrix", principal_point_px=(40.0, 27.5)),
+        ExportContract(sensor_mm=(23.76, 18.0)),
+    ],
+    ids=str,
+)
+def test_contracts_of_the_metadata_give_the_same_pictures_depth(tmp_path, contract):
+    """However a scene's files are spelt, warping the right view by disparity gives the left."""
+    request = SynthRequest(size_px=96, height_px=64, frames=1, seed=3, contract=contract)
+    synthesise(tmp_path, request, workers=1)
+    sample = StereoPairs(
+        tmp_path, fields=("left", "right", "disparity", "visible", "pair", "intrinsics")
+    )[0]
+    left, right = (sample[name].numpy().astype(float) for name in ("left", "right"))
+    disparity, visible = sample["disparity"][0].numpy(), sample["visible"][0].numpy()
+    rows, columns = np.indices(disparity.shape)
+    place = np.clip(columns - disparity, 0, 95)
+    near = np.minimum(place.astype(int), 94)
+    warped = right[:, rows, near] * (1 - place + near) + right[:, rows, near + 1] * (place - near)
+
+    assert tuple(sample["pair"].tolist()) == contract.primary_pair
+    assert visible.mean() > 0.3
+    error = np.mean((warped - left)[:, visible] ** 2)
+    unmoved = np.mean((right - left)[:, visible] ** 2)
+    assert 10 * np.log10(unmoved / error) > 5

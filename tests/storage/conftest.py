@@ -1,0 +1,137 @@
+"""Small scenes in the released layout, written without the package: 4 frames of 32 x 24 pixels."""
+
+import itertools
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+FRAMES = 4
+SIZE = (24, 32)
+PLACES_CM = (0.0, 10.0, 25.0, 31.0, 60.0, 72.5)
+MarkedRoot = tuple[Path, str]
+
+
+def write_video(
+    path: Path, *, frames: int = FRAMES, size: tuple[int, int] = SIZE, tags: dict[str, str]
+) -> Path:
+    """Write an H.264 clip (mp4) or FFV1 16-bit depth of which the first row is not measured."""
+    is_depth = path.suffix == ".mkv"
+    with av.open(str(path), "w") as container:
+        container.metadata.update(tags)
+        stream = container.add_stream("ffv1" if is_depth else "libx264", rate=15)
+        stream.height, stream.width = size
+        stream.pix_fmt = "gray16le" if is_depth else "yuv420p"
+        for index in range(frames):
+            if is_depth:
+                units = np.full(size, 3000 + index, dtype=np.uint16)
+                units[0] = 0
+                frame = av.VideoFrame.from_ndarray(units, format="gray16le")
+            else:
+                grey = np.full((*size, 3), 40 * index, dtype=np.uint8)
+                frame = av.VideoFrame.from_ndarray(grey, format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+@pytest.fixture(scope="session")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """A video file of a kind ("rgb.mp4" or "depth.mkv"), written once for each set of arguments."""
+    folder = tmp_path_factory.mktemp("videos")
+    known: dict[str, Path] = {}
+
+    def write(kind: str, **how: Any) -> Path:
+        tags = how.pop("tags", {"DEPTH_SCALE": "0.001"} if kind == "depth.mkv" else {})
+        key = repr((kind, sorted(how.items()), sorted(tags.items())))
+        if key not in known:
+            known[key] = write_video(folder / f"{len(known)}_{kind}", tags=tags, **how)
+        return known[key]
+
+    return write
+
+
+def documents(frames: int = FRAMES) -> dict[str, Any]:
+    """The metadata files of a scene whose six cameras stand on a line and look along x."""
+    names = {"scene_label": "Town_scene_7", "scene_index": 7, "map_name": "Car_Dealer"}
+    return {
+        "baseline.json": {
+            **names,
+            "image_width": SIZE[1],
+            "image_height": SIZE[0],
+            "camera_intrinsics": {
+                "focal_length_mm": 30.0,
+                "sensor_width_mm": 24.0,
+                "sensor_height_mm": 18.0,
+            },
+            "primary_stereo_pair": [0, 1],
+            "pairwise_pairs": [
+                {
+                    "camera_index_a": a,
+                    "camera_index_b": b,
+                    "baseline_cm": PLACES_CM[b] - PLACES_CM[a],
+                }
+                for a, b in itertools.combinations(range(6), 2)
+            ],
+            "character_mesh": "SK_Ch13",
+        },
+        "trajectory.json": {
+            "unit": "cm",
+            "frames": [
+                {
+                    "frame_index": frame,
+                    "cameras": [
+                        {
+                            "camera_index": camera,
+                            "location": {"x": 500.0 + frame, "y": place, "z": 160.0},
+                            "rotation": {"pitch": 0.0, "yaw": 0.0, "roll": 0.0},
+                        }
+                        for camera, place in enumerate(PLACES_CM)
+                    ],
+                }
+                for frame in range(frames)
+            ],
+        },
+        "_scene_complete.json": {**names, "map_path": "/Game/Car_Dealer"},
+        "scene_description_qwen_dataset_level.json": {"detailed_caption": "Cars behind glass."},
+    }
+
+
+@pytest.fixture
+def make_scene(tmp_path: Path, video: Callable[..., Path]) -> Callable[..., Path]:
+    """Write a whole scene below ``tmp_path / "release"`` and return its folder."""
+
+    def make(key: str = "train/Uniform/Car_Dealer/scene_000001", *, frames: int = FRAMES) -> Path:
+        folder = tmp_path / "release" / key
+        folder.mkdir(parents=True)
+        for name, document in documents(frames).items():
+            (folder / name).write_text(json.dumps(document))
+        for camera in range(6):
+            for kind in ("rgb.mp4", "depth.mkv"):
+                shutil.copy(video(kind, frames=frames), folder / f"cam_{camera:02d}_{kind}")
+        return folder
+
+    return make
+
+
+@pytest.fixture
+def rewrite() -> Callable[[Path, Callable[[Any], object]], None]:
+    """Change a JSON file in place."""
+
+    def change(path: Path, edit: Callable[[Any], object]) -> None:
+        document = json.loads(path.read_text())
+        edit(document)
+        path.write_text(json.dumps(document))
+
+    return change
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Where `make_scene` writes."""
+    return tmp_path / "release"

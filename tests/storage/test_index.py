@@ -1,0 +1,367 @@
+"""The index: the same rows in memory, on disk and in another process."""
+
+import contextlib
+import dataclasses
+import json
+import pickle
+import random
+import shutil
+import warnings
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
+from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
+
+METADATA = b"stereogenbench_data.index"
+
+
+def scene_of(number, *, seed=0):
+    """A scene whose every number comes from a seed."""
+    rng = random.Random(f"{seed} {number}")
+    key = f"train/Uniform/Car_Dealer/scene_{number:06d}"
+    size = rng.choice([64, 1280])
+    return Scene(
+        id=SceneId(key, "train", rng.choice([None, "seen_map"]), "Uniform", "Car_Dealer"),
+        labels=SceneLabels(
+            scene_label=rng.choice([None, f"label {number}"]),
+            scene_index=rng.choice([None, number]),
+            character=rng.choice([None, "SK_\u00c4"]),
+            aperture_fstop=rng.choice([None, 2.8]),
+        ),
+        caption=rng.choice(["", 'A caf\u00e9 "in" Vienna.']),
+        rig=Rig(
+            focal_mm=rng.uniform(18, 85),
+            sensor_width_mm=23.76,
+            sensor_height_mm=rng.uniform(10, 30),
+            image_width_px=size,
+            image_height_px=size,
+            principal_point_px=rng.choice([None, (31.5, 32.25)]),
+            baselines_cm=tuple(rng.uniform(1, 200) for _ in range(15)),
+            primary_pair=rng.choice([(0, 1), (2, 5)]),
+            image_size_source=rng.choice(["recorded", "default"]),
+        ),
+        frames=rng.randint(1, 100),
+        frame_rate_hz=15.0,
+        lateral_m=tuple(rng.uniform(0, 2) for _ in range(6)),
+        rig_residual_px=rng.choice([1e-9, float("inf")]),
+        depth_unit_m=tuple(rng.choice([0.1, 0.001]) for _ in range(6)),
+        depth_unit_source=tuple(rng.choice(["tag", "default"]) for _ in range(6)),
+        valid_depth_ratio=rng.choice([None, 0.9459]),
+        members={
+            name: Member(f"{key}/{name}", 0, rng.randint(0, 2**40))
+            for name in ["baseline.json", "cam_00_rgb.mp4", "cam_00_depth.mkv"]
+        },
+    )
+
+
+@pytest.fixture
+def scenes():
+    return [scene_of(number) for number in range(5)]
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32), count=st.integers(1, 6))
+def test_a_scene_comes_back_from_the_file_as_it_was(tmp_path_factory, seed, count):
+    root = tmp_path_factory.mktemp("root")
+    scenes = [scene_of(number, seed=seed) for number in range(count)]
+    SceneIndex.from_scenes(scenes, root).write(root / "index.parquet")
+
+    index = SceneIndex.open(root)
+
+    assert len(index) == count
+    assert [index.scene(row) for row in range(count)] == scenes
+
+
+def test_rows_are_in_the_order_of_their_keys_whatever_order_they_came_in(scenes, tmp_path):
+    forth = SceneIndex.from_scenes(scenes, tmp_path)
+    back = SceneIndex.from_scenes(reversed(scenes), tmp_path)
+
+    assert back.column("key").tolist() == sorted(scene.id.key for scene in scenes)
+    assert back.digest == forth.digest
+
+
+def test_the_digest_is_the_same_after_writing_and_in_parts_of_a_table(scenes, tmp_path):
+    index = SceneIndex.from_scenes(scenes, tmp_path)
+    index.write(tmp_path / "index.parquet")
+    table = pq.read_table(tmp_path / "index.parquet")
+    pq.write_table(table, tmp_path / "parts.parquet", row_group_size=2)
+
+    assert SceneIndex.open(tmp_path / "index.parquet").digest == index.digest
+    assert SceneIndex.open(tmp_path / "parts.parquet").digest == index.digest
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frames": 7},
+        {"caption": "Other."},
+        {"valid_depth_ratio": 0.5},
+        {"lateral_m": (0.0, 0.1, 0.2, 0.3, 0.4, 0.6)},
+        {"members": {"a.mp4": Member("a.mp4", 0, 1)}},
+    ],
+)
+def test_the_digest_changes_with_a_scene(scenes, tmp_path, change):
+    changed = [*scenes[:-1], dataclasses.replace(scenes[-1], **change)]
+
+    before = SceneIndex.from_scenes(scenes, tmp_path).digest
+
+    assert SceneIndex.from_scenes(changed, tmp_path).digest != before
+
+
+def test_the_digest_is_pinned(tmp_path):
+    index = SceneIndex.from_scenes([scene_of(3)], tmp_path)
+
+    assert index.digest == "17523b85975608764d74fc304d89cad3b42bb82d1c96f61dc12092e04d7efd31"
+
+
+def test_columns_are_arrays_that_cannot_be_changed(scenes, tmp_path):
+    index = SceneIndex.from_scenes(scenes, tmp_path)
+
+    baselines_cm = index.column("baselines_cm")
+
+    assert (baselines_cm.shape, baselines_cm.dtype) == ((5, 15), np.float64)
+    np.testing.assert_array_equal(baselines_cm[2], scenes[2].rig.baselines_cm)
+    np.testing.assert_array_equal(index.column("lateral_m")[4], scenes[4].lateral_m)
+    assert index.column("frames").dtype == np.int64
+    assert index.column("character").tolist() == [scene.labels.character for scene in scenes]
+    assert index.column("depth_unit_source")[1].tolist() == list(scenes[1].depth_unit_source)
+    ratios = [scene.valid_depth_ratio or np.nan for scene in scenes]
+    np.testing.assert_array_equal(index.column("valid_depth_ratio"), ratios)
+    for name in ("baselines_cm", "frames", "key", "valid_depth_ratio"):
+        with pytest.raises(ValueError, match="read-only"):
+            index.column(name)[0] = 0
+
+
+@pytest.mark.parametrize("name", ["nothing", "members"])
+def test_a_column_that_is_not_there_is_named_with_those_that_are(scenes, tmp_path, name):
+    with pytest.raises(StorageError, match=f"has no column '{name}'; it has key, split, family"):
+        SceneIndex.from_scenes(scenes, tmp_path).column(name)
+
+
+@pytest.mark.parametrize("row", [-1, 5])
+def test_a_row_that_is_not_there_is_named(scenes, tmp_path, row):
+    with pytest.raises(StorageError, match=f"there is no row {row}; the index has 5"):
+        SceneIndex.from_scenes(scenes, tmp_path).scene(row)
+
+
+def test_an_index_goes_to_another_process_whole(scenes, tmp_path):
+    index = SceneIndex.from_scenes(scenes, tmp_path)
+    index.column("frames")
+
+    copy = pickle.loads(pickle.dumps(index))
+
+    assert (copy.root, copy.digest, len(copy)) == (index.root, index.digest, 5)
+    assert copy.scene(3) == scenes[3]
+
+
+def test_two_scenes_of_one_key_are_refused(scenes, tmp_path):
+    with pytest.raises(StorageError, match="scene_000001' is there twice"):
+        SceneIndex.from_scenes([*scenes, scenes[1]], tmp_path)
+
+
+@pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a/../../b", "a\\b", ""])
+def test_a_path_that_could_leave_the_root_is_refused(scenes, tmp_path, path):
+    bad = dataclasses.replace(scenes[0], members={"a": Member(path, 0, 1)})
+
+    with pytest.raises(StorageError, match="is no path inside the data's root"):
+        SceneIndex.from_scenes([bad], tmp_path)
+
+
+def written(scenes, root):
+    SceneIndex.from_scenes(scenes, root).write(root / "index.parquet")
+    return root / "index.parquet"
+
+
+def altered(path, edit):
+    """Rewrite an index with another table or another description of itself."""
+    table = pq.read_table(path)
+    head = json.loads(table.schema.metadata[METADATA])
+    table = edit(table, head) or table
+    pq.write_table(table.replace_schema_metadata({METADATA: json.dumps(head)}), path)
+
+
+def with_path(path):
+    def edit(table, head):
+        rows = table.to_pylist()
+        rows[2]["members"][1]["path"] = path
+        return pa.Table.from_pylist(rows, schema=table.schema)
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("edit", "match"),
+    [
+        (lambda table, head: head.update(format=2), "of format 2, and this version .* reads fo"),
+        (lambda table, head: head.update(broken=3), "description of itself was altered"),
+        (lambda table, head: table.drop_columns(["frames"]), r"not those of an index \(see frames"),
+        (
+            lambda table, head: table.set_column(0, "key", pa.array([1, 2, 3, 4, 5])),
+            r"not those of an index \(see key",
+        ),
+        (lambda table, head: table.take([1, 0, 2, 3, 4]), "is there twice or out of order"),
+        (with_path("train/other"), "its rows are not those that were written"),
+        (with_path("../../etc/passwd"), "'../../etc/passwd' is no path inside the data's root"),
+        (with_path("/etc/passwd"), "'/etc/passwd' is no path inside the data's root"),
+    ],
+)
+def test_an_altered_index_is_refused(scenes, tmp_path, edit, match):
+    path = written(scenes, tmp_path)
+    altered(path, edit)
+
+    with pytest.raises(StorageError, match=match):
+        SceneIndex.open(path)
+
+
+def test_a_foreign_parquet_file_is_refused(tmp_path):
+    pq.write_table(pa.table({"a": [1]}), tmp_path / "other.parquet")
+
+    with pytest.raises(StorageError, match="is a Parquet file, but no index of this package"):
+        SceneIndex.open(tmp_path / "other.parquet")
+
+
+@pytest.mark.parametrize("keep", [0, 3, 200, 0.5, 0.99])
+def test_a_truncated_index_is_refused(scenes, tmp_path, keep):
+    path = written(scenes, tmp_path)
+    content = path.read_bytes()
+    path.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
+
+    with pytest.raises(StorageError, match=r"no Parquet file that can be read .* cut short"):
+        SceneIndex.open(path)
+
+
+def test_bytes_that_changed_inside_an_index_never_change_a_scene(scenes, tmp_path):
+    path = written(scenes, tmp_path)
+    content = path.read_bytes()
+    rng = random.Random(0)
+    for _ in range(80):
+        damaged = bytearray(content)
+        damaged[rng.randrange(len(content))] ^= rng.randrange(1, 256)
+        path.write_bytes(damaged)
+        with contextlib.suppress(StorageError):
+            assert SceneIndex.open(path).scene(0) == scenes[0]
+
+
+def test_data_that_do_not_exist_are_named(tmp_path):
+    with pytest.raises(StorageError, match=r"nowhere: does not exist; expected an index file"):
+        SceneIndex.open(tmp_path / "nowhere")
+
+
+def test_a_url_is_refused():
+    with pytest.raises(StorageError, match="hf://datasets/x: a URL cannot be opened"):
+        SceneIndex.open("hf://datasets/x")
+
+
+def test_an_index_in_its_root_moves_with_it(scenes, tmp_path):
+    (tmp_path / "old").mkdir()
+    written(scenes, tmp_path / "old")
+    (tmp_path / "old").rename(tmp_path / "new")
+
+    assert SceneIndex.open(tmp_path / "new").root == str(tmp_path / "new")
+
+
+def test_an_index_elsewhere_remembers_its_root(scenes, tmp_path):
+    (tmp_path / "data").mkdir()
+    SceneIndex.from_scenes(scenes, tmp_path / "data").write(tmp_path / "a" / "index.parquet")
+
+    assert SceneIndex.open(tmp_path / "a" / "index.parquet").root == str(tmp_path / "data")
+
+
+def test_an_index_whose_root_is_gone_says_where_it_was(scenes, tmp_path):
+    (tmp_path / "data").mkdir()
+    SceneIndex.from_scenes(scenes, tmp_path / "data").write(tmp_path / "index.parquet")
+    (tmp_path / "data").rmdir()
+
+    with pytest.raises(StorageError, match=f"its data were at {tmp_path}/data, which is no folder"):
+        SceneIndex.open(tmp_path / "index.parquet")
+
+
+def test_a_file_that_cannot_be_written_is_named_and_leaves_nothing(scenes, tmp_path):
+    (tmp_path / "index.parquet").mkdir()
+
+    with pytest.raises(StorageError, match=r"index cannot be written .*Choose another place"):
+        SceneIndex.from_scenes(scenes, tmp_path).write(tmp_path / "index.parquet")
+
+    assert [path.name for path in tmp_path.iterdir()] == ["index.parquet"]
+
+
+def test_a_tree_opens_directly(make_scene, root):
+    make_scene("train/Uniform/Car_Dealer/scene_000002")
+    make_scene("train/Uniform/Car_Dealer/scene_000001")
+
+    index = SceneIndex.open(root)
+
+    assert [key[-1] for key in index.column("key")] == ["1", "2"]
+    assert index.root == str(root)
+
+
+def test_incomplete_scenes_of_a_tree_are_warned_of(make_scene, root):
+    make_scene()
+    shutil.rmtree(make_scene("train/Uniform/Car_Dealer/scene_000002"))
+    (root / "train/Uniform/Car_Dealer/scene_000002").mkdir()
+
+    with pytest.warns(IncompleteSceneWarning, match=r"(?s)1 scene cannot be used:.*folder is empt"):
+        index = SceneIndex.open(root)
+
+    assert list(index.incomplete) == ["train/Uniform/Car_Dealer/scene_000002"]
+
+
+def test_broken_scenes_of_a_tree_are_an_error_that_lists_them(make_scene, root):
+    for number in range(12):
+        make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
+        (root / f"train/Uniform/Car_Dealer/scene_{number:06d}" / "trajectory.json").unlink()
+
+    with pytest.raises(StorageError, match="12 scenes cannot be used:") as caught:
+        SceneIndex.open(root)
+
+    lines = str(caught.value).splitlines()
+    assert "scene_000009: is marked as complete and has no trajectory.json" in lines[10]
+    assert lines[11].strip() == "and 2 more"
+    assert "stereogenbench index" in lines[12]
+
+
+def test_a_tree_of_unfinished_scenes_is_an_error(make_scene, root):
+    (make_scene() / "_scene_complete.json").unlink()
+
+    with pytest.raises(StorageError, match="no scene is finished: 1 scene cannot be used"):
+        SceneIndex.open(root)
+
+
+def test_what_was_left_out_is_told_when_the_index_is_opened(scenes, tmp_path):
+    index = SceneIndex.from_scenes(scenes, tmp_path)
+    index.incomplete = {"train/a/b/c": "is empty"}
+    index.broken = {"train/a/b/d": "has no baseline.json"}
+    index.write(tmp_path / "index.parquet")
+
+    with pytest.warns(IncompleteSceneWarning, match=r"(?s)2 scenes.*b/c: is empty.*b/d: has no b"):
+        opened = SceneIndex.open(tmp_path)
+
+    assert (opened.incomplete, opened.broken) == (index.incomplete, index.broken)
+
+
+def test_an_index_without_anything_left_out_opens_without_a_warning(scenes, tmp_path):
+    written(scenes, tmp_path)
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        SceneIndex.open(tmp_path)
+
+    assert caught == []
+
+
+def test_as_many_scenes_as_the_release_has_come_back(tmp_path):
+    scenes = [dataclasses.replace(scene_of(0), id=scene_of(n).id) for n in range(8493)]
+    SceneIndex.from_scenes(scenes, tmp_path).write(tmp_path / "index.parquet")
+
+    index = SceneIndex.open(tmp_path)
+
+    assert len(index) == 8493
+    assert index.scene(8492).id == scenes[8492].id
+    assert index.column("baselines_cm").shape == (8493, 15)

@@ -1,0 +1,127 @@
+"""Depth against numbers worked by other means: by hand, by bisection, by a finer picture."""
+
+import numpy as np
+import pytest
+
+from stereogenbench_data.synthesis import SynthRequest
+from stereogenbench_data.synthesis.casting import GROUND, SKY, View, first_met, pixel_rays
+from stereogenbench_data.synthesis.plan import plan_scene
+from stereogenbench_data.synthesis.render import Scenery, draw_depth, draw_frame, still_light
+from stereogenbench_data.synthesis.shapes import Material, Shape
+
+LEVEL = np.zeros(2)
+STONE = Material("plaster", 1.0, (1.0, 1.0, 1.0))
+
+
+def view_from(eye, *, size_px=(5, 5), focal_px=5.0):
+    """A camera that looks along the stage's x axis, its principal point in the middle."""
+    width, height = size_px
+    return View(
+        eye=np.array(eye),
+        axes=np.eye(3),
+        focal_px=(focal_px, focal_px),
+        centre_px=(width / 2, height / 2),
+        size_px=size_px,
+    )
+
+
+def depth_of(shapes, view):
+    ((_, rays),) = pixel_rays(view)
+    return first_met(rays, view=view, shapes=shapes, slope=LEVEL)
+
+
+def test_the_ground_is_at_height_over_descent_and_the_sky_has_no_depth():
+    """Rows look 0.4, 0.2, 0, -0.2, -0.4 up at depth 1, from 2 m: 10 m and 5 m to the ground."""
+    depth_m, solid = depth_of([], view_from([0.0, 0.0, 2.0]))
+
+    np.testing.assert_allclose(depth_m[:, 3], [np.inf, np.inf, np.inf, 10.0, 5.0])
+    assert solid[:, 0].tolist() == [SKY, SKY, SKY, GROUND, GROUND]
+
+
+def test_the_depth_of_a_box_face_is_the_same_all_over_the_face():
+    """Depth is along the optical axis: a face across it has one depth, whatever the ray's length."""
+    box = Shape("box", np.array([6.0, 0.0, 2.0]), np.eye(3), np.array([2.0, 1.9, 1.9]), STONE)
+
+    depth_m, _ = depth_of([box], view_from([0.0, 0.0, 2.0]))
+
+    np.testing.assert_allclose(depth_m, np.full((5, 5), 4.0))
+
+
+def test_the_depth_of_a_ball_is_that_of_the_nearest_point_on_its_axis():
+    ball = Shape("ellipsoid", np.array([6.0, 0.0, 2.0]), np.eye(3), np.full(3, 1.5), STONE)
+
+    depth_m, solid = depth_of([ball], view_from([0.0, 0.0, 2.0]))
+
+    assert depth_m[2, 2] == pytest.approx(4.5)
+    assert solid[0, 0] == SKY
+
+
+def test_a_nearer_shape_hides_a_farther_one_in_either_order():
+    near = Shape("box", np.array([3.0, 0.0, 2.0]), np.eye(3), np.full(3, 0.4), STONE)
+    far = Shape("box", np.array([8.0, 0.0, 2.0]), np.eye(3), np.full(3, 3.9), STONE)
+    view = view_from([0.0, 0.0, 2.0])
+
+    first, _ = depth_of([near, far], view)
+    second, _ = depth_of([far, near], view)
+
+    np.testing.assert_array_equal(first, second)
+    assert first[2, 2] == pytest.approx(2.6)
+    assert first[2, 0] == pytest.approx(4.1)
+
+
+def test_a_shape_behind_the_camera_is_not_seen():
+    behind = Shape("box", np.array([-3.0, 0.0, 2.0]), np.eye(3), np.full(3, 1.0), STONE)
+
+    depth_m, _ = depth_of([behind], view_from([0.0, 0.0, 2.0]))
+
+    assert depth_m[2, 2] == np.inf
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_every_depth_lies_on_the_surface_of_what_was_met(index):
+    """Independent of how it was found: the point at that depth fulfils the solid's equation."""
+    plan = plan_scene(SynthRequest(family="Uniform", size_px=48), index=index)
+    scenery = Scenery(plan.stage, moment_s=0.3, still_light=still_light(plan.stage))
+    view = plan.view(camera=2, frame=40)
+    ((_, rays),) = pixel_rays(view)
+    depth_m, solid = scenery.first_met(rays, view=view)
+
+    v, u = np.nonzero(np.isfinite(depth_m))
+    camera = np.stack(
+        [np.ones(len(u)), (u + 0.5 - 24) / plan.focal_px[0], (23.5 - v) / plan.focal_px[1]]
+    )
+    points = view.eye[:, None] + depth_m[v, u] * (view.axes @ camera)
+    checked = 0
+    for point, met in zip(points.T, solid[v, u], strict=True):
+        if met == GROUND:
+            level = point[2] - plan.stage.slope @ point[:2]
+        else:
+            shape = scenery.shapes[met - 2]
+            place = shape.axes @ (point - shape.centre) / shape.half_m
+            level = np.abs(place).max() - 1 if shape.kind == "box" else np.linalg.norm(place) - 1
+        assert abs(level) < 1e-9
+        checked += 1
+    assert checked > 1000
+
+
+def test_strips_of_a_large_picture_join_without_a_seam():
+    """A 1280 px picture is cast in strips; its rows are those of rays cast one row at a time."""
+    plan = plan_scene(SynthRequest(size_px=1280, height_px=240), index=0)
+    scenery = Scenery(plan.stage, moment_s=0.0, still_light=still_light(plan.stage))
+    view = plan.view(camera=0, frame=0)
+
+    picture, depth_m = draw_frame(scenery, view=view)
+
+    assert picture.shape == (240, 1280, 3)
+    np.testing.assert_array_equal(depth_m, draw_depth(scenery, view=view))
+    for row in (0, 101, 102, 103, 204, 239):
+        alone = View(
+            eye=view.eye,
+            axes=view.axes,
+            focal_px=view.focal_px,
+            centre_px=(view.centre_px[0], view.centre_px[1] - row),
+            size_px=(1280, 1),
+        )
+        np.testing.assert_allclose(
+            depth_m[row : row + 1], draw_depth(scenery, view=alone), rtol=1e-9
+        )

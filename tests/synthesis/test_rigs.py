@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+from scipy import stats
+
+from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.synthesis.rigs import draw_gaps_cm, lateral_places_cm, pair_distances_cm
+
+
+def gaps_cm(family, *, rigs=800):
+    rng = np.random.default_rng(5)
+    return np.array([draw_gaps_cm(family, rng=rng) for _ in range(rigs)])
+
+
+def test_ipd_gaussian_gaps_follow_the_truncated_normal_of_the_paper():
+    mean, sd, low, high = 6.38, 0.5, 4.5, 8.5
+    truncated = stats.truncnorm((low - mean) / sd, (high - mean) / sd, loc=mean, scale=sd)
+
+    assert stats.kstest(gaps_cm("IPD_Gaussian").ravel(), truncated.cdf).pvalue > 0.01
+
+
+def test_uniform_gaps_come_out_as_the_release_realised_them():
+    """Train split: mean 52.79, standard deviation 38.95, median 43.29 cm in [1, 150]."""
+    drawn = gaps_cm("Uniform").ravel()
+
+    assert drawn.min() >= 1
+    assert drawn.max() <= 150
+    assert drawn.mean() == pytest.approx(52.8, abs=2.5)
+    assert drawn.std() == pytest.approx(38.95, abs=1.5)
+    assert np.median(drawn) == pytest.approx(43.3, abs=3)
+
+
+def test_pairwise_uniform_spreads_all_pairs_up_to_two_metres():
+    """The release: 5.11 to 200.00 cm, mean 97.76, standard deviation 56.78, median 93.36."""
+    drawn = gaps_cm("Pairwise_Uniform", rigs=300)
+    pairs = np.array([pair_distances_cm(gaps) for gaps in drawn])
+
+    assert pairs.min() >= 5
+    assert 195 < pairs.max() <= 200
+    assert pairs.mean() == pytest.approx(97.8, abs=4)
+    assert pairs.std() == pytest.approx(56.8, abs=3)
+    assert np.median(pairs) == pytest.approx(93.4, abs=4)
+    assert drawn.std() == pytest.approx(20.8, abs=5)
+
+
+def test_pair_distances_of_a_rig_worked_by_hand():
+    """The gaps of the scene that was rendered elsewhere, with its recorded distances."""
+    gaps = np.array([18.5, 33.0, 9.75, 61.25, 40.5])
+
+    assert lateral_places_cm(gaps).tolist() == [0, 18.5, 51.5, 61.25, 122.5, 163.0]
+    assert pair_distances_cm(gaps).tolist() == [
+        *(18.5, 51.5, 61.25, 122.5, 163.0, 33.0, 42.75, 104.0),
+        *(144.5, 9.75, 71.0, 111.5, 61.25, 101.75, 40.5),
+    ]
+
+
+def test_a_family_without_a_rig_is_refused_by_name():
+    with pytest.raises(SynthesisError, match="family 'Wide' has no rig: ask for IPD_Gaussian"):
+        draw_gaps_cm("Wide", rng=np.random.default_rng(0))

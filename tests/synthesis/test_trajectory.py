@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from stereogenbench_data.synthesis.plan import plan_scene
+from stereogenbench_data.synthesis.request import SynthRequest
+from stereogenbench_data.synthesis.trajectory import (
+    quaternion_from_rotator,
+    rig_locations_cm,
+    rotation_from_rotator,
+)
+
+angles = st.floats(-180, 180)
+rotators = st.tuples(st.floats(-90, 90), angles, angles).map(np.array)
+
+
+def test_a_rotator_turns_the_camera_as_unreal_does():
+    """Yaw turns right, pitch up; a positive roll lowers the right hand."""
+    forward, right, up = rotation_from_rotator(np.array([0.0, 90.0, 0.0])).T
+    np.testing.assert_allclose([forward, right, up], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-15)
+
+    forward, right, up = rotation_from_rotator(np.array([90.0, 0.0, 0.0])).T
+    np.testing.assert_allclose([forward, right, up], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-15)
+
+    forward, right, up = rotation_from_rotator(np.array([0.0, 0.0, 90.0])).T
+    np.testing.assert_allclose([forward, right, up], [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-15)
+
+
+@given(rotator_deg=rotators)
+@settings(max_examples=50, deadline=None)
+def test_the_quaternion_is_the_same_rotation_as_the_matrix(rotator_deg):
+    pitch, yaw, roll = rotator_deg
+    composed = Rotation.from_euler("ZYX", [yaw, -pitch, -roll], degrees=True).as_matrix()
+
+    matrix = rotation_from_rotator(rotator_deg)
+    quaternion = quaternion_from_rotator(rotator_deg)
+
+    np.testing.assert_allclose(matrix, composed, atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_quat(quaternion).as_matrix(), composed, atol=1e-12)
+
+
+@given(rotator_deg=rotators, offset_cm=st.tuples(*[st.floats(-1e6, 1e6)] * 3).map(np.array))
+@settings(max_examples=50, deadline=None)
+def test_centres_keep_their_distances_at_any_offset(rotator_deg, offset_cm):
+    places_cm = np.array([0.0, 1.0, 6.5, 60.0, 150.0, 749.0])
+
+    centres_cm = rig_locations_cm(
+        centre_cm=np.array([-523.0, 77.0, 181.0]),
+        rotator_deg=rotator_deg,
+        places_cm=places_cm,
+        offset_cm=offset_cm,
+    )
+
+    distances_cm = np.linalg.norm(centres_cm[1:] - centres_cm[:-1], axis=1)
+    np.testing.assert_allclose(distances_cm, np.diff(places_cm), rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("family", ["IPD_Gaussian", "Uniform", "Pairwise_Uniform"])
+@pytest.mark.parametrize("index", range(4))
+def test_a_path_turns_in_every_way_and_smoothly(family, index):
+    plan = plan_scene(SynthRequest(family=family), index=index)
+
+    rotators = np.array([plan.path.rotator_deg(plan.moment_s(frame)) for frame in range(81)])
+    centres = np.array([plan.path.centre_m(plan.moment_s(frame)) for frame in range(81)])
+
+    assert (np.ptp(rotators, axis=0) > [0.3, 2.0, 1.0]).all()
+    assert np.abs(np.diff(rotators, axis=0)).max() < 2.5
+    assert np.abs(np.diff(rotators, n=2, axis=0)).max() < 0.3
+    assert np.linalg.norm(np.diff(centres, axis=0), axis=1).max() < 0.3
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_the_rig_looks_at_the_subject_from_above_the_ground(index):
+    plan = plan_scene(SynthRequest(family="Uniform"), index=index)
+
+    for frame in range(0, 81, 8):
+        view = plan.view(camera=0, frame=frame)
+        other = plan.view(camera=5, frame=frame)
+        middle = (view.eye + other.eye) / 2
+        hips = plan.stage.walker(plan.moment_s(frame))[0].centre
+        forward, right, up = view.axes.T @ (hips - middle)
+        assert abs(right) < 0.35 * forward * 23.76 / plan.focal_mm + 0.4
+        assert abs(up) < 0.5 * forward * 23.76 / plan.focal_mm
+        for eye in (view.eye, other.eye):
+            assert eye[2] > plan.stage.ground_m(*eye[:2]) + 0.15
+
+
+def test_focal_lengths_fill_the_range_of_the_release():
+    focal_mm = [plan_scene(SynthRequest(), index=index).focal_mm for index in range(60)]
+
+    assert 18 <= min(focal_mm) < 25
+    assert 78 < max(focal_mm) <= 85

@@ -1,0 +1,44 @@
+"""What the README says is so: its Python runs, its table of fields is the code's."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from stereogenbench_data import PAIR_FIELDS
+from stereogenbench_data.synthesis import SynthRequest, synthesise
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def folder_with_scenes(tmp_path_factory):
+    """A folder that holds ``scenes/``, as the README has its reader make."""
+    folder = tmp_path_factory.mktemp("readme")
+    synthesise(
+        folder / "scenes", SynthRequest(family="Uniform", scenes=3, size_px=64, frames=5, seed=6)
+    )
+    return folder
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=[f"block {n + 1}" for n in range(len(BLOCKS))])
+def test_a_block_of_python_runs(folder_with_scenes, monkeypatch, block):
+    monkeypatch.chdir(folder_with_scenes)
+
+    exec(compile(block, README.name, "exec"), {})
+
+
+def test_there_are_blocks_to_run():
+    assert len(BLOCKS) >= 3
+
+
+def test_the_table_of_fields_is_the_codes():
+    table = README.read_text().split("<!-- fields -->")[1].split("<!-- /fields -->")[0]
+    told = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|$", table, flags=re.MULTILINE)
+
+    assert told == [
+        (name, f"{field.dtype} {field.shape}".strip() if field.dtype != "str" else "str",
+         field.meaning)
+        for name, field in PAIR_FIELDS.items()
+    ]  # fmt: skip
