@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
-import av
 from av.container import InputContainer
 from av.packet import Packet
 from av.video.frame import VideoFrame
@@ -57,7 +56,7 @@ class Decoder:
         self._knows_key_frames = self._stream.frames > 0
         self._packets: Iterator[VideoPacket] = container.demux(self._stream)
         self._pending: deque[tuple[int, VideoFrame]] = deque()
-        # The frame at which decoding began: pictures shown before it are not whole.
+        # The frame at which decoding began.
         self._key = 0
         # The frame after the last one given, and the frames whose packets came from there on.
         self._next = 0
@@ -93,7 +92,7 @@ class Decoder:
         found = -1
         while found < index:
             found, frame = self._pull()
-            if found >= self._key and frame.is_corrupt:
+            if frame.is_corrupt:
                 raise Astray(f"the picture of frame {found} is damaged")
         if found > index:
             raise Astray(f"frame {found} came where frame {index} was due")
@@ -153,20 +152,13 @@ class Decoder:
         return self._pending.popleft()
 
     def _feed(self, packet: VideoPacket) -> None:
-        is_whole = True
-        if packet.size and not packet.is_discard:
-            is_whole = self._register(packet)
-        # A picture shown before the key frame lacks what it is predicted from: it may fail.
-        try:
-            frames = packet.decode()
-        except av.FFmpegError:
-            if is_whole:
-                raise
+        # After a seek, a picture shown before the key frame lacks what it is predicted from.
+        if packet.size and not packet.is_discard and self._registered(packet) < self._key:
             return
-        self._pending.extend((self._index(frame), frame) for frame in frames)
+        self._pending.extend((self._index(frame), frame) for frame in packet.decode())
 
-    def _register(self, packet: VideoPacket) -> bool:
-        """Take note of a packet; return whether its picture can be decoded whole."""
+    def _registered(self, packet: VideoPacket) -> int:
+        """Take note of a packet that is to be decoded; return the frame that it stands for."""
         index = self._index(packet)
         if packet.is_corrupt:
             raise Astray(f"the packet of frame {index} is cut short")
@@ -175,4 +167,4 @@ class Decoder:
         self._fed.add(index)
         self._newest = max(self._newest, index)
         self._context.skip_frame = "NONREF" if index < self._skip_until else "DEFAULT"
-        return index >= self._key
+        return index

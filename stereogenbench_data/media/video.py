@@ -6,7 +6,7 @@ expect (a gap, a cut, a damaged packet), reading is an error, never a neighbouri
 
 from dataclasses import replace
 from types import TracebackType
-from typing import Final, Literal, NoReturn, Self
+from typing import Final, Literal, NoReturn
 
 import av
 import numpy as np
@@ -175,7 +175,7 @@ class VideoReader:
         self._current = None
         self._drop_decoder()
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "VideoReader":
         """Return the reader itself."""
         return self
 

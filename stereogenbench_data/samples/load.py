@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Shaped
@@ -41,6 +41,7 @@ Sample = dict[str, Any]
 Clip = Literal["frame", "clip"]
 
 
+@runtime_checkable
 class Transform(Protocol):
     """What changes pictures and cameras together.
 

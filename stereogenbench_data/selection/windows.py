@@ -5,7 +5,7 @@ A window is the frames of one sample: one frame, or a clip of several.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -21,6 +21,7 @@ FramesSpec = (
 )
 
 
+@runtime_checkable
 class Windows(Protocol):
     """A rule that gives the windows of a scene with a known number of frames."""
 

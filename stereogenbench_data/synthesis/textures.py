@@ -156,7 +156,7 @@ def _clouds(rng: np.random.Generator) -> Tile:
 
 
 def _grain(rng: np.random.Generator) -> Tile:
-    return 0.5 + 0.13 * np.repeat(_noise(rng, slope=0.75, low=6), 3, axis=2)
+    return 0.5 + 0.13 * np.repeat(_noise(rng, slope=0.75, low=6.0), 3, axis=2)
 
 
 def _plaster(rng: np.random.Generator) -> Tile:

@@ -14,7 +14,6 @@ import pytest
 FRAMES = 4
 SIZE = (24, 32)
 PLACES_CM = (0.0, 10.0, 25.0, 31.0, 60.0, 72.5)
-MarkedRoot = tuple[Path, str]
 
 
 def write_video(

@@ -1,0 +1,115 @@
+"""Clips whose every frame carries its own number, written and read back by ffmpeg's own binary."""
+
+import subprocess
+from collections.abc import Collection
+from pathlib import Path
+
+import av
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from scipy import ndimage
+
+FRAMES, HEIGHT, WIDTH = 48, 64, 96
+BLOCK = 8  # a painted bit is a square of so many pixels
+
+
+def painted(frames: int = FRAMES) -> np.ndarray:
+    """Return a moving texture, (frames, h, w, 3), with the frame's number in blocks at the top."""
+    rng = np.random.default_rng(0)
+    wide = ndimage.gaussian_filter(rng.normal(size=(HEIGHT, WIDTH + 2 * frames, 3)), (1, 1, 0))
+    wide = np.uint8((wide - wide.min()) / np.ptp(wide) * 255)
+    pictures = np.stack([wide[:, 2 * i : 2 * i + WIDTH] for i in range(frames)])
+    for index, picture in enumerate(pictures):
+        for bit in range(8):
+            picture[:BLOCK, bit * BLOCK : (bit + 1) * BLOCK] = 255 * (index >> bit & 1)
+    return pictures
+
+
+class Clips:
+    """A folder of clips, each made once."""
+
+    frames, height, width = FRAMES, HEIGHT, WIDTH
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.pictures = painted()
+
+    def ffmpeg(self, *arguments: object, stdin: bytes = b"") -> bytes:
+        """Run ffmpeg; return what it writes."""
+        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *map(str, arguments)]
+        return subprocess.run(command, input=stdin, capture_output=True, check=True).stdout
+
+    def rgb(
+        self, name: str, *codec: str, pictures: np.ndarray | None = None, rate: str = "15"
+    ) -> Path:
+        """Encode pictures, the painted ones unless others are given."""
+        return self._encode(
+            name, *codec, pictures=self.pictures if pictures is None else pictures,
+            pixel_format="rgb24", rate=rate,
+        )  # fmt: skip
+
+    def gray(self, name: str, *codec: str, pictures: np.ndarray, pixel_format: str) -> Path:
+        """Encode pictures of one number a pixel."""
+        return self._encode(
+            name, *codec, pictures=pictures, pixel_format=pixel_format, rate="15"
+        )  # fmt: skip
+
+    def _encode(
+        self, name: str, *codec: str, pictures: np.ndarray, pixel_format: str, rate: str
+    ) -> Path:
+        path = self.folder / name
+        if not path.exists():
+            height, width = pictures.shape[1:3]
+            source = ("-f", "rawvideo", "-pix_fmt", pixel_format, "-s", f"{width}x{height}")
+            self.ffmpeg(*source, "-r", rate, "-i", "-", *codec, path, stdin=pictures.tobytes())
+        return path
+
+    def truth(self, path: Path) -> np.ndarray:
+        """Return all frames as ffmpeg itself decodes them to rgb24, as (frames, 3, h, w)."""
+        raw = self.ffmpeg(
+            "-i", path, "-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"
+        )
+        pictures = np.frombuffer(raw, np.uint8).reshape(-1, HEIGHT, WIDTH, 3)
+        return pictures.transpose(0, 3, 1, 2)
+
+    def remuxed(self, source: Path, name: str, *, without: Collection[int] = ()) -> Path:
+        """Copy a clip's packets, but for some of them as stored."""
+        path = self.folder / name
+        if path.exists():
+            return path
+        with av.open(str(source)) as old, av.open(str(path), "w") as new:
+            stream = new.add_stream_from_template(old.streams.video[0])
+            packets = (packet for packet in old.demux(video=0) if packet.size)
+            for number, packet in enumerate(packets):
+                if number not in without:
+                    packet.stream = stream
+                    new.mux(packet)
+        return path
+
+    def damaged(self, source: Path, name: str, *, packet: int) -> Path:
+        """Copy a clip and change bytes in the middle of one of its packets."""
+        with av.open(str(source)) as container:
+            places = [(p.pos, p.size) for p in container.demux(video=0) if p.size]
+        content = bytearray(source.read_bytes())
+        position, size = places[packet]
+        middle = content.find(self._packet(source, packet), position) + size // 2
+        content[middle : middle + 8] = bytes(byte ^ 0xA5 for byte in content[middle : middle + 8])
+        path = self.folder / name
+        path.write_bytes(content)
+        return path
+
+    def _packet(self, source: Path, number: int) -> bytes:
+        with av.open(str(source)) as container:
+            packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+        return packets[number]
+
+    def number(self, rgb: np.ndarray) -> int:
+        """Return the number painted into a frame, (3, h, w)."""
+        blocks = rgb[1, :BLOCK, : 8 * BLOCK].reshape(BLOCK, 8, BLOCK).mean(axis=(0, 2))
+        return sum(1 << bit for bit, level in enumerate(blocks) if level > 127)
+
+
+@pytest.fixture(scope="session")
+def clips(tmp_path_factory: pytest.TempPathFactory) -> Clips:
+    return Clips(tmp_path_factory.mktemp("clips"))

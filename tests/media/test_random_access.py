@@ -1,0 +1,151 @@
+"""Any frame, in any order, is the one that ffmpeg decodes at that place."""
+
+import random
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from stereogenbench_data.media.video import VideoReader, read_rgb
+
+X264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p")
+STRUCTURES = {
+    "one group with b-pyramid": X264,
+    "groups of 12": (*X264, "-g", "12"),
+    "open groups": (*X264, "-x264-params", "open-gop=1:keyint=10:scenecut=0:bframes=3"),
+    "key frames only": (*X264, "-g", "1"),
+    "no b-frames": (*X264, "-bf", "0", "-g", "10"),
+    "deep pyramid": (*X264, "-bf", "8", "-x264-params", "b-pyramid=strict:b-adapt=0:keyint=30"),
+    "many references": (*X264, "-preset", "veryslow", "-refs", "8", "-g", "20"),
+    "intra refresh": (*X264, "-x264-params", "intra-refresh=1:keyint=15"),
+    "no reorder information": (*X264, "-g", "15", "-bsf:v", "filter_units=remove_types=6"),
+    "mpeg4": ("-c:v", "mpeg4", "-q:v", "3", "-g", "12"),
+    "mpeg4 with b-frames": ("-c:v", "mpeg4", "-q:v", "3", "-bf", "2", "-g", "12"),
+    "hevc": ("-c:v", "libx265", "-pix_fmt", "yuv420p", "-x265-params", "log-level=0:keyint=20"),
+    "ffv1": ("-c:v", "ffv1", "-pix_fmt", "yuv420p"),
+}
+
+
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_every_frame_in_random_order_is_ffmpegs_own(clips, structure):
+    suffix = "mkv" if structure == "ffv1" else "mp4"
+    path = clips.rgb(f"{structure}.{suffix}", *STRUCTURES[structure])
+    truth = clips.truth(path)
+    order = random.Random(1).sample(range(clips.frames), clips.frames)
+
+    with VideoReader(path, name="clip", frames=clips.frames) as reader:
+        for index in [*range(clips.frames), *order]:
+            np.testing.assert_array_equal(read_rgb(reader, index), truth[index])
+
+
+@pytest.mark.parametrize("structure", ["groups of 12", "open groups", "mpeg4 with b-frames"])
+def test_frames_of_matroska_are_found_like_those_of_mp4(clips, structure):
+    path = clips.rgb(f"{structure}.mkv", *STRUCTURES[structure])
+    truth = clips.truth(path)
+
+    with VideoReader(path, name="clip", frames=clips.frames) as reader:
+        for index in random.Random(2).sample(range(clips.frames), clips.frames):
+            np.testing.assert_array_equal(read_rgb(reader, index), truth[index])
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@given(order=st.lists(st.integers(0, 47), min_size=1, max_size=6))
+@pytest.mark.parametrize("structure", ["one group with b-pyramid", "groups of 12"])
+def test_any_walk_over_the_frames_shows_the_painted_numbers(clips, structure, order):
+    path = clips.rgb(f"{structure}.mp4", *STRUCTURES[structure])
+
+    with VideoReader(path, name="clip", frames=clips.frames) as reader:
+        shown = [clips.number(read_rgb(reader, index)) for index in order]
+
+    assert shown == order
+
+
+def test_the_last_frames_come_out_of_the_decoders_buffer(clips):
+    path = clips.rgb("one group with b-pyramid.mp4", *X264)
+
+    with VideoReader(path, name="clip", frames=clips.frames) as reader:
+        shown = [clips.number(read_rgb(reader, index)) for index in (47, 46, 47, 0, 47)]
+
+    assert shown == [47, 46, 47, 0, 47]
+
+
+def test_a_variable_frame_rate_is_counted_by_order_and_not_by_time(clips):
+    path = clips.rgb(
+        "variable.mkv", "-vf", "setpts='(N+N*N/40)/15/TB'", "-fps_mode", "vfr", *X264, "-g", "12"
+    )
+    frames = len(clips.truth(path))
+
+    with VideoReader(path, name="clip", frames=frames) as reader:
+        shown = [clips.number(read_rgb(reader, index)) for index in (30, 5, 47, 0, 46)]
+
+    assert (frames, shown) == (48, [30, 5, 47, 0, 46])
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_late_start_does_not_shift_the_numbers(clips, suffix):
+    source = clips.rgb("groups of 12.mp4", *STRUCTURES["groups of 12"])
+    path = clips.folder / f"late.{suffix}"
+    clips.ffmpeg("-i", source, "-c", "copy", "-output_ts_offset", "2.03", path)
+
+    with VideoReader(path, name="clip", frames=clips.frames) as reader:
+        shown = [clips.number(read_rgb(reader, index)) for index in (40, 0, 1, 47)]
+
+    assert shown == [40, 0, 1, 47]
+
+
+@pytest.mark.parametrize("flags", ["", "+negative_cts_offsets", "+frag_keyframe+empty_moov"])
+def test_other_ways_of_writing_mp4_do_not_shift_the_numbers(clips, flags):
+    source = clips.rgb("groups of 12.mp4", *STRUCTURES["groups of 12"])
+    path = clips.folder / f"written{flags}.mp4"
+    clips.ffmpeg("-i", source, "-c", "copy", "-use_editlist", "0", "-movflags", flags, path)
+
+    with VideoReader(path, name="clip", frames=clips.frames) as reader:
+        shown = [clips.number(read_rgb(reader, index)) for index in (40, 0, 1, 47)]
+
+    assert shown == [40, 0, 1, 47]
+
+
+def test_an_edit_list_that_hides_frames_counts_those_that_are_left(clips):
+    source = clips.rgb("groups of 12.mp4", *STRUCTURES["groups of 12"])
+    path = clips.folder / "edited.mp4"
+    clips.ffmpeg("-ss", "1.01", "-i", source, "-c", "copy", path)
+    truth = clips.truth(path)
+
+    with VideoReader(path, name="clip", frames=len(truth)) as reader:
+        for index in (20, 0, len(truth) - 1, 1):
+            np.testing.assert_array_equal(read_rgb(reader, index), truth[index])
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_rate_that_no_clock_ticks_is_followed(clips, suffix):
+    path = clips.rgb(f"film.{suffix}", *X264, "-g", "12", rate="24000/1001")
+
+    with VideoReader(path, name="clip", frames=clips.frames) as reader:
+        shown = [clips.number(read_rgb(reader, index)) for index in (33, 7, 47)]
+
+    assert (shown, reader.facts.frame_rate_hz) == ([33, 7, 47], pytest.approx(24000 / 1001))
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_clip_of_one_frame_is_read(clips, suffix):
+    path = clips.rgb(f"single.{suffix}", *X264, pictures=clips.pictures[5:6])
+
+    with VideoReader(path, name="clip", frames=1) as reader:
+        assert clips.number(read_rgb(reader, 0)) == 5
+
+
+def test_the_rendered_scene_is_ffmpegs_own_at_frames_far_apart(clips, shared_scenes):
+    path = next(shared_scenes.rglob("cam_02_rgb.mp4"))
+    frames = (77, 0, 40)
+    select = "+".join(f"eq(n,{index})" for index in frames)
+    raw = clips.ffmpeg(
+        "-i", path, "-vf", f"select='{select}'", "-fps_mode", "passthrough",
+        "-f", "rawvideo", "-pix_fmt", "rgb24", "-",
+    )  # fmt: skip
+    truth = dict(zip(sorted(frames), np.frombuffer(raw, np.uint8).reshape(-1, 320, 320, 3)))
+
+    with VideoReader(path, name="clip", frames=81) as reader:
+        for index in frames:
+            rgb = read_rgb(reader, index)
+            np.testing.assert_array_equal(rgb.transpose(1, 2, 0), truth[index])
