@@ -83,7 +83,7 @@ def test_every_public_name_can_be_had_and_says_what_it_is():
     for name in stereogenbench_data.__all__:
         public = getattr(stereogenbench_data, name)
 
-        assert isinstance(public, dict) or len(public.__doc__ or "") > 40, name
+        assert isinstance(public, dict) or len(public.__doc__ or "") > 30, name
 
 
 def test_an_unknown_public_name_is_an_attribute_error():

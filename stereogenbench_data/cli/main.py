@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import dataclass
+from importlib.metadata import version as package_version
 from typing import Annotated
 
 import typer
@@ -36,9 +37,7 @@ app.command()(index)
 
 def _print_version(value: bool) -> None:
     if value:
-        from stereogenbench_data import __version__
-
-        typer.echo(f"stereogenbench-data {__version__}")
+        typer.echo(f"stereogenbench-data {package_version('stereogenbench-data')}")
         raise typer.Exit
 
 

@@ -17,7 +17,13 @@ from stereogenbench_data.samples.fields import (
     VIEW_FIELDS,
     require_fields,
 )
-from stereogenbench_data.samples.load import Request, Sample, SampleLoader, Transform
+from stereogenbench_data.samples.load import (
+    Request,
+    Sample,
+    SampleLoader,
+    Transform,
+    require_whole_depth,
+)
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.filters import SceneFilters
@@ -34,6 +40,7 @@ class _MappedScenes(Dataset[Sample]):
     """Samples of a plan by number, loaded in whatever process asks."""
 
     def __init__(self, index: SceneIndex, plan: Plan, request: Request) -> None:
+        require_whole_depth(index, plan, request)
         self.index = index
         self.plan = plan
         self._loader = SampleLoader(index, request)
@@ -133,6 +140,8 @@ class StereoPairs(_MappedScenes):
                 there is; or if a pair, frame or filter does not exist.
             FieldError: If a field does not exist, or a size is not one.
             StorageError: If the data are not there, or hold broken scenes (all are named).
+            MediaError: If depth that a field needs cannot have been stored whole (8 bits, a lossy
+                codec, chroma) and the depth contract does not accept it.
         """
         index = open_index(data)
         plan = plan_pairs(index, seed=require_seed(seed), **selection)

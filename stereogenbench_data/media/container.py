@@ -8,14 +8,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import BinaryIO, Final, Literal
+from typing import Final, Literal, Protocol, runtime_checkable
 
 import av
 from av.container import InputContainer
 
 from stereogenbench_data.errors import MediaError, StorageError
 
-VideoFile = str | Path | BinaryIO
+
+@runtime_checkable
+class BinaryFile(Protocol):
+    """An open binary file that can be sought in, such as `open(path, "rb")` or `io.BytesIO`."""
+
+    def read(self, size: int = -1, /) -> bytes:
+        """Return at most so many bytes."""
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        """Go to a place; return it."""
+
+    def tell(self) -> int:
+        """Return where the file stands."""
+
+
+VideoFile = str | Path | BinaryFile
 
 _OPTIONS: Final = {"format_whitelist": "mov,matroska"}
 _UNDECODED: Final = {**_OPTIONS, "probesize": "32", "skip_frame": "all"}

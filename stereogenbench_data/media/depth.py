@@ -71,14 +71,16 @@ def _unit_m(value: str) -> float | None:
     return unit_m if math.isfinite(unit_m) and unit_m > 0 else None
 
 
-def require_depth_stream(facts: StreamFacts, encoding: DepthEncoding, *, name: str) -> None:
+def require_depth_stream(
+    *, codec: str, pixel_format: str, encoding: DepthEncoding, name: str
+) -> None:
     """Refuse a stream that cannot have kept 16-bit depth whole, unless the encoding accepts it.
 
     Raises:
         MediaError: If the stream stores colours, or has a risk (8 bits, a lossy codec, chroma
             planes) that ``encoding.accept`` does not name.
     """
-    _accepted_layout(facts, encoding, name=name)
+    _accepted_layout(codec, pixel_format, encoding, name=name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,9 +102,11 @@ def _layout(pixel_format: str) -> _Layout | None:
     return _Layout(bits, has_chroma=match["kind"] != "gray", dtype=dtype)
 
 
-def _accepted_layout(facts: StreamFacts, encoding: DepthEncoding, *, name: str) -> _Layout:
-    layout = _layout(facts.pixel_format)
-    stored = f"{name}: depth is stored by codec {facts.codec} as {facts.pixel_format}"
+def _accepted_layout(
+    codec: str, pixel_format: str, encoding: DepthEncoding, *, name: str
+) -> _Layout:
+    layout = _layout(pixel_format)
+    stored = f"{name}: depth is stored by codec {codec} as {pixel_format}"
     if layout is None:
         raise MediaError(
             f"{stored}, which is not one number of 8 to 16 bits a pixel: no DepthEncoding accepts "
@@ -110,7 +114,7 @@ def _accepted_layout(facts: StreamFacts, encoding: DepthEncoding, *, name: str) 
         )
     risks: dict[DepthRisk, bool] = {
         "8-bit": layout.bits == 8,
-        "lossy": facts.codec not in _LOSSLESS_CODECS,
+        "lossy": codec not in _LOSSLESS_CODECS,
         "chroma": layout.has_chroma,
     }
     refused = [risk for risk, present in risks.items() if present and risk not in encoding.accept]
@@ -140,7 +144,8 @@ def read_depth_units(
     Raises:
         MediaError: If the stream is refused (see `require_depth_stream`) or does not decode.
     """
-    layout = _accepted_layout(reader.facts, encoding, name=reader.name)
+    facts = reader.facts
+    layout = _accepted_layout(facts.codec, facts.pixel_format, encoding, name=reader.name)
     return plane_numbers(reader.frame(index), 0, dtype=layout.dtype).astype(np.uint16)
 
 

@@ -168,9 +168,9 @@ class PairGeometry:
         focal_px = self._views.intrinsics.fx_px
         if self._encoding.form == "inverse":
             half_step_px = focal_px * abs(self.baseline_m) / self._encoding.unit_m / 2
-            bound: MapF32 = self.stored.measured * np.float32(half_step_px)
-            return bound
-        bound = disparity_error_px(
+            flat: MapF32 = self.stored.measured * np.float32(half_step_px)
+            return flat
+        bound: MapF32 = disparity_error_px(
             self.depth_m,
             focal_px=focal_px,
             baseline_m=self.baseline_m,

@@ -1,6 +1,7 @@
 """One sample: from its address to its fields, reading and decoding only what the fields need."""
 
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol, runtime_checkable
@@ -11,7 +12,11 @@ from jaxtyping import Shaped
 from stereogenbench_data.errors import MediaError, SchemaError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.media.depth import depth_frame_index, measured
+from stereogenbench_data.media.depth import (
+    depth_frame_index,
+    measured,
+    require_depth_stream,
+)
 from stereogenbench_data.samples.derive import (
     PAIR_BUILDERS,
     RECTIFIED_PX,
@@ -33,7 +38,7 @@ from stereogenbench_data.samples.views import StoredDepth, Views
 from stereogenbench_data.schema.parse import parse_trajectory
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import TRAJECTORY_JSON, depth_name, rgb_name
-from stereogenbench_data.selection.plan import Address
+from stereogenbench_data.selection.plan import Address, Plan
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.source import member_path, read_member
 
@@ -107,6 +112,42 @@ SWAPPED: Final[dict[Stream, Stream]] = {
 }
 KEPT_POSES: Final = 32
 """Of how many scenes the poses are kept (46 kB a scene of 81 frames)."""
+
+
+def require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None:
+    """Refuse, before anything is read, depth that cannot have been stored whole.
+
+    Raises:
+        MediaError: Naming the first file that a sample needs whose codec or pixel format loses
+            depth, unless the request's depth contract accepts it.
+    """
+    if not request.streams & {"source_depth", "target_depth"}:
+        return
+    stored = np.stack([index.column("depth_codec"), index.column("depth_pixel_format")], axis=-1)
+    encoding = request.depth or DepthEncoding()
+    for codec, pixel_format in sorted(set(map(tuple, stored.reshape(-1, 2)))):
+        try:
+            require_depth_stream(
+                codec=codec, pixel_format=pixel_format, encoding=encoding, name="depth"
+            )
+        except MediaError:
+            uses = (stored == (codec, pixel_format)).all(axis=-1)
+            for row, camera in _depth_reads(plan, request):
+                if uses[row, camera]:
+                    name = index.scene(row).members[depth_name(camera)].path
+                    require_depth_stream(
+                        codec=codec, pixel_format=pixel_format, encoding=encoding, name=name
+                    )
+
+
+def _depth_reads(plan: Plan, request: Request) -> Iterator[tuple[int, int]]:
+    """Yield the (row, camera) of every depth video that samples need."""
+    pairs = plan.pairs
+    if "source_depth" in request.streams:
+        yield from zip(pairs.row.tolist(), pairs.source.tolist(), strict=True)
+    if "target_depth" in request.streams:
+        for row, targets in zip(pairs.row.tolist(), pairs.targets.tolist(), strict=True):
+            yield from ((row, target) for target in targets if target >= 0)
 
 
 class SampleLoader:

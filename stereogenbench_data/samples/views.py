@@ -17,15 +17,15 @@ Pictures = UInt8[np.ndarray, "t 3 h w"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredDepth:
-    """Depth as it is stored, over the frames of a sample.
+    """Depth as it is stored, of one frame or over the frames of a sample.
 
     Attributes:
-        units: (t, h, w) uint16, stored numbers.
-        measured: (t, h, w) bool, where they mean a depth.
+        units: (t, h, w) or (h, w) uint16, stored numbers.
+        measured: (t, h, w) or (h, w) bool, where they mean a depth.
     """
 
-    units: UInt16[np.ndarray, "t h w"]
-    measured: Bool[np.ndarray, "t h w"]
+    units: UInt16[np.ndarray, "*t h w"]
+    measured: Bool[np.ndarray, "*t h w"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

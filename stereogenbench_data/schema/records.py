@@ -184,6 +184,8 @@ class Scene:
             the pose chain, in pixels of the recorded image.
         depth_unit_m: Metres in a stored unit for each camera's depth, as tagged or by default.
         depth_unit_source: "tag" or "default", for each camera.
+        depth_codec: FFmpeg's name of the codec of each camera's depth.
+        depth_pixel_format: FFmpeg's name of the pixel format of each camera's depth.
         frames: Frames that every video and the trajectory have.
         members: File name to the place of its bytes.
     """
@@ -198,5 +200,7 @@ class Scene:
     rig_residual_px: float
     depth_unit_m: tuple[float, ...]
     depth_unit_source: tuple[str, ...]
+    depth_codec: tuple[str, ...]
+    depth_pixel_format: tuple[str, ...]
     valid_depth_ratio: float | None
     members: Mapping[str, Member] = field(hash=False)

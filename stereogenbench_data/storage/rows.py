@@ -26,6 +26,10 @@ def _numbers(count: int) -> pa.DataType:
     return pa.list_(pa.field("item", pa.float64(), nullable=False), count)
 
 
+def _texts(count: int) -> pa.DataType:
+    return pa.list_(pa.field("item", pa.string(), nullable=False), count)
+
+
 _REQUIRED: Final = {
     "key": pa.string(),
     "split": pa.string(),
@@ -46,7 +50,9 @@ _REQUIRED: Final = {
     "lateral_m": _numbers(CAMERA_COUNT),
     "rig_residual_px": pa.float64(),
     "depth_unit_m": _numbers(CAMERA_COUNT),
-    "depth_unit_source": pa.list_(pa.field("item", pa.string(), nullable=False), CAMERA_COUNT),
+    "depth_unit_source": _texts(CAMERA_COUNT),
+    "depth_codec": _texts(CAMERA_COUNT),
+    "depth_pixel_format": _texts(CAMERA_COUNT),
     "members": pa.list_(pa.field("item", _MEMBER, nullable=False)),
 }
 _OPTIONAL: Final = {
@@ -104,6 +110,8 @@ def row_of(scene: Scene) -> dict[str, Any]:
         "rig_residual_px": scene.rig_residual_px,
         "depth_unit_m": list(scene.depth_unit_m),
         "depth_unit_source": list(scene.depth_unit_source),
+        "depth_codec": list(scene.depth_codec),
+        "depth_pixel_format": list(scene.depth_pixel_format),
         "valid_depth_ratio": scene.valid_depth_ratio,
         "members": [
             {"name": name, "path": member.path, "offset": member.offset, "size": member.size}
@@ -144,6 +152,8 @@ def scene_of(row: Mapping[str, Any]) -> Scene:
         rig_residual_px=row["rig_residual_px"],
         depth_unit_m=tuple(row["depth_unit_m"]),
         depth_unit_source=tuple(row["depth_unit_source"]),
+        depth_codec=tuple(row["depth_codec"]),
+        depth_pixel_format=tuple(row["depth_pixel_format"]),
         valid_depth_ratio=row["valid_depth_ratio"],
         members={
             item["name"]: Member(item["path"], item["offset"], item["size"])

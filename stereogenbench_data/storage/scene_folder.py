@@ -124,10 +124,8 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     rig = _sized_as_videos(key, rig, facts)
     poses = CameraPoses.from_trajectory(trajectory)
     _require_recorded_baselines(key, rig, poses)
-    encodings = [
-        resolve_encoding(facts[name], name=f"{key}/{name}")
-        for name in map(depth_name, range(CAMERA_COUNT))
-    ]
+    depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
+    encodings = [resolve_encoding(facts[name], name=f"{key}/{name}") for name in depth_names]
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames, encodings)
     return Scene(
         id=parse_scene_key(key),
@@ -140,6 +138,8 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         rig_residual_px=rectification_residual_px(poses, rig_intrinsics(rig)),
         depth_unit_m=tuple(encoding.unit_m for encoding in encodings),
         depth_unit_source=tuple(encoding.source for encoding in encodings),
+        depth_codec=tuple(facts[name].codec for name in depth_names),
+        depth_pixel_format=tuple(facts[name].pixel_format for name in depth_names),
         valid_depth_ratio=ratio,
         members={name: Member(f"{key}/{name}", 0, size) for name, (size, _) in files.items()},
     )

@@ -1,5 +1,6 @@
 """Clips whose every frame carries its own number, written and read back by ffmpeg's own binary."""
 
+import io
 import subprocess
 from collections.abc import Collection
 from pathlib import Path
@@ -26,6 +27,18 @@ def painted(frames: int = FRAMES) -> np.ndarray:
     return pictures
 
 
+class CountingFile(io.BytesIO):
+    """A file in memory that counts the bytes read from it."""
+
+    bytes_read = 0
+
+    def read(self, size: int | None = -1) -> bytes:
+        """Read, and count."""
+        content = super().read(size)
+        self.bytes_read += len(content)
+        return content
+
+
 class Clips:
     """A folder of clips, each made once."""
 
@@ -37,7 +50,13 @@ class Clips:
 
     def ffmpeg(self, *arguments: object, stdin: bytes = b"") -> bytes:
         """Run ffmpeg; return what it writes."""
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *map(str, arguments)]
+        command = [
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            "-loglevel",
+            "error",
+            "-y",
+            *map(str, arguments),
+        ]
         return subprocess.run(command, input=stdin, capture_output=True, check=True).stdout
 
     def rgb(
@@ -88,21 +107,24 @@ class Clips:
         return path
 
     def damaged(self, source: Path, name: str, *, packet: int) -> Path:
-        """Copy a clip and change bytes in the middle of one of its packets."""
-        with av.open(str(source)) as container:
-            places = [(p.pos, p.size) for p in container.demux(video=0) if p.size]
+        """Copy a clip and change a third of one of its packets, in the middle."""
+        payload = self.packets(source)[packet]
         content = bytearray(source.read_bytes())
-        position, size = places[packet]
-        middle = content.find(self._packet(source, packet), position) + size // 2
-        content[middle : middle + 8] = bytes(byte ^ 0xA5 for byte in content[middle : middle + 8])
+        start = content.index(payload) + len(payload) // 3
+        for at in range(start, start + len(payload) // 3):
+            content[at] ^= 0xA5
         path = self.folder / name
         path.write_bytes(content)
         return path
 
-    def _packet(self, source: Path, number: int) -> bytes:
-        with av.open(str(source)) as container:
-            packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
-        return packets[number]
+    def packets(self, path: Path) -> list[bytes]:
+        """Return a clip's packets, as stored."""
+        with av.open(str(path)) as container:
+            return [bytes(packet) for packet in container.demux(video=0) if packet.size]
+
+    def counting(self, path: Path) -> CountingFile:
+        """Return a clip's bytes as a file that counts what is read."""
+        return CountingFile(path.read_bytes())
 
     def number(self, rgb: np.ndarray) -> int:
         """Return the number painted into a frame, (3, h, w)."""

@@ -45,6 +45,8 @@ def facts(encoding, *, residual_px=0.0, order=1.0, yaw_deg=(0.0,) * 6):
         rig_residual_px=residual_px,
         depth_unit_m=(encoding.unit_m,) * 6,
         depth_unit_source=("tag",) * 6,
+        depth_codec=("ffv1",) * 6,
+        depth_pixel_format=("gray16le",) * 6,
         valid_depth_ratio=None,
         members={},
     )  # fmt: skip

@@ -41,6 +41,8 @@ def made_scene(key, *, gaps_cm=(6.0,) * 5, frames=81, primary=(0, 1), **labels):
         rig_residual_px=0.0,
         depth_unit_m=(0.1,) * 6,
         depth_unit_source=("default",) * 6,
+        depth_codec=("ffv1",) * 6,
+        depth_pixel_format=("gray16le",) * 6,
         valid_depth_ratio=labels.get("valid_depth_ratio"),
         members={},
     )

@@ -30,6 +30,8 @@ def test_a_row_says_what_the_files_say(make_scene, root):
     assert scene.rig_residual_px < 1e-9
     assert scene.depth_unit_m == (0.001,) * 6
     assert scene.depth_unit_source == ("tag",) * 6
+    assert scene.depth_codec == ("ffv1",) * 6
+    assert scene.depth_pixel_format == ("gray16le",) * 6
     assert scene.valid_depth_ratio is None
     assert len(scene.members) == 16
     size = (folder / "cam_03_depth.mkv").stat().st_size

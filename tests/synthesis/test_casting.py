@@ -39,7 +39,7 @@ def test_the_ground_is_at_height_over_descent_and_the_sky_has_no_depth():
 
 
 def test_the_depth_of_a_box_face_is_the_same_all_over_the_face():
-    """Depth is along the optical axis: a face across it has one depth, whatever the ray's length."""
+    """A face across the optical axis has one depth, whatever the length of the rays."""
     box = Shape("box", np.array([6.0, 0.0, 2.0]), np.eye(3), np.array([2.0, 1.9, 1.9]), STONE)
 
     depth_m, _ = depth_of([box], view_from([0.0, 0.0, 2.0]))
@@ -106,15 +106,15 @@ def test_every_depth_lies_on_the_surface_of_what_was_met(index):
 
 def test_strips_of_a_large_picture_join_without_a_seam():
     """A 1280 px picture is cast in strips; its rows are those of rays cast one row at a time."""
-    plan = plan_scene(SynthRequest(size_px=1280, height_px=240), index=0)
+    plan = plan_scene(SynthRequest(size_px=1280, height_px=112), index=0)
     scenery = Scenery(plan.stage, moment_s=0.0, still_light=still_light(plan.stage))
     view = plan.view(camera=0, frame=0)
 
     picture, depth_m = draw_frame(scenery, view=view)
 
-    assert picture.shape == (240, 1280, 3)
+    assert picture.shape == (112, 1280, 3)
     np.testing.assert_array_equal(depth_m, draw_depth(scenery, view=view))
-    for row in (0, 101, 102, 103, 204, 239):
+    for row in (0, 101, 102, 111):
         alone = View(
             eye=view.eye,
             axes=view.axes,

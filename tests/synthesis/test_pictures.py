@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from stereogenbench_data.synthesis import SynthRequest
+from stereogenbench_data.synthesis.plan import plan_scene
+
 
 def warped(right, disparity_px):
-    """Sample the right picture where the left one's pixels land, bilinearly; own code on purpose."""
+    """Sample the right picture where the left one's pixels land; own code on purpose."""
     height, width, _ = right.shape
     place = np.arange(width) - disparity_px
     column = np.clip(np.floor(place).astype(int), 0, width - 2)
@@ -66,12 +69,7 @@ def test_depth_has_near_far_and_sky(draw):
     assert np.percentile(units[units < 65535], 95) > 6000
 
 
-def test_the_subject_moves_between_frames(draw):
-    """Two frames of a still camera could only differ where something moves; here the rig turns,
-    so the walker is found by its own limbs."""
-    from stereogenbench_data.synthesis import SynthRequest
-    from stereogenbench_data.synthesis.plan import plan_scene
-
+def test_every_limb_of_the_subject_moves():
     stage = plan_scene(SynthRequest(), index=0).stage
     before, after = stage.walker(0.0), stage.walker(0.4)
 

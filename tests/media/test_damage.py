@@ -1,0 +1,149 @@
+"""A file that is not what it should be is an error by name, never another picture."""
+
+import numpy as np
+import pytest
+
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.depth import read_depth_units
+from stereogenbench_data.media.integrity import fails_slice_checksums
+from stereogenbench_data.media.video import VideoReader, read_rgb
+from stereogenbench_data.schema.records import DepthEncoding
+
+X264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p")
+
+
+def depth_clip(clips, name, *codec):
+    rows, columns = np.indices((64, 96))
+    ramps = [rows * 300 + columns * 7 + 11 * index for index in range(48)]
+    return clips.gray(
+        name, "-c:v", "ffv1", "-g", "12", *codec,
+        pictures=np.array(ramps, dtype="<u2"), pixel_format="gray16le",
+    )  # fmt: skip
+
+
+def outcome(reader, clips, index):
+    """Return the painted number of a frame, or the error."""
+    try:
+        return clips.number(read_rgb(reader, index))
+    except MediaError as error:
+        return str(error)
+
+
+def read_one(path, index):
+    """Open a clip of 48 frames and read one."""
+    with VideoReader(path, name="clip", frames=48) as reader:
+        return read_rgb(reader, index)
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+@pytest.mark.parametrize(("stored", "expected"), [(48, 49), (48, 47), (48, 81)])
+def test_another_number_of_frames_is_refused_when_opened(clips, suffix, stored, expected):
+    path = clips.rgb(f"groups of 12.{suffix}", *X264, "-g", "12")
+
+    with pytest.raises(MediaError, match=f"clip: holds {stored} frames where {expected} are expec"):
+        VideoReader(path, name="clip", frames=expected)
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+@pytest.mark.parametrize("lost", [0, 20, 47])
+def test_a_lost_frame_is_never_passed_over(clips, suffix, lost):
+    source = clips.rgb(f"intra.{suffix}", *X264, "-g", "1")
+    path = clips.remuxed(source, f"without {lost}.{suffix}", without=[lost])
+
+    try:
+        with VideoReader(path, name="clip", frames=48) as reader:
+            in_order = [outcome(reader, clips, index) for index in range(48)]
+            from_afar = [outcome(reader, clips, index) for index in (lost, 10, 40)]
+    except MediaError as error:
+        in_order = from_afar = [str(error)]
+
+    wrong = [f for f, index in zip(in_order, range(48)) if isinstance(f, int) and f != index]
+    assert (wrong, "clip: holds 47 frames where 48 are expected" in str(in_order)) == ([], True)
+    assert "clip: holds 47 frames where 48 are expected" in str(from_afar[0])
+
+
+@pytest.mark.parametrize("codec", [("libx264", "-bf", "0"), ("mpeg4",), ("ffv1",)])
+def test_a_picture_predicted_from_a_lost_one_is_not_given(clips, codec):
+    name = f"groups {codec[0]}"
+    source = clips.rgb(f"{name}.mkv", "-c:v", *codec, "-pix_fmt", "yuv420p", "-g", "12")
+    path = clips.remuxed(source, f"{name} without 20.mkv", without=[20])
+
+    with pytest.raises(MediaError, match="clip: holds 47 frames where 48 are expected"):
+        read_one(path, 22)
+
+
+def test_a_cut_matroska_file_gives_its_frames_up_to_the_cut(clips):
+    source = clips.rgb("groups of 12.mkv", *X264, "-g", "12")
+    path = clips.folder / "cut rgb.mkv"
+    path.write_bytes(source.read_bytes()[: source.stat().st_size // 2])
+
+    with VideoReader(path, name="clip", frames=48) as reader:
+        assert outcome(reader, clips, 5) == 5
+        with pytest.raises(
+            MediaError, match="clip: (holds .. frames where 48|is cut|cannot be read)"
+        ):
+            reader.frame(47)
+        assert outcome(reader, clips, 6) == 6
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_damaged_h264_packet_spoils_its_group_and_no_other(clips, suffix):
+    source = clips.rgb(f"slow.{suffix}", *X264, "-g", "12", "-bf", "0", "-crf", "12")
+    path = clips.damaged(source, f"damaged.{suffix}", packet=26)
+
+    with VideoReader(path, name="a/cam_03_rgb.mp4", frames=48) as reader:
+        found = [outcome(reader, clips, index) for index in (5, 26, 30, 40)]
+
+    assert (found[0], found[3]) == (5, 40)
+    assert found[1].startswith("a/cam_03_rgb.mp4: frame 26 cannot be decoded (")
+    assert found[2].endswith("damaged: compare it with its checksum, or fetch it again.")
+
+
+@pytest.mark.parametrize("codec", [(), ("-level", "4", "-strict", "-2")], ids=["v3", "v4"])
+def test_a_damaged_ffv1_slice_is_found_by_its_checksum(clips, codec):
+    source = depth_clip(clips, f"ramp{len(codec)}.mkv", *codec)
+    path = clips.damaged(source, f"damaged{len(codec)}.mkv", packet=26)
+
+    with VideoReader(path, name="clip", frames=48) as reader:
+        whole = read_depth_units(reader, 25, encoding=DepthEncoding())
+        with pytest.raises(MediaError, match=r"frame 26 cannot be decoded \(.* fails its checksum"):
+            reader.frame(26)
+
+    assert whole[0, 0] == 11 * 25
+
+
+def test_every_changed_byte_of_an_ffv1_packet_fails_its_checksums(clips):
+    packet = clips.packets(depth_clip(clips, "ramp0.mkv"))[3]
+
+    changed = [
+        packet[:at] + bytes([packet[at] ^ 1]) + packet[at + 1 :] for at in range(len(packet))
+    ]
+
+    assert not fails_slice_checksums(packet)
+    assert all(fails_slice_checksums(other) for other in changed)
+
+
+def test_ffv1_without_checksums_is_read(clips):
+    path = depth_clip(clips, "unchecked.mkv", "-slicecrc", "0")
+
+    with VideoReader(path, name="clip", frames=48) as reader:
+        assert read_depth_units(reader, 30, encoding=DepthEncoding())[0, 0] == 330
+
+
+def test_a_size_that_changes_within_the_stream_is_refused(clips):
+    small = clips.rgb("tiny.h264", *X264, "-bf", "0", pictures=clips.pictures[:6])
+    large = clips.rgb(
+        "wide.h264", *X264, "-bf", "0", pictures=clips.pictures[6:12].repeat(2, axis=2)
+    )
+    both = clips.folder / "both.h264"
+    both.write_bytes(small.read_bytes() + large.read_bytes())
+    path = clips.folder / "both.mkv"
+    clips.ffmpeg("-r", "15", "-i", both, "-c", "copy", "-bsf:v", "setts=ts=N*1200000/15", path)
+
+    with (
+        VideoReader(path, name="clip", frames=12) as reader,
+        pytest.raises(
+            MediaError, match=r"clip: frame \d is yuv420p \d+x64 where yuv420p \d+x64 is"
+        ),
+    ):
+        _ = reader.frame(0), reader.frame(9)

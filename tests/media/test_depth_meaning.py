@@ -1,0 +1,148 @@
+"""What stored depth numbers mean: unit, kind, form, what is not measured, and which frame."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.media.depth import (
+    depth_frame_index,
+    depth_m_from_units,
+    measured,
+    resolve_encoding,
+)
+from stereogenbench_data.media.video import StreamFacts
+from stereogenbench_data.schema.records import DepthEncoding
+
+
+def facts(**tags):
+    return StreamFacts(
+        codec="ffv1", pixel_format="gray16le", width_px=8, height_px=8, frames=1,
+        frame_rate_hz=15.0, tags=tags,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("tags", "unit_m", "source"),
+    [
+        pytest.param({}, 0.1, "default", id="no tag is the release's 0.1 m"),
+        pytest.param({"encoder": "Lavf"}, 0.1, "default", id="other tags tell nothing"),
+        pytest.param({"depth_scale": "0.001"}, 0.001, "tag", id="millimetres"),
+        pytest.param({"scale": " 1e-2 "}, 0.01, "tag", id="a bare scale"),
+        pytest.param({"scale": "0.010", "stream.scale": "1e-2"}, 0.01, "tag", id="two that agree"),
+    ],
+)
+def test_the_unit_is_the_tags_or_the_releases(tags, unit_m, source):
+    encoding = resolve_encoding(facts(**tags), name="clip")
+
+    assert (encoding.unit_m, encoding.source, encoding.kind) == (unit_m, source, "planar")
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [{"scale": text} for text in ("", "mm", "0", "-1", "nan", "inf", "0.1 m")]
+    + [{"depth_scale": "0.1", "stream.depth_scale": "0.001"}],
+    ids=str,
+)
+def test_tags_that_tell_no_unit_are_refused(tags):
+    told = re.escape(", ".join(f"{key}={value!r}" for key, value in tags.items()))
+
+    with pytest.raises(
+        MediaError, match=rf"clip: its tags .* found {told}: correct .*unit_m=\.\.\."
+    ):
+        resolve_encoding(facts(**tags), name="clip")
+
+
+def test_the_users_contract_wins_over_any_tag():
+    override = DepthEncoding(unit_m=0.02, kind="ray", source="tag")
+
+    encoding = resolve_encoding(facts(depth_scale="mm"), name="clip", override=override)
+
+    assert encoding == DepthEncoding(unit_m=0.02, kind="ray", source="user")
+
+
+@pytest.mark.parametrize(
+    ("pixel_format", "largest"),
+    [("gray", 255), ("gray10le", 1023), ("gray12be", 4095), ("gray16le", 65535),
+     ("yuv420p10le", 1023), ("yuvj420p", 255)],
+)  # fmt: skip
+def test_zero_and_the_formats_largest_number_are_not_measured(pixel_format, largest):
+    units = np.array([[0, 1, largest - 1, largest]], dtype=np.uint16)
+
+    found = measured(units, encoding=DepthEncoding(), pixel_format=pixel_format)
+
+    np.testing.assert_array_equal(found, [[False, True, True, False]])
+
+
+def test_numbers_that_are_not_measured_can_be_named():
+    units = np.array([[0, 7, 65535]], dtype=np.uint16)
+
+    found = measured(units, encoding=DepthEncoding(no_depth=(7,)), pixel_format="gray16le")
+
+    np.testing.assert_array_equal(found, [[True, False, True]])
+
+
+@settings(max_examples=50, deadline=None)
+@given(unit_m=st.floats(1e-5, 10))
+def test_metres_are_the_exact_product_rounded_once(unit_m):
+    units = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+    encoding = DepthEncoding(unit_m=unit_m)
+    everywhere = np.ones(units.shape, dtype=bool)
+
+    depth_m = depth_m_from_units(units, measured=everywhere, encoding=encoding)
+
+    assert depth_m.dtype == np.float32
+    np.testing.assert_array_equal(depth_m, (units.astype(float) * unit_m).astype(np.float32))
+
+
+@pytest.mark.parametrize("form", ["depth", "inverse"])
+def test_depth_is_zero_where_it_was_not_measured(form):
+    units = np.array([[0, 4, 65535, 4]], dtype=np.uint16)
+    encoding = DepthEncoding(unit_m=2.0, form=form)
+    where = np.array([[False, True, False, False]])
+
+    depth_m = depth_m_from_units(units, measured=where, encoding=encoding)
+
+    np.testing.assert_array_equal(depth_m, [[0, 8.0 if form == "depth" else 0.5, 0, 0]])
+
+
+def test_an_inverse_depth_of_zero_that_counts_is_infinitely_far():
+    units = np.array([[0, 50]], dtype=np.uint16)
+    encoding = DepthEncoding(unit_m=100.0, form="inverse", no_depth=())
+
+    depth_m = depth_m_from_units(units, measured=np.ones((1, 2), bool), encoding=encoding)
+
+    np.testing.assert_array_equal(depth_m, [[np.inf, 2.0]])
+
+
+def test_a_ray_becomes_depth_along_the_optical_axis():
+    camera = Intrinsics(
+        fx_px=1.5, fy_px=2.0, cx_px=0.5, cy_px=0.5, width_px=3, height_px=1
+    )  # the last pixel's ray is (2 / 1.5, 0, 1), 5/3 long
+    units = np.array([[10, 0, 10]], dtype=np.uint16)
+    encoding = DepthEncoding(unit_m=1.0, kind="ray")
+
+    depth_m = depth_m_from_units(units, measured=units > 0, encoding=encoding, intrinsics=camera)
+
+    assert depth_m.dtype == np.float32
+    np.testing.assert_allclose(depth_m, [[10, 0, 6]], rtol=1e-6)
+
+
+def test_a_ray_without_a_camera_is_refused():
+    units = np.ones((1, 1), dtype=np.uint16)
+
+    with pytest.raises(MediaError, match="kind 'ray' .* got None: pass intrinsics="):
+        depth_m_from_units(units, measured=units > 0, encoding=DepthEncoding(kind="ray"))
+
+
+@pytest.mark.parametrize(
+    ("index", "lag", "expected"), [(0, 0, 0), (5, 2, 7), (5, -5, 0), (5, -6, None), (79, 2, None)]
+)
+def test_a_lag_names_the_depth_frame_or_none(index, lag, expected):
+    encoding = DepthEncoding(frame_lag=lag)
+
+    assert depth_frame_index(index, encoding=encoding, frames=81) == expected

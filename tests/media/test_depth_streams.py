@@ -1,0 +1,172 @@
+"""Stored depth numbers come back bit for bit, and a stream that cannot keep them is refused."""
+
+import numpy as np
+import pytest
+
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.depth import read_depth_units, require_depth_stream
+from stereogenbench_data.media.video import StreamFacts, VideoReader, probe
+from stereogenbench_data.schema.records import DepthEncoding
+
+HEIGHT, WIDTH = 30, 54  # rows that FFmpeg pads
+
+
+def noise(bits, dtype):
+    values = np.random.default_rng(bits).integers(0, 1 << bits, (3, HEIGHT, WIDTH))
+    values[:, 0, :2] = (0, (1 << bits) - 1)
+    return values.astype(dtype)
+
+
+LOSSLESS = {
+    "gray9le": (9, "<u2", "ffv1", "mkv"),
+    "gray10le": (10, "<u2", "ffv1", "mkv"),
+    "gray12le": (12, "<u2", "ffv1", "mkv"),
+    "gray14le": (14, "<u2", "ffv1", "mkv"),
+    "gray16le": (16, "<u2", "ffv1", "mkv"),
+    "gray16le in ffvhuff": (16, "<u2", "ffvhuff", "mkv"),
+    "gray16be": (16, ">u2", "png", "mkv"),
+    "gray16be raw": (16, ">u2", "rawvideo", "mov"),
+}
+
+
+@pytest.mark.parametrize("case", LOSSLESS)
+def test_every_number_survives(clips, case):
+    bits, dtype, codec, suffix = LOSSLESS[case]
+    pictures = noise(bits, dtype)
+    path = clips.gray(
+        f"{case}.{suffix}", "-c:v", codec, pictures=pictures, pixel_format=case.split()[0]
+    )
+
+    with VideoReader(path, name="clip", frames=3) as reader:
+        units = [read_depth_units(reader, index, encoding=DepthEncoding()) for index in (2, 0, 1)]
+        assert reader.facts.pixel_format == case.split()[0]
+
+    assert all(frame.dtype == np.uint16 and frame.flags.c_contiguous for frame in units)
+    np.testing.assert_array_equal(units, pictures[[2, 0, 1]])
+
+
+@pytest.mark.parametrize("pixel_format", ["gray10be", "gray12be"])
+def test_big_endian_numbers_of_fewer_bits_are_swapped(clips, pixel_format):
+    bits = int(pixel_format[4:6])
+    pictures = noise(bits, ">u2")
+    path = clips.gray(
+        f"{pixel_format}.mkv", "-c:v", "rawvideo", "-allow_raw_vfw", "1",
+        pictures=pictures, pixel_format=pixel_format,
+    )  # fmt: skip
+
+    with VideoReader(path, name="clip", frames=3) as reader:
+        found = read_depth_units(reader, 1, encoding=DepthEncoding())
+
+    np.testing.assert_array_equal(found, pictures[1])
+
+
+def test_what_is_returned_does_not_change_with_the_next_frame(clips):
+    pictures = noise(16, "<u2")
+    path = clips.gray("gray16le.mkv", "-c:v", "ffv1", pictures=pictures, pixel_format="gray16le")
+
+    with VideoReader(path, name="clip", frames=3) as reader:
+        first = read_depth_units(reader, 0, encoding=DepthEncoding())
+        read_depth_units(reader, 1, encoding=DepthEncoding())
+
+    np.testing.assert_array_equal(first, pictures[0])
+
+
+def encoded(clips, name, *codec, bits=8):
+    dtype, pixel_format = ("u1", "gray") if bits == 8 else ("<u2", f"gray{bits}le")
+    return clips.gray(name, *codec, pictures=noise(bits, dtype), pixel_format=pixel_format)
+
+
+REFUSED = {
+    "8-bit": ("ffv1.mkv", ("-c:v", "ffv1"), "ffv1 as gray", ["8-bit"]),
+    "lossy": (
+        "x264.mkv", ("-c:v", "libx264", "-pix_fmt", "gray10le"), "h264 as gray10le", ["lossy"],
+    ),
+    "chroma": (
+        "yuv.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p10le"), "ffv1 as yuv420p10le", ["chroma"],
+    ),
+    "all three": (
+        "mp4v.mp4", ("-c:v", "mpeg4"), "mpeg4 as yuv420p", ["8-bit", "lossy", "chroma"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_stream_that_may_have_lost_depth_is_refused_by_name(clips, case):
+    name, codec, stored, risks = REFUSED[case]
+    path = encoded(clips, f"refused {name}", *codec)
+    accept = ", ".join(repr(risk) for risk in sorted(risks))
+
+    with (
+        VideoReader(path, name="a/cam_01_depth.mkv", frames=3) as reader,
+        pytest.raises(MediaError) as refusal,
+    ):
+        read_depth_units(reader, 0, encoding=DepthEncoding(unit_m=0.5))
+
+    assert str(refusal.value) == (
+        f"a/cam_01_depth.mkv: depth is stored by codec {stored} ({', '.join(risks)}), which does "
+        f"not keep depth whole. Store it as gray16le with FFV1; if it is meant so, pass "
+        f"DepthEncoding(unit_m=0.5, accept=frozenset({{{accept}}}))."
+    )
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_the_message_proposes_is_accepted(clips, case):
+    name, codec, _, risks = REFUSED[case]
+    path = encoded(clips, f"refused {name}", *codec)
+
+    with VideoReader(path, name="clip", frames=3) as reader:
+        units = read_depth_units(reader, 0, encoding=DepthEncoding(accept=frozenset(risks)))
+
+    assert (units.dtype, units.shape) == (np.uint16, (HEIGHT, WIDTH))
+
+
+def test_8_bit_numbers_are_kept_where_they_are_accepted(clips):
+    path = encoded(clips, "refused ffv1.mkv", "-c:v", "ffv1")
+
+    with VideoReader(path, name="clip", frames=3) as reader:
+        units = read_depth_units(reader, 1, encoding=DepthEncoding(accept=frozenset({"8-bit"})))
+
+    np.testing.assert_array_equal(units, noise(8, "u1")[1])
+
+
+def test_the_luma_plane_is_read_where_chroma_is_accepted(clips):
+    path = encoded(clips, "luma.mkv", "-c:v", "ffv1", "-pix_fmt", "yuv420p12le", bits=12)
+    raw = clips.ffmpeg("-i", path, "-f", "rawvideo", "-pix_fmt", "yuv420p12le", "-")
+    luma = np.frombuffer(raw, "<u2").reshape(3, -1)[:, : HEIGHT * WIDTH]
+
+    with VideoReader(path, name="clip", frames=3) as reader:
+        units = read_depth_units(reader, 1, encoding=DepthEncoding(accept=frozenset({"chroma"})))
+
+    np.testing.assert_array_equal(units.ravel(), luma[1])
+
+
+@pytest.mark.parametrize(
+    "pixel_format",
+    ["rgb24", "gbrp16le", "pal8", "rgb48be", "grayf32le", "gray32le", "ya8", "nv12", "monow"],
+)
+def test_colours_are_refused_whatever_is_accepted(pixel_format):
+    facts = StreamFacts(
+        codec="ffv1", pixel_format=pixel_format, width_px=8, height_px=8, frames=1,
+        frame_rate_hz=15.0, tags={},
+    )  # fmt: skip
+    everything = DepthEncoding(accept=frozenset({"8-bit", "lossy", "chroma"}))
+
+    with pytest.raises(
+        MediaError, match=f"clip: depth is stored by codec ffv1 as {pixel_format}, w"
+    ):
+        require_depth_stream(
+            codec=facts.codec, pixel_format=facts.pixel_format, encoding=everything, name="clip"
+        )
+
+
+def test_the_rendered_scene_is_read_as_ffmpeg_reads_it(clips, shared_scenes):
+    path = next(shared_scenes.rglob("cam_04_depth.mkv"))
+    raw = clips.ffmpeg(
+        "-i", path, "-vf", "select='eq(n,57)'", "-fps_mode", "passthrough",
+        "-f", "rawvideo", "-pix_fmt", "gray16le", "-",
+    )  # fmt: skip
+
+    with VideoReader(path, name="clip", frames=probe(path, name="clip").frames) as reader:
+        units = read_depth_units(reader, 57, encoding=DepthEncoding())
+
+    np.testing.assert_array_equal(units, np.frombuffer(raw, "<u2").reshape(320, 320))

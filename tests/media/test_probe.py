@@ -1,0 +1,115 @@
+"""What a file is, from few of its bytes, and counted where the header cannot be trusted."""
+
+import numpy as np
+import pytest
+
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.video import probe
+
+GROUPS_OF_12 = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-g", "12")
+FFV1 = ("-c:v", "ffv1", "-g", "12")
+
+
+@pytest.fixture(scope="module")
+def depth_clip(clips):
+    noise = np.random.default_rng(0).integers(0, 65536, (48, 64, 96))
+    return clips.gray(
+        "noise.mkv", *FFV1, "-metadata", "DEPTH_SCALE=0.001",
+        pictures=noise.astype("<u2"), pixel_format="gray16le",
+    )  # fmt: skip
+
+
+def test_an_mp4_is_told_by_its_header(clips):
+    facts = probe(clips.rgb("groups of 12.mp4", *GROUPS_OF_12), name="clip")
+
+    assert (facts.codec, facts.pixel_format, facts.width_px, facts.height_px) == (
+        "h264", "yuv420p", 96, 64,
+    )  # fmt: skip
+    assert (facts.frames, facts.frame_rate_hz) == (48, 15.0)
+
+
+def test_a_matroska_file_is_told_by_its_header_and_its_tags(depth_clip):
+    facts = probe(depth_clip, name="clip")
+
+    assert (facts.codec, facts.pixel_format, facts.frames) == ("ffv1", "gray16le", 48)
+    assert facts.tags["depth_scale"] == "0.001"
+
+
+def test_a_tag_of_the_stream_does_not_hide_the_containers(clips):
+    path = clips.rgb(
+        "tags.mkv", *GROUPS_OF_12, "-metadata", "Scale=1", "-metadata:s:v:0", "SCALE=2"
+    )
+
+    facts = probe(path, name="clip")
+
+    assert (facts.tags["scale"], facts.tags["stream.scale"]) == ("1", "2")
+
+
+@pytest.mark.parametrize("flags", ["-movflags +faststart", ""])
+def test_probing_an_mp4_reads_its_header_and_first_frame(clips, flags):
+    path = clips.rgb(
+        f"probe{flags}.mp4", *GROUPS_OF_12, *flags.split(), "-crf", "1", "-g", "1",
+        pictures=clips.pictures.repeat(4, axis=1).repeat(4, axis=2),
+    )  # fmt: skip
+    file = clips.counting(path)
+
+    assert probe(file, name="clip").frames == 48
+    assert file.bytes_read < path.stat().st_size / 4
+
+
+def test_probing_a_matroska_file_reads_its_header_and_its_last_group(clips, depth_clip):
+    file = clips.counting(depth_clip)
+
+    assert probe(file, name="clip").frames == 48
+    assert file.bytes_read < 0.6 * depth_clip.stat().st_size
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+@pytest.mark.parametrize(
+    ("without", "frames"),
+    [((), 48), ((47,), 47), ((0,), 47)],
+    ids=["whole", "without its last frame", "without its first frame"],
+)
+def test_frames_that_are_left_out_at_an_end_are_not_counted(clips, suffix, without, frames):
+    source = clips.rgb(f"intra.{suffix}", *GROUPS_OF_12[:4], "-g", "1")
+    path = clips.remuxed(source, f"without {without}.{suffix}", without=without)
+
+    assert probe(path, name="clip").frames == frames
+
+
+def test_a_matroska_file_cut_in_the_middle_is_counted_up_to_the_cut(clips, depth_clip):
+    path = clips.folder / "cut.mkv"
+    path.write_bytes(depth_clip.read_bytes()[: depth_clip.stat().st_size // 2])
+
+    assert 20 <= probe(path, name="clip").frames <= 25
+
+
+def test_a_matroska_file_without_a_duration_is_counted(clips):
+    source = clips.rgb("groups of 12.mp4", *GROUPS_OF_12)
+    path = clips.folder / "live.mkv"
+    path.write_bytes(clips.ffmpeg("-i", source, "-c", "copy", "-f", "matroska", "-live", "1", "-"))
+
+    assert probe(path, name="clip").frames == 48
+
+
+def test_an_mp4_whose_payload_is_cut_tells_what_is_missing(clips):
+    source = clips.rgb("fast.mp4", *GROUPS_OF_12, "-movflags", "+faststart")
+    size = source.stat().st_size
+    path = clips.folder / "payload cut.mp4"
+    path.write_bytes(source.read_bytes()[: size - 100])
+
+    with pytest.raises(
+        MediaError, match=f"clip: is cut short: .* up to byte {size}, .* {size - 100}:"
+    ):
+        probe(path, name="clip")
+
+
+def test_an_mp4_without_its_header_is_named_as_cut(clips):
+    source = clips.rgb("groups of 12.mp4", *GROUPS_OF_12)
+    path = clips.folder / "no header.mp4"
+    path.write_bytes(source.read_bytes()[:-2000])
+
+    with pytest.raises(
+        MediaError, match="clip: cannot be opened as MP4 or Matroska .* is cut short"
+    ):
+        probe(path, name="clip")

@@ -1,0 +1,162 @@
+"""What a reader takes, keeps, refuses and gives back."""
+
+import io
+import pickle
+
+import pytest
+
+from stereogenbench_data.errors import MediaError, StorageError
+from stereogenbench_data.media.video import VideoReader, read_rgb
+
+GROUPS_OF_12 = ("-c:v", "libx264", "-pix_fmt", "yuv420p", "-g", "12")
+
+
+@pytest.fixture(scope="module")
+def clip(clips):
+    return clips.rgb("groups of 12.mp4", *GROUPS_OF_12)
+
+
+@pytest.mark.parametrize("kind", [str, "path", "file"])
+def test_a_path_a_string_and_an_open_file_are_read_alike(clips, clip, kind):
+    file = {"path": clip, "file": io.BytesIO(clip.read_bytes())}.get(kind, str(clip))
+
+    with VideoReader(file, name="clip", frames=clips.frames) as reader:
+        assert clips.number(read_rgb(reader, 40)) == 40
+
+
+def test_a_name_that_looks_like_an_address_is_a_file_name(clips, clip, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "concat:a|é.mp4").write_bytes(clip.read_bytes())
+
+    with VideoReader("concat:a|é.mp4", name="clip", frames=clips.frames) as reader:
+        assert clips.number(read_rgb(reader, 3)) == 3
+
+
+def test_the_callers_file_stays_open(clips, clip):
+    file = io.BytesIO(clip.read_bytes())
+
+    VideoReader(file, name="clip", frames=clips.frames).close()
+
+    assert not file.closed
+
+
+def test_the_same_frame_again_is_the_same_object(clips, clip):
+    with VideoReader(clip, name="clip", frames=clips.frames) as reader:
+        assert reader.frame(7) is reader.frame(7)
+
+
+def test_reading_in_order_reads_the_file_once(clips, clip):
+    file = clips.counting(clip)
+
+    with VideoReader(file, name="clip", frames=clips.frames) as reader:
+        for index in range(clips.frames):
+            reader.frame(index)
+
+    assert file.bytes_read < 2 * clip.stat().st_size
+
+
+def test_a_frame_far_ahead_is_sought_and_not_decoded_up_to(clips):
+    pictures = clips.pictures.repeat(4, axis=1).repeat(4, axis=2)
+    path = clips.rgb("large.mp4", *GROUPS_OF_12, "-crf", "1", pictures=pictures)
+    file = clips.counting(path)
+
+    with VideoReader(file, name="clip", frames=clips.frames) as reader:
+        reader.frame(0)
+        before = file.bytes_read
+        reader.frame(36)
+
+    assert file.bytes_read - before < path.stat().st_size / 4
+
+
+def test_facts_can_be_asked_for_between_two_frames_of_an_open_file(clips, clip):
+    file = io.BytesIO(clip.read_bytes())
+
+    with VideoReader(file, name="clip", frames=clips.frames) as reader:
+        first = clips.number(read_rgb(reader, 20))
+        pixel_format = reader.facts.pixel_format
+        second = clips.number(read_rgb(reader, 21))
+
+    assert (first, pixel_format, second) == (20, "yuv420p", 21)
+
+
+def test_slices_can_be_decoded_at_once(clips):
+    path = clips.rgb("slices.mkv", "-c:v", "ffv1", "-pix_fmt", "yuv420p", "-slices", "4")
+
+    with VideoReader(path, name="clip", frames=clips.frames, threads=2) as reader:
+        assert [clips.number(read_rgb(reader, index)) for index in (3, 30, 29)] == [3, 30, 29]
+
+
+def test_closing_twice_is_allowed_and_reading_after_it_is_not(clips, clip):
+    reader = VideoReader(clip, name="a/cam_00_rgb.mp4", frames=clips.frames)
+    reader.close()
+    reader.close()
+
+    with pytest.raises(MediaError, match=r"a/cam_00_rgb.mp4: is closed, so frame 3 cannot be read"):
+        reader.frame(3)
+
+
+@pytest.mark.parametrize("index", [-1, 48])
+def test_a_frame_that_does_not_exist_is_refused(clips, clip, index):
+    with (
+        VideoReader(clip, name="clip", frames=clips.frames) as reader,
+        pytest.raises(MediaError, match=f"clip: has no frame {index}: ask for one of 0 to 47"),
+    ):
+        reader.frame(index)
+
+
+def test_a_reader_says_why_it_cannot_be_pickled(clips, clip):
+    with (
+        VideoReader(clip, name="clip", frames=clips.frames) as reader,
+        pytest.raises(
+            TypeError, match="clip: an open VideoReader cannot be pickled: pass the path"
+        ),
+    ):
+        pickle.dumps(reader)
+
+
+@pytest.mark.parametrize(("frames", "threads"), [(0, 1), (48, 0)])
+def test_no_frames_and_no_threads_are_refused(clip, frames, threads):
+    with pytest.raises(MediaError, match="clip: (frames|threads) must be at least 1, got 0"):
+        VideoReader(clip, name="clip", frames=frames, threads=threads)
+
+
+def test_a_missing_file_is_named_with_its_path(tmp_path):
+    with pytest.raises(
+        StorageError, match=r"cam_00_rgb.mp4: cannot be read at .*none.mp4 \(No such"
+    ):
+        VideoReader(tmp_path / "none.mp4", name="cam_00_rgb.mp4", frames=1)
+
+
+def test_a_folder_is_not_a_video(tmp_path):
+    with pytest.raises(StorageError, match="clip: is a folder, not a video file"):
+        VideoReader(tmp_path, name="clip", frames=1)
+
+
+def test_an_empty_file_is_named_as_empty(tmp_path):
+    (tmp_path / "a.mp4").touch()
+
+    with pytest.raises(MediaError, match="clip: is empty .0 bytes"):
+        VideoReader(tmp_path / "a.mp4", name="clip", frames=1)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param("not a video", id="text"),
+        pytest.param("ffconcat version 1.0\nfile other.mp4\n", id="a script that opens a file"),
+        pytest.param("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\no.mp4\n", id="a playlist"),
+    ],
+)
+def test_a_text_is_not_a_video_and_opens_nothing(tmp_path, text):
+    (tmp_path / "a.mp4").write_text(text)
+
+    with pytest.raises(MediaError, match="clip: cannot be opened as MP4 or Matroska .Invalid"):
+        VideoReader(tmp_path / "a.mp4", name="clip", frames=1)
+
+
+def test_a_file_of_sound_alone_is_refused(clips):
+    path = clips.folder / "sound.mp4"
+    clips.ffmpeg("-f", "lavfi", "-i", "sine=duration=0.2", path)
+
+    with pytest.raises(MediaError, match=r"clip: holds no video stream \(it holds audio\)"):
+        VideoReader(path, name="clip", frames=1)

@@ -1,0 +1,154 @@
+"""RGB is ffmpeg's own at the stored size, and neither shifted nor aliased at another."""
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.video import VideoReader, read_rgb
+
+X264 = ("-c:v", "libx264", "-crf", "10")
+COLOURS = {
+    "untagged": (),
+    "bt709": ("-vf", "scale=out_color_matrix=bt709", "-colorspace", "bt709"),
+    "bt709 full range": (
+        "-vf", "scale=out_color_matrix=bt709:out_range=pc", "-colorspace", "bt709",
+        "-color_range", "pc",
+    ),
+    "bt601 full range": ("-vf", "scale=out_range=pc", "-color_range", "pc"),
+    "bt2020": ("-vf", "scale=out_color_matrix=bt2020nc", "-colorspace", "bt2020nc"),
+}  # fmt: skip
+
+
+def coloured_noise(height, width):
+    rng = np.random.default_rng(3)
+    coarse = rng.integers(0, 256, (3, height // 4 + 1, width // 4 + 1, 3))
+    return coarse.repeat(4, axis=1).repeat(4, axis=2)[:, :height, :width].astype(np.uint8)
+
+
+@pytest.mark.parametrize("pixel_format", ["yuv420p", "yuv422p", "yuv444p"])
+@pytest.mark.parametrize("colour", COLOURS)
+def test_matrix_and_range_are_those_of_the_file(clips, colour, pixel_format):
+    path = clips.rgb(
+        f"{colour} {pixel_format}.mp4", *COLOURS[colour], *X264, "-pix_fmt", pixel_format,
+        pictures=coloured_noise(64, 96),
+    )  # fmt: skip
+
+    with VideoReader(path, name="clip", frames=3) as reader:
+        found = np.stack([read_rgb(reader, index) for index in range(3)])
+
+    np.testing.assert_array_equal(found, clips.truth(path))
+
+
+@pytest.mark.parametrize(("height", "width"), [(62, 94), (66, 130), (2, 2), (64, 34)])
+def test_padded_rows_are_not_part_of_the_picture(clips, height, width):
+    path = clips.rgb(
+        f"padded {height} {width}.mp4", *X264, "-pix_fmt", "yuv420p",
+        pictures=coloured_noise(height, width),
+    )  # fmt: skip
+    raw = clips.ffmpeg("-i", path, "-f", "rawvideo", "-pix_fmt", "rgb24", "-")
+    truth = np.frombuffer(raw, np.uint8).reshape(3, height, width, 3)
+
+    with VideoReader(path, name="clip", frames=3) as reader:
+        found = read_rgb(reader, 2)
+
+    assert found.flags.c_contiguous
+    np.testing.assert_array_equal(found.transpose(1, 2, 0), truth[2])
+
+
+@pytest.fixture(scope="module")
+def texture(clips):
+    """A clip of one large picture with detail at every scale, and that picture as decoded."""
+    rng = np.random.default_rng(5)
+    noise = rng.normal(size=(320, 320, 3))
+    layers = [ndimage.gaussian_filter(noise, (s, s, 0)) * s for s in (1, 2, 4, 8)]
+    picture = sum(layers)
+    picture = np.uint8((picture - picture.min()) / np.ptp(picture) * 255)
+    path = clips.rgb("texture.mp4", *X264, "-pix_fmt", "yuv444p", pictures=picture[None])
+    with VideoReader(path, name="clip", frames=1) as reader:
+        return path, read_rgb(reader, 0)
+
+
+SIZES = {
+    "half": (160, 160),
+    "as 1280x1280 to 832x480": (120, 208),
+    "slightly smaller": (318, 316),
+    "odd": (131, 77),
+    "wider and lower": (200, 400),
+    "larger": (480, 640),
+}
+
+
+def shift_px(picture, reference):
+    """Return the translation (x, y) that explains best how a picture differs from another."""
+    grey, expected = picture.mean(axis=0), reference.mean(axis=0)
+    down, right = np.gradient(expected)
+    slopes = np.stack([right.ravel(), down.ravel(), np.ones(right.size)], axis=1)
+    x, y, _ = np.linalg.lstsq(slopes, (expected - grey).ravel(), rcond=None)[0]
+    return x, y
+
+
+@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
+def test_scaling_keeps_pixel_centres(texture, size):
+    path, stored = texture
+    height, width = size
+    image = Image.fromarray(stored.transpose(1, 2, 0))
+    reference = np.asarray(image.resize((width, height), Image.Resampling.BILINEAR))
+    reference = reference.transpose(2, 0, 1).astype(float)
+
+    with VideoReader(path, name="clip", frames=1) as reader:
+        scaled = read_rgb(reader, 0, size=size)
+
+    difference = scaled - reference
+    difference -= difference.mean()
+    psnr_db = 10 * np.log10(255**2 / np.mean(difference**2))
+    assert np.abs(shift_px(scaled, reference)).max() < 0.01
+    assert psnr_db > 36
+
+
+def test_scaling_by_whole_factors_averages_areas(texture):
+    path, stored = texture
+    areas = stored.reshape(3, 80, 4, 80, 4).mean(axis=(2, 4))
+
+    with VideoReader(path, name="clip", frames=1) as reader:
+        scaled = read_rgb(reader, 0, size=(80, 80))
+
+    difference = scaled - areas
+    assert difference.mean() == pytest.approx(1.1, abs=0.3)  # ffmpeg's unscaled path cuts off
+    assert difference.std() < 0.7
+
+
+def test_the_stored_size_asked_for_is_no_scaling(texture):
+    path, stored = texture
+
+    with VideoReader(path, name="clip", frames=1) as reader:
+        np.testing.assert_array_equal(read_rgb(reader, 0, size=(320, 320)), stored)
+
+
+def test_a_given_array_is_written_and_returned(texture):
+    path, stored = texture
+    batch = np.zeros((2, 3, 320, 320), np.uint8)
+
+    with VideoReader(path, name="clip", frames=1) as reader:
+        result = read_rgb(reader, 0, out=batch[1])
+
+    assert np.shares_memory(result, batch)
+    np.testing.assert_array_equal(batch[1], stored)
+
+
+@pytest.mark.parametrize("size", [(0, 10), (10, 0), (-1, 10)])
+def test_a_size_of_zero_is_refused(texture, size):
+    with (
+        VideoReader(texture[0], name="clip", frames=1) as reader,
+        pytest.raises(MediaError, match=r"clip: a picture of .* pixels .* cannot be made: ask for"),
+    ):
+        read_rgb(reader, 0, size=size)
+
+
+def test_an_array_that_does_not_fit_is_refused(texture):
+    with (
+        VideoReader(texture[0], name="clip", frames=1) as reader,
+        pytest.raises(MediaError, match=r"needs room of uint8 \(3, 320, 320\), got uint8 \(3, 1, "),
+    ):
+        read_rgb(reader, 0, out=np.zeros((3, 1, 320), np.uint8))

@@ -1,0 +1,283 @@
+"""The written files, read by other means: json, PyAV, scipy, and the release's parser."""
+
+from dataclasses import replace
+
+import av
+import numpy as np
+import pytest
+from av.video.frame import PictureType
+from scipy.ndimage import maximum_filter, minimum_filter
+from scipy.spatial.transform import Rotation
+
+from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.schema.parse import parse_rig, parse_trajectory
+from stereogenbench_data.schema.release import CAMERA_PAIRS
+from stereogenbench_data.storage.scene_folder import describe_scene
+from stereogenbench_data.synthesis import ExportContract, SynthRequest
+
+OPENCV_FROM_UNREAL = np.array([[0, 1, 0], [0, 0, -1], [1, 0, 0]])
+
+
+def small(**changes):
+    return {"size_px": 32, "frames": 2, "seed": 3} | changes
+
+
+def trajectory_of(scene):
+    return parse_trajectory((scene.folder / "trajectory.json").read_bytes(), where="trajectory")
+
+
+def rig_of(scene):
+    return parse_rig((scene.folder / "baseline.json").read_bytes(), where="baseline")[0]
+
+
+def tags(path):
+    with av.open(str(path)) as container:
+        return {key.upper(): value for key, value in container.metadata.items()}
+
+
+def test_files_have_the_keys_of_a_scene_that_was_rendered_elsewhere(draw, shared_scenes):
+    (marker,) = shared_scenes.rglob("_scene_complete.json")
+    ours = draw(**small())
+
+    assert {path.name for path in ours.folder.iterdir()} == {
+        path.name for path in marker.parent.iterdir()
+    }
+    for name in ("baseline.json", "trajectory.json", "scene_description_qwen_dataset_level.json"):
+        theirs = type(ours)(marker.parent).json(name)
+        assert list(ours.json(name)) == list(theirs)
+    pose, their_pose = (
+        scene.json("trajectory.json")["frames"][1]["cameras"][4]
+        for scene in (ours, type(ours)(marker.parent))
+    )
+    assert {key: type(value) for key, value in pose.items()} == {
+        key: type(value) for key, value in their_pose.items()
+    }
+
+
+def test_the_text_is_the_detailed_caption(draw):
+    scene = draw(**small())
+    text = (scene.folder / "scene_description_qwen_dataset_level.txt").read_text()
+
+    assert text == scene.json("scene_description_qwen_dataset_level.json")["detailed_caption"]
+
+
+def test_videos_are_encoded_as_the_release_is(draw):
+    scene = draw(**small(frames=12))
+
+    with av.open(str(scene.folder / "cam_03_rgb.mp4")) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
+        assert stream.average_rate == 15
+        kinds = [PictureType(frame.pict_type).name for frame in container.decode(stream)]
+    assert len(kinds) == 12
+    assert kinds.count("I") == 1
+    assert "B" in kinds
+    with av.open(str(scene.folder / "cam_03_depth.mkv")) as container:
+        stream = container.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt) == ("ffv1", "gray16le")
+        assert stream.average_rate == 15
+        assert sum(1 for _ in container.decode(stream)) == 12
+
+
+@pytest.mark.parametrize("family", ["IPD_Gaussian", "Uniform", "Pairwise_Uniform"])
+def test_recorded_baselines_are_the_distances_of_the_recorded_poses(draw, family):
+    """At world offsets of up to 1e6 cm, where a coordinate is rounded to 1.2e-10 cm."""
+    scene = draw(family=family, **small(frames=5))
+    rig, locations = rig_of(scene), trajectory_of(scene).locations
+
+    assert np.abs(locations).max() > 1e4
+    for (left, right), recorded_cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True):
+        distances_cm = np.linalg.norm(locations[:, right] - locations[:, left], axis=1)
+        np.testing.assert_allclose(distances_cm, recorded_cm, rtol=0, atol=1e-9)
+
+
+def test_every_rotation_form_says_the_same(draw):
+    poses = {}
+    for form in ("rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"):
+        scene = draw(contract=ExportContract(rotation=form), **small())
+        poses[form] = CameraPoses.from_trajectory(trajectory_of(scene))
+        raw = scene.json("trajectory.json")["frames"][1]["cameras"][2]["rotation"]
+        if form == "quaternion_wxyz":
+            raw = [*raw[1:], raw[0]]
+        if form == "rotator":
+            raw = Rotation.from_euler(
+                "ZYX", [raw["yaw"], -raw["pitch"], -raw["roll"]], degrees=True
+            ).as_matrix()
+        elif form != "matrix":
+            raw = Rotation.from_quat(raw).as_matrix()
+        in_opencv = OPENCV_FROM_UNREAL @ np.array(raw) @ OPENCV_FROM_UNREAL.T
+        np.testing.assert_allclose(poses[form].world_from_cam(1, 2)[:3, :3], in_opencv, atol=1e-12)
+    first, *others = (pose.world_from_cam(1, 2) for pose in poses.values())
+    for other in others:
+        np.testing.assert_allclose(other, first, rtol=0, atol=1e-9)
+
+
+def share_found(units_m, *, focal_px, later_from_first):
+    """How many of frame 0's points the last frame measured where a motion takes them."""
+    v, u = np.nonzero((units_m[0] > 0) & (units_m[0] < 60))
+    z = units_m[0][v, u]
+    x, y = (u - 63.5) / focal_px * z, (v - 63.5) / focal_px * z
+    x, y, z, _ = later_from_first @ np.stack([x, y, z, np.ones_like(z)])
+    column = np.rint(focal_px * x / z + 63.5).astype(int)
+    row = np.rint(focal_px * y / z + 63.5).astype(int)
+    inside = (column >= 0) & (column < 128) & (row >= 0) & (row < 128)
+    place, z = (row[inside], column[inside]), z[inside]
+    nearest = minimum_filter(units_m[-1], size=3)[place]
+    farthest = maximum_filter(units_m[-1], size=3)[place]
+    return ((nearest - 0.01 * z < z) & (z < farthest + 0.01 * z)).mean()
+
+
+def test_the_recorded_poses_carry_depth_from_frame_to_frame(draw):
+    """All but the walker and what it and the poles come to hide; a roll with a wrong sign shows."""
+    scene = draw(size_px=128, frames=13, seed=8, family="IPD_Gaussian", focal_mm=30.0)
+    trajectory = trajectory_of(scene)
+    mirrored = replace(trajectory, rotations=trajectory.rotations * [1, 1, -1])
+    found = []
+    for recorded in (trajectory, mirrored):
+        poses = CameraPoses.from_trajectory(recorded)
+        first, later = poses.world_from_cam(0, 1), poses.world_from_cam(12, 1)
+        found.append(
+            share_found(
+                scene.units(1) / 1000,
+                focal_px=scene.focal_px,
+                later_from_first=np.linalg.inv(later) @ first,
+            )
+        )
+
+    assert found[0] > 0.85
+    assert found[1] < found[0] - 0.1
+
+
+def test_the_release_reader_takes_a_scene_as_rectified(draw):
+    """Read with the package's own walker: closed form and pose chain agree to 1e-6 px."""
+    scene = draw(family="Uniform", **small())
+    key = "train/Uniform/SynthStage/scene_000000"
+
+    described = describe_scene(scene.folder.parents[3], key)
+
+    assert described.rig_residual_px < 1e-6
+    assert described.depth_unit_m == (0.001,) * 6
+    assert described.depth_unit_source == ("tag",) * 6
+    assert described.labels.character.startswith("SK_Synth")
+
+
+def test_the_depth_tag_tells_the_unit_or_is_left_out(draw):
+    tagged = draw(contract=ExportContract(depth_unit_m=0.01, depth_tag="scale"), **small())
+    bare = draw(contract=ExportContract(depth_unit_m=0.1, depth_tag=None), **small())
+
+    assert float(tags(tagged.folder / "cam_00_depth.mkv")["SCALE"]) == 0.01
+    assert not [key for key in tags(bare.folder / "cam_00_depth.mkv") if "SCALE" in key]
+    fine, coarse = tagged.units(0).astype(float), bare.units(0).astype(float)
+    measured = fine < 65535
+    np.testing.assert_allclose(coarse[measured] / 10, fine[measured] / 100, atol=0.056)
+
+
+@pytest.mark.parametrize(("depth_format", "largest"), [("gray10le", 1023), ("gray12le", 4095)])
+def test_depth_of_fewer_bits_saturates_at_its_largest_number(draw, depth_format, largest):
+    fine = draw(**small(focal_mm=18.0))
+    coarse = draw(
+        contract=ExportContract(depth_format=depth_format, depth_unit_m=0.002),
+        **small(focal_mm=18.0),
+    )
+
+    expected = np.minimum(np.rint(fine.units(0) / 2), largest)
+    assert (expected == largest).any()
+    assert np.abs(coarse.units(0) - expected).max() <= 1
+    with av.open(str(coarse.folder / "cam_00_depth.mkv")) as container:
+        assert container.streams.video[0].pix_fmt == depth_format
+
+
+def test_depth_along_the_ray_is_longer_by_the_rays_length(draw):
+    planar = draw(**small(focal_mm=20.0))
+    ray = draw(contract=ExportContract(depth_kind="ray"), **small(focal_mm=20.0))
+
+    right, below = np.meshgrid(*[(np.arange(32) - 15.5) / planar.focal_px] * 2)
+    measured = ray.units(2)[0] < 65535
+    expected = planar.units(2)[0] * np.sqrt(1 + right**2 + below**2)
+    np.testing.assert_allclose(ray.units(2)[0][measured], expected[measured], atol=1.5)
+
+
+@pytest.mark.parametrize("lag", [2, -1])
+def test_depth_lags_behind_the_pictures_by_whole_frames(draw, lag):
+    plain = draw(**small(frames=4))
+    lagged = draw(contract=ExportContract(frame_lag=lag), **small(frames=4))
+
+    expected = np.roll(plain.units(4), lag, axis=0)
+    kept = slice(lag, None) if lag > 0 else slice(None, lag)
+    np.testing.assert_array_equal(lagged.units(4)[kept], expected[kept])
+    np.testing.assert_array_equal(lagged.pictures(4), plain.pictures(4))
+
+
+def test_a_principal_point_beside_the_centre_moves_the_picture(draw):
+    centred = draw(**small())
+    moved = draw(contract=ExportContract(principal_point_px=(21.0, 13.0)), **small())
+
+    assert moved.json("baseline.json")["camera_intrinsics"]["principal_point_px"] == {
+        "x": 21.0,
+        "y": 13.0,
+    }
+    assert rig_of(moved).principal_point_px == (21.0, 13.0)
+    np.testing.assert_allclose(
+        moved.units(0)[:, :-3, 5:].astype(float), centred.units(0)[:, 3:, :-5], atol=1
+    )
+
+
+def test_a_sensor_that_is_not_square_scales_one_axis(draw):
+    """Half as high a sensor at half as high a picture leaves pixels square."""
+    contract = ExportContract(sensor_mm=(23.76, 11.88))
+    wide = draw(contract=contract, **small(height_px=16, focal_mm=30.0))
+    tall = draw(contract=contract, **small(height_px=32, focal_mm=30.0))
+
+    assert wide.units(0).shape == (2, 16, 32)
+    assert wide.json("baseline.json")["image_height"] == 16
+    pairs = tall.units(0).astype(float).reshape(2, 16, 2, 32)
+    between = (pairs.min(axis=2) - 1 <= wide.units(0)) & (wide.units(0) <= pairs.max(axis=2) + 1)
+    assert between.mean() > 0.9
+
+
+def test_the_primary_pair_is_written_in_either_form(draw):
+    named = draw(contract=ExportContract(primary_pair=(2, 4)), **small())
+    numbered = draw(contract=ExportContract(primary_pair=(2, 4), pair_form="indices"), **small())
+
+    assert named.json("baseline.json")["primary_stereo_pair"] == {
+        "left_camera": "SynthStage_scene_1000_Cam_02",
+        "right_camera": "SynthStage_scene_1000_Cam_04",
+    }
+    assert numbered.json("baseline.json")["primary_stereo_pair"] == [2, 4]
+    assert rig_of(named).primary_pair == rig_of(numbered).primary_pair == (2, 4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"size_px": 0}, "size_px must be an even number .* got 0"),
+        ({"size_px": 31}, "size_px must be an even number .* got 31"),
+        ({"height_px": 10_000}, "height_px must be an even number .* got 10000"),
+        ({"frames": 0}, "frames must be at least 1, got 0"),
+        ({"scenes": -1}, "scenes must be at least 1, got -1"),
+        ({"seed": -1}, "seed must be 0 or more, got -1"),
+        ({"family": "Wide"}, "family must be one of IPD_Gaussian, .* got 'Wide'"),
+        ({"family": "Pairwise_Uniform", "split": "eval"}, "in the train split only"),
+        ({"map_name": "a.b"}, "map_name must be letters.* got 'a.b'"),
+        ({"focal_mm": float("nan")}, "focal_mm must be a positive number, got nan"),
+        ({"world_offset_cm": 2e6}, "world_offset_cm must be in 0..1e[+]06, got 2000000.0"),
+    ],
+)
+def test_a_request_that_no_scene_can_meet_is_refused(changes, message):
+    with pytest.raises(SynthesisError, match=message):
+        SynthRequest(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"depth_unit_m": 0.0}, "depth_unit_m must be a positive number, got 0.0"),
+        ({"sensor_mm": (23.76, -1.0)}, "sensor_mm must be a positive number, got -1.0"),
+        ({"primary_pair": (3, 3)}, "primary_pair must be two different cameras .* got .3, 3."),
+        ({"primary_pair": (0, 6)}, "primary_pair must be two different cameras .* got .0, 6."),
+    ],
+)
+def test_a_contract_that_cannot_be_written_is_refused(changes, message):
+    with pytest.raises(SynthesisError, match=message):
+        ExportContract(**changes)

@@ -1,0 +1,163 @@
+"""Runs that go well, are stopped, fail, and are run again."""
+
+import errno
+import multiprocessing
+import os
+
+import pytest
+
+from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis.videos import VideoFile
+
+SMALL = {"size_px": 32, "frames": 2, "seed": 9}
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("request_", "key"),
+    [
+        (
+            SynthRequest(family="Uniform", map_name="Stylized_Egypt", **SMALL),
+            "train/Uniform/Stylized_Egypt/scene_000000",
+        ),
+        (
+            SynthRequest(split="eval", **SMALL),
+            "eval/MapSeenInTrain/IPD_Gaussian/SynthStage/scene_000000",
+        ),
+        (
+            SynthRequest(split="eval", subset="unseen_map", **SMALL),
+            "eval/MapUnseenInTrain/IPD_Gaussian/SynthStage/scene_000000",
+        ),
+    ],
+)
+def test_scenes_stand_where_the_release_has_them(tmp_path, request_, key):
+    assert synthesise(tmp_path, request_) == [key]
+    assert {path.name for path in tmp_path.iterdir()} == {key.split("/")[0]}
+    assert len(contents(tmp_path / key)) == 17
+
+
+def test_a_scene_is_the_same_whatever_the_number_of_scenes_and_workers(tmp_path):
+    (alone,) = synthesise(tmp_path / "alone", SynthRequest(scenes=1, **SMALL))
+    first, second = synthesise(tmp_path / "more", SynthRequest(scenes=2, **SMALL), workers=2)
+
+    assert contents(tmp_path / "alone" / alone) == contents(tmp_path / "more" / first)
+    assert contents(tmp_path / "more" / first) != contents(tmp_path / "more" / second)
+
+
+@pytest.mark.parametrize("other", [{"seed": 10}, {"split": "eval"}, {"map_name": "Elsewhere"}])
+def test_another_seed_or_folder_draws_another_scene(tmp_path, other):
+    (first,) = synthesise(tmp_path / "first", SynthRequest(**SMALL))
+    (second,) = synthesise(tmp_path / "second", SynthRequest(**(SMALL | other)))
+
+    name = "cam_00_depth.mkv"
+    assert (tmp_path / "first" / first / name).read_bytes() != (
+        tmp_path / "second" / second / name
+    ).read_bytes()
+
+
+def test_progress_counts_camera_frames_up_to_all(tmp_path):
+    told = []
+
+    synthesise(
+        tmp_path, SynthRequest(scenes=2, **SMALL), progress=lambda *counts: told.append(counts)
+    )
+
+    assert told[0] == (0, 24)
+    assert told[-1] == (24, 24)
+    assert told == sorted(told)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_run_that_was_stopped_leaves_whole_scenes_only_and_goes_on(tmp_path, workers):
+    request = SynthRequest(scenes=2, **(SMALL | {"frames": 6}))
+
+    def stop(done, total):
+        if done >= 42:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        synthesise(tmp_path, request, workers=workers, progress=stop)
+
+    assert not multiprocessing.active_children()
+    assert not (tmp_path / ".unfinished").exists()
+    finished = [path.parent for path in tmp_path.rglob("_scene_complete.json")]
+    assert [path.name for path in tmp_path.rglob("scene_*") if path.is_dir()] == [
+        folder.name for folder in finished
+    ]
+    before = {folder: folder.stat().st_mtime_ns for folder in finished}
+
+    keys = synthesise(tmp_path, request)
+
+    assert all(len(contents(tmp_path / key)) == 17 for key in keys)
+    assert {folder: folder.stat().st_mtime_ns for folder in finished} == before
+
+
+def test_what_a_killed_run_left_is_drawn_anew(tmp_path):
+    request = SynthRequest(**SMALL)
+    stale = tmp_path / ".unfinished" / request.key(0)
+    stale.mkdir(parents=True)
+    (stale / "cam_00_rgb.mp4").write_bytes(b"cut")
+    (stale / "stray.txt").write_text("not ours")
+
+    (key,) = synthesise(tmp_path, request)
+
+    assert len(contents(tmp_path / key)) == 17
+    assert not (tmp_path / ".unfinished").exists()
+
+
+def test_a_scene_that_another_request_wrote_is_neither_kept_nor_overwritten(tmp_path):
+    (key,) = synthesise(tmp_path, SynthRequest(**SMALL))
+    before = contents(tmp_path / key)
+
+    with pytest.raises(SynthesisError, match="scene_000000: is a scene that another request wrote"):
+        synthesise(tmp_path, SynthRequest(**(SMALL | {"frames": 3})))
+
+    assert contents(tmp_path / key) == before
+
+
+def test_a_folder_that_is_no_finished_scene_is_not_touched(tmp_path):
+    request = SynthRequest(**SMALL)
+    (tmp_path / request.key(0)).mkdir(parents=True)
+
+    with pytest.raises(SynthesisError, match="scene_000000: stands where a scene is to be written"):
+        synthesise(tmp_path, request)
+
+
+def test_an_output_that_is_no_folder_is_named(tmp_path):
+    taken = tmp_path / "file"
+    taken.write_text("")
+
+    with pytest.raises(SynthesisError, match="file: no folder could be made in it"):
+        synthesise(taken, SynthRequest(**SMALL))
+
+
+def test_a_full_disk_is_an_error_that_names_scene_camera_and_cure(tmp_path, monkeypatch):
+    def fail(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(VideoFile, "write", fail)
+
+    with pytest.raises(
+        SynthesisError, match=r"scene_000000: camera 0 .* No space left .* that the disk has room"
+    ):
+        synthesise(tmp_path, SynthRequest(**SMALL))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_worker_that_dies_is_an_error_and_not_a_hang(tmp_path):
+    def kill(done, total):
+        if done:
+            multiprocessing.active_children()[0].kill()
+
+    with pytest.raises(SynthesisError, match=r"worker process died .* with fewer workers"):
+        synthesise(tmp_path, SynthRequest(**(SMALL | {"frames": 200})), workers=2, progress=kill)
+    assert not multiprocessing.active_children()
+
+
+def test_no_workers_are_refused(tmp_path):
+    with pytest.raises(SynthesisError, match="workers must be at least 1, got 0"):
+        synthesise(tmp_path, SynthRequest(**SMALL), workers=0)
