@@ -5,6 +5,7 @@ StereoGenBenchError
 ├── GeometryError  (ValueError)   a camera, a pose or a map that no formula holds for
 ├── MediaError     (ValueError)   a video or a depth map does not decode to what its metadata says
 ├── StorageError   (OSError)      a folder, a file or an index is missing, unreadable or altered
+│   └── ShardError                a shard is missing, cut short or altered
 ├── SelectionError (LookupError)  a filter, a pair or a window that no sample can satisfy
 ├── FieldError     (ValueError)   fields or transforms that cannot be had together
 └── SynthesisError (ValueError)   a scene that cannot be drawn as asked
@@ -31,6 +32,10 @@ class MediaError(StereoGenBenchError, ValueError):
 
 class StorageError(StereoGenBenchError, OSError):
     """A folder, a file or an index is missing, unreadable or altered."""
+
+
+class ShardError(StorageError):
+    """A shard is missing, cut short or altered, or cannot be packed."""
 
 
 class SelectionError(StereoGenBenchError, LookupError):

@@ -293,15 +293,38 @@ def read_rgb(
             f"{reader.name}: frame {index} needs room of uint8 (3, {height}, {width}), got "
             f"{out.dtype} {out.shape}: pass a fitting array or none."
         )
-    shrinks = height * width < frame.height * frame.width
-    planes = reader.scaler.reformat(
+    scaled = (height, width) != (frame.height, frame.width)
+    pixel_format = "gbrp" if scaled or _has_exact_planes(frame) else "rgb24"
+    picture = reader.scaler.reformat(
         frame,
         width=width,
         height=height,
-        format="gbrp",
-        interpolation=Interpolation.AREA if shrinks else Interpolation.BICUBIC,
+        format=pixel_format,
+        interpolation=_interpolation(frame, height=height, width=width),
         threads=1,
     )
+    if pixel_format == "rgb24":
+        pixels = plane_numbers(picture, 0, dtype="u1", per_pixel=3)
+        out[...] = pixels.reshape(height, width, 3).transpose(2, 0, 1)
+        return out
     for channel, plane in enumerate(_RED_GREEN_BLUE):
-        out[channel] = plane_numbers(planes, plane, dtype="u1")
+        out[channel] = plane_numbers(picture, plane, dtype="u1")
     return out
+
+
+def _has_exact_planes(frame: VideoFrame) -> bool:
+    """Return whether FFmpeg's unscaled conversion to planes equals the one to rgb24.
+
+    It is 1.6 ms faster at 1280x1280. But its last columns are garbage where 1 to 8 are left over
+    from groups of 16 (measured with FFmpeg 8: 24, 360 and 854 pixels wide, for example).
+    """
+    return (
+        frame.format.name in ("yuv420p", "yuvj420p")
+        and frame.height % 2 == 0
+        and not 1 <= frame.width % 16 <= 8
+    )
+
+
+def _interpolation(frame: VideoFrame, *, height: int, width: int) -> Interpolation:
+    shrinks = height * width < frame.height * frame.width
+    return Interpolation.AREA if shrinks else Interpolation.BICUBIC

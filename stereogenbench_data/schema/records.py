@@ -165,12 +165,23 @@ class Member:
     """Where the bytes of one of a scene's files lie: ``size`` bytes from ``offset`` of ``path``.
 
     ``path`` is relative to the data's root, with forward slashes. Of a released folder each file
-    is its own path at offset 0; of a shard all members share the path.
+    is its own path at offset 0; of a shard all members share the path. ``crc32`` is zlib's of the
+    bytes, known for what was packed; None for released folders.
     """
 
     path: str
     offset: int
     size: int
+    crc32: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ShardFacts:
+    """What an index knows of a shard: its size in bytes, sha256 in hex, and number of members."""
+
+    size: int
+    sha256: str
+    members: int
 
 
 @dataclass(frozen=True, slots=True)

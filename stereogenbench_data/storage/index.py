@@ -9,6 +9,7 @@ import json
 import os
 import warnings
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +19,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.schema.records import Scene
+from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.storage.digest import table_digest
 from stereogenbench_data.storage.rows import SCHEMA, row_of, scene_of
 from stereogenbench_data.storage.source import UNSAFE_PATH
@@ -42,13 +43,17 @@ class SceneIndex:
         root: The folder to which the members' paths are relative.
         incomplete: Key to reason, for scenes that were not finished when the index was made.
         broken: Key to what is wrong, for scenes that were left out for it.
+        shards: What is known of each shard, by its path below the root; empty for folders.
     """
 
-    def __init__(self, table: pa.Table, *, root: str | Path, left_out: Mapping[str, Any]) -> None:
+    def __init__(self, table: pa.Table, *, root: str | Path, head: Mapping[str, Any]) -> None:
         """Take a checked table; use `open` or `from_scenes` to make an index."""
         self.root = str(root)
-        self.incomplete: dict[str, str] = dict(left_out.get("incomplete", {}))
-        self.broken: dict[str, str] = dict(left_out.get("broken", {}))
+        self.incomplete: dict[str, str] = dict(head.get("incomplete", {}))
+        self.broken: dict[str, str] = dict(head.get("broken", {}))
+        self.shards: dict[str, ShardFacts] = {
+            path: ShardFacts(**facts) for path, facts in head.get("shards", {}).items()
+        }
         self._table = table
         self._columns: dict[str, np.ndarray] = {}
         self._digest = ""
@@ -85,8 +90,19 @@ class SceneIndex:
         return index
 
     @classmethod
-    def from_scenes(cls, scenes: Iterable[Scene], root: str | Path) -> "SceneIndex":
+    def from_scenes(
+        cls,
+        scenes: Iterable[Scene],
+        root: str | Path,
+        *,
+        shards: Mapping[str, ShardFacts] | None = None,
+    ) -> "SceneIndex":
         """Return the index of some scenes, in whatever order they come.
+
+        Args:
+            scenes: The scenes, with the places of their members.
+            root: The folder to which these places are relative.
+            shards: What is known of each shard, where the members lie in shards.
 
         Raises:
             StorageError: If two scenes have one key, or a path leaves the root.
@@ -97,7 +113,9 @@ class SceneIndex:
         except (pa.ArrowException, UnicodeEncodeError, OverflowError) as error:
             raise StorageError(f"{root}: a scene does not fit the index: {error}.") from error
         _require_sound(table, where=str(root))
-        return cls(table, root=root, left_out={})
+        index = cls(table, root=root, head={})
+        index.shards = dict(shards or {})
+        return index
 
     @classmethod
     def from_report(cls, report: TreeReport) -> "SceneIndex":
@@ -135,7 +153,7 @@ class SceneIndex:
                 f"something else. {_AGAIN}"
             ) from error
         _require_sound(table, where=str(path))
-        index = cls(table, root=_root_of(path, head, table), left_out=head)
+        index = cls(table, root=_root_of(path, head, table), head=head)
         if index.digest != head.get("digest"):
             raise StorageError(f"{path}: its rows are not those that were written. {_AGAIN}")
         return index
@@ -156,6 +174,7 @@ class SceneIndex:
             "digest": self.digest,
             "incomplete": self.incomplete,
             "broken": self.broken,
+            "shards": {path: asdict(facts) for path, facts in sorted(self.shards.items())},
         }
         table = self._table.replace_schema_metadata({_METADATA_KEY: json.dumps(head)})
         unfinished = path.with_name(f".{path.name}.{os.getpid()}")
@@ -260,8 +279,8 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
             f"{where}: is an index of format {head.get('format')!r}, and this version of the "
             f"package reads format {_FORMAT}. {_AGAIN}"
         )
-    left_out = [head.get("incomplete"), head.get("broken")]
-    if not all(isinstance(each, dict) for each in left_out) or not isinstance(head["root"], str):
+    tables = [head.get("incomplete"), head.get("broken"), head.get("shards")]
+    if not all(isinstance(each, dict) for each in tables) or not isinstance(head["root"], str):
         raise StorageError(f"{where}: its description of itself was altered. {_AGAIN}")
     return head
 

@@ -5,6 +5,7 @@ mean. A column of several numbers a scene is a list of fixed length.
 """
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any, Final
 
 import pyarrow as pa
@@ -18,6 +19,7 @@ _MEMBER: Final = pa.struct(
         pa.field("path", pa.string(), nullable=False),
         pa.field("offset", pa.int64(), nullable=False),
         pa.field("size", pa.int64(), nullable=False),
+        pa.field("crc32", pa.uint32()),
     ]
 )
 
@@ -114,8 +116,7 @@ def row_of(scene: Scene) -> dict[str, Any]:
         "depth_pixel_format": list(scene.depth_pixel_format),
         "valid_depth_ratio": scene.valid_depth_ratio,
         "members": [
-            {"name": name, "path": member.path, "offset": member.offset, "size": member.size}
-            for name, member in sorted(scene.members.items())
+            {"name": name, **asdict(member)} for name, member in sorted(scene.members.items())
         ],
     }
 
@@ -156,7 +157,7 @@ def scene_of(row: Mapping[str, Any]) -> Scene:
         depth_pixel_format=tuple(row["depth_pixel_format"]),
         valid_depth_ratio=row["valid_depth_ratio"],
         members={
-            item["name"]: Member(item["path"], item["offset"], item["size"])
+            item["name"]: Member(item["path"], item["offset"], item["size"], item["crc32"])
             for item in row["members"]
         },
     )

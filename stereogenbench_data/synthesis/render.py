@@ -30,8 +30,8 @@ _AMBIENT: Final = 0.42
 _SKYLIGHT: Final = 0.1
 _SUNLIGHT: Final = 0.62
 _GRAIN_TILE_M: Final = 0.45
-_GRAIN_CONTRAST: Final = 1.7
-_BLUR_PX: Final = 1.0
+_GRAIN_CONTRAST: Final = 2.0
+_BLUR_PX: Final = 0.8
 _SLANT_POWER: Final = 0.8
 _FACE_LIGHT: Final = 0.05
 _SUBPIXELS: Final = np.array([(-1, -3), (3, -1), (1, 3), (-3, 1)]) / 8
@@ -197,10 +197,10 @@ def _lit(*, sunward: Array, upward: Array, sunlight: Array) -> Array:
 
 
 def _on_sky(rays: Rays, *, view: View) -> tuple[Array, Array, Array, Array]:
-    """Return place, facing and light on a ceiling of clouds at height 1, bent up at the horizon."""
+    """Return place, facing and light on a ceiling of clouds, bent down to the horizon."""
     x, y, z = rays.directions(view.axes)
     length = np.sqrt(x * x + y * y + z * z)
-    height = np.maximum(z, 0) / length + 0.15
+    height = np.abs(z) / length + 0.15
     return x / length / height, y / length / height, height**2, 1.06 - 0.25 * height
 
 

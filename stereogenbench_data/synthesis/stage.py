@@ -160,11 +160,11 @@ def _things(rng: np.random.Generator, *, lens: Lens) -> list[Shape]:
         y_m = rng.uniform(-0.5, 0.5) * (view_m + lens.span_m)
         if abs(x_m) < 0.4 + half_m.max():
             x_m = 0.6 + 2 * half_m.max()
-        kind = "box" if rng.random() < 0.55 else "ellipsoid"
+        is_box = rng.random() < 0.55
         tilt = rng.uniform(-0.6, 0.6) if rng.random() < 0.4 else 0.0
         shapes.append(
             Shape(
-                "box" if kind == "box" else "ellipsoid",
+                "box" if is_box else "ellipsoid",
                 np.array([x_m, y_m, half_m[2] * rng.uniform(0.75, 0.98)]),
                 _turned(yaw=rng.uniform(0, np.pi), tilt=tilt),
                 half_m,

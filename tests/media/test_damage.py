@@ -57,7 +57,7 @@ def test_a_lost_frame_is_never_passed_over(clips, suffix, lost):
     except MediaError as error:
         in_order = from_afar = [str(error)]
 
-    wrong = [f for f, index in zip(in_order, range(48)) if isinstance(f, int) and f != index]
+    wrong = [f for index, f in enumerate(in_order) if isinstance(f, int) and f != index]
     assert (wrong, "clip: holds 47 frames where 48 are expected" in str(in_order)) == ([], True)
     assert "clip: holds 47 frames where 48 are expected" in str(from_afar[0])
 
@@ -80,7 +80,7 @@ def test_a_cut_matroska_file_gives_its_frames_up_to_the_cut(clips):
     with VideoReader(path, name="clip", frames=48) as reader:
         assert outcome(reader, clips, 5) == 5
         with pytest.raises(
-            MediaError, match="clip: (holds .. frames where 48|is cut|cannot be read)"
+            MediaError, match=r"clip: (holds .. frames where 48|is cut|cannot be read)"
         ):
             reader.frame(47)
         assert outcome(reader, clips, 6) == 6

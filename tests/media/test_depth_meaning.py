@@ -135,7 +135,7 @@ def test_a_ray_becomes_depth_along_the_optical_axis():
 def test_a_ray_without_a_camera_is_refused():
     units = np.ones((1, 1), dtype=np.uint16)
 
-    with pytest.raises(MediaError, match="kind 'ray' .* got None: pass intrinsics="):
+    with pytest.raises(MediaError, match=r"kind 'ray' .* got None: pass intrinsics="):
         depth_m_from_units(units, measured=units > 0, encoding=DepthEncoding(kind="ray"))
 
 

@@ -110,6 +110,6 @@ def test_an_mp4_without_its_header_is_named_as_cut(clips):
     path.write_bytes(source.read_bytes()[:-2000])
 
     with pytest.raises(
-        MediaError, match="clip: cannot be opened as MP4 or Matroska .* is cut short"
+        MediaError, match=r"clip: cannot be opened as MP4 or Matroska .* is cut short"
     ):
         probe(path, name="clip")

@@ -2,11 +2,13 @@
 
 import random
 
+import av
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.video import VideoReader, read_rgb
 
 X264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p")
@@ -36,6 +38,20 @@ def test_every_frame_in_random_order_is_ffmpegs_own(clips, structure):
     with VideoReader(path, name="clip", frames=clips.frames) as reader:
         for index in [*range(clips.frames), *order]:
             np.testing.assert_array_equal(read_rgb(reader, index), truth[index])
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+@pytest.mark.parametrize("structure", ["deep pyramid", "mpeg4 with b-frames", "hevc"])
+def test_no_frame_of_a_sound_file_is_reached_the_long_way(clips, structure, suffix, monkeypatch):
+    def long_way(reader, index):
+        pytest.fail(f"frame {index} was decoded from the start")
+
+    monkeypatch.setattr(VideoReader, "_reach_from_start", long_way)
+    path = clips.rgb(f"{structure}.{suffix}", *STRUCTURES[structure])
+
+    with VideoReader(path, name="clip", frames=clips.frames) as reader:
+        for index in random.Random(3).sample(range(clips.frames), clips.frames):
+            reader.frame(index)
 
 
 @pytest.mark.parametrize("structure", ["groups of 12", "open groups", "mpeg4 with b-frames"])
@@ -81,6 +97,16 @@ def test_a_variable_frame_rate_is_counted_by_order_and_not_by_time(clips):
     assert (frames, shown) == (48, [30, 5, 47, 0, 46])
 
 
+def test_frames_that_come_late_within_a_steady_clip_are_counted_by_order(clips):
+    late = "setpts='(N+0.4*between(N,10,20))/15/TB'"
+    path = clips.rgb("jitter.mkv", "-vf", late, "-fps_mode", "vfr", *X264, "-g", "12")
+
+    with VideoReader(path, name="clip", frames=clips.frames) as reader:
+        shown = [clips.number(read_rgb(reader, index)) for index in (40, 15, 10, 21, 20)]
+
+    assert shown == [40, 15, 10, 21, 20]
+
+
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
 def test_a_late_start_does_not_shift_the_numbers(clips, suffix):
     source = clips.rgb("groups of 12.mp4", *STRUCTURES["groups of 12"])
@@ -112,7 +138,11 @@ def test_an_edit_list_that_hides_frames_counts_those_that_are_left(clips):
     path = clips.folder / "edited.mp4"
     clips.ffmpeg("-ss", "1.01", "-i", source, "-c", "copy", path)
     truth = clips.truth(path)
+    with av.open(str(path)) as container:
+        stored = container.streams.video[0].frames
 
+    with pytest.raises(MediaError, match=f"holds {len(truth)} frames where {stored} are expected"):
+        VideoReader(path, name="clip", frames=stored)
     with VideoReader(path, name="clip", frames=len(truth)) as reader:
         for index in (20, 0, len(truth) - 1, 1):
             np.testing.assert_array_equal(read_rgb(reader, index), truth[index])
@@ -144,7 +174,8 @@ def test_the_rendered_scene_is_ffmpegs_own_at_frames_far_apart(clips, shared_sce
         "-i", path, "-vf", f"select='{select}'", "-fps_mode", "passthrough",
         "-f", "rawvideo", "-pix_fmt", "rgb24", "-",
     )  # fmt: skip
-    truth = dict(zip(sorted(frames), np.frombuffer(raw, np.uint8).reshape(-1, 320, 320, 3)))
+    pictures = np.frombuffer(raw, np.uint8).reshape(3, 320, 320, 3)
+    truth = dict(zip(sorted(frames), pictures, strict=True))
 
     with VideoReader(path, name="clip", frames=81) as reader:
         for index in frames:
