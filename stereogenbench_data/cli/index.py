@@ -1,33 +1,15 @@
 """``stereogenbench index``: walk a released tree once, and keep what training asks of it."""
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
+
+from stereogenbench_data.cli.progress import progress_bar
 
 _INDEX_NAME = "index.parquet"
-
-
-class _RateColumn(ProgressColumn):
-    """Scenes a second."""
-
-    def render(self, task: Task) -> Text:
-        """Return the rate since the start."""
-        rate = task.finished_speed or task.speed
-        return Text("? scenes/s" if rate is None else f"{rate:.1f} scenes/s")
 
 
 def index(
@@ -65,7 +47,7 @@ def index(
     try:
         with (
             Journal(done_before, walk=f"{root.resolve()} valid_depth={mode}") as journal,
-            _progress(console) as progress,
+            progress_bar("indexing", unit="scenes") as progress,
         ):
             report = walk(
                 root, workers=workers, progress=progress, journal=journal, valid_depth=mode
@@ -85,21 +67,6 @@ def index(
     typer.echo(f"{target}: {len(report.scenes)} scenes")
     if report.broken:
         raise typer.Exit(1)
-
-
-@contextmanager
-def _progress(console: Console) -> Iterator[Callable[[int, int], None]]:
-    """Show a bar; give the function that moves it."""
-    columns = (
-        TextColumn("indexing"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        _RateColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task("indexing", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _list(console: Console, title: str, reasons: Mapping[str, str]) -> None:

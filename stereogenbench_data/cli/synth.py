@@ -5,18 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.text import Text
 
+from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.release import (
     FAMILIES,
     FRAME_COUNT,
@@ -25,15 +15,6 @@ from stereogenbench_data.schema.release import (
     Subset,
 )
 from stereogenbench_data.synthesis.request import ExportContract, RotationForm, SynthRequest
-
-
-class _RateColumn(ProgressColumn):
-    """Camera frames a second."""
-
-    def render(self, task: Task) -> Text:
-        """Return the rate since the start."""
-        rate = task.finished_speed or task.speed
-        return Text("? frames/s" if rate is None else f"{rate:.1f} frames/s")
 
 
 def synth(  # noqa: PLR0913 - one parameter an option
@@ -93,18 +74,5 @@ def synth(  # noqa: PLR0913 - one parameter an option
 def _drawn(out: Path, request: SynthRequest, *, workers: int) -> list[str]:
     from stereogenbench_data.synthesis.produce import synthesise
 
-    columns = (
-        TextColumn("drawing"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        _RateColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("drawing", total=None)
-        return synthesise(
-            out,
-            request,
-            workers=workers,
-            progress=lambda done, total: bar.update(task, completed=done, total=total),
-        )
+    with progress_bar("drawing", unit="frames") as report:
+        return synthesise(out, request, workers=workers, progress=report)

@@ -56,8 +56,6 @@ class Decoder:
         self._knows_key_frames = self._stream.frames > 0
         self._packets: Iterator[VideoPacket] = container.demux(self._stream)
         self._pending: deque[tuple[int, VideoFrame]] = deque()
-        # The frame at which decoding began.
-        self._key = 0
         # The frame after the last one given, and the frames whose packets came from there on.
         self._next = 0
         self._fed: set[int] = set()
@@ -123,7 +121,7 @@ class Decoder:
         self._packets = chain([first], self._packets)
         self._pending.clear()
         self._fed.clear()
-        self._key = self._next = self._index(first)
+        self._next = self._index(first)
         self._newest = 0
         self._knows_key_frames = True
 
@@ -152,13 +150,12 @@ class Decoder:
         return self._pending.popleft()
 
     def _feed(self, packet: VideoPacket) -> None:
-        # After a seek, a picture shown before the key frame lacks what it is predicted from.
-        if packet.size and not packet.is_discard and self._registered(packet) < self._key:
-            return
+        if packet.size and not packet.is_discard:
+            self._register(packet)
         self._pending.extend((self._index(frame), frame) for frame in packet.decode())
 
-    def _registered(self, packet: VideoPacket) -> int:
-        """Take note of a packet that is to be decoded; return the frame that it stands for."""
+    def _register(self, packet: VideoPacket) -> None:
+        """Take note of a packet that is to be decoded."""
         index = self._index(packet)
         if packet.is_corrupt:
             raise Astray(f"the packet of frame {index} is cut short")
@@ -167,4 +164,3 @@ class Decoder:
         self._fed.add(index)
         self._newest = max(self._newest, index)
         self._context.skip_frame = "NONREF" if index < self._skip_until else "DEFAULT"
-        return index

@@ -5,7 +5,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -69,8 +69,8 @@ _shared: list[_Shared] = []
 
 def run_jobs(
     jobs: Iterable[Job], *, workers: int, after_frames: Callable[[int], None]
-) -> Iterator[Job]:
-    """Do jobs in any order and yield each when it is done.
+) -> Generator[Job, None, None]:
+    """Do jobs in any order and yield each when it is done; close it to stop the rest.
 
     Args:
         jobs: The work; taken one by one, shortly before it is done.

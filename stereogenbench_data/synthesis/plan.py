@@ -26,6 +26,7 @@ from stereogenbench_data.synthesis.trajectory import (
 _SUBJECT_M: Final = 1.75
 _SUBJECT_PART: Final = 0.62
 _FIRST_LABEL: Final = 1000
+_MIDDLE_S: Final = 2.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,9 +104,6 @@ class ScenePlan:
             places_cm=self.places_cm,
             offset_cm=self.offset_cm,
         )
-
-
-_MIDDLE_S: Final = 2.6
 
 
 def plan_scene(request: SynthRequest, *, index: int) -> ScenePlan:

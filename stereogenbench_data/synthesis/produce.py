@@ -7,7 +7,7 @@ a scene, and the next run of the same request goes on with the scenes that are m
 
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Final
 
@@ -24,7 +24,7 @@ _UNFINISHED: Final = ".unfinished"
 
 
 def synthesise(
-    out: Path, request: SynthRequest, *, workers: int = 1, progress: Progress | None = None
+    out: str | Path, request: SynthRequest, *, workers: int = 1, progress: Progress | None = None
 ) -> list[str]:
     """Write scenes in the released layout, and keep those that the same request wrote before.
 
@@ -44,7 +44,8 @@ def synthesise(
     """
     if workers < 1:
         raise SynthesisError(f"workers must be at least 1, got {workers}.")
-    missing = [index for index in range(request.scenes) if _is_missing(out, request, index=index)]
+    root = Path(out)
+    missing = [index for index in range(request.scenes) if _is_missing(root, request, index=index)]
     per_scene = CAMERA_COUNT * request.frames
     drawn = (request.scenes - len(missing)) * per_scene
 
@@ -55,37 +56,33 @@ def synthesise(
             progress(drawn, request.scenes * per_scene)
 
     left = dict.fromkeys(missing, CAMERA_COUNT)
-    jobs = _jobs(out, request, missing=missing)
+    jobs = _jobs(root, request, missing=missing)
+    needed = min(workers, max(1, len(missing) * CAMERA_COUNT))
     after_frames(0)
     try:
-        for job in run_jobs(
-            jobs,
-            workers=min(workers, max(1, len(missing) * CAMERA_COUNT)),
-            after_frames=after_frames,
-        ):
-            left[job.index] -= 1
-            if not left[job.index]:
-                _finish(out, plan_scene(request, index=job.index), drawn_in=job.folder)
+        with closing(run_jobs(jobs, workers=needed, after_frames=after_frames)) as done:
+            for job in done:
+                left[job.index] -= 1
+                if not left[job.index]:
+                    _finish(root, plan_scene(request, index=job.index), drawn_in=job.folder)
     finally:
-        _clear(out, request, missing=missing)
+        _clear(root, request, missing=missing)
     return [request.key(index) for index in range(request.scenes)]
 
 
 def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
     """Tell whether a scene is to be drawn, and refuse a folder that another request wrote."""
     folder = out / request.key(index)
-    if not folder.exists():
-        return True
-    marker = folder / COMPLETE_JSON
-    expected = completion_text(plan_scene(request, index=index))
     try:
-        found = marker.read_text()
-    except OSError as error:
+        if not folder.exists():
+            return True
+        found = (folder / COMPLETE_JSON).read_text()
+    except (OSError, UnicodeDecodeError) as error:
         raise SynthesisError(
             f"{folder}: stands where a scene is to be written, and its {COMPLETE_JSON} could not "
             f"be read ({error}). Move it away or choose another folder."
         ) from error
-    if found != expected:
+    if found != completion_text(plan_scene(request, index=index)):
         raise SynthesisError(
             f"{folder}: is a scene that another request wrote (its {COMPLETE_JSON} differs). "
             f"Choose another folder or map_name, or move that one away."

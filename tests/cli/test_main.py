@@ -1,0 +1,69 @@
+"""The command as a whole, run as a user runs it."""
+
+import subprocess
+import sys
+
+import pytest
+
+
+def run(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "stereogenbench_data.cli.main", *map(str, arguments)],
+        capture_output=True, text=True, check=False, timeout=120, **options,
+    )  # fmt: skip
+
+
+def test_help_tells_a_newcomer_what_to_do_first():
+    shown = run("--help")
+
+    assert shown.returncode == 0
+    assert "New here? Draw some scenes with `stereogenbench synth scenes/`" in " ".join(
+        shown.stdout.split()
+    )
+
+
+def test_no_arguments_show_the_help():
+    assert "Usage" in run().stdout + run().stderr
+
+
+def test_the_version_is_the_packages():
+    from stereogenbench_data import __version__
+
+    assert run("--version").stdout.strip() == f"stereogenbench-data {__version__}"
+
+
+def test_an_error_is_said_without_a_traceback_and_ends_with_exit_code_2(tmp_path):
+    shown = run("index", tmp_path / "nowhere")
+
+    assert shown.returncode == 2
+    assert "nowhere" in shown.stderr
+    assert "Traceback" not in shown.stderr
+    assert len(shown.stderr.strip().splitlines()) <= 2
+
+
+def test_debug_shows_the_traceback(tmp_path):
+    shown = run("--debug", "index", tmp_path / "nowhere")
+
+    assert shown.returncode != 0
+    assert "Traceback" in shown.stderr
+
+
+@pytest.mark.parametrize("arguments", [["idnex"], ["index"], ["synth", "out", "--scenes", "some"]])
+def test_a_call_that_is_off_is_a_usage_error(arguments, tmp_path):
+    shown = run(*arguments, cwd=tmp_path)
+
+    assert shown.returncode == 2
+    assert "Usage" in shown.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_scenes_are_drawn_indexed_and_opened(tmp_path):
+    drawn = run("synth", "scenes", "--family", "Uniform", "--scenes", 2, "--size", 32,
+                "--frames", 3, "--seed", 1, cwd=tmp_path)  # fmt: skip
+    indexed = run("index", "scenes", cwd=tmp_path)
+
+    from stereogenbench_data import StereoPairs
+
+    assert (drawn.returncode, indexed.returncode) == (0, 0)
+    assert (tmp_path / "scenes" / "index.parquet").is_file()
+    assert len(StereoPairs(tmp_path / "scenes", pairs="all", frames="all")) == 2 * 15 * 3

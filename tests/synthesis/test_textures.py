@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+
+from stereogenbench_data.synthesis.shapes import Material, Shape
+from stereogenbench_data.synthesis.stage import Lens, draw_stage
+from stereogenbench_data.synthesis.sunlight import cast_shadow, full_light, sunlight_at
+from stereogenbench_data.synthesis.textures import TEXTURES, sample_atlas, texture_row
+
+
+def sampled(name, *, footprint_tiles, shift=(0.0, 0.0), side=96):
+    u, v = np.meshgrid(*[np.linspace(0, 1, side, endpoint=False)] * 2)
+    tiles = np.stack([u.ravel() + shift[0], v.ravel() + shift[1]]).astype(np.float32)
+    return sample_atlas(
+        tiles=tiles,
+        rows=np.full(side * side, texture_row(name), np.float32),
+        footprint_tiles=np.full(side * side, footprint_tiles, np.float32),
+    )
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_a_texture_repeats_without_a_seam(name):
+    here = sampled(name, footprint_tiles=0.004)
+    elsewhere = sampled(name, footprint_tiles=0.004, shift=(3.0, -2.0))
+
+    np.testing.assert_allclose(here, elsewhere, atol=2e-3)
+    rows = here.reshape(3, 96, 96)
+    across_the_seam = np.abs(rows[:, :, 0] - rows[:, :, -1]).mean()
+    assert across_the_seam < 2 * np.abs(np.diff(rows, axis=2)).mean()
+
+
+@pytest.mark.parametrize("name", TEXTURES)
+def test_the_larger_a_pixel_the_less_detail_and_the_same_mean(name):
+    drawn = [sampled(name, footprint_tiles=tiles) for tiles in (0.002, 0.03, 0.3, 5.0)]
+
+    for colours in drawn:
+        np.testing.assert_allclose(colours.mean(axis=1), drawn[0].mean(axis=1), atol=0.02)
+    spread = [colours.std(axis=1).max() for colours in drawn]
+    assert spread[0] > 0.05
+    assert spread == sorted(spread, reverse=True)
+    assert spread[-1] < 0.01
+
+
+def test_a_box_shades_the_ground_on_the_side_away_from_the_sun():
+    lens = Lens(distance_m=4.0, width_per_m=0.8, span_m=0.3, pixel_per_m=0.001)
+    stage = draw_stage(np.random.default_rng(1), lens=lens, walk_m_s=0.6)
+    stone = Material("plaster", 1.0, (1.0, 1.0, 1.0))
+    box = Shape("box", np.array([0.0, 0.0, 1.0]), np.eye(3), np.full(3, 1.0), stone)
+    light = full_light()
+
+    cast_shadow(light, shape=box, stage=stage)
+
+    away = 1.6 * -stage.sun[:2] / np.linalg.norm(stage.sun[:2])
+    behind, before = (
+        sunlight_at(light, x_m=np.array([x]), y_m=np.array([y]), stage=stage)[0]
+        for x, y in (away, -away)
+    )
+    assert behind < 0.5
+    assert before == 1.0
