@@ -76,7 +76,7 @@ class Decoder:
         """
         if self._must_seek(index):
             self._seek(index)
-        if self._can_skip and self._next != index:
+        if self._can_skip:
             self._skip_until = index
         return self.decode_to(index)
 

@@ -261,11 +261,12 @@ def read_rgb(
 ) -> UInt8[np.ndarray, "3 h w"]:
     """Return a frame as red, green and blue planes.
 
-    At the stored size the numbers equal those of ``ffmpeg -pix_fmt rgb24``, for 8-bit video bit
-    for bit, its colour matrix and range as the file tells them. At another size they are scaled
-    before the conversion, antialiased, with pixel centres kept (u' + 0.5 = s (u + 0.5)): by area
-    where the picture shrinks, else bicubic. The scaled conversion rounds, where ffmpeg's unscaled
-    one cuts off: it is 1.1 grey levels brighter on average.
+    At the stored size the numbers equal those of ``ffmpeg -pix_fmt rgb24``, bit for bit for
+    progressive 8-bit video, its colour matrix and range as the file tells them. At another size
+    they are scaled before the conversion, antialiased, with pixel centres kept (u' = s u, where
+    the first pixel's centre is 0.5): by area where the picture shrinks, else bicubic. The scaled
+    conversion of yuv420p rounds, where ffmpeg's unscaled one cuts off: it is 1.1 grey levels
+    brighter on average.
 
     Args:
         reader: An open video.

@@ -129,7 +129,8 @@ def _in_pool(
     told = 0
     while True:
         for job in itertools.islice(jobs, workers + 1 - len(running)):
-            running[pool.submit(_run_job, job)] = job
+            with _interrupts_held():
+                running[pool.submit(_run_job, job)] = job
         if not running:
             return
         done, _ = wait(running, timeout=_POLL_S, return_when=FIRST_COMPLETED)
@@ -139,6 +140,19 @@ def _in_pool(
         for future in done:
             future.result()
             yield running.pop(future)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Start processes so that Ctrl-C never reaches them; here it counts as soon as they started."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start_worker(shared: _Shared) -> None:

@@ -33,6 +33,7 @@ _GRAIN_TILE_M: Final = 0.45
 _GRAIN_CONTRAST: Final = 2.0
 _BLUR_PX: Final = 0.8
 _SLANT_POWER: Final = 0.8
+_LEAST_SLANT: Final = np.float32(1e-3)
 _FACE_LIGHT: Final = 0.05
 _SUBPIXELS: Final = np.array([(-1, -3), (3, -1), (1, 3), (-3, 1)]) / 8
 _SUBPIXEL_BATCH: Final = 1 << 15
@@ -60,7 +61,7 @@ class Scenery:
                 )
             ],
             np.float32,
-        )
+        ).T.copy()
 
     def first_met(self, rays: Rays, *, view: View) -> tuple[Array, Array]:
         """Return depth in metres and number of the solid that each ray meets first."""
@@ -145,13 +146,13 @@ def _shaded(
 ) -> tuple[Float32[np.ndarray, "3 n"], Float32[np.ndarray, " n"]]:
     """Return colours in 0..1, and the light alone, which tells the faces of a box apart."""
     place_m = np.empty((2, solid.size), np.float32)
-    footprint_m, light = np.empty((2, solid.size), np.float32)
+    footprint_m, slant, light = np.empty((3, solid.size), np.float32)
     for number in np.flatnonzero(np.bincount(solid)):
         index = np.flatnonzero(solid == number)
         part = Rays(rays.right[index], rays.below[index])
         if number == SKY:
             u_m, v_m, facing, lit = _on_sky(part, view=view)
-            reach = np.ones(1)
+            reach = 1.0
         else:
             reach = depth_m[index]
             if number == GROUND:
@@ -162,10 +163,11 @@ def _shaded(
                     part, view=view, shape=shape, depth_m=reach, sun=scenery.stage.sun
                 )
         place_m[0, index], place_m[1, index], light[index] = u_m, v_m, lit
-        footprint_m[index] = reach * np.maximum(facing, 1e-3) ** -_SLANT_POWER
+        footprint_m[index], slant[index] = reach, facing
+    footprint_m *= np.maximum(slant, _LEAST_SLANT) ** np.float32(-_SLANT_POWER)
     footprint_m *= _BLUR_PX / max(view.focal_px)
     return _painted(
-        scenery.materials[solid].T, place_m=place_m, footprint_m=footprint_m, light=light
+        scenery.materials[:, solid], place_m=place_m, footprint_m=footprint_m, light=light
     ), light
 
 

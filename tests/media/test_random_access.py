@@ -41,7 +41,9 @@ def test_every_frame_in_random_order_is_ffmpegs_own(clips, structure):
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
-@pytest.mark.parametrize("structure", ["deep pyramid", "mpeg4 with b-frames", "hevc"])
+@pytest.mark.parametrize(
+    "structure", ["deep pyramid", "groups of 12", "mpeg4 with b-frames", "hevc"]
+)
 def test_no_frame_of_a_sound_file_is_reached_the_long_way(clips, structure, suffix, monkeypatch):
     def long_way(reader, index):
         pytest.fail(f"frame {index} was decoded from the start")
@@ -50,8 +52,8 @@ def test_no_frame_of_a_sound_file_is_reached_the_long_way(clips, structure, suff
     path = clips.rgb(f"{structure}.{suffix}", *STRUCTURES[structure])
 
     with VideoReader(path, name="clip", frames=clips.frames) as reader:
-        for index in random.Random(3).sample(range(clips.frames), clips.frames):
-            reader.frame(index)
+        for index in random.Random(3).sample(range(clips.frames - 1), clips.frames - 1):
+            _ = reader.frame(index), reader.frame(index + 1)
 
 
 @pytest.mark.parametrize("structure", ["groups of 12", "open groups", "mpeg4 with b-frames"])
