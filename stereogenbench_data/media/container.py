@@ -45,7 +45,8 @@ class StreamFacts:
 
     Attributes:
         codec: FFmpeg's name of the codec, such as "h264" or "ffv1".
-        pixel_format: FFmpeg's name of the stored pixel format, such as "yuv420p" or "gray16le".
+        pixel_format: FFmpeg's name of the stored pixel format, such as "yuv420p" or "gray16le";
+            empty where it was not asked for and the header does not tell it.
         width_px: Width of every picture.
         height_px: Height of every picture.
         frames: Number of pictures.
@@ -123,15 +124,24 @@ def _require_file(path: Path, *, name: str) -> None:
         raise MediaError(f"{name}: is empty (0 bytes at {path}): fetch it again.")
 
 
-def stream_facts(container: InputContainer, *, name: str, frames: int) -> StreamFacts:
+def stream_facts(
+    container: InputContainer,
+    *,
+    name: str,
+    frames: int,
+    pixel_format: Literal["needed", "later"] = "needed",
+) -> StreamFacts:
     """Return the header's facts; ``frames`` is what the caller knows of the number of pictures.
+
+    With pixel format "later", it is empty where the header does not tell it.
 
     Raises:
         MediaError: If the codec cannot be decoded or the header lacks size or pixel format.
     """
     stream = container.streams.video[0]
     context = stream.codec_context
-    if context.pix_fmt is None or not (context.width > 0 and context.height > 0):
+    told = context.pix_fmt is not None or pixel_format == "later"
+    if not (told and context.width > 0 and context.height > 0):
         raise MediaError(
             f"{name}: its header tells no picture (codec {context.name}, pixel format "
             f"{context.pix_fmt}, {context.width}x{context.height}). The file is cut short or "
@@ -139,7 +149,7 @@ def stream_facts(container: InputContainer, *, name: str, frames: int) -> Stream
         )
     return StreamFacts(
         codec=context.codec.canonical_name,
-        pixel_format=context.pix_fmt,
+        pixel_format=context.pix_fmt or "",
         width_px=context.width,
         height_px=context.height,
         frames=frames,

@@ -34,7 +34,9 @@ _RED_GREEN_BLUE: Final = (2, 0, 1)
 """Where the planes of FFmpeg's gbrp are."""
 
 
-def probe(file: VideoFile, *, name: str) -> StreamFacts:
+def probe(
+    file: VideoFile, *, name: str, pixel_format: Literal["needed", "later"] = "needed"
+) -> StreamFacts:
     """Return what a video file is, from its header where the header can be trusted.
 
     Frames are counted by the header of an MP4 file, and by duration and rate of a Matroska file
@@ -43,15 +45,17 @@ def probe(file: VideoFile, *, name: str) -> StreamFacts:
     Args:
         file: A path, or a seekable binary file; the latter stays the caller's to close.
         name: What messages call the file.
+        pixel_format: "later" spares the decoding of a picture (tens of milliseconds of large
+            H.264), where only that would tell the pixel format.
 
     Raises:
         StorageError: If the file cannot be read.
         MediaError: If it is no MP4 or Matroska video, is cut short or holds no frame.
     """
-    with open_container(file, name=name) as container:
+    with open_container(file, name=name, pixel_format=pixel_format) as container:
         require_whole_payload(container, name=name)
         frames = _told_frames(container)
-        facts = stream_facts(container, name=name, frames=frames)
+        facts = stream_facts(container, name=name, frames=frames, pixel_format=pixel_format)
     if frames:
         return facts
     with open_container(file, name=name) as container:

@@ -119,12 +119,19 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         _text(folder, key, TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}"
     )
     caption = _caption(folder, key, files)
-    facts = {name: probe(folder / name, name=f"{key}/{name}") for name in VIDEO_FILES}
+    depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
+    facts = {
+        name: probe(
+            folder / name,
+            name=f"{key}/{name}",
+            pixel_format="needed" if name in depth_names else "later",
+        )
+        for name in VIDEO_FILES
+    }
     frames = _common_frames(key, facts, trajectory)
     rig = _sized_as_videos(key, rig, facts)
     poses = CameraPoses.from_trajectory(trajectory)
     _require_recorded_baselines(key, rig, poses)
-    depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
     encodings = [resolve_encoding(facts[name], name=f"{key}/{name}") for name in depth_names]
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames, encodings)
     return Scene(

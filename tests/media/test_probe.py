@@ -1,5 +1,7 @@
 """What a file is, from few of its bytes, and counted where the header cannot be trusted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -113,3 +115,12 @@ def test_an_mp4_without_its_header_is_named_as_cut(clips):
         MediaError, match=r"clip: cannot be opened as MP4 or Matroska .* is cut short"
     ):
         probe(path, name="clip")
+
+
+def test_the_pixel_format_may_wait_and_all_else_is_told(clips):
+    path = clips.rgb("groups of 12.mp4", *GROUPS_OF_12)
+
+    asked, waiting = (probe(path, name="clip", pixel_format=when) for when in ("needed", "later"))
+
+    assert (asked.pixel_format, waiting.pixel_format) == ("yuv420p", "")
+    assert replace(waiting, pixel_format="yuv420p") == asked

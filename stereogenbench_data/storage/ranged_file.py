@@ -1,0 +1,155 @@
+"""A member's bytes as a file of their own: seekable, read-only, and blind to what lies around it."""
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.schema.records import Member
+
+FIRST_BLOCK: Final = 64 * 1024
+"""Bytes fetched where reading starts anew."""
+
+LARGEST_BLOCK: Final = 1024 * 1024
+"""Bytes to which a block grows while reading goes on where the one before it ended."""
+
+KEPT_BYTES: Final = 2 * LARGEST_BLOCK
+"""Bytes of a member that are kept to be read again: a file's header, the frames nearby."""
+
+
+class MemberFile(io.RawIOBase):
+    """A file that holds just the bytes of one member; what reads them is up to the subclass."""
+
+    def __init__(self, size: int) -> None:
+        """Stand at the start of so many bytes."""
+        super().__init__()
+        self.size = size
+        self._position = 0
+
+    def readable(self) -> bool:
+        """Return that it can be read."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return that it can be sought in."""
+        return True
+
+    def tell(self) -> int:
+        """Return where the next byte is read."""
+        return self._position
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        """Go to a place, counted from the start, from here or from the end; return it."""
+        start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence]
+        if start + offset < 0:
+            raise ValueError(f"there is no place {start + offset} in a file")
+        self._position = start + offset
+        return self._position
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next so many bytes, fewer only at the end; with -1 all that are left."""
+        wanted = self.size if size is None or size < 0 else self._position + size
+        stop = min(wanted, self.size)
+        if stop <= self._position:
+            return b""
+        data = self._bytes(self._position, stop)
+        self._position = stop
+        return data
+
+    def readinto(self, buffer: bytearray | memoryview, /) -> int:  # type: ignore[override]
+        """Fill a buffer as far as there are bytes; return how many."""
+        data = self.read(len(buffer))
+        buffer[: len(data)] = data
+        return len(data)
+
+    def _bytes(self, start: int, stop: int) -> bytes:
+        """Return the bytes from start to stop, which lie within the member."""
+        raise NotImplementedError
+
+
+class FileSlice(MemberFile):
+    """A member of a local shard, or of the cache: it stays readable while the file is replaced."""
+
+    def __init__(self, path: Path, member: Member) -> None:
+        """Open the file that holds the member's bytes.
+
+        Raises:
+            OSError: If it cannot be opened.
+        """
+        super().__init__(member.size)
+        self._path = path
+        self._offset = member.offset
+        self._file = path.open("rb", buffering=0)
+
+    def close(self) -> None:
+        """Close the file."""
+        if not self.closed:
+            self._file.close()
+        super().close()
+
+    def _bytes(self, start: int, stop: int) -> bytes:
+        self._file.seek(self._offset + start)
+        data = self._file.read(stop - start)
+        while len(data) < stop - start:
+            more = self._file.read(stop - start - len(data))
+            if not more:
+                raise StorageError(
+                    f"{self._path}: ends at byte {self._file.tell()}, within a member of "
+                    f"{self.size} bytes from {self._offset} on. It was cut short while it was "
+                    f"open: fetch it again."
+                )
+            data += more
+        return data
+
+
+class RangedFile(MemberFile):
+    """A member of which bytes are fetched in blocks as they are asked for, ahead of the reader.
+
+    Blocks start small and double while reading goes on where one ended, so that a first frame
+    costs little and a whole pass few requests. No byte is fetched twice in a pass forwards, and
+    none beyond the member.
+    """
+
+    def __init__(self, fetch: Callable[[int, int], bytes], *, size: int) -> None:
+        """Read through ``fetch(start, stop)``, which returns these bytes of the member."""
+        super().__init__(size)
+        self._fetch = fetch
+        self._blocks: list[tuple[int, bytes]] = []
+        self.failure: StorageError | None = None
+
+    def close(self) -> None:
+        """Forget what was fetched."""
+        self._blocks.clear()
+        super().close()
+
+    def _bytes(self, start: int, stop: int) -> bytes:
+        parts: list[bytes] = []
+        while start < stop:
+            first, data = self._block(start, stop)
+            parts.append(data[start - first : stop - first])
+            start += len(parts[-1])
+        return b"".join(parts)
+
+    def _block(self, start: int, stop: int) -> tuple[int, bytes]:
+        """Return a block that holds the byte at start; the last one used comes last."""
+        for number, (first, data) in enumerate(self._blocks):
+            if first <= start < first + len(data):
+                self._blocks.append(self._blocks.pop(number))
+                return self._blocks[-1]
+        before = [len(data) for first, data in self._blocks if first + len(data) == start]
+        length = min(2 * max(before, default=FIRST_BLOCK // 2), LARGEST_BLOCK)
+        behind = [first for first, _ in self._blocks if first > start]
+        end = min(max(start + length, stop), self.size, *behind)
+        if self.failure is not None:
+            raise self.failure
+        try:
+            block = (start, self._fetch(start, end))
+        except StorageError as error:
+            # Whoever reads may take an error for the end of the file and try again: tell it anew.
+            self.failure = error
+            raise
+        self._blocks.append(block)
+        while sum(len(data) for _, data in self._blocks) > KEPT_BYTES and len(self._blocks) > 1:
+            self._blocks.pop(0)
+        return block
