@@ -21,7 +21,7 @@ GROUND: Final = 1
 FIRST_SHAPE: Final = 2
 
 _NEAREST_M: Final = 0.05
-_STRIP_RAYS: Final = 1 << 21
+_STRIP_RAYS: Final = 1 << 17
 
 
 @dataclass(frozen=True, slots=True, eq=False)

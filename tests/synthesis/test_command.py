@@ -1,0 +1,41 @@
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.synth import synth
+from stereogenbench_data.errors import SynthesisError
+
+app = typer.Typer()
+app.command()(synth)
+SMALL = ("--size", "32", "--frames", "1", "--workers", "1")
+
+
+def test_the_command_writes_scenes_and_says_where(tmp_path):
+    arguments = [str(tmp_path), *SMALL, "--family", "Uniform", "--scenes", "2", "--map", "Downtown"]
+
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+    assert result.exit_code == 0
+    assert f"{tmp_path}: 2 scenes in train/Uniform/Downtown" in result.stdout
+    assert "12/12" in result.stderr
+    assert len(list(tmp_path.rglob("_scene_complete.json"))) == 2
+
+
+def test_the_command_passes_the_contract_on(tmp_path):
+    options = ["--rotation", "matrix", "--depth-tag", "", "--depth-unit-m", "0.1"]
+
+    CliRunner().invoke(app, [str(tmp_path), *SMALL, *options], catch_exceptions=False)
+
+    (trajectory,) = tmp_path.rglob("trajectory.json")
+    (marker,) = tmp_path.rglob("_scene_complete.json")
+    assert '"rotation_representation": "matrix_3x3"' in trajectory.read_text()
+    assert "depth_unit_m=0.1, depth_tag=None" in marker.read_text()
+
+
+def test_a_request_that_no_scene_can_meet_ends_the_command(tmp_path):
+    with pytest.raises(SynthesisError, match="in the train split only"):
+        CliRunner().invoke(
+            app,
+            [str(tmp_path), *SMALL, "--family", "Pairwise_Uniform", "--split", "eval"],
+            catch_exceptions=False,
+        )
