@@ -4,7 +4,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint clean
+SAMPLE := build/sample
+SYNTH := $(BIN)/stereogenbench synth $(SAMPLE)/release --size 72 --frames 81 --depth-unit-m 0.01
+
+.PHONY: demo test lint sample clean
 .DELETE_ON_ERROR:
 
 demo: $(READY)
@@ -17,6 +20,21 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+# The scenes in shards/: videos are not drawn to the same bytes everywhere, packing is the same.
+sample: $(READY)
+	rm -rf $(SAMPLE)
+	$(SYNTH) --family IPD_Gaussian --seed 1
+	$(SYNTH) --family Uniform --seed 2 --scenes 2
+	$(SYNTH) --family Pairwise_Uniform --seed 3
+	$(SYNTH) --family IPD_Gaussian --seed 4 --split eval
+	$(SYNTH) --family Uniform --seed 5 --split eval
+	$(SYNTH) --family IPD_Gaussian --seed 6 --split eval --subset unseen_map --map SynthYard
+	$(SYNTH) --family Uniform --seed 7 --split eval --subset unseen_map --map SynthYard
+	$(BIN)/stereogenbench pack $(SAMPLE)/release $(SAMPLE)/shards --shard-size 4MB
+	rm -rf shards/*.tar shards/dali
+	cp -r $(SAMPLE)/shards/* shards/
+	$(BIN)/stereogenbench verify --deep shards
 
 $(READY): pyproject.toml constraints/cpu.txt
 	$(PYTHON) -m venv $(VENV)

@@ -9,7 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from stereogenbench_data.datasets.adapters import to_raft_stereo, to_torchvision
+    from stereogenbench_data.datasets.batches import EpochBatches
+    from stereogenbench_data.datasets.loader import PairsLoader
     from stereogenbench_data.datasets.mapped import SceneViews, StereoPairs
+    from stereogenbench_data.datasets.streamed import StereoPairStream
     from stereogenbench_data.datasets.tensors import collate
     from stereogenbench_data.errors import (
         FieldError,
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
         MediaError,
         SchemaError,
         SelectionError,
+        StateError,
         StereoGenBenchError,
         StorageError,
         SynthesisError,
@@ -34,13 +38,18 @@ if TYPE_CHECKING:
         Resize,
     )
     from stereogenbench_data.schema.records import DepthEncoding
+    from stereogenbench_data.selection.quality import order_quality
+    from stereogenbench_data.storage.cache import ShardCache
     from stereogenbench_data.storage.index import SceneIndex
 
 __version__ = version("stereogenbench-data")
 
 _HOMES = {
     "datasets.adapters": ("to_raft_stereo", "to_torchvision"),
+    "datasets.batches": ("EpochBatches",),
+    "datasets.loader": ("PairsLoader",),
     "datasets.mapped": ("SceneViews", "StereoPairs"),
+    "datasets.streamed": ("StereoPairStream",),
     "datasets.tensors": ("collate",),
     "errors": (
         "FieldError",
@@ -48,6 +57,7 @@ _HOMES = {
         "MediaError",
         "SchemaError",
         "SelectionError",
+        "StateError",
         "StereoGenBenchError",
         "StorageError",
         "SynthesisError",
@@ -65,6 +75,8 @@ _HOMES = {
         "Resize",
     ),
     "schema.records": ("DepthEncoding",),
+    "selection.quality": ("order_quality",),
+    "storage.cache": ("ShardCache",),
     "storage.index": ("SceneIndex",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
@@ -76,12 +88,14 @@ __all__ = [
     "Compose",
     "Crop",
     "DepthEncoding",
+    "EpochBatches",
     "Eraser",
     "FieldError",
     "GeometryError",
     "HorizontalFlip",
     "Letterbox",
     "MediaError",
+    "PairsLoader",
     "RandomCrop",
     "RandomScale",
     "Resize",
@@ -89,11 +103,15 @@ __all__ = [
     "SceneViews",
     "SchemaError",
     "SelectionError",
+    "ShardCache",
+    "StateError",
     "StereoGenBenchError",
+    "StereoPairStream",
     "StereoPairs",
     "StorageError",
     "SynthesisError",
     "collate",
+    "order_quality",
     "to_raft_stereo",
     "to_torchvision",
 ]

@@ -8,6 +8,7 @@ StereoGenBenchError
 │   └── ShardError                a shard is missing, cut short or altered
 ├── SelectionError (LookupError)  a filter, a pair or a window that no sample can satisfy
 ├── FieldError     (ValueError)   fields or transforms that cannot be had together
+├── StateError     (ValueError)   a saved position of other samples or of another order
 └── SynthesisError (ValueError)   a scene that cannot be drawn as asked
 
 Each takes one message: so a DataLoader worker's error is rebuilt as itself in the main process.
@@ -44,6 +45,10 @@ class SelectionError(StereoGenBenchError, LookupError):
 
 class FieldError(StereoGenBenchError, ValueError):
     """Fields or transforms that cannot be had together."""
+
+
+class StateError(StereoGenBenchError, ValueError):
+    """A saved position that belongs to other samples, or to another order of them."""
 
 
 class SynthesisError(StereoGenBenchError, ValueError):

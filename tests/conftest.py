@@ -6,6 +6,8 @@ import pytest
 
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 
+pytest_plugins = ("tests.servers.fixtures",)
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 

@@ -43,6 +43,10 @@ def index(
     console = Console(stderr=True)
     target = root / _INDEX_NAME if out is None else out
     mode: Literal["skip", "sample"] = "sample" if valid_depth else "skip"
+    if target.is_dir():
+        raise typer.BadParameter(
+            f"{target} is a folder: name a file, such as {target / _INDEX_NAME}."
+        )
     done_before = target.with_name(f"{target.name}.journal")
     try:
         with (

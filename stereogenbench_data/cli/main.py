@@ -8,7 +8,9 @@ from typing import Annotated
 import typer
 
 from stereogenbench_data.cli.index import index
+from stereogenbench_data.cli.pack import pack
 from stereogenbench_data.cli.synth import synth
+from stereogenbench_data.cli.verify import verify
 from stereogenbench_data.errors import StereoGenBenchError
 
 EXIT_ERROR = 2
@@ -33,6 +35,8 @@ app = typer.Typer(
 )
 app.command()(synth)
 app.command()(index)
+app.command()(pack)
+app.command()(verify)
 
 
 def _print_version(value: bool) -> None:

@@ -50,6 +50,7 @@ def disparity_from_depth(
     array([[40.,  0.,  0.]])
     """
     _require_pair(focal_px, baseline_m)
+    _require_float(depth_m)
     xp = array_namespace(depth_m)
     disparity_px = quotient(focal_px * baseline_m, as_float64(_inf_where_not_positive(depth_m)))
     return xp.astype(disparity_px, depth_m.dtype, copy=False)
@@ -206,6 +207,15 @@ def _ray_per_planar(like: Float[Any, "*batch h w"], intrinsics: Intrinsics) -> F
 def _inf_where_not_positive(values: Float[Any, "*batch h w"]) -> Float[Any, "*batch h w"]:
     xp = array_namespace(values)
     return xp.where(values > 0, values, math.inf)
+
+
+def _require_float(depth_m: Any) -> None:
+    xp = array_namespace(depth_m)
+    if depth_m.dtype not in (xp.float32, xp.float64):
+        raise GeometryError(
+            f"depth in metres must be float32 or float64, got {depth_m.dtype}: convert it, or use "
+            "disparity_from_units for stored numbers."
+        )
 
 
 def _require_pair(focal_px: float, baseline_m: float) -> None:

@@ -35,7 +35,8 @@ def resolve_encoding(
     """Return how a depth stream's numbers become metres: as the user says, else as it is tagged.
 
     A tag is one whose key contains "scale", in any case, of the container or of the stream; its
-    value is metres in a stored unit. Without one the release's default holds, 0.1 m.
+    value is metres in a stored unit. Without one the release's default holds, 0.1 m. Beside a tag
+    that is a number, one that is none is taken to speak of something else.
 
     Args:
         facts: What `probe` found.
@@ -47,20 +48,20 @@ def resolve_encoding(
 
     Source: the paper's appendix on the file schema.
     """
-    if override is not None:
+    if override is not None and override.unit_m is not None:
         return replace(override, source="user")
+    contract = override or DepthEncoding()
     scales = {key: value for key, value in facts.tags.items() if "scale" in key}
     if not scales:
-        return DepthEncoding(unit_m=DEFAULT_DEPTH_UNIT_M, source="default")
-    units_m = {_unit_m(value) for value in scales.values()}
-    unit_m = units_m.pop() if len(units_m) == 1 else None
-    if unit_m is None:
+        return contract.with_file_unit(DEFAULT_DEPTH_UNIT_M, source="default")
+    units_m = {unit_m for value in scales.values() if (unit_m := _unit_m(value)) is not None}
+    if len(units_m) != 1:
         told = ", ".join(f"{key}={value!r}" for key, value in sorted(scales.items()))
         raise MediaError(
             f"{name}: its tags must tell one positive number of metres in a stored unit of depth, "
             f"found {told}: correct the tags, or pass DepthEncoding(unit_m=...)."
         )
-    return DepthEncoding(unit_m=unit_m, source="tag")
+    return contract.with_file_unit(units_m.pop(), source="tag")
 
 
 def _unit_m(value: str) -> float | None:
@@ -122,8 +123,9 @@ def _accepted_layout(
         accept = ", ".join(repr(risk) for risk in sorted({*encoding.accept, *refused}))
         raise MediaError(
             f"{stored} ({', '.join(refused)}), which does not keep depth whole. Store it as "
-            f"gray16le with FFV1; if it is meant so, pass DepthEncoding("
-            f"unit_m={encoding.unit_m!r}, accept=frozenset({{{accept}}}))."
+            f"gray16le with FFV1; if it is meant so, pass "
+            f"DepthEncoding(accept=frozenset({{{accept}}})), with unit_m=... if the file does not "
+            f"tell its unit."
         )
     return layout
 
@@ -193,13 +195,14 @@ def depth_m_from_units(
             "depth of kind 'ray' becomes depth along the optical axis by the camera's intrinsics, "
             "got None: pass intrinsics=... of this picture."
         )
+    unit_m = encoding.known_unit_m
     depth_m = np.empty(units.shape, dtype=np.float32)
     if encoding.form == "depth":
-        np.multiply(units, encoding.unit_m, out=depth_m, dtype=np.float64, casting="same_kind")
+        np.multiply(units, unit_m, out=depth_m, dtype=np.float64, casting="same_kind")
         depth_m *= measured
     else:
         with np.errstate(divide="ignore"):
-            np.divide(encoding.unit_m, units, out=depth_m, dtype=np.float64, casting="same_kind")
+            np.divide(unit_m, units, out=depth_m, dtype=np.float64, casting="same_kind")
         depth_m[~measured] = 0
     if encoding.kind == "ray" and intrinsics is not None:
         planar_m: Float32[np.ndarray, "*batch h w"] = planar_from_ray(depth_m, intrinsics)

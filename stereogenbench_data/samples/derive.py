@@ -118,7 +118,7 @@ class PairGeometry:
             by_depth: MapF32 = disparity_from_depth(self.depth_m, **rig)
             return by_depth
         disparity: MapF32 = disparity_from_units(
-            self.stored.units, **rig, unit_m=self._encoding.unit_m, form=self._encoding.form
+            self.stored.units, **rig, unit_m=self._encoding.known_unit_m, form=self._encoding.form
         )
         disparity *= self.stored.measured
         return disparity
@@ -159,22 +159,22 @@ class PairGeometry:
     def quantum_m(self, target: DepthEncoding) -> float | MapF32:
         """Return the coarser step between depths that the two cameras can store."""
         if self._encoding.form == "depth":
-            return max(self._encoding.unit_m, target.unit_m)
-        return self.depth_m**2 / np.float32(self._encoding.unit_m)
+            return max(self._encoding.known_unit_m, target.known_unit_m)
+        return self.depth_m**2 / np.float32(self._encoding.known_unit_m)
 
     @cached_property
     def disparity_error(self) -> MapF32:
         """How far quantised depth can put disparity off, in pixels; 0 where not measured."""
         focal_px = self._views.intrinsics.fx_px
         if self._encoding.form == "inverse":
-            half_step_px = focal_px * abs(self.baseline_m) / self._encoding.unit_m / 2
+            half_step_px = focal_px * abs(self.baseline_m) / self._encoding.known_unit_m / 2
             flat: MapF32 = self.stored.measured * np.float32(half_step_px)
             return flat
         bound: MapF32 = disparity_error_px(
             self.depth_m,
             focal_px=focal_px,
             baseline_m=self.baseline_m,
-            quantum_m=self._encoding.unit_m,
+            quantum_m=self._encoding.known_unit_m,
         )
         return bound
 

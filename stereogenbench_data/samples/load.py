@@ -3,13 +3,12 @@
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final, Literal, Protocol, runtime_checkable
+from typing import Any, Final, Literal, NoReturn, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Shaped
 
-from stereogenbench_data.errors import MediaError, SchemaError, StorageError
+from stereogenbench_data.errors import MediaError, SchemaError, ShardError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.media.depth import (
@@ -39,8 +38,9 @@ from stereogenbench_data.schema.parse import parse_trajectory
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import TRAJECTORY_JSON, depth_name, rgb_name
 from stereogenbench_data.selection.plan import Address, Plan
+from stereogenbench_data.storage.cache import ShardCache
 from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.source import member_path, read_member
+from stereogenbench_data.storage.source import MemberSource
 
 Sample = dict[str, Any]
 Clip = Literal["frame", "clip"]
@@ -123,21 +123,40 @@ def require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None
     """
     if not request.streams & {"source_depth", "target_depth"}:
         return
-    stored = np.stack([index.column("depth_codec"), index.column("depth_pixel_format")], axis=-1)
     encoding = request.depth or DepthEncoding()
-    for codec, pixel_format in sorted(set(map(tuple, stored.reshape(-1, 2)))):
+    units_told = index.column("depth_unit_source") != "unreadable"
+    stored = np.stack([index.column("depth_codec"), index.column("depth_pixel_format")], axis=-1)
+    whole = np.zeros(units_told.shape, dtype=bool)
+    for codec, pixel_format in set(map(tuple, stored.reshape(-1, 2))):
         try:
             require_depth_stream(
                 codec=codec, pixel_format=pixel_format, encoding=encoding, name="depth"
             )
         except MediaError:
-            uses = (stored == (codec, pixel_format)).all(axis=-1)
-            for row, camera in _depth_reads(plan, request):
-                if uses[row, camera]:
-                    name = index.scene(row).members[depth_name(camera)].path
-                    require_depth_stream(
-                        codec=codec, pixel_format=pixel_format, encoding=encoding, name=name
-                    )
+            continue
+        whole |= (stored == (codec, pixel_format)).all(axis=-1)
+    usable = whole & (units_told | (encoding.unit_m is not None))
+    if usable.all():
+        return
+    for row, camera in _depth_reads(plan, request):
+        if not usable[row, camera]:
+            _refuse_depth(index.scene(row), camera, encoding=encoding)
+
+
+def _refuse_depth(scene: Scene, camera: int, *, encoding: DepthEncoding) -> NoReturn:
+    name = scene.members[depth_name(camera)].path
+    if not name.endswith(depth_name(camera)):
+        name = f"{name}: {scene.id.key}.{depth_name(camera)}"
+    require_depth_stream(
+        codec=scene.depth_codec[camera],
+        pixel_format=scene.depth_pixel_format[camera],
+        encoding=encoding,
+        name=name,
+    )
+    raise MediaError(
+        f"{name}: its tags do not tell one positive number of metres in a stored unit of depth. "
+        "Correct the tags, or pass DepthEncoding(unit_m=...)."
+    )
 
 
 def _depth_reads(plan: Plan, request: Request) -> Iterator[tuple[int, int]]:
@@ -153,11 +172,16 @@ def _depth_reads(plan: Plan, request: Request) -> Iterator[tuple[int, int]]:
 class SampleLoader:
     """Loads samples as flat dicts of numpy arrays and texts; open files stay in this process."""
 
-    def __init__(self, index: SceneIndex, request: Request) -> None:
+    def __init__(
+        self, index: SceneIndex, request: Request, *, cache: ShardCache | None = None
+    ) -> None:
         """Prepare to load what is requested from the index's data; nothing is opened yet."""
         self._index = index
         self._request = request
-        self._streams = Streams()
+        self._source = MemberSource(
+            index.root, shards=index.shards, revision=index.digest, cache=cache
+        )
+        self._streams = Streams(self._source)
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
 
     def load(self, address: Address, *, clip: Clip, generator: np.random.Generator) -> Sample:
@@ -175,16 +199,39 @@ class SampleLoader:
         """
         scene = self._index.scene(address.row)
         try:
-            views, facts = self._decode(scene, address)
+            views, facts = self._decode_or_again(scene, address)
         except (StorageError, MediaError, SchemaError) as error:
             raise type(error)(f"{scene.id.key}, frames {address.frames}: {error}") from error
         if self._request.transform is not None:
             views = self._request.transform(views, generator)
         return self._fields(views, facts, clip=clip)
 
+    def keep_open(self, videos: int) -> None:
+        """Keep up to so many videos open, in this process and in copies of this loader."""
+        self._streams.keep(videos)
+
+    def release(self, row: int) -> None:
+        """Close the videos of a scene that has been read to its end."""
+        self._streams.release(self._index.scene(row))
+
     def close(self) -> None:
         """Close the videos that are open in this process."""
         self._streams.close()
+
+    def _decode_or_again(self, scene: Scene, address: Address) -> tuple[Views, SceneFacts]:
+        """Decode; again, where what was decoded came from a cache that was damaged since."""
+        try:
+            return self._decode(scene, address)
+        except (MediaError, SchemaError, ShardError):
+            names = [
+                *(rgb_name(camera) for camera in self._cameras(address, suffix="rgb")),
+                *(depth_name(camera) for camera in self._cameras(address, suffix="depth")),
+                TRAJECTORY_JSON,
+            ]
+            if not self._source.drop_damaged(scene, names):
+                raise
+            self._streams.close()
+            return self._decode(scene, address)
 
     def _decode(self, scene: Scene, address: Address) -> tuple[Views, SceneFacts]:
         encodings = {
@@ -216,7 +263,8 @@ class SampleLoader:
             },
             intrinsics=intrinsics,
         )
-        return views, SceneFacts(scene, encodings, self._camera_poses(scene), self._url(scene))
+        url = self._source.url(scene, rgb_name(address.source))
+        return views, SceneFacts(scene, encodings, self._camera_poses(scene), url)
 
     def _cameras(self, address: Address, *, suffix: Literal["rgb", "depth"]) -> list[int]:
         """Return the cameras whose colour or depth the request needs."""
@@ -228,29 +276,27 @@ class SampleLoader:
         return list(dict.fromkeys(cameras))
 
     def _encoding(self, scene: Scene, camera: int) -> DepthEncoding:
-        if self._request.depth is not None:
-            return self._request.depth
-        source: Any = scene.depth_unit_source[camera]
-        return DepthEncoding(unit_m=scene.depth_unit_m[camera], source=source)
+        contract = self._request.depth or DepthEncoding()
+        source = scene.depth_unit_source[camera]
+        if source == "unreadable":
+            return contract
+        return contract.with_file_unit(scene.depth_unit_m[camera], source=source)
 
     def _picture(self, scene: Scene, camera: int, frame: int) -> Any:
-        path = member_path(self._index.root, scene.members[rgb_name(camera)])
-        return self._streams.rgb(path, frame, frames=scene.frames, size=self._request.size)
+        return self._streams.rgb(scene, rgb_name(camera), frame, size=self._request.size)
 
     def _stored(
         self, scene: Scene, camera: int, frame: int, *, encoding: DepthEncoding
     ) -> StoredDepth:
-        path = member_path(self._index.root, scene.members[depth_name(camera)])
+        name = depth_name(camera)
         stored_frame = depth_frame_index(frame, encoding=encoding, frames=scene.frames)
         if stored_frame is None:
             size = self._request.size or (scene.rig.image_height_px, scene.rig.image_width_px)
             return StoredDepth(np.zeros(size, dtype=np.uint16), np.zeros(size, dtype=bool))
-        units = self._streams.depth_units(
-            path, stored_frame, frames=scene.frames, encoding=encoding
-        )
+        units = self._streams.depth_units(scene, name, stored_frame, encoding=encoding)
         if self._request.size is not None:
             units = resized_nearest(units, size=self._request.size)
-        pixel_format = self._streams.pixel_format(path, frames=scene.frames)
+        pixel_format = self._streams.pixel_format(scene, name)
         return StoredDepth(units, measured(units, encoding=encoding, pixel_format=pixel_format))
 
     def _camera_poses(self, scene: Scene) -> CameraPoses | None:
@@ -259,16 +305,13 @@ class SampleLoader:
         if "always" not in needs and (rectified or "unless rectified" not in needs):
             return None
         if scene.id.key not in self._poses:
-            member = scene.members[TRAJECTORY_JSON]
-            text = read_member(self._index.root, member)
-            trajectory = parse_trajectory(text, where=member.path)
+            text = self._source.read(scene, TRAJECTORY_JSON)
+            where = self._source.label(scene, TRAJECTORY_JSON)
+            trajectory = parse_trajectory(text, where=where)
             self._poses[scene.id.key] = CameraPoses.from_trajectory(trajectory)
             while len(self._poses) > KEPT_POSES:
                 self._poses.popitem(last=False)
         return self._poses[scene.id.key]
-
-    def _url(self, scene: Scene) -> str:
-        return str(Path(self._index.root) / scene.id.key)
 
     def _fields(self, views: Views, facts: SceneFacts, *, clip: Clip) -> Sample:
         targets = views.targets

@@ -1,12 +1,15 @@
 """The open videos of one process: opened when first needed, decoded forwards, closed in turn.
 
 Samples that share a frame (pairs of one moment, fields of one pair) share its decoding: each
-stream keeps the last picture that it gave.
+stream keeps the last picture that it gave. A stream that failed is closed, so that it is opened
+anew if it is asked for again.
 """
 
 import os
+import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -14,9 +17,12 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import UInt8, UInt16
 
+from stereogenbench_data.errors import MediaError, StorageError
 from stereogenbench_data.media.depth import read_depth_units
 from stereogenbench_data.media.video import VideoReader, read_rgb
-from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.storage.ranged_file import MemberFile, RangedFile
+from stereogenbench_data.storage.source import MemberSource
 
 OPEN_STREAMS: Final = 24
 """How many videos a process keeps open: two scenes with all their cameras' colour and depth."""
@@ -29,86 +35,146 @@ nor closed here: the operating system takes them back when the process ends."""
 @dataclass(slots=True)
 class _Stream:
     reader: VideoReader
+    file: Path | MemberFile
     last: dict[object, Any] = field(default_factory=dict)
+
+    def close(self) -> None:
+        self.reader.close()
+        if isinstance(self.file, MemberFile):
+            self.file.close()
 
 
 class Streams:
     """A pool of open videos that survives fork and spawn: each process opens its own.
 
-    Pictures come back read-only, because the pool may hand out the same one again.
+    Threads of one process take turns. Pictures come back read-only, because the pool may hand out
+    the same one again.
     """
 
-    def __init__(self, *, limit: int = OPEN_STREAMS) -> None:
-        """Keep at most ``limit`` videos open."""
+    def __init__(self, source: MemberSource, *, limit: int = OPEN_STREAMS) -> None:
+        """Open videos from a source, and keep at most ``limit`` of them open."""
+        self._source = source
         self._limit = limit
-        self._open: OrderedDict[Path, _Stream] = OrderedDict()
+        self._open: OrderedDict[tuple[str, int], _Stream] = OrderedDict()
+        self._lock = threading.RLock()
         self._process = os.getpid()
 
     def rgb(
-        self, path: Path, index: int, *, frames: int, size: tuple[int, int] | None
+        self, scene: Scene, name: str, index: int, *, size: tuple[int, int] | None
     ) -> UInt8[np.ndarray, "3 h w"]:
-        """Return one frame as RGB, scaled to (height, width) where a size is given.
+        """Return one frame of a scene's video as RGB, scaled to (height, width) if it is given.
 
         Raises:
-            MediaError: If the video does not decode to so many frames.
+            StorageError: If the video cannot be read.
+            MediaError: If it does not decode to the scene's number of frames.
         """
-        stream = self._stream(path, frames=frames)
-        picture: UInt8[np.ndarray, "3 h w"] = _kept(
-            stream, (index, size), lambda: read_rgb(stream.reader, index, size=size)
+        picture: UInt8[np.ndarray, "3 h w"] = self._read(
+            scene, name, (index, size), lambda reader: read_rgb(reader, index, size=size)
         )
         return picture
 
     def depth_units(
-        self, path: Path, index: int, *, frames: int, encoding: DepthEncoding
+        self, scene: Scene, name: str, index: int, *, encoding: DepthEncoding
     ) -> UInt16[np.ndarray, "h w"]:
-        """Return one depth frame as stored numbers.
+        """Return one depth frame of a scene's video as stored numbers.
 
         Raises:
-            MediaError: If the stream is not one that the encoding describes or does not decode.
+            StorageError: If the video cannot be read.
+            MediaError: If it is not one that the encoding describes or does not decode.
         """
-        stream = self._stream(path, frames=frames)
-        units: UInt16[np.ndarray, "h w"] = _kept(
-            stream, index, lambda: read_depth_units(stream.reader, index, encoding=encoding)
+        units: UInt16[np.ndarray, "h w"] = self._read(
+            scene, name, index, lambda reader: read_depth_units(reader, index, encoding=encoding)
         )
         return units
 
-    def pixel_format(self, path: Path, *, frames: int) -> str:
-        """Return the pixel format of a video."""
-        return self._stream(path, frames=frames).reader.facts.pixel_format
+    def pixel_format(self, scene: Scene, name: str) -> str:
+        """Return the pixel format of a scene's video.
+
+        Raises:
+            StorageError: If the video cannot be read.
+            MediaError: If its header does not tell.
+        """
+        with self._stream(scene, name) as stream:
+            return stream.reader.facts.pixel_format
+
+    def keep(self, limit: int) -> None:
+        """Keep at most so many videos open from now on."""
+        self._limit = limit
+
+    def release(self, scene: Scene) -> None:
+        """Close a scene's videos, of which no more is wanted for now."""
+        self._drop_inherited()
+        with self._lock:
+            for member in scene.members.values():
+                stream = self._open.pop((member.path, member.offset), None)
+                if stream is not None:
+                    stream.close()
 
     def close(self) -> None:
         """Close every video; the pool can be used again."""
         self._drop_inherited()
-        while self._open:
-            self._open.popitem()[1].reader.close()
+        with self._lock:
+            while self._open:
+                self._open.popitem()[1].close()
 
-    def _stream(self, path: Path, *, frames: int) -> _Stream:
+    def _read(
+        self, scene: Scene, name: str, key: object, read: Callable[[VideoReader], Any]
+    ) -> Any:
+        """Return what a stream gave last, if that is what is asked for; else read and keep it."""
+        with self._stream(scene, name) as stream:
+            if key not in stream.last:
+                picture = read(stream.reader)
+                picture.flags.writeable = False
+                stream.last = {key: picture}
+            return stream.last[key]
+
+    @contextmanager
+    def _stream(self, scene: Scene, name: str) -> Iterator[_Stream]:
+        """Give an open video, to be read within; it stays open unless it fails."""
         self._drop_inherited()
-        if path in self._open:
-            self._open.move_to_end(path)
-            return self._open[path]
-        while len(self._open) >= self._limit:
-            self._open.popitem(last=False)[1].reader.close()
-        stream = self._open[path] = _Stream(VideoReader(path, name=str(path), frames=frames))
-        return stream
+        with self._lock:
+            member = scene.members[name]
+            place = (member.path, member.offset)
+            if place not in self._open:
+                while len(self._open) >= self._limit:
+                    self._open.popitem(last=False)[1].close()
+                file = self._source.open(scene, name)
+                with _cause_told(file):
+                    label = self._source.label(scene, name)
+                    reader = VideoReader(file, name=label, frames=scene.frames)
+                self._open[place] = _Stream(reader, file)
+            self._open.move_to_end(place)
+            stream = self._open[place]
+            try:
+                with _cause_told(stream.file):
+                    yield stream
+            except (MediaError, StorageError):
+                self._open.pop(place).close()
+                raise
 
     def _drop_inherited(self) -> None:
         if os.getpid() != self._process:
             _inherited.append(self._open)
             self._open = OrderedDict()
+            self._lock = threading.RLock()
             self._process = os.getpid()
 
-    def __getstate__(self) -> dict[str, int]:
-        return {"limit": self._limit}
+    def __getstate__(self) -> dict[str, Any]:
+        return {"source": self._source, "limit": self._limit}
 
-    def __setstate__(self, state: dict[str, int]) -> None:
-        self.__init__(limit=state["limit"])  # type: ignore[misc]
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
 
 
-def _kept(stream: _Stream, key: object, read: Callable[[], Any]) -> Any:
-    """Return what a stream gave last, if that is what is asked for; else read it and keep it."""
-    if key not in stream.last:
-        picture = read()
-        picture.flags.writeable = False
-        stream.last = {key: picture}
-    return stream.last[key]
+@contextmanager
+def _cause_told(file: Path | MemberFile) -> Iterator[None]:
+    """Where a video failed because its bytes could not be fetched, raise that; close the file."""
+    try:
+        yield
+    except (MediaError, StorageError) as error:
+        if isinstance(file, MemberFile):
+            file.close()
+        failure = file.failure if isinstance(file, RangedFile) else None
+        if failure is None or failure is error:
+            raise
+        raise failure from error

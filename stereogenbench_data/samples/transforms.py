@@ -8,6 +8,7 @@ treated alike, but where a docstring says otherwise.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,7 +33,10 @@ class Compose:
     transforms: Sequence[Transform]
 
     def __post_init__(self) -> None:
-        """Refuse an order that would give wrong samples."""
+        """Refuse what is no transform, and an order that would give wrong samples."""
+        odd = [step for step in self.transforms if not isinstance(step, Transform)]
+        if odd or any(isinstance(step, type) for step in self.transforms):
+            raise FieldError(f"Compose takes transforms, got {(odd or self.transforms)[0]!r}.")
         erased = False
         for transform in self._steps():
             if erased and transform.swaps_views:
@@ -118,6 +122,7 @@ class Crop:
     def __post_init__(self) -> None:
         """Refuse a size of nothing."""
         _require_size(self.height, self.width)
+        _require_size(self.top + 1, self.left + 1)
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return cropped views."""
@@ -172,6 +177,13 @@ class RandomScale:
     at_least: tuple[int, int] = (1, 1)
     swaps_views: ClassVar[bool] = False
 
+    def __post_init__(self) -> None:
+        """Refuse a range that is none."""
+        _require_range(self, -8.0, "low", "high")
+        _require_range(self, 0.0, "stretch")
+        _require_probability(self, "stretch_probability")
+        _require_size(*self.at_least)
+
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return scaled views."""
         exponents = np.full(2, generator.uniform(self.low, self.high))
@@ -195,6 +207,10 @@ class HorizontalFlip:
 
     probability: float = 0.5
     swaps_views: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Refuse what is no probability."""
+        _require_probability(self, "probability")
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return the views, or their mirror image."""
@@ -241,6 +257,12 @@ class ColorJitter:
     asymmetric_probability: float = 0.2
     swaps_views: ClassVar[bool] = False
 
+    def __post_init__(self) -> None:
+        """Refuse factors below 0 and what is no probability."""
+        for name in ("brightness", "contrast", "saturation", "hue"):
+            _require_probability(self, name)
+        _require_probability(self, "asymmetric_probability")
+
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return views with other colours."""
         common = self._draw(generator)
@@ -272,6 +294,12 @@ class Eraser:
     high: int = 100
     swaps_views: ClassVar[bool] = False
 
+    def __post_init__(self) -> None:
+        """Refuse boxes of nothing and what is no probability."""
+        _require_probability(self, "probability")
+        _require_range(self, 1, "low", "high")
+        _require_size(self.most_boxes, 1)
+
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return views with boxes erased."""
         if generator.random() >= self.probability:
@@ -292,9 +320,28 @@ class Eraser:
         return replace(views, pictures=pictures)
 
 
-def _require_size(height: int, width: int) -> None:
-    if min(height, width) < 1:
-        raise FieldError(f"a picture of {width} x {height} pixels cannot be: sizes start at 1.")
+def _require_size(height: Any, width: Any) -> None:
+    whole = all(isinstance(side, int | np.integer) for side in (height, width))
+    if not whole or min(height, width) < 1:
+        raise FieldError(
+            f"{width!r} x {height!r} pixels cannot be: sizes are whole numbers and start at 1."
+        )
+
+
+def _require_probability(transform: Any, name: str) -> None:
+    value = getattr(transform, name)
+    if not isinstance(value, int | float) or not 0 <= value <= 1:
+        raise FieldError(f"{name} of {type(transform).__name__} must be 0 to 1, got {value!r}.")
+
+
+def _require_range(transform: Any, least: float, *names: str) -> None:
+    values = [getattr(transform, name) for name in names]
+    numbers = all(isinstance(value, int | float) for value in values)
+    if not numbers or not all(a <= b for a, b in pairwise([least, *values])):
+        raise FieldError(
+            f"{', '.join(names)} of {type(transform).__name__} must ascend from {least}, got "
+            f"{', '.join(map(repr, values))}."
+        )
 
 
 def _resized(views: Views, *, height: int, width: int) -> Views:

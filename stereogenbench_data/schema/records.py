@@ -7,19 +7,20 @@ can be formed before anything is rounded.
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.release import CAMERA_PAIRS, DEFAULT_DEPTH_UNIT_M, Split, Subset
+from stereogenbench_data.schema.release import CAMERA_PAIRS, Split, Subset
 
 RotationKind = Literal["rotator_deg", "quaternion_xyzw", "matrix"]
 DepthKind = Literal["planar", "ray"]
 DepthForm = Literal["depth", "inverse"]
 DepthRisk = Literal["8-bit", "lossy", "chroma"]
+DepthUnitSource = Literal["tag", "default", "unreadable"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,13 +118,14 @@ class DepthEncoding:
     """The depth contract: how a number stored in a depth video becomes metres.
 
     Attributes:
-        unit_m: Metres in one stored unit. With ``form="inverse"``, the depth in metres that
-            the stored number 1 stands for: depth = unit_m / stored.
+        unit_m: Metres in one stored unit; None for what the file's own tag says, and where it
+            has none the release's default of 0.1 m. With ``form="inverse"``, the depth in metres
+            that the stored number 1 stands for: depth = unit_m / stored.
         kind: "planar" is depth along the optical axis (z); "ray" is the distance from the
             camera's centre, turned into z by the intrinsics.
         form: "depth" or "inverse".
-        frame_lag: RGB frame t shows what depth frame t + frame_lag measured. Where that frame
-            does not exist, depth counts as not measured.
+        frame_lag: A whole number: RGB frame t shows what depth frame t + frame_lag measured.
+            Where that frame does not exist, depth counts as not measured.
         no_depth: Stored numbers that mean "not measured"; "max" is the pixel format's largest.
         accept: Streams that are refused unless named here: "8-bit", "lossy" (a codec that
             does not return what it was given) or "chroma" (only the luma plane is read).
@@ -135,7 +137,7 @@ class DepthEncoding:
     Source: the paper's appendix on the file schema; a missing tag means 0.1 m a unit.
     """
 
-    unit_m: float = DEFAULT_DEPTH_UNIT_M
+    unit_m: float | None = None
     kind: DepthKind = "planar"
     form: DepthForm = "depth"
     frame_lag: int = 0
@@ -145,8 +147,14 @@ class DepthEncoding:
 
     def __post_init__(self) -> None:
         """Refuse a contract that no stream can follow."""
-        if not (math.isfinite(self.unit_m) and self.unit_m > 0):
+        if self.unit_m is not None and not _is_positive(self.unit_m):
             raise SchemaError(f"unit_m must be a positive number of metres, got {self.unit_m!r}.")
+        for name, numbers in (
+            ("frame_lag", (self.frame_lag,)),
+            ("no_depth", [number for number in self.no_depth if number != "max"]),
+        ):
+            if not all(type(number) is int for number in numbers):
+                raise SchemaError(f"{name} must be of whole numbers, got {getattr(self, name)!r}.")
         for name, value, choices in (
             ("kind", self.kind, ("planar", "ray")),
             ("form", self.form, ("depth", "inverse")),
@@ -158,6 +166,30 @@ class DepthEncoding:
             raise SchemaError(
                 f"accept may hold '8-bit', 'lossy' and 'chroma', got {sorted(unknown)}."
             )
+
+    @property
+    def known_unit_m(self) -> float:
+        """Metres in one stored unit.
+
+        Raises:
+            SchemaError: If that waits for the file's tag.
+        """
+        if self.unit_m is None:
+            raise SchemaError(
+                "a depth contract without unit_m means the file's own: resolve it with "
+                "`resolve_encoding`, or give unit_m."
+            )
+        return self.unit_m
+
+    def with_file_unit(
+        self, unit_m: float, *, source: Literal["tag", "default"]
+    ) -> "DepthEncoding":
+        """Return the contract with the file's unit, unless it states its own."""
+        return self if self.unit_m is not None else replace(self, unit_m=unit_m, source=source)
+
+
+def _is_positive(number: object) -> bool:
+    return isinstance(number, int | float) and math.isfinite(number) and number > 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +226,8 @@ class Scene:
         rig_residual_px: The largest distance between the closed form of a rectified rig and
             the pose chain, in pixels of the recorded image.
         depth_unit_m: Metres in a stored unit for each camera's depth, as tagged or by default.
-        depth_unit_source: "tag" or "default", for each camera.
+        depth_unit_source: "tag", "default", or "unreadable" (contradictory tags, unit nan), for
+            each camera.
         depth_codec: FFmpeg's name of the codec of each camera's depth.
         depth_pixel_format: FFmpeg's name of the pixel format of each camera's depth.
         frames: Frames that every video and the trajectory have.
@@ -210,7 +243,7 @@ class Scene:
     lateral_m: tuple[float, ...]
     rig_residual_px: float
     depth_unit_m: tuple[float, ...]
-    depth_unit_source: tuple[str, ...]
+    depth_unit_source: tuple[DepthUnitSource, ...]
     depth_codec: tuple[str, ...]
     depth_pixel_format: tuple[str, ...]
     valid_depth_ratio: float | None

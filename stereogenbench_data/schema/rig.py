@@ -57,7 +57,7 @@ def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels]:
         ),
         image_width_px=width_px,
         image_height_px=height_px,
-        principal_point_px=_principal_point(root),
+        principal_point_px=_principal_point(root, size_px=(width_px, height_px)),
         baselines_cm=tuple(baselines_cm.get(pair, math.nan) for pair in CAMERA_PAIRS),
         primary_pair=_primary_pair(root),
         image_size_source=size_source,
@@ -89,7 +89,7 @@ def _size(side: Node | None) -> int:
     return size_px
 
 
-def _principal_point(root: Node) -> tuple[float, float] | None:
+def _principal_point(root: Node, *, size_px: tuple[int, int]) -> tuple[float, float] | None:
     point = root.find("principal_point_px")
     x, y = root.find("principal_x_px"), root.find("principal_y_px")
     if point is not None:
@@ -107,6 +107,12 @@ def _principal_point(root: Node) -> tuple[float, float] | None:
         given = x or y or root
         given.complain("one coordinate of the principal point is recorded and the other is not")
         return None
+    for place, side_px in zip((x, y), size_px, strict=True):
+        if not 1 < place.number() < side_px:
+            place.complain(
+                f"must be a place inside a picture of {side_px} pixels, in pixels and not as a "
+                f"share, found {brief(place.value)}"
+            )
     return x.number(), y.number()
 
 

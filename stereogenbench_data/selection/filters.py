@@ -1,7 +1,7 @@
 """Which scenes: filters on the index, each of which names itself where it leaves nothing."""
 
 import difflib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypedDict
 
 import numpy as np
@@ -89,8 +89,15 @@ def _apply(
 ) -> tuple[Bool[np.ndarray, " n"], Callable[[], str]]:
     """Return which rows one filter keeps, and a way to say what values they have."""
     if name in _TEXT_COLUMNS:
-        values = index.column(_TEXT_COLUMNS[name])[rows]
+        column = index.column(_TEXT_COLUMNS[name])
+        values = column[rows]
         names = _texts(name, wanted)
+        nowhere = sorted(set(names) - set(column.tolist()))
+        if nowhere and len(nowhere) < len(set(names)):
+            raise SelectionError(
+                f"{name}={nowhere[0]!r} matches none of {len(column)} scenes of the index; {name} "
+                f"there is {_listed(column, near=nowhere)}."
+            )
         return np.isin(values.astype(str), names), lambda: _listed(values, near=names)
     if name in _RANGE_COLUMNS:
         numbers = index.column(_RANGE_COLUMNS[name])[rows].astype(np.float64)
@@ -139,7 +146,7 @@ def require_range(name: str, wanted: Any) -> Range:
 
 
 def _texts(name: str, wanted: Any) -> list[str]:
-    names = [wanted] if isinstance(wanted, str) else list(wanted)
+    names = [wanted] if isinstance(wanted, str) or not isinstance(wanted, Iterable) else [*wanted]
     if not names or not all(isinstance(value, str) for value in names):
         raise SelectionError(f"{name} must be a text or a sequence of texts, got {wanted!r}.")
     return names

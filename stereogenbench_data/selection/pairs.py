@@ -1,5 +1,6 @@
 """Which cameras: the ordered pairs of each scene, by name, by index and by baseline."""
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -65,8 +66,9 @@ def choose_pairs(
         index: The index that the rows belong to.
         rows: Rows of scenes, ascending.
         pairs: "primary" (one a scene), "adjacent" (5), "all" (15), explicit pairs
-            (left, right) with left < right, or "sweep": the primary pair's first view together
-            with every camera on its other side, as one entry.
+            (left, right) with left < right, or "sweep", several pairs as one entry: the primary
+            pair's left view with every view to its right, or right to left the rightmost view with
+            every view to its left.
         direction: "left_to_right": the left camera's pixels have the disparity.
             "right_to_left": the right camera's, with negative disparity and baseline.
         baseline_cm: A closed range in cm, or names of the paper's bins.
@@ -109,9 +111,9 @@ def require_pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
             f"pairs must be 'primary', 'adjacent', 'all', 'sweep' or camera pairs, got {pairs!r}."
         )
     found = []
-    for pair in pairs:
+    for pair in pairs.tolist() if isinstance(pairs, np.ndarray) else pairs:
         try:
-            left, right = (int(camera) for camera in pair)
+            left, right = (operator.index(camera) for camera in pair)
         except (TypeError, ValueError):
             raise SelectionError(f"a pair is (left, right) camera numbers, got {pair!r}.") from None
         if (left, right) not in CAMERA_PAIRS:
@@ -152,10 +154,12 @@ def _plain(
 def _sweeps(
     rows: Int64[np.ndarray, " s"], primary: Int8[np.ndarray, "s 2"], *, direction: Direction
 ) -> PairList:
-    source = primary[:, 0] if direction == "left_to_right" else primary[:, 1]
     cameras = np.broadcast_to(np.arange(CAMERA_COUNT, dtype=np.int8), (len(rows), CAMERA_COUNT))
-    ahead = cameras > source[:, None] if direction == "left_to_right" else cameras < source[:, None]
-    return PairList(row=rows, source=source, targets=_packed(cameras, ahead))
+    if direction == "right_to_left":
+        source = np.full(len(rows), CAMERA_COUNT - 1, dtype=np.int8)
+        return PairList(row=rows, source=source, targets=cameras[:, -2::-1])
+    source = primary.min(axis=1)
+    return PairList(row=rows, source=source, targets=_packed(cameras, cameras > source[:, None]))
 
 
 def _packed(cameras: Int8[np.ndarray, "n m"], keep: Bool[np.ndarray, "n m"]) -> Any:
@@ -168,9 +172,10 @@ def _packed(cameras: Int8[np.ndarray, "n m"], keep: Bool[np.ndarray, "n m"]) -> 
 def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairList:
     """Keep what lies in a range or in bins; a sweep keeps those of its targets that do."""
     found = baselines_cm(index, pairs)
-    if isinstance(wanted, str) or (len(wanted) > 0 and isinstance(wanted[0], str)):
+    names = [wanted] if isinstance(wanted, str) else wanted
+    if isinstance(names, Sequence) and names and isinstance(names[0], str):
         keep = np.zeros(found.shape, dtype=bool)
-        for name in [wanted] if isinstance(wanted, str) else wanted:
+        for name in names:
             keep |= _in_bin(found, str(name))
     else:
         low, high = require_range("baseline_cm", wanted)

@@ -4,6 +4,7 @@ Samples are numbered scene by scene; within a scene window by window, so that re
 decodes every stream once; within a window pair by pair, so that pairs share their frames.
 """
 
+import hashlib
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -79,6 +80,28 @@ class Plan:
 
     def __len__(self) -> int:
         return int(self.first_sample[-1])
+
+    @property
+    def digest(self) -> str:
+        """A sha256 of the selection, in hex: the same for the same samples by the same numbers."""
+        digest = hashlib.sha256(f"{self.windows!r} {self.seed}".encode())
+        for numbers in (
+            self.pairs.source,
+            self.pairs.targets,
+            self.scene_rows,
+            self.first_pair,
+            self.first_sample,
+            self.frame_counts,
+            self.scene_seeds,
+        ):
+            digest.update(f" {numbers.shape} ".encode())
+            digest.update(np.ascontiguousarray(numbers, dtype="<i8").tobytes())
+        return digest.hexdigest()
+
+    def is_last_of_scene(self, number: int) -> bool:
+        """Return whether a sample is its scene's last."""
+        place = int(np.searchsorted(self.first_sample, number + 1))
+        return int(self.first_sample[place]) == number + 1
 
     def locate(self, number: int, *, epoch: int) -> Address:
         """Return where a sample comes from; only random frames depend on the epoch.
@@ -170,7 +193,8 @@ def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) ->
         try:
             per_scene[same] = windows.count(int(frames))
         except SelectionError as error:
-            raise SelectionError(f"{keys[same][0]} (and {same.sum() - 1} more): {error}") from error
+            others = f" and {same.sum() - 1} more" if same.sum() > 1 else ""
+            raise SelectionError(f"{keys[same][0]}{others}: {error}") from error
     samples = np.concatenate([[0], np.cumsum(np.diff(first_pair) * per_scene)])
     return Plan(
         pairs=pairs,

@@ -4,9 +4,6 @@ On disk it is one Parquet file; in memory one Arrow table, sorted by key. Paths 
 data's root and never leave it.
 """
 
-import itertools
-import json
-import os
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
@@ -15,20 +12,33 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.storage.digest import table_digest
+from stereogenbench_data.storage.index_file import (
+    AGAIN,
+    read_index_file,
+    require_sound,
+    root_of,
+    root_told,
+    write_index_file,
+)
+from stereogenbench_data.storage.location import (
+    is_remote,
+    joined,
+    local_path,
+    shown,
+    split_name,
+)
+from stereogenbench_data.storage.remote import RemoteObject
 from stereogenbench_data.storage.rows import SCHEMA, row_of, scene_of
-from stereogenbench_data.storage.source import UNSAFE_PATH
 from stereogenbench_data.storage.walk import TreeReport, walk
 
 INDEX_NAME: Final = "index.parquet"
-_FORMAT: Final = 1
-_METADATA_KEY: Final = b"stereogenbench_data.index"
-_AGAIN: Final = "Run `stereogenbench index ROOT` again."
+MAX_INDEX_BYTES: Final = 256 * 2**20
+"""The largest index that is fetched. One of 8,493 scenes has a few megabytes."""
+
 _SHOWN: Final = 10
 
 
@@ -40,7 +50,7 @@ class SceneIndex:
     """The scenes of one root, by row; rows are sorted by key.
 
     Attributes:
-        root: The folder to which the members' paths are relative.
+        root: The folder or URL to which the members' paths are relative.
         incomplete: Key to reason, for scenes that were not finished when the index was made.
         broken: Key to what is wrong, for scenes that were left out for it.
         shards: What is known of each shard, by its path below the root; empty for folders.
@@ -63,19 +73,21 @@ class SceneIndex:
         """Return the index of some data.
 
         Args:
-            data: An index file; a folder that holds ``index.parquet``; or a folder in the
-                released layout, which is then walked (seconds for hundreds of scenes, minutes
-                for all: ``stereogenbench index`` keeps the result).
+            data: An index file; a folder that holds ``index.parquet``, such as one of shards; the
+                URL of either (``https://``, ``hf://datasets/``, ``s3://`` or whatever fsspec
+                opens), of which only the index is fetched; or a folder in the released layout,
+                which is then walked (seconds for hundreds of scenes, minutes for all:
+                ``stereogenbench index`` keeps the result).
 
         Raises:
             StorageError: If there is no such data, it holds no scene, the index is damaged or
                 was made by another version, or scenes of a tree are broken.
         """
-        if "://" in str(data):
-            raise StorageError(
-                f"{data}: a URL cannot be opened; fetch the data and pass the folder."
-            )
-        path = Path(data)
+        if is_remote(data):
+            index = cls._from_url(str(data))
+            _warn_of(index.incomplete | index.broken, where=shown(str(data)))
+            return index
+        path = local_path(data)
         if path.is_dir():
             if not (path / INDEX_NAME).is_file():
                 return cls._from_tree(path)
@@ -111,8 +123,10 @@ class SceneIndex:
         try:
             table = pa.Table.from_pylist(rows, schema=SCHEMA)
         except (pa.ArrowException, UnicodeEncodeError, OverflowError) as error:
-            raise StorageError(f"{root}: a scene does not fit the index: {error}.") from error
-        _require_sound(table, where=str(root))
+            raise StorageError(
+                f"{shown(str(root))}: a scene does not fit the index: {error}."
+            ) from error
+        require_sound(table, where=shown(str(root)))
         index = cls(table, root=root, head={})
         index.shards = dict(shards or {})
         return index
@@ -126,7 +140,8 @@ class SceneIndex:
 
     @classmethod
     def _from_tree(cls, root: Path) -> "SceneIndex":
-        report = walk(root)
+        # In this process: a script without `if __name__ == "__main__"` could start no others.
+        report = walk(root, workers=1)
         if report.broken:
             raise StorageError(
                 f"{root}: {_listed(report.broken)}\nRepair or remove them; or leave them out on "
@@ -139,23 +154,34 @@ class SceneIndex:
 
     @classmethod
     def _from_file(cls, path: Path) -> "SceneIndex":
-        try:
-            with pq.ParquetFile(path) as file:
-                metadata = (file.schema_arrow.metadata or {}).get(_METADATA_KEY)
-                head = _require_head(metadata, where=str(path))
-                table = file.read().replace_schema_metadata().combine_chunks()
-            table.validate(full=True)
-        except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-            if isinstance(error, StorageError):
-                raise
+        table, head = read_index_file(path, where=str(path))
+        return cls._checked(table, head, root=root_of(path, head, table), where=str(path))
+
+    @classmethod
+    def _from_url(cls, url: str) -> "SceneIndex":
+        """Fetch an index; its data lie beside it."""
+        root, name = split_name(url)
+        if not name.endswith(".parquet"):
+            root, url = url.rstrip("/"), joined(url.rstrip("/"), INDEX_NAME)
+        remote = RemoteObject(url)
+        size = remote.size()
+        if size > MAX_INDEX_BYTES:
             raise StorageError(
-                f"{path}: is no Parquet file that can be read ({error}). It was cut short or is "
-                f"something else. {_AGAIN}"
-            ) from error
-        _require_sound(table, where=str(path))
-        index = cls(table, root=_root_of(path, head, table), head=head)
+                f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
+                f"{size:,}. It was not read: is it another file?"
+            )
+        content = pa.BufferReader(remote.read(0, size))
+        table, head = read_index_file(content, where=remote.where)
+        return cls._checked(table, head, root=root, where=remote.where)
+
+    @classmethod
+    def _checked(
+        cls, table: pa.Table, head: Mapping[str, Any], *, root: str | Path, where: str
+    ) -> "SceneIndex":
+        """Return the index that a file's rows and its description of itself are."""
+        index = cls(table, root=root, head=head)
         if index.digest != head.get("digest"):
-            raise StorageError(f"{path}: its rows are not those that were written. {_AGAIN}")
+            raise StorageError(f"{where}: its rows are not those that were written. {AGAIN}")
         return index
 
     def write(self, path: str | Path) -> None:
@@ -167,29 +193,15 @@ class SceneIndex:
         Raises:
             StorageError: If the file cannot be written.
         """
-        path, root = Path(path), Path(self.root)
-        head = {
-            "format": _FORMAT,
-            "root": "." if path.parent.resolve() == root.resolve() else str(root.resolve()),
+        path = Path(path)
+        description = {
+            "root": root_told(self.root, beside=path.parent),
             "digest": self.digest,
             "incomplete": self.incomplete,
             "broken": self.broken,
             "shards": {path: asdict(facts) for path, facts in sorted(self.shards.items())},
         }
-        table = self._table.replace_schema_metadata({_METADATA_KEY: json.dumps(head)})
-        unfinished = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                pq.write_table(table, unfinished, compression="zstd")
-                unfinished.replace(path)
-            finally:
-                unfinished.unlink(missing_ok=True)
-        except OSError as error:
-            raise StorageError(
-                f"{path}: the index cannot be written ({error.strerror or error}). Choose "
-                f"another place with --out."
-            ) from error
+        write_index_file(path, self._table, description)
 
     def __len__(self) -> int:
         """The number of scenes."""
@@ -202,7 +214,9 @@ class SceneIndex:
             StorageError: If there is no such row.
         """
         if not 0 <= row < len(self):
-            raise StorageError(f"{self.root}: there is no row {row}; the index has {len(self)}.")
+            raise StorageError(
+                f"{shown(self.root)}: there is no row {row}; the index has {len(self)}."
+            )
         return scene_of(self._table.slice(int(row), 1).to_pylist()[0])
 
     def column(self, name: str) -> np.ndarray:
@@ -261,76 +275,3 @@ def _listed(left_out: Mapping[str, str]) -> str:
 def _warn_of(left_out: Mapping[str, str], *, where: str) -> None:
     if left_out:
         warnings.warn(f"{where}: {_listed(left_out)}", IncompleteSceneWarning, stacklevel=3)
-
-
-def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
-    """Return what an index says of itself, once it is known to be one of this version."""
-    try:
-        head = json.loads(metadata or b"null")
-    except ValueError:
-        head = None
-    if not isinstance(head, dict):
-        raise StorageError(
-            f"{where}: is a Parquet file, but no index of this package. Pass another file, or "
-            f"make one with `stereogenbench index ROOT`."
-        )
-    if head.get("format") != _FORMAT:
-        raise StorageError(
-            f"{where}: is an index of format {head.get('format')!r}, and this version of the "
-            f"package reads format {_FORMAT}. {_AGAIN}"
-        )
-    tables = [head.get("incomplete"), head.get("broken"), head.get("shards")]
-    if not all(isinstance(each, dict) for each in tables) or not isinstance(head["root"], str):
-        raise StorageError(f"{where}: its description of itself was altered. {_AGAIN}")
-    return head
-
-
-def _require_sound(table: pa.Table, *, where: str) -> None:
-    """Refuse a table that is no index, or whose rows could lead out of the root."""
-    if not table.schema.equals(SCHEMA):
-        odd = [
-            field.name
-            for field in SCHEMA
-            if field.name not in table.schema.names
-            or not table.schema.field(field.name).equals(field)
-        ]
-        raise StorageError(
-            f"{where}: its columns are not those of an index (see {', '.join(odd) or 'order'}). "
-            f"{_AGAIN}"
-        )
-    keys = table.column("key").to_pylist()
-    for key, following in itertools.pairwise(keys):
-        if key >= following:
-            raise StorageError(f"{where}: scene {following!r} is there twice or out of order.")
-    members = pc.list_flatten(table.column("members"))
-    for paths in (table.column("key"), pc.struct_field(members, "path")):
-        unsafe = paths.filter(pc.match_substring_regex(paths, UNSAFE_PATH))
-        if len(unsafe):
-            raise StorageError(
-                f"{where}: {unsafe[0].as_py()!r} is no path inside the data's root. The index "
-                f"was altered. {_AGAIN}"
-            )
-    for name, numbers, least in (
-        ("frames", table.column("frames"), 1),
-        ("size", pc.struct_field(members, "size"), 0),
-        ("offset", pc.struct_field(members, "offset"), 0),
-    ):
-        lowest = pc.min(numbers).as_py()
-        if lowest is not None and lowest < least:
-            raise StorageError(f"{where}: {name} is {lowest}, below {least}. {_AGAIN}")
-
-
-def _root_of(path: Path, head: Mapping[str, Any], table: pa.Table) -> Path:
-    """Return the data's root: the index's own folder if the data are there, else the recorded."""
-    beside, recorded = path.parent, Path(head["root"])
-    if head["root"] == "." or not table.num_rows:
-        return beside
-    first = table.column("members")[0].as_py()[0]["path"]
-    if (beside / first).exists():
-        return beside
-    if not recorded.is_dir():
-        raise StorageError(
-            f"{path}: its data were at {recorded}, which is no folder now. Move the index into "
-            f"the data's root, or run `stereogenbench index` again."
-        )
-    return recorded

@@ -13,9 +13,11 @@ def is_remote(location: str | Path) -> bool:
 
 
 def local_path(location: str | Path) -> Path:
-    """Return a local location as a path; a ``file://`` URL is one too."""
+    """Return a local location as an absolute path, ``~`` expanded; a ``file://`` URL is one too."""
     text = str(location)
-    return Path(unquote(urlsplit(text).path)) if text.startswith("file://") else Path(location)
+    if text.startswith("file://"):
+        return Path(unquote(urlsplit(text).path))
+    return Path(location).expanduser().absolute()
 
 
 def joined(root: str, path: str) -> str:

@@ -1,6 +1,9 @@
-"""A member's bytes as a file of their own: seekable, read-only, and blind to what lies around it."""
+"""A member's bytes as a file of their own: seekable, read-only, blind to what lies around it."""
 
+import errno
 import io
+import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -75,16 +78,21 @@ class FileSlice(MemberFile):
         """Open the file that holds the member's bytes.
 
         Raises:
-            OSError: If it cannot be opened.
+            OSError: If it cannot be opened, or is no file.
         """
         super().__init__(member.size)
         self._path = path
         self._offset = member.offset
-        self._file = path.open("rb", buffering=0)
+        self._file = io.FileIO(_regular_file(path), "rb")
+
+    def file_size(self) -> int:
+        """Return the bytes of the whole file that holds the member."""
+        return os.fstat(self._file.fileno()).st_size
 
     def close(self) -> None:
         """Close the file."""
-        if not self.closed:
+        # An object whose making failed is closed too.
+        if not self.closed and hasattr(self, "_file"):
             self._file.close()
         super().close()
 
@@ -101,6 +109,13 @@ class FileSlice(MemberFile):
                 )
             data += more
         return data
+
+
+def _regular_file(path: Path) -> Path:
+    """Return a path that is a file; a pipe would be waited for when it is opened."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "it is no regular file")
+    return path
 
 
 class RangedFile(MemberFile):

@@ -59,7 +59,7 @@ def find_scene_folders(root: str | Path) -> SceneFolders:
         try:
             keys.append(parse_scene_key(key).key)
         except SchemaError as error:
-            refused[key] = f"{error}{_where_to_point(folder)}"
+            refused[key] = f"{error}{_where_to_point(folder, root=root)}"
     if not keys:
         raise StorageError(_nothing_found(root, refused))
     return SceneFolders(tuple(sorted(keys)), dict(sorted(refused.items())))
@@ -109,13 +109,17 @@ def root_of(folder: Path) -> Path | None:
     return None
 
 
-def _where_to_point(folder: Path) -> str:
-    root = root_of(folder)
-    return f" Move it, or point at {root} instead." if root else " Move it to such a path."
+def _where_to_point(folder: Path, *, root: Path) -> str:
+    other = root_of(folder)
+    if other == Path(os.path.abspath(root)):  # noqa: PTH100 (resolve would follow links)
+        return " Rename the folder."
+    return f" Move it, or point at {other} instead." if other else " Move it to such a path."
 
 
 def _nothing_found(root: Path, refused: dict[str, str]) -> str:
-    suggested = {str(found) for path in refused if (found := root_of(root / path)) is not None}
+    here = Path(os.path.abspath(root))  # noqa: PTH100 (resolve would follow links)
+    roots = {root_of(root / path) for path in refused}
+    suggested = {str(found) for found in roots if found not in (None, here)}
     looked = f"{root}: holds no scene; looked for folders {LAYOUT}"
     if suggested:
         return f"{looked}. Point at {' or '.join(sorted(suggested)[:3])} instead."

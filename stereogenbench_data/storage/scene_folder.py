@@ -5,6 +5,7 @@ videos; no picture is decoded, unless the share of measured depth is asked for.
 """
 
 import hashlib
+import math
 import os
 from collections import Counter
 from collections.abc import Mapping
@@ -13,8 +14,9 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
+from jaxtyping import Float64
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import MediaError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import (
@@ -39,6 +41,7 @@ from stereogenbench_data.schema.parse import (
 )
 from stereogenbench_data.schema.records import (
     DepthEncoding,
+    DepthUnitSource,
     Member,
     Rig,
     Scene,
@@ -65,6 +68,9 @@ ValidDepth = Literal["skip", "sample"]
 _NEEDED: Final = (COMPLETE_JSON, BASELINE_JSON, TRAJECTORY_JSON, *VIDEO_FILES)
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
+_LEAST_BESIDE: Final = 0.9
+"""How much of a baseline must lie along camera 0's x axis: a rig turned by more than 25 degrees
+against the line on which its cameras stand is no lateral rig."""
 
 
 class IncompleteScene(StorageError):
@@ -132,8 +138,11 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     rig = _sized_as_videos(key, rig, facts)
     poses = CameraPoses.from_trajectory(trajectory)
     _require_recorded_baselines(key, rig, poses)
-    encodings = [resolve_encoding(facts[name], name=f"{key}/{name}") for name in depth_names]
-    ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames, encodings)
+    lateral_m = lateral_offsets_m(poses)
+    residual_px = rectification_residual_px(poses, rig_intrinsics(rig))
+    _require_lateral_rig(key, rig, lateral_m, residual_px=residual_px)
+    units = [_depth_unit(facts[name], name=f"{key}/{name}") for name in depth_names]
+    ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
     return Scene(
         id=parse_scene_key(key),
         labels=_merged(labels, marked),
@@ -141,10 +150,10 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         rig=rig,
         frames=frames,
         frame_rate_hz=facts[rgb_name(0)].frame_rate_hz,
-        lateral_m=tuple(map(float, lateral_offsets_m(poses))),
-        rig_residual_px=rectification_residual_px(poses, rig_intrinsics(rig)),
-        depth_unit_m=tuple(encoding.unit_m for encoding in encodings),
-        depth_unit_source=tuple(encoding.source for encoding in encodings),
+        lateral_m=tuple(map(float, lateral_m)),
+        rig_residual_px=residual_px,
+        depth_unit_m=tuple(unit_m for unit_m, _ in units),
+        depth_unit_source=tuple(source for _, source in units),
         depth_codec=tuple(facts[name].codec for name in depth_names),
         depth_pixel_format=tuple(facts[name].pixel_format for name in depth_names),
         valid_depth_ratio=ratio,
@@ -249,10 +258,38 @@ def _require_recorded_baselines(key: str, rig: Rig, poses: CameraPoses) -> None:
                 )
 
 
-def _valid_ratio(folder: Path, key: str, frames: int, encodings: list[DepthEncoding]) -> float:
+def _require_lateral_rig(
+    key: str, rig: Rig, lateral_m: Float64[np.ndarray, "6"], *, residual_px: float
+) -> None:
+    """Refuse poses by which the cameras do not stand beside each other and look the same way."""
+    for (camera_a, camera_b), recorded_cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True):
+        beside_cm = abs(float(lateral_m[camera_b] - lateral_m[camera_a])) * 100
+        if not math.isfinite(residual_px) or beside_cm < _LEAST_BESIDE * recorded_cm:
+            raise StorageError(
+                f"{key}: by the poses of {TRAJECTORY_JSON}, cameras {camera_a} and {camera_b} are "
+                f"{beside_cm:.6g} cm beside each other as camera 0 looks, and {BASELINE_JSON} says "
+                f"that they are {recorded_cm:.6g} cm apart; or a camera looks away from what the "
+                f"others see. Are the rotations transposed, in other axes, or in radians? Correct "
+                f"rotation_representation or the poses."
+            )
+
+
+def _depth_unit(facts: StreamFacts, *, name: str) -> tuple[float, DepthUnitSource]:
+    """Return metres in a stored unit and where that stands; nan where the tags contradict.
+
+    Such a scene can be used all the same, for its colours, or with the user's own unit.
+    """
+    try:
+        encoding = resolve_encoding(facts, name=name)
+    except MediaError:
+        return math.nan, "unreadable"
+    return encoding.known_unit_m, "tag" if encoding.source == "tag" else "default"
+
+
+def _valid_ratio(folder: Path, key: str, frames: int) -> float:
     shares = []
-    for camera, encoding in enumerate(encodings):
-        name = depth_name(camera)
+    encoding = DepthEncoding()
+    for name in map(depth_name, range(CAMERA_COUNT)):
         with VideoReader(folder / name, name=f"{key}/{name}", frames=frames) as reader:
             for frame in sorted({0, frames // 2, frames - 1}):
                 units = read_depth_units(reader, frame, encoding=encoding)

@@ -1,18 +1,206 @@
-"""Where a scene's bytes are: checked paths of the members that an index names."""
+"""Where a scene's bytes are, and how they are opened: files, members of shards, URLs, the cache."""
 
 import re
 import stat
+import zlib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.document import require_text_size
-from stereogenbench_data.schema.records import Member
+from stereogenbench_data.schema.records import Member, Scene, ShardFacts
+from stereogenbench_data.storage.cache import ShardCache
+from stereogenbench_data.storage.location import is_remote, joined, local_path, shown
+from stereogenbench_data.storage.ranged_file import FileSlice, MemberFile, RangedFile
+from stereogenbench_data.storage.remote import RemoteObject
 
 UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
 """What no member's path may hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
 
 _UNSAFE_PATH: Final = re.compile(UNSAFE_PATH)
+
+
+def size_of(location: str | Path) -> int:
+    """Return how many bytes a file has, local or by URL.
+
+    Raises:
+        StorageError: If it is not there or cannot be read.
+    """
+    if is_remote(location):
+        return RemoteObject(str(location)).size()
+    path = local_path(location)
+    try:
+        return path.stat().st_size
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read ({error.strerror}). Fetch it again.") from error
+
+
+def read_range(location: str | Path, start: int, stop: int) -> bytes:
+    """Return the bytes from start to stop of a file, local or by URL.
+
+    Raises:
+        StorageError: If they cannot be had.
+    """
+    if is_remote(location):
+        return RemoteObject(str(location)).read(start, stop)
+    path = local_path(location)
+    try:
+        with FileSlice(path, Member(path.name, start, stop - start)) as file:
+            return file.read()
+    except StorageError:
+        raise
+    except OSError as error:
+        raise StorageError(f"{path}: cannot be read ({error.strerror}). Fetch it again.") from error
+
+
+class MemberSource:
+    """Opens the files of an index's scenes, wherever they lie.
+
+    A file of a released folder is given by its path. A member of a local shard is an open file
+    over its part of the shard. What lies behind a URL is fetched by ranges as it is read or,
+    with a cache, as a whole once.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        shards: Mapping[str, ShardFacts],
+        revision: str = "",
+        cache: ShardCache | None = None,
+    ) -> None:
+        """Prepare to read; nothing is opened yet.
+
+        Args:
+            root: The folder or URL that members' paths are relative to.
+            shards: What the index knows of each shard, by path.
+            revision: The index's digest, by which a cache tells data apart.
+            cache: Where to keep members that come from a URL, or None.
+        """
+        self._root = str(root)
+        self._shards = shards
+        self._revision = revision
+        self._cache = cache
+        self._objects: dict[str, RemoteObject] = {}
+
+    def open(self, scene: Scene, name: str) -> Path | MemberFile:
+        """Return one of a scene's files: its path, or an open file that is the caller's to close.
+
+        Raises:
+            StorageError: If it is missing, unreadable or not the one that was indexed.
+        """
+        member = scene.members[name]
+        if not is_remote(self._root):
+            return open_local(self._root, member, shard=self._shards.get(member.path))
+        _require_safe(member)
+        remote = self._object(member)
+        if self._cache is not None:
+            return self._cache.open(member, remote=remote, revision=self._revision)
+        offset = member.offset
+        return RangedFile(
+            lambda start, stop: remote.read(offset + start, offset + stop), size=member.size
+        )
+
+    def read(self, scene: Scene, name: str) -> bytes:
+        """Return one of a scene's metadata files, whole and as its checksum says.
+
+        Raises:
+            StorageError: If it is missing, unreadable or not the one that was indexed.
+            SchemaError: If it is too large for a metadata file.
+        """
+        where, member = self.label(scene, name), scene.members[name]
+        require_text_size(member.size, where=where)
+        opened = self.open(scene, name)
+        if isinstance(opened, Path):
+            return read_text_file(opened, where=where)
+        with opened:
+            text = opened.read()
+        found = zlib.crc32(text)
+        if member.crc32 not in (None, found):
+            raise ShardError(
+                f"{where}: has crc32 {found:08x}, and the index says {member.crc32:08x}. The file "
+                f"was damaged or replaced: fetch it again."
+            )
+        return text
+
+    def label(self, scene: Scene, name: str) -> str:
+        """Return what messages call one of a scene's files: where it lies, and its name."""
+        place = self._shown(scene.members[name].path)
+        return place if place.endswith(name) else f"{place}: {name}"
+
+    def url(self, scene: Scene, name: str) -> str:
+        """Return what holds a scene's file: its shard, or the scene's own folder."""
+        place = scene.members[name].path
+        return self._shown(place if place in self._shards else scene.id.key)
+
+    def drop_damaged(self, scene: Scene, names: Iterable[str]) -> bool:
+        """Drop files of a scene from the cache that are not as they were stored.
+
+        Returns:
+            Whether there were any, so that reading again may help.
+        """
+        if self._cache is None or not is_remote(self._root):
+            return False
+        dropped = [
+            self._cache.drop_damaged(
+                member, where=self._object(member).where, revision=self._revision
+            )
+            for member in (scene.members[name] for name in names)
+        ]
+        return any(dropped)
+
+    def _shown(self, path: str) -> str:
+        if is_remote(self._root):
+            return shown(joined(self._root, path))
+        return str(local_path(self._root) / path)
+
+    def _object(self, member: Member) -> RemoteObject:
+        """Return what holds a member; it is kept, so that its size is checked once."""
+        if member.path not in self._objects:
+            shard = self._shards.get(member.path)
+            self._objects[member.path] = RemoteObject(
+                joined(self._root, member.path),
+                expected_size=member.offset + member.size if shard is None else shard.size,
+            )
+        return self._objects[member.path]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy in another process needs; it checks sizes for itself."""
+        return self.__dict__ | {"_objects": {}}
+
+
+def open_local(
+    root: str | Path, member: Member, *, shard: ShardFacts | None = None
+) -> Path | MemberFile:
+    """Return a member's path where it is a whole file, else an open file over its part.
+
+    Args:
+        root: The folder that the member's path is relative to.
+        member: What to open.
+        shard: What the index knows of the file that holds the member, where that is a shard.
+
+    Raises:
+        StorageError: If the file is missing, unreadable or not the one that was indexed.
+    """
+    if shard is None and member.offset == 0:
+        return member_path(root, member)
+    _require_safe(member)
+    path = local_path(root) / member.path
+    again = "Fetch the shard again, or use the index that was made with it."
+    try:
+        file = FileSlice(path, member)
+    except OSError as error:
+        raise ShardError(f"{path}: cannot be read ({error.strerror}). {again}") from error
+    found, end = file.file_size(), member.offset + member.size
+    if found < end or (shard is not None and found != shard.size):
+        file.close()
+        says = f"at least {end}" if shard is None else shard.size
+        raise ShardError(
+            f"{path}: has {found} bytes, and the index says {says}. The index is of another pack, "
+            f"or the shard was replaced or cut short. {again}"
+        )
+    return file
 
 
 def member_path(root: str | Path, member: Member) -> Path:
@@ -22,12 +210,8 @@ def member_path(root: str | Path, member: Member) -> Path:
         StorageError: If the path leaves the root, or the file is missing, unreadable or has
             another size than the index says.
     """
-    if _UNSAFE_PATH.search(member.path):
-        raise StorageError(
-            f"{member.path!r}: a member's path is relative to the data's root and stays inside "
-            f"it. The index was not made by this package: run `stereogenbench index` again."
-        )
-    path = Path(root, member.path)
+    _require_safe(member)
+    path = local_path(root) / member.path
     try:
         size_bytes = path.stat().st_size
     except OSError as error:
@@ -44,15 +228,12 @@ def member_path(root: str | Path, member: Member) -> Path:
     return path
 
 
-def read_member(root: str | Path, member: Member) -> bytes:
-    """Return the bytes of a metadata file, having checked that it is the one that was indexed.
-
-    Raises:
-        StorageError: If the file is missing, unreadable or not the one that was indexed.
-        SchemaError: If it is too large for a metadata file.
-    """
-    path = member_path(root, member)
-    return read_text_file(path, where=str(path))
+def _require_safe(member: Member) -> None:
+    if _UNSAFE_PATH.search(member.path):
+        raise StorageError(
+            f"{member.path!r}: a member's path is relative to the data's root and stays inside "
+            f"it. The index was not made by this package: run `stereogenbench index` again."
+        )
 
 
 def read_text_file(path: Path, *, where: str) -> bytes:

@@ -15,9 +15,10 @@ import re
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import BinaryIO, Final
+from typing import Final
 
 from stereogenbench_data.errors import ShardError
+from stereogenbench_data.media.container import BinaryFile
 from stereogenbench_data.storage.source import UNSAFE_PATH
 
 BLOCK_BYTES: Final = 512
@@ -27,7 +28,7 @@ LARGEST_MEMBER_BYTES: Final = 8**11 - 1
 """Eleven octal digits: 8 GiB less one byte."""
 
 CODE_SUFFIXES: Final = frozenset(
-    {"pickle", "pkl", "pk", "p", "pyd", "pyc", "py", "so", "dill", "joblib"}
+    {"pickle", "pkl", "pk", "pyd", "pyc", "py", "so", "dill", "joblib"}
     | {"pt", "pth", "ckpt", "npy", "npz"}
 )
 """Suffixes of files that loaders unpickle, load or may be made to: no shard holds such a member."""
@@ -122,7 +123,7 @@ def _unfit_name(name: str) -> str:
     return f"may hold code that runs when it is loaded (.{code[0]})" if code else ""
 
 
-def read_members(file: BinaryIO, size: int, *, where: str) -> list[TarMember]:
+def read_members(file: BinaryFile, size: int, *, where: str) -> list[TarMember]:
     """Return what an open tar of a known size holds, having read its headers and its end.
 
     Args:
@@ -164,7 +165,7 @@ def read_members(file: BinaryIO, size: int, *, where: str) -> list[TarMember]:
         last, at = repr(name), following
 
 
-def _require_end(file: BinaryIO, left: int, *, place: str) -> None:
+def _require_end(file: BinaryFile, left: int, *, place: str) -> None:
     if left < len(END_OF_ARCHIVE):
         raise ShardError(
             f"{place} only {left} of the {len(END_OF_ARCHIVE)} zeros are there that end the "
@@ -222,7 +223,7 @@ class Checksums:
 
 
 def read_checksums(
-    file: BinaryIO,
+    file: BinaryFile,
     size: int,
     *,
     parts: Sequence[tuple[int, int]],
@@ -259,7 +260,7 @@ def read_checksums(
     return Checksums(whole.hexdigest(), tuple(crc32s))
 
 
-def _chunks(file: BinaryIO, length: int) -> Iterator[bytes]:
+def _chunks(file: BinaryFile, length: int) -> Iterator[bytes]:
     """Yield so many bytes of a file, from where it stands."""
     while length > 0:
         chunk = file.read(min(length, _CHUNK_BYTES))

@@ -1,10 +1,6 @@
 """From a released tree to its scenes: all described, in parallel, none left out in silence."""
 
-import multiprocessing
-import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
@@ -14,6 +10,7 @@ from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Scene, SceneId
 from stereogenbench_data.schema.release import TRAIN_MAPS
 from stereogenbench_data.storage.journal import Journal
+from stereogenbench_data.storage.pool import AfterBytes, run_tasks
 from stereogenbench_data.storage.release_tree import SceneFolders, find_scene_folders
 from stereogenbench_data.storage.scene_folder import (
     IncompleteScene,
@@ -90,7 +87,7 @@ def walk(
         progress(len(outcomes), total)
     pending = [key for key in folders.keys if key not in outcomes]
     task = _Task(str(root), valid_depth)
-    for outcome in _described(task, pending, workers or os.cpu_count() or 1):
+    for outcome in _described(task, pending, workers):
         outcomes[outcome.key] = outcome
         if journal is not None and outcome.scene is not None:
             journal.add(outcome.scene, stamp=outcome.stamp)
@@ -130,23 +127,20 @@ def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> d
     return outcomes
 
 
-def _described(task: _Task, keys: list[str], workers: int) -> Iterator[_Outcome]:
-    if workers == 1 or len(keys) < POOL_FROM:
-        yield from map(task, keys)
-        return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(keys)), mp_context=context)
-    try:
-        for future in as_completed([pool.submit(task, key) for key in keys]):
-            yield future.result()
-    except BrokenProcessPool as error:
-        raise StorageError(
-            f"{task.root}: a process that reads scenes died before {len(keys)} were done. It was "
-            f"killed (is memory short?), or the calling script starts work without "
-            f"`if __name__ == '__main__':`. Run it again, or with workers=1."
-        ) from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+def _described(task: _Task, keys: list[str], workers: int | None) -> Iterator[_Outcome]:
+    items = [(task, key) for key in keys]
+    few = len(keys) < POOL_FROM
+    return run_tasks(_describe, items, workers=1 if few else workers, after_bytes=_ignore)
+
+
+def _describe(item: tuple[_Task, str], after_bytes: AfterBytes) -> _Outcome:
+    task, key = item
+    after_bytes(0)
+    return task(key)
+
+
+def _ignore(count: int) -> None:
+    """Take no note of bytes: scenes are counted."""
 
 
 def _report(root: str | Path, folders: SceneFolders, outcomes: list[_Outcome]) -> TreeReport:

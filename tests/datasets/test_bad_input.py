@@ -2,7 +2,9 @@
 
 import json
 import shutil
+import subprocess
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from stereogenbench_data import (
     StereoPairs,
     StorageError,
 )
+from stereogenbench_data.datasets.mapped import OddSceneWarning
 from stereogenbench_data.storage.index import IncompleteSceneWarning
 from stereogenbench_data.synthesis import ExportContract, SynthRequest, synthesise
 
@@ -224,6 +227,83 @@ def test_depth_that_cannot_be_whole_is_refused_unless_it_is_meant(scene, codec, 
     meant = DepthEncoding(0.1, accept=frozenset({"8-bit", "lossy", "chroma"}))
     assert StereoPairs(root_of(scene), fields=("depth",), depth=meant)[0]["depth"].max() > 3
     assert StereoPairs(root_of(scene), fields=("left",))[0]["left"].any()
+
+
+def retagged(scene, camera, *options):
+    """Write a depth video again with other tags."""
+    path = scene / f"cam_{camera:02d}_depth.mkv"
+    aside = path.with_name("aside.mkv")
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", path, "-c", "copy"]
+    subprocess.run([*command, "-map_metadata", "-1", *options, aside], check=True)
+    aside.replace(path)
+
+
+def test_a_tag_that_is_no_number_needs_the_users_unit(scene):
+    retagged(scene, 1, "-metadata", "DEPTH_SCALE=mm")
+    root = root_of(scene)
+
+    with pytest.raises(MediaError, match=r"cam_01_depth\.mkv: its tags .* DepthEncoding\(unit_m="):
+        StereoPairs(root, fields=("visible",))
+    with pytest.warns(OddSceneWarning, match="other units of depth"):
+        untouched = StereoPairs(root, fields=("disparity",))[0]
+    assert untouched["disparity"].any()
+    meant = StereoPairs(root, fields=("depth_right",), depth=DepthEncoding(0.001))[0]
+    assert 1 < float(meant["depth_right"].median()) < 100
+
+
+def test_a_tag_that_one_camera_lacks_is_warned_of(scene):
+    retagged(scene, 1)
+
+    with pytest.warns(OddSceneWarning, match="1 selected scenes state other units of depth"):
+        StereoPairs(root_of(scene))
+
+
+def turn(scene, camera, **angles_deg):
+    def change(doc):
+        for frame in doc["frames"]:
+            for name, angle_deg in angles_deg.items():
+                frame["cameras"][camera]["rotation"][name] += angle_deg
+
+    rewrite(scene / "trajectory.json", change)
+
+
+def test_a_rig_that_is_not_rectified_is_warned_of_and_goes_through_its_poses(scene):
+    straight = StereoPairs(root_of(scene), fields=("disparity", "valid"))[0]
+    turn(scene, 1, yaw=0.5)
+
+    with pytest.warns(OddSceneWarning, match=r"1 selected scenes are not rectified \(by up to"):
+        pairs = StereoPairs(root_of(scene), fields=("disparity", "valid"))
+    focal_px = pairs.index.scene(0).rig.focal_mm / 23.76 * 64
+    moved = (pairs[0]["disparity"] - straight["disparity"])[straight["valid"]]
+    # a camera turned right by half a degree sees everything about f tan(0.5 degrees) further left
+    assert float(moved.median()) == pytest.approx(focal_px * np.tan(np.radians(0.5)), rel=0.1)
+
+
+@pytest.mark.parametrize("angles_deg", [{"yaw": 90.0}, {"roll": 90.0}], ids=str)
+def test_cameras_that_do_not_stand_beside_each_other_are_refused(scene, angles_deg):
+    for camera in range(6):
+        turn(scene, camera, **angles_deg)
+
+    with pytest.raises(StorageError, match=r"cameras 0 and 1 are .* cm beside each other"):
+        StereoPairs(root_of(scene))
+
+
+def test_a_camera_that_looks_back_is_refused(scene):
+    turn(scene, 4, yaw=180.0)
+
+    with pytest.raises(StorageError, match="a camera looks away from what the others see"):
+        StereoPairs(root_of(scene))
+
+
+@pytest.mark.parametrize("point", [[0.5, 0.5], [3000, 32], [32, -4]], ids=str)
+def test_a_principal_point_outside_the_picture_is_refused(scene, point):
+    rewrite(
+        scene / "baseline.json",
+        lambda doc: doc["camera_intrinsics"].update(principal_point_px=point),
+    )
+
+    with pytest.raises(StorageError, match=r"principal_point_px.*inside a picture of 64 pixels"):
+        StereoPairs(root_of(scene))
 
 
 @pytest.mark.parametrize("depth_format", ["gray16le", "gray12le", "gray10le"])

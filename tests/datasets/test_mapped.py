@@ -3,6 +3,7 @@
 import os
 import pickle
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
 import numpy as np
@@ -265,6 +266,9 @@ def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():
         ({"split": "test"}, SelectionError, "split there is 'eval', 'train'"),
         ({"pairs": [(0, 7)]}, SelectionError, "no pair"),
         ({"frames": 7}, SelectionError, "scene with 7 frames"),
+        ({"transform": 42}, FieldError, "a transform is called with"),
+        ({"transform": HorizontalFlip}, FieldError, "a transform is called with"),
+        ({"depth": 0.001}, FieldError, "depth must be a DepthEncoding"),
     ],
     ids=str,
 )
@@ -297,10 +301,43 @@ def test_the_users_depth_contract_overrides_the_files(small_release):
     assert torch.allclose(stated["disparity"], doubled["disparity"] * 2, rtol=1e-6)
 
 
+@pytest.mark.parametrize("contract", [DepthEncoding(), DepthEncoding(accept=frozenset({"8-bit"}))])
+def test_a_contract_that_states_no_unit_keeps_the_files(small_release, contract):
+    stated = StereoPairs(small_release, fields=("depth",))[0]
+
+    assert torch.equal(StereoPairs(small_release, fields=("depth",), depth=contract)[0]["depth"],
+                       stated["depth"])  # fmt: skip
+
+
+def test_threads_that_share_a_dataset_get_what_one_thread_gets(small_release):
+    pairs = StereoPairs(small_release, pairs="all", frames="all", fields=("left", "depth"))
+    numbers = np.random.default_rng(0).integers(0, len(pairs), 60).tolist()
+    expected = [pairs[number] for number in numbers]
+
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(pairs.__getitem__, numbers))
+
+    assert all(same(one, other) for one, other in zip(found, expected, strict=True))
+
+
+def test_a_dataset_goes_on_after_a_change_of_folder(small_release, monkeypatch, tmp_path):
+    monkeypatch.chdir(small_release.parent)
+    pairs = StereoPairs(small_release.name, fields=("left", "__url__"))
+    monkeypatch.chdir(tmp_path)
+
+    assert pairs[0]["__url__"].startswith(str(small_release))
+
+
+@pytest.mark.parametrize("number", [2.7, "0", slice(0, 2), [0, 1], None])
+def test_a_sample_is_asked_for_by_a_whole_number(small_release, number):
+    with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
+        StereoPairs(small_release)[number]
+
+
 def test_a_frame_lag_takes_depth_from_another_frame_and_none_beyond_the_last(small_release):
     options = {"frames": "all", "family": "IPD_Gaussian", "fields": ("left", "depth", "valid")}
     plain = StereoPairs(small_release, **options)
-    lagged = StereoPairs(small_release, depth=DepthEncoding(0.001, frame_lag=1), **options)
+    lagged = StereoPairs(small_release, depth=DepthEncoding(frame_lag=1), **options)
 
     assert torch.equal(lagged[2]["depth"], plain[3]["depth"])
     assert torch.equal(lagged[2]["left"], plain[2]["left"])

@@ -1,17 +1,31 @@
 """The pool of open videos."""
 
 import gc
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from stereogenbench_data.errors import MediaError
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.source import MemberSource
+
+RGB = [f"cam_{camera:02d}_rgb.mp4" for camera in range(6)]
+DEPTH = "cam_00_depth.mkv"
 
 
-def videos(root, kind):
-    return sorted(root.glob(f"train/*/*/*/cam_*_{kind}"))
+@pytest.fixture(params=["files", "shards"])
+def data(request, small_release, small_shards):
+    """An index of released files, and one of the same in shards."""
+    return SceneIndex.open(small_release if request.param == "files" else small_shards)
+
+
+def pool_of(data, **how):
+    return Streams(MemberSource(data.root, shards=data.shards), **how)
 
 
 def open_files():
@@ -23,57 +37,76 @@ def open_files():
             links.append(str(link.readlink()))
         except OSError:
             continue
-    return sorted(link for link in links if link.endswith((".mp4", ".mkv")))
+    return sorted(link for link in links if link.endswith((".mp4", ".mkv", ".tar")))
 
 
-def test_the_pool_keeps_no_more_videos_open_than_its_limit(small_release):
-    pool = Streams(limit=4)
-    for path in videos(small_release, "rgb.mp4"):
-        pool.rgb(path, 0, frames=7, size=None)
+def test_the_pool_keeps_no_more_videos_open_than_its_limit(data):
+    pool = pool_of(data, limit=4)
+    for row in range(2):
+        for name in RGB:
+            pool.rgb(data.scene(row), name, 0, size=None)
 
     assert len(open_files()) == 4
     pool.close()
     assert open_files() == []
 
 
-def test_a_video_that_was_closed_in_turn_is_read_again_the_same(small_release):
-    paths = videos(small_release, "rgb.mp4")[:3]
-    roomy, tight = Streams(limit=8), Streams(limit=1)
+def test_a_video_that_was_closed_in_turn_is_read_again_the_same(data):
+    scene = data.scene(0)
+    roomy, tight = pool_of(data, limit=8), pool_of(data, limit=1)
 
     for frame in (0, 3, 1):
-        for path in paths:
-            expected = roomy.rgb(path, frame, frames=7, size=None)
-            assert np.array_equal(tight.rgb(path, frame, frames=7, size=None), expected)
+        for name in RGB[:3]:
+            expected = roomy.rgb(scene, name, frame, size=None)
+            assert np.array_equal(tight.rgb(scene, name, frame, size=None), expected)
     roomy.close()
     tight.close()
 
 
-def test_a_picture_is_handed_out_read_only_and_not_decoded_twice(small_release):
-    path = videos(small_release, "rgb.mp4")[0]
-    pool = Streams()
-    first = pool.rgb(path, 2, frames=7, size=None)
+def test_a_picture_is_handed_out_read_only_and_not_decoded_twice(data):
+    pool = pool_of(data)
+    first = pool.rgb(data.scene(0), RGB[0], 2, size=None)
 
-    assert pool.rgb(path, 2, frames=7, size=None) is first
+    assert pool.rgb(data.scene(0), RGB[0], 2, size=None) is first
     with pytest.raises(ValueError, match="read-only"):
         first[0, 0, 0] = 1
     pool.close()
 
 
-def test_another_size_is_another_picture(small_release):
-    path = videos(small_release, "rgb.mp4")[0]
-    pool = Streams()
+def test_another_size_is_another_picture(data):
+    pool, scene = pool_of(data), data.scene(0)
 
-    assert pool.rgb(path, 0, frames=7, size=None).shape == (3, 64, 64)
-    assert pool.rgb(path, 0, frames=7, size=(10, 20)).shape == (3, 10, 20)
-    assert pool.rgb(path, 0, frames=7, size=None).shape == (3, 64, 64)
+    assert pool.rgb(scene, RGB[0], 0, size=None).shape == (3, 64, 64)
+    assert pool.rgb(scene, RGB[0], 0, size=(10, 20)).shape == (3, 10, 20)
+    assert pool.rgb(scene, RGB[0], 0, size=None).shape == (3, 64, 64)
     pool.close()
 
 
-def test_stored_depth_comes_back_as_it_was_written(small_release):
-    path = videos(small_release, "depth.mkv")[0]
-    pool = Streams()
-    units = pool.depth_units(path, 0, frames=7, encoding=DepthEncoding(0.001))
+def test_stored_depth_comes_back_as_it_was_written(data):
+    pool = pool_of(data)
+    units = pool.depth_units(data.scene(0), DEPTH, 0, encoding=DepthEncoding(0.001))
 
     assert units.dtype == np.uint16
-    assert pool.pixel_format(path, frames=7) == "gray16le"
+    assert pool.pixel_format(data.scene(0), DEPTH) == "gray16le"
     pool.close()
+
+
+def test_a_copy_for_another_process_opens_its_own_videos(data):
+    pool = pool_of(data, limit=2)
+    expected = pool.rgb(data.scene(0), RGB[0], 1, size=None)
+    copy = pickle.loads(pickle.dumps(pool))
+
+    assert np.array_equal(copy.rgb(data.scene(0), RGB[0], 1, size=None), expected)
+    pool.close()
+    copy.close()
+
+
+def test_a_video_that_failed_is_closed(data):
+    pool = pool_of(data)
+    scene = data.scene(0)
+    with pytest.raises(MediaError, match="holds 7 frames where 8 are expected"):
+        pool.rgb(replace(scene, frames=8), RGB[0], 7, size=None)
+    with pytest.raises(MediaError, match=r"cam_00_rgb.mp4: has no frame 9"):
+        pool.rgb(scene, RGB[0], 9, size=None)
+
+    assert open_files() == []

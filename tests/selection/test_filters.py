@@ -56,6 +56,17 @@ def test_a_misspelt_value_is_answered_with_the_nearest_one(index):
         keys(index, family="Unifrom")
 
 
+def test_a_value_that_no_scene_has_is_not_passed_over_beside_one_that_some_have(index):
+    with pytest.raises(SelectionError, match="family='Nope' matches none of 9 scenes of the index"):
+        keys(index, family=["Uniform", "Nope"])
+
+
+@pytest.mark.parametrize("family", [3, [], [3], [None]])
+def test_a_text_filter_that_is_no_text_is_refused(index, family):
+    with pytest.raises(SelectionError, match="family must be a text or a sequence of texts"):
+        keys(index, family=family)
+
+
 def test_a_misspelt_filter_is_answered_with_the_nearest_one(index):
     with pytest.raises(SelectionError, match="no filter 'famly'; did you mean 'family'"):
         filter_scenes(index, {"famly": "Uniform"})

@@ -50,7 +50,7 @@ def test_a_sweep_groups_what_stands_to_the_right_of_the_primary_view(index):
 def test_a_sweep_from_the_right_groups_what_stands_to_the_left(index):
     found = chosen(index, {"subset": "seen_map"}, pairs="sweep", direction="right_to_left")
 
-    assert found == [(0, 3, [0, 1, 2])]
+    assert found == [(0, 5, [4, 3, 2, 1, 0])]
 
 
 def test_a_baseline_range_is_closed_and_drops_pairs_not_scenes(index):
@@ -128,11 +128,20 @@ def test_a_baseline_that_no_pair_has_says_which_there_are(index):
         ("every", "must be 'primary'"),
         ([5], "got 5"),
         ([(0, 1, 2)], r"got \(0, 1, 2\)"),
+        ([(0.9, 1.9)], r"got \(0.9, 1.9\)"),
+        ([("0", "1")], "got"),
+        (np.array([[0, 9]]), r"there is no pair \(0, 9\)"),
     ],
 )
 def test_a_pair_that_does_not_exist_is_refused(index, pairs, message):
     with pytest.raises(SelectionError, match=message):
         chosen(index, pairs=pairs)
+
+
+@pytest.mark.parametrize("baseline_cm", [10, (), (5, 1), ("a", 3)], ids=str)
+def test_a_baseline_that_is_no_range_is_refused(index, baseline_cm):
+    with pytest.raises(SelectionError, match=r"baseline_cm must be|no baseline bin 'a'"):
+        chosen(index, baseline_cm=baseline_cm)
 
 
 def test_an_unknown_bin_is_answered_with_the_bins(index):

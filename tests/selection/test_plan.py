@@ -54,7 +54,9 @@ def test_scenes_of_other_lengths_have_their_own_windows(index):
 
 
 def test_a_frame_that_one_scene_lacks_names_the_scene(index):
-    with pytest.raises(SelectionError, match=r"eval/MapUnseenInTrain/.*frame 60 .* with 40 frames"):
+    with pytest.raises(
+        SelectionError, match=r"eval/MapUnseenInTrain/.*: frame 60 .* with 40 frames"
+    ):
         plan_pairs(index, split="eval", frames=60)
 
 

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
+from stereogenbench_data.storage import index as index_module
 from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
 
 METADATA = b"stereogenbench_data.index"
@@ -203,6 +204,12 @@ def with_path(path):
     [
         (lambda table, head: head.update(format=2), "of format 2, and this version .* reads fo"),
         (lambda table, head: head.update(broken=3), "description of itself was altered"),
+        (lambda table, head: head.update(root=3), "description of itself was altered"),
+        (lambda table, head: head["shards"].update(x=3), "description of itself was altered"),
+        (
+            lambda table, head: head["shards"].update(x={"size": "1", "sha256": "", "members": 1}),
+            "description of itself was altered",
+        ),
         (lambda table, head: table.drop_columns(["frames"]), r"not those of an index \(see frames"),
         (
             lambda table, head: table.set_column(0, "key", pa.array([1, 2, 3, 4, 5])),
@@ -256,9 +263,55 @@ def test_data_that_do_not_exist_are_named(tmp_path):
         SceneIndex.open(tmp_path / "nowhere")
 
 
-def test_a_url_is_refused():
-    with pytest.raises(StorageError, match="hf://datasets/x: a URL cannot be opened"):
-        SceneIndex.open("hf://datasets/x")
+def test_an_index_behind_a_url_is_fetched_and_its_data_lie_beside_it(scenes, web):
+    SceneIndex.from_scenes(scenes, web.folder).write(web.folder / "index.parquet")
+    for url in (web.url, f"{web.url}/", f"{web.url}/index.parquet"):
+        web.asked.clear()
+        index = SceneIndex.open(url)
+
+        assert index.root == web.url
+        assert index.digest == SceneIndex.open(web.folder).digest
+        assert {asked.path for asked in web.asked} == {"index.parquet"}
+
+
+def test_a_url_without_an_index_is_named(web):
+    with pytest.raises(StorageError, match=r"/data/index.parquet: the server answers 404 Not Fou"):
+        SceneIndex.open(f"{web.url}/data?key=secret")
+
+
+def test_a_damaged_index_behind_a_url_is_named(web):
+    (web.folder / "index.parquet").write_bytes(b"PAR1 and no more")
+
+    with pytest.raises(StorageError, match=r"/index.parquet: is no Parquet file that can be read"):
+        SceneIndex.open(f"{web.url}?key=secret")
+
+
+def test_an_index_behind_a_url_that_is_far_too_large_is_not_fetched(web, monkeypatch):
+    monkeypatch.setattr(index_module, "MAX_INDEX_BYTES", 99)
+    (web.folder / "index.parquet").write_bytes(bytes(100))
+
+    with pytest.raises(StorageError, match=r"an index may have 99 bytes, this one has 100. It was"):
+        SceneIndex.open(web.url)
+    assert web.sent == 1
+
+
+def test_an_index_kept_elsewhere_remembers_a_url(scenes, tmp_path, web):
+    SceneIndex.from_scenes(scenes, web.url).write(tmp_path / "kept.parquet")
+
+    assert SceneIndex.open(tmp_path / "kept.parquet").root == web.url
+
+
+def test_an_index_behind_a_url_cannot_send_its_readers_elsewhere(scenes, web):
+    SceneIndex.from_scenes(scenes, "https://elsewhere").write(web.folder / "index.parquet")
+
+    assert SceneIndex.open(web.url).root == web.url
+
+
+def test_no_secret_is_written_into_an_index(scenes, tmp_path):
+    index = SceneIndex.from_scenes(scenes, "https://me:word@host/data?key=secret")
+
+    with pytest.raises(StorageError, match=r"https://host/data: the URL has a login or a query"):
+        index.write(tmp_path / "kept.parquet")
 
 
 def test_an_index_in_its_root_moves_with_it(scenes, tmp_path):

@@ -1,0 +1,54 @@
+"""``stereogenbench verify``: every byte of the shards against their index."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from stereogenbench_data.cli.progress import progress_bar
+
+_MEGABYTE = 1_000_000
+
+
+def verify(
+    shards: Annotated[Path, typer.Argument(help="Folder of shards, or its index file.")],
+    *,
+    deep: Annotated[
+        bool, typer.Option("--deep", help="Decode every video too, and count its frames.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Report as JSON.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes that read [one a core].")
+    ] = None,
+) -> None:
+    """Read shards through, and list all that is wrong with them.
+
+    The exit status is 0 if nothing is wrong, 1 if something is, 2 if they cannot be verified.
+    """
+    from stereogenbench_data.storage.verify import verify as verified
+
+    mode: Literal["bytes", "decode"] = "decode" if deep else "bytes"
+    try:
+        with progress_bar("verifying", unit="MB") as bar:
+
+            def progress(done: int, total: int) -> None:
+                bar(-(-done // _MEGABYTE), -(-total // _MEGABYTE))
+
+            report = verified(shards, mode=mode, workers=workers, progress=progress)
+    except KeyboardInterrupt:
+        typer.echo("stopped", err=True)
+        raise typer.Exit(130) from None
+    if as_json:
+        typer.echo(json.dumps(asdict(report), indent=2))
+    else:
+        for problem in report.problems:
+            typer.echo(str(problem))
+        decoded = f", {report.videos_decoded} videos decoded" if deep else ""
+        typer.echo(
+            f"{report.root}: {report.shards} shards, {report.scenes} scenes, {report.members} "
+            f"members, {report.bytes / _MEGABYTE:.1f} MB{decoded}; {len(report.problems)} problems"
+        )
+    if report.problems:
+        raise typer.Exit(1)

@@ -1,0 +1,328 @@
+"""The batches of an epoch as one rank gets them, and positions in them that can be saved."""
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Any, Protocol, TypedDict, Unpack, runtime_checkable
+
+import numpy as np
+import torch.distributed
+from torch.utils.data import Sampler
+
+from stereogenbench_data.errors import SelectionError, StateError
+from stereogenbench_data.selection.order import (
+    LANES,
+    OPEN_SCENES,
+    ORDER_VERSION,
+    EpochOrder,
+    OrderKind,
+    OrderRule,
+    Tail,
+    last_batch,
+    rank_share,
+)
+from stereogenbench_data.selection.plan import Plan
+from stereogenbench_data.storage.index import SceneIndex
+
+State = dict[str, Any]
+"""A position: a flat dict of numbers and texts, which JSON and `torch.save` take."""
+
+
+class EpochOptions(TypedDict, total=False):
+    """How an epoch is ordered and shared out.
+
+    Attributes:
+        seed: The seed of the order; that of the dataset if left out.
+        rank: Which share of the batches this process gets; as torch.distributed says if left out
+            (0 where it is not initialised).
+        world_size: How many shares there are; as torch.distributed says, or 1, if left out.
+        tail: What becomes of the epoch's last batches. "drop" (the default): each rank gets as
+            many batches, all of them full; what is left over is dropped (see
+            `EpochBatches.left_out`). "wrap": each rank gets as many full batches and no sample is
+            left out; samples from the epoch's start fill up, marked in the field ``is_padding``
+            (batch,) bool. "uneven": every sample exactly once; the last batch may be short, and
+            ranks may differ by one batch. Validate with "uneven" (or "wrap", less its padding).
+        lanes: Into how many lanes the scenes are parted, 4 if left out; batch n belongs to lane
+            n mod lanes. Each video is decoded by one process, once an epoch, if
+            world_size * num_workers divides ``lanes``; make it a multiple of (or equal to) that
+            product. Selections too small for so many lanes have fewer.
+        open_scenes: How many scenes each lane interleaves; if left out 16, or the batch size where
+            that is more. Fewer take less memory and shuffle less well.
+        order: "shuffled" (the default) or "sequential".
+    """
+
+    seed: int
+    rank: int
+    world_size: int
+    tail: Tail
+    lanes: int
+    open_scenes: int
+    order: OrderKind
+
+
+@runtime_checkable
+class Numbered(Protocol):
+    """A dataset whose samples a plan numbers."""
+
+    index: SceneIndex
+    plan: Plan
+
+    @property
+    def epoch(self) -> int:
+        """The current epoch."""
+        ...
+
+    def set_epoch(self, epoch: int) -> None:
+        """Go to another epoch."""
+        ...
+
+
+class EpochBatches(Sampler[list[int]]):
+    """A batch sampler: the samples of each batch of an epoch, for one rank.
+
+    The order depends on the selection, the seed, the epoch, the batch size, the lanes and the open
+    scenes, and on nothing else: global batch n goes to rank n mod world_size, whoever asks. It
+    offers its position as torchdata's ``StatefulDataLoader`` asks for it; with torch's own
+    `DataLoader`, which reads ahead, use the dataset's ``loader(...)``, which counts what the
+    training loop has taken.
+
+    >>> from stereogenbench_data import EpochBatches, StereoPairs
+    >>> pairs = StereoPairs(getfixture("small_release"), frames="all")
+    >>> shares = [EpochBatches(pairs, 4, rank=r, world_size=2, tail="uneven") for r in (0, 1)]
+    >>> [len(share) for share in shares]
+    [4, 3]
+    >>> sorted(sum([*shares[0], *shares[1]], [])) == list(range(28))
+    True
+    """
+
+    def __init__(self, dataset: Numbered, batch_size: int, **options: Unpack[EpochOptions]) -> None:
+        """Order the samples of a dataset; nothing is computed before the first batch.
+
+        Args:
+            dataset: Such as `StereoPairs`; its epoch is the epoch of the batches.
+            batch_size: Samples in a batch of one rank.
+            **options: See `EpochOptions`.
+
+        Raises:
+            SelectionError: If an option is out of its range, or every batch would be dropped.
+        """
+        unknown = sorted(set(options) - set(EpochOptions.__annotations__))
+        if unknown:
+            raise SelectionError(
+                f"there is no option {unknown[0]!r}; there are "
+                f"{', '.join(EpochOptions.__annotations__)}."
+            )
+        self.dataset = dataset
+        self.rule = OrderRule(
+            batch_size=batch_size,
+            seed=options.get("seed", dataset.plan.seed),
+            lanes=options.get("lanes", LANES),
+            open_scenes=options.get("open_scenes", max(OPEN_SCENES, batch_size)),
+            kind=options.get("order", "shuffled"),
+        )
+        self.tail = options.get("tail", "drop")
+        self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
+        self._follows_the_group = "rank" not in options
+        self._resumed = (0, 0)
+        self._order: EpochOrder | None = None
+        self._latest: BatchPass | None = None
+        if self.end() == 0:
+            raise SelectionError(
+                f"tail='drop' drops all of {len(dataset.plan)} samples: they fill no batch of "
+                f"{batch_size} for each of {self.world_size} ranks. Take a smaller batch_size, "
+                "tail='wrap' or tail='uneven'."
+            )
+
+    @property
+    def left_out(self) -> int:
+        """How many samples of an epoch no rank gets: of ``tail="drop"`` only."""
+        return max(0, len(self.dataset.plan) - self.end() * self.rule.batch_size)
+
+    def __len__(self) -> int:
+        """The number of this rank's batches in a whole epoch."""
+        return len(self.share(0))
+
+    def __iter__(self) -> "BatchPass":
+        """Return this rank's batches of the current epoch, or what a loaded state left of it."""
+        epoch, start = self.next_position()
+        return BatchPass(self, epoch=epoch, start=start)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Go to another epoch, which begins at its beginning; the dataset goes with it."""
+        self.dataset.set_epoch(epoch)
+
+    def state_dict(self) -> State:
+        """Return the position after the last batch that was given out."""
+        if self._latest is None:
+            return self.state_at(*self.next_position())
+        return self._latest.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go to a saved position: the next pass begins there, all later ones at the beginning.
+
+        Raises:
+            StateError: If it belongs to other samples or another order, naming what differs.
+        """
+        self._resumed = self.position_in(state)
+        self._latest = None
+        self.dataset.set_epoch(self._resumed[0])
+
+    def next_position(self) -> tuple[int, int]:
+        """Return the epoch and the global batch at which the next pass begins."""
+        epoch, start = self._resumed
+        return (epoch, start) if epoch == self.dataset.epoch else (self.dataset.epoch, 0)
+
+    def begun(self, latest: "BatchPass") -> None:
+        """Note that a pass has begun: the next one starts its epoch from the beginning."""
+        self._resumed = (0, 0)
+        self._latest = latest
+
+    def end(self, start: int = 0) -> int:
+        """Return the global number at which an epoch ends for ranks that go on from ``start``."""
+        return last_batch(
+            len(self.dataset.plan),
+            batch_size=self.rule.batch_size,
+            tail=self.tail,
+            world_size=self.world_size,
+            start=start,
+        )
+
+    def share(self, start: int) -> range:
+        """Return the global numbers of this rank's batches from ``start`` on.
+
+        Raises:
+            SelectionError: If torch.distributed was initialised after these batches were made.
+        """
+        if self._follows_the_group and _group() not in (None, (self.rank, self.world_size)):
+            raise SelectionError(
+                f"these batches were made for rank {self.rank} of {self.world_size}, and "
+                f"torch.distributed now says (rank, world size) is {_group()}. Make them after "
+                "init_process_group, or give rank= and world_size=."
+            )
+        return rank_share(start, self.end(start), rank=self.rank, world_size=self.world_size)
+
+    def batch(self, number: int, *, epoch: int) -> list[int]:
+        """Return the samples of a global batch."""
+        order = self.order(epoch)
+        found = order.full_batch(number) if self.tail == "wrap" else order.batch(number)
+        samples: list[int] = found.tolist()
+        return samples
+
+    def is_padding(self, number: int) -> np.ndarray:
+        """Return, for each sample of a global batch, whether it fills up after the epoch's end."""
+        size = self.rule.batch_size
+        return np.arange(number * size, (number + 1) * size) >= len(self.dataset.plan)
+
+    def order(self, epoch: int) -> EpochOrder:
+        """Return the order of an epoch; the last one asked for is kept."""
+        if self._order is None or self._order.epoch != epoch:
+            self._order = EpochOrder(self.dataset.plan.first_sample, self.rule, epoch=epoch)
+        return self._order
+
+    def state_at(self, epoch: int, batches: int) -> State:
+        """Return the state after so many global batches of an epoch."""
+        return {
+            "version": ORDER_VERSION,
+            "epoch": epoch,
+            "batches_consumed": batches,
+            **self._identity,
+        }
+
+    def position_in(self, state: Mapping[str, Any]) -> tuple[int, int]:
+        """Return the epoch and the number of global batches that a state says are consumed.
+
+        Raises:
+            StateError: If it belongs to other samples or another order, naming what differs.
+        """
+        own = {"version": ORDER_VERSION, **self._identity}
+        missing = sorted({*own, "epoch", "batches_consumed"} - state.keys())
+        if missing:
+            raise StateError(
+                f"the state has no {', '.join(missing)} (it has {', '.join(map(str, state))}). "
+                "Pass what state_dict() of a loader, of EpochBatches or of a stream returned."
+            )
+        differing = [
+            f"{name} is {own[name]!r} here and {state[name]!r} there"
+            for name in own
+            if state[name] != own[name]
+        ]
+        if differing:
+            raise StateError(
+                f"the state was saved for other batches: {'; '.join(differing)}. Open the same "
+                "data with the same selection and options, or begin the epoch anew without it."
+            )
+        epoch, batches = state["epoch"], state["batches_consumed"]
+        for name, value in (("epoch", epoch), ("batches_consumed", batches)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+                raise StateError(f"the state's {name} is {value!r}, no whole number from 0.")
+        return epoch, batches
+
+    @cached_property
+    def _identity(self) -> State:
+        """What must be equal where a state is saved and where it is loaded."""
+        return {
+            "seed": self.rule.seed,
+            "batch_size": self.rule.batch_size,
+            "lanes": self.rule.lanes,
+            "open_scenes": self.rule.open_scenes,
+            "order": self.rule.kind,
+            "tail": self.tail,
+            "selection": self.dataset.plan.digest,
+            "index": self.dataset.index.digest,
+        }
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy in another process needs, which orders the epoch by itself."""
+        return self.__dict__ | {"_order": None, "_latest": None}
+
+
+class BatchPass(Iterator[list[int]]):
+    """One pass over a rank's batches."""
+
+    def __init__(self, batches: EpochBatches, *, epoch: int, start: int) -> None:
+        """Begin an epoch at a global batch."""
+        self._batches = batches
+        self._go_to(epoch, start)
+
+    def __next__(self) -> list[int]:
+        """Return the next batch: the numbers of its samples."""
+        self._batches.begun(self)
+        number = next(self._left)
+        self._given += 1
+        return self._batches.batch(number, epoch=self._epoch)
+
+    def state_dict(self) -> State:
+        """Return the position after the last batch that this pass gave out."""
+        given = min(self._start + self._given * self._batches.world_size, self._end)
+        return self._batches.state_at(self._epoch, given)
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go to a saved position."""
+        epoch, start = self._batches.position_in(state)
+        self._batches.dataset.set_epoch(epoch)
+        self._batches.begun(self)
+        self._go_to(epoch, start)
+
+    def _go_to(self, epoch: int, start: int) -> None:
+        self._epoch, self._start, self._given = epoch, start, 0
+        self._end = self._batches.end(start)
+        self._left = iter(self._batches.share(start))
+
+
+def _group() -> tuple[int, int] | None:
+    """Return rank and world size as torch.distributed says, None where it is not initialised."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        return torch.distributed.get_rank(), torch.distributed.get_world_size()
+    return None
+
+
+def _require_group(rank: int | None, world_size: int | None) -> tuple[int, int]:
+    """Return rank and world size, given or as torch.distributed says."""
+    if rank is None and world_size is None:
+        return _group() or (0, 1)
+    whole = all(isinstance(n, int) and not isinstance(n, bool) for n in (rank, world_size))
+    if rank is None or world_size is None or not whole or not 0 <= rank < world_size:
+        raise SelectionError(
+            f"rank must be a number from 0 below world_size, and both be given: got rank={rank!r}, "
+            f"world_size={world_size!r}."
+        )
+    return rank, world_size

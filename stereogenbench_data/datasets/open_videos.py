@@ -1,0 +1,68 @@
+"""How many videos a process keeps open so that none is opened twice."""
+
+import math
+import warnings
+
+import numpy as np
+
+from stereogenbench_data.datasets.batches import EpochBatches
+from stereogenbench_data.samples.fields import Stream
+from stereogenbench_data.samples.streams import OPEN_STREAMS
+from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.selection.plan import Plan
+
+SPARE_FILES = 128
+"""Open files that are left to everything else."""
+
+
+class OpenVideosWarning(UserWarning):
+    """More videos would be open at a time than the process may have: some are opened again."""
+
+
+def videos_to_keep(
+    plan: Plan, batches: EpochBatches, *, streams: frozenset[Stream], processes: int
+) -> int:
+    """Return how many videos one of so many processes keeps open for its share of an epoch.
+
+    It reads every lane of which it gets batches, each with its open scenes. As many files are
+    asked for as the process may open; if that is too few, a warning says what to do.
+    """
+    lengths = np.diff(plan.first_sample)
+    lanes = batches.rule.lanes_of(lengths)
+    scenes = lanes // math.gcd(lanes, processes) * batches.rule.most_open(lengths)
+    wanted = max(OPEN_STREAMS, scenes * videos_per_scene(plan, streams))
+    allowed = max(OPEN_STREAMS, _most_files() - SPARE_FILES)
+    if wanted > allowed:
+        warnings.warn(
+            f"up to {wanted} videos would be open at a time, and this process may open {allowed}: "
+            "they will be closed and opened again, which is slow. Raise the limit (`ulimit -n "
+            f"{wanted + SPARE_FILES}`), use more workers, or fewer open_scenes than "
+            f"{batches.rule.open_scenes}.",
+            OpenVideosWarning,
+            stacklevel=5,
+        )
+    return min(wanted, allowed)
+
+
+def _most_files() -> int:
+    """Return how many files this process may open: where a system does not tell, 512."""
+    try:
+        import resource
+    except ImportError:
+        return 512
+    return resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+
+
+def videos_per_scene(plan: Plan, streams: frozenset[Stream]) -> int:
+    """Return how many videos the samples of one scene are made from, at the most."""
+    pairs = plan.pairs
+    scene = np.repeat(np.arange(len(plan.scene_rows)), np.diff(plan.first_pair))
+    used = np.zeros((len(plan.scene_rows), 2, CAMERA_COUNT), dtype=bool)
+    for kind, suffix in enumerate(("rgb", "depth")):
+        if f"source_{suffix}" in streams:
+            used[scene, kind, pairs.source] = True
+        if f"target_{suffix}" in streams:
+            for targets in pairs.targets.T:
+                there = targets >= 0
+                used[scene[there], kind, targets[there]] = True
+    return int(used.sum(axis=(1, 2)).max())

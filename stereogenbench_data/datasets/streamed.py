@@ -1,0 +1,224 @@
+"""An iterable dataset with the order of the map-style ones, for trainers that want one."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Unpack
+
+import torch
+from torch.utils.data import IterableDataset, get_worker_info
+
+from stereogenbench_data.datasets.batches import EpochBatches, EpochOptions, State
+from stereogenbench_data.datasets.loader import split_options
+from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.errors import StateError
+from stereogenbench_data.samples.load import Sample, Transform
+from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.selection.plan import Selection
+from stereogenbench_data.storage.cache import ShardCache
+
+MOST_WORKERS = 4096
+
+
+class StreamOptions(Selection, EpochOptions, total=False):
+    """What `StereoPairs` takes, and `EpochOptions`; ``seed`` is the seed of both."""
+
+    fields: Iterable[str]
+    size: tuple[int, int] | None
+    transform: Transform | None
+    depth: DepthEncoding | None
+    cache: ShardCache | None
+
+
+class StereoPairStream(IterableDataset[Sample]):
+    """The samples of `StereoPairs` one after another, in the order of its batches.
+
+    ``DataLoader(stream, batch_size=B, num_workers=W)``, with the batch size of the stream, gives
+    the batches that ``StereoPairs(...).loader(B, num_workers=W)`` gives: each rank and worker
+    yields its own, without duplicates or holes, also where there are more workers than scenes. With
+    ``tail="wrap"`` a sample has the field ``is_padding``, a bool.
+
+    >>> from stereogenbench_data import StereoPairStream
+    >>> stream = StereoPairStream(getfixture("small_release"), 2, tail="uneven")
+    >>> len(stream), len({sample["scene"] for sample in stream})
+    (4, 4)
+    """
+
+    def __init__(self, data: Data, batch_size: int, **options: Unpack[StreamOptions]) -> None:
+        """Select the samples; no video is opened before the first sample is asked for.
+
+        Args:
+            data: As for `StereoPairs`.
+            batch_size: Samples in a batch of one rank; give `DataLoader` the same.
+            **options: What `StereoPairs` takes; and `EpochOptions` (rank, world_size, tail, lanes,
+                open_scenes, order).
+
+        Raises:
+            SelectionError: If nothing matches, or an option is out of its range.
+            FieldError: If a field does not exist, or a size is not one.
+            StorageError: If the data are not there, or hold broken scenes (all are named).
+            MediaError: If depth that a field needs cannot have been stored whole.
+        """
+        ordering, others = split_options(options)
+        if "seed" in ordering:
+            others["seed"] = ordering["seed"]
+        self.pairs = StereoPairs(data, **others)
+        self.batches = EpochBatches(self.pairs, batch_size, **ordering)
+        # Which worker has begun since a state was loaded: workers may be new copies every epoch.
+        self._begun = torch.zeros(MOST_WORKERS, dtype=torch.bool).share_memory_()  # type: ignore[no-untyped-call]
+        self._latest: SamplePass | None = None
+
+    @property
+    def epoch(self) -> int:
+        """The current epoch, from 0."""
+        return self.pairs.epoch
+
+    def set_epoch(self, epoch: int) -> None:
+        """Go to another epoch, in this process and in running workers. Call it before each epoch.
+
+        Raises:
+            SelectionError: If it is negative.
+        """
+        self.pairs.set_epoch(epoch)
+
+    def __len__(self) -> int:
+        """Return how many samples this rank has in a whole epoch."""
+        batches = self.batches
+        share, size = batches.share(0), batches.rule.batch_size
+        short = len(self.pairs) % size
+        has_short = batches.tail == "uneven" and short > 0 and len(self.pairs) // size in share
+        return len(share) * size - (size - short if has_short else 0)
+
+    def __iter__(self) -> "SamplePass":
+        """Return this rank's and this worker's samples of the current epoch."""
+        info = get_worker_info()
+        worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
+        epoch, start = self.batches.next_position()
+        if self._begun[worker % MOST_WORKERS]:
+            start = 0
+        self._begun[worker % MOST_WORKERS] = True
+        self.pairs.keep_open(self.batches, processes=self.batches.world_size * workers)
+        self._latest = SamplePass(self, epoch=epoch, start=start, worker=worker, workers=workers)
+        return self._latest
+
+    def state_dict(self, *, batches: int | None = None) -> State:
+        """Return a position, to be loaded under whatever ranks and workers.
+
+        Args:
+            batches: How many batches of this rank the training loop has taken in this epoch, since
+                it began or since a state was loaded; what this process has itself iterated if
+                None, which tells nothing where worker processes iterate.
+
+        Raises:
+            StateError: If the number is needed and not given.
+        """
+        epoch, start = self.batches.next_position()
+        if self._latest is not None and batches is None:
+            return self._latest.state_dict()
+        if batches is None:
+            if self._begun.any():
+                raise StateError(
+                    "worker processes iterate this stream, and read ahead: tell state_dict("
+                    "batches=...) how many batches the loop has taken, or use the loader of "
+                    "StereoPairs or torchdata's StatefulDataLoader, which count them."
+                )
+            batches = 0
+        consumed = min(start + batches * self.batches.world_size, self.batches.end(start))
+        return self.batches.state_at(epoch, consumed)
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go to a saved position: the next pass begins there, all later ones at the beginning.
+
+        Raises:
+            StateError: If it belongs to other samples or another order, naming what differs.
+        """
+        self.batches.load_state_dict(state)
+        self._begun.zero_()
+        self._latest = None
+
+    def close(self) -> None:
+        """Close the videos that this process holds open; the stream can be used again."""
+        self.pairs.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy in another process needs."""
+        return self.__dict__ | {"_latest": None}
+
+
+class SamplePass(Iterator[Sample]):
+    """One pass of one worker over its samples."""
+
+    def __init__(
+        self, stream: StereoPairStream, *, epoch: int, start: int, worker: int, workers: int
+    ) -> None:
+        """Begin an epoch at a global batch."""
+        self._stream = stream
+        self._place = {"worker": worker, "workers": workers}
+        self._left: Iterator[int] = iter(())
+        self._batch: list[int] = []
+        self._padding: list[bool] = []
+        self._at = 0
+        self._go_to(epoch, start, given=0)
+
+    def __next__(self) -> Sample:
+        """Return the next sample."""
+        batches = self._stream.batches
+        if self._at == len(self._batch):
+            self._next_batch()
+        sample = self._stream.pairs[self._batch[self._at]]
+        if batches.tail == "wrap":
+            sample["is_padding"] = torch.tensor(self._padding[self._at])
+        self._at += 1
+        self._given += 1
+        return sample
+
+    def state_dict(self) -> State:
+        """Return the position: for all ranks, and for this worker in its own samples."""
+        batches = self._stream.batches
+        taken = self._given // batches.rule.batch_size * batches.world_size
+        return {
+            **batches.state_at(self._epoch, min(self._start + taken, batches.end(self._start))),
+            "start": self._start,
+            "samples_given": self._given,
+            **self._own_place,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go to the position of the same worker of as many.
+
+        Raises:
+            StateError: If it belongs to other samples, another order, or another worker.
+        """
+        batches = self._stream.batches
+        epoch, _ = batches.position_in(state)
+        differing = [
+            f"{name} is {value} here and {state.get(name)} there"
+            for name, value in self._own_place.items()
+            if state.get(name) != value
+        ]
+        if differing:
+            raise StateError(
+                f"the position is that of another worker: {'; '.join(differing)}. Load it under "
+                "the same ranks and workers; the state of a stream itself goes with any."
+            )
+        self._stream.set_epoch(epoch)
+        self._go_to(epoch, int(state["start"]), given=int(state["samples_given"]))
+
+    @property
+    def _own_place(self) -> dict[str, int]:
+        batches = self._stream.batches
+        return {"rank": batches.rank, "world_size": batches.world_size, **self._place}
+
+    def _go_to(self, epoch: int, start: int, *, given: int) -> None:
+        batches = self._stream.batches
+        self._epoch, self._start, self._given = epoch, start, given
+        share = batches.share(start)[self._place["worker"] :: self._place["workers"]]
+        whole, part = divmod(given, batches.rule.batch_size)
+        self._left = iter(share[whole:])
+        self._batch, self._at = [], 0
+        if part > 0:
+            self._next_batch()
+            self._at = part
+
+    def _next_batch(self) -> None:
+        batches, number = self._stream.batches, next(self._left)
+        self._batch, self._at = batches.batch(number, epoch=self._epoch), 0
+        self._padding = batches.is_padding(number).tolist()

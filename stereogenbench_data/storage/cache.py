@@ -1,0 +1,272 @@
+"""A cache of members on a local disk, shared by the processes of a machine.
+
+An item is one member, stored whole under a name made of the dataset's revision, the shard's path
+and the member's place, size and checksum. It is written beside its place and moved there, so that
+no reader meets half of one; a lock lets one process fetch it while others wait. When the limit is
+reached, items that were not used for longest go. A reader keeps what it has opened even then: its
+open file stays whole until it is closed.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import re
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.schema.records import Member
+from stereogenbench_data.storage.locks import locked
+from stereogenbench_data.storage.ranged_file import FileSlice
+from stereogenbench_data.storage.remote import RemoteObject
+
+FOLDER_NAME: Final = "stereogenbench-members"
+_TAG: Final = "CACHEDIR.TAG"
+_SIGNATURE: Final = b"Signature: 8a477f597d28d172789f06886806bc55\n"
+_TAG_TEXT: Final = _SIGNATURE + (
+    b"# Members of StereoGenBench shards, kept by stereogenbench-data. The folder may be deleted.\n"
+)
+_OWN_FILE: Final = re.compile(r"([0-9a-f]{64})\.(member|part)")
+_FULL: Final = 0.9
+"""The share of the limit to which a full cache is emptied, so that not every item empties it."""
+
+_CHUNK: Final = 1024 * 1024
+
+
+class ShardCache:
+    """Keeps the members of remote shards that were read once.
+
+    Any number of processes may use one folder, each with its own `ShardCache`; the smallest of
+    their limits counts. Members that others fetch at that moment may come on top of it. Only files
+    that a cache wrote are ever deleted.
+    """
+
+    def __init__(self, folder: str | Path, *, limit_bytes: int) -> None:
+        """Use a folder, in which the cache makes one of its own.
+
+        Args:
+            folder: Where to keep members; made if it is not there.
+            limit_bytes: The bytes that all members together may take.
+
+        Raises:
+            StorageError: If the folder cannot be written, or what has the cache's name in it was
+                not made by one.
+        """
+        if limit_bytes < 1:
+            raise StorageError(f"{folder}: a cache needs a limit above 0 bytes, got {limit_bytes}.")
+        self.folder = Path(folder, FOLDER_NAME)
+        self.limit_bytes = limit_bytes
+        self._items = self.folder / "items"
+        self._locks = self.folder / "locks"
+        with _named_errors(self.folder):
+            self._make()
+
+    def open(self, member: Member, *, remote: RemoteObject, revision: str) -> FileSlice:
+        """Return a member, fetched if it is not here; it is the caller's to close.
+
+        Args:
+            member: What to open.
+            remote: The shard or file that holds it.
+            revision: What tells the dataset from its other versions.
+
+        Raises:
+            ShardError: If what is fetched has not the member's checksum, twice.
+            StorageError: If it cannot be fetched or stored, or the limit is below its size.
+        """
+        key = _key(member, where=remote.where, revision=revision)
+        with _named_errors(self.folder):
+            found = self._find(key, member)
+            if found is not None:
+                return found
+            self._require_room(member, where=remote.where)
+            with self._locked(key[:2]):
+                # Another process may have fetched it meanwhile.
+                found = self._find(key, member)
+                return found or self._fill(key, member, remote=remote)
+
+    def drop_damaged(self, member: Member, *, where: str, revision: str) -> bool:
+        """Drop a member whose bytes are not those that were stored; say whether it was one."""
+        key = _key(member, where=where, revision=revision)
+        with _named_errors(self.folder), self._locked(key[:2]):
+            place = self._place(key)
+            if member.crc32 is None or not place.is_file():
+                return False
+            with place.open("rb") as file:
+                crc32 = 0
+                while data := file.read(_CHUNK):
+                    crc32 = zlib.crc32(data, crc32)
+            if crc32 == member.crc32:
+                return False
+            self._drop(place)
+            return True
+
+    def used_bytes(self) -> int:
+        """Return the bytes of all members stored."""
+        return sum(size for _, size, _ in self._own_files())
+
+    def _make(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        tag = self.folder / _TAG
+        names = sorted(each.name for each in self.folder.iterdir())
+        if names and _TAG not in names:
+            raise StorageError(
+                f"{self.folder}: holds {names[0]} and is no cache of this package. Choose another "
+                f"folder, or delete it."
+            )
+        if not names:
+            unfinished = self.folder.with_name(f".{FOLDER_NAME}.{os.getpid()}")
+            unfinished.write_bytes(_TAG_TEXT)
+            unfinished.replace(tag)
+        if not tag.read_bytes().startswith(_SIGNATURE):
+            raise StorageError(
+                f"{tag}: was not written by this package. Choose another folder, or delete it."
+            )
+        self._items.mkdir(exist_ok=True)
+        self._locks.mkdir(exist_ok=True)
+
+    def _find(self, key: str, member: Member) -> FileSlice | None:
+        """Return an item that is stored and has its size; it counts as used now."""
+        place = self._place(key)
+        try:
+            found = FileSlice(place, Member(key, 0, member.size))
+            if found.file_size() == member.size:
+                os.utime(place)
+                return found
+            found.close()
+        except FileNotFoundError:
+            pass
+        return None
+
+    def _fill(self, key: str, member: Member, *, remote: RemoteObject) -> FileSlice:
+        """Fetch a member, store it and open it; a wrong checksum is given a second try."""
+        part = self._items / f"{key}.part"
+        self._drop(self._place(key))
+        self._make_room(member.size, part=part)
+        try:
+            crc32 = _fetch(part, member, remote=remote)
+            if member.crc32 not in (None, crc32):
+                crc32 = _fetch(part, member, remote=remote)
+            if member.crc32 not in (None, crc32):
+                raise ShardError(
+                    f"{remote.where}: the {member.size} bytes from {member.offset} on have crc32 "
+                    f"{crc32:08x}, and the index says {member.crc32:08x}, twice. The shard was "
+                    f"damaged or replaced: use the index that was made with it."
+                )
+            # Opened before others may see it, for they may evict it at once.
+            found = FileSlice(part, Member(key, 0, member.size))
+            with self._locked("size"):
+                # So that who counts meets it under one name.
+                part.replace(self._place(key))
+            return found
+        finally:
+            self._drop(part)
+
+    def _require_room(self, member: Member, *, where: str) -> None:
+        if member.size > self.limit_bytes:
+            raise StorageError(
+                f"{self.folder}: its limit of {self.limit_bytes} bytes is below the "
+                f"{member.size} bytes of a member of {where}. Give the cache a larger limit."
+            )
+
+    def _make_room(self, size: int, *, part: Path) -> None:
+        """Count an item in, once others have made way for it where they must.
+
+        Its part is made at full size at once, so that all who count see it.
+        """
+        with self._locked("size") as ledger:
+            told = ledger.read_bytes()
+            used = int(told) if told.isdigit() else self.used_bytes()
+            if used + size > self.limit_bytes:
+                used = self._evict(down_to=max(0, int(_FULL * self.limit_bytes) - size))
+            ledger.write_text(str(used + size))
+            part.touch()
+            os.truncate(part, size)
+
+    def _drop(self, path: Path) -> None:
+        """Delete an item or a part, if it is there; all are counted anew the next time."""
+        if path.exists():
+            with self._locked("size") as ledger:
+                path.unlink(missing_ok=True)
+                ledger.write_bytes(b"")
+
+    def _evict(self, *, down_to: int) -> int:
+        """Delete what was not used for longest until so many bytes are left; return how many."""
+        files = sorted(self._own_files())
+        used = sum(size for _, size, _ in files)
+        for _, size, path in files:
+            if used <= down_to:
+                break
+            if path.suffix == ".member":
+                path.unlink(missing_ok=True)
+                used -= size
+                continue
+            # A part is left alone while someone writes it, that is while its lock is taken.
+            with locked(self._locks / path.name[:2], when_taken="skip") as is_held:
+                if is_held:
+                    path.unlink(missing_ok=True)
+                    used -= size
+        return used
+
+    def _own_files(self) -> Iterator[tuple[int, int, Path]]:
+        """Yield time of last use, size and path of every file that a cache wrote."""
+        with os.scandir(self._items) as entries:
+            for entry in entries:
+                if _OWN_FILE.fullmatch(entry.name):
+                    try:
+                        status = entry.stat(follow_symlinks=False)
+                    except FileNotFoundError:
+                        continue
+                    yield status.st_mtime_ns, status.st_size, Path(entry.path)
+
+    def _place(self, key: str) -> Path:
+        return self._items / f"{key}.member"
+
+    @contextmanager
+    def _locked(self, name: str) -> Iterator[Path]:
+        path = self._locks / name
+        with locked(path):
+            yield path
+
+
+def _key(member: Member, *, where: str, revision: str) -> str:
+    """Return what an item is stored under: equal only for equal bytes.
+
+    Where no checksum is known, that takes the address too.
+    """
+    where = where if member.crc32 is None else ""
+    parts = [revision, where, member.path, member.offset, member.size, member.crc32]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def _fetch(part: Path, member: Member, *, remote: RemoteObject) -> int:
+    """Write a member's bytes to the disk and return their crc32."""
+    crc32 = 0
+    with part.open("r+b") as file:
+        for data in remote.chunks(member.offset, member.offset + member.size):
+            file.write(data)
+            crc32 = zlib.crc32(data, crc32)
+        file.flush()
+        os.fsync(file.fileno())
+    return crc32
+
+
+@contextmanager
+def _named_errors(folder: Path) -> Iterator[None]:
+    """Turn what the disk raises into an error that names the cache."""
+    try:
+        yield
+    except StorageError:
+        raise
+    except OSError as error:
+        cure = (
+            "Free space, or give the cache a smaller limit."
+            if error.errno in (errno.ENOSPC, errno.EDQUOT)
+            else "Choose another folder for the cache."
+        )
+        raise StorageError(
+            f"{folder}: the cache cannot be read or written ({error.strerror or error}). {cure}"
+        ) from error

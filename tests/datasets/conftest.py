@@ -1,0 +1,34 @@
+"""Samples that cost nothing to load: their keys, which tell them all apart."""
+
+import itertools
+
+import pytest
+
+from stereogenbench_data import SceneIndex, StereoPairs
+
+
+@pytest.fixture(scope="session")
+def small_index(small_release):
+    return SceneIndex.open(small_release)
+
+
+@pytest.fixture
+def keyed(small_index):
+    """All adjacent pairs of all frames, 140 samples of 4 scenes, with no field but their key."""
+    return StereoPairs(small_index, fields=("__key__",), pairs="adjacent", frames="all")
+
+
+def keys_of(batches):
+    """Return the keys of each batch."""
+    return [batch["__key__"] for batch in batches]
+
+
+def flat(batches):
+    """Return what the batches hold, as one list."""
+    return list(itertools.chain.from_iterable(batches))
+
+
+def in_turn(shares):
+    """Return the batches of all ranks in the order of the training steps."""
+    rows = itertools.zip_longest(*shares)
+    return [batch for row in rows for batch in row if batch is not None]

@@ -1,0 +1,242 @@
+"""`EpochBatches`, and positions saved and loaded."""
+
+import itertools
+import json
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+from torchdata.stateful_dataloader import StatefulDataLoader
+
+from stereogenbench_data import EpochBatches, SelectionError, StateError, StereoPairs
+from tests.datasets.conftest import flat, in_turn, keys_of
+
+
+def test_the_batches_of_all_ranks_are_the_epoch_exactly_once(keyed):
+    for world in range(1, 6):
+        shares = [
+            list(EpochBatches(keyed, 9, rank=rank, world_size=world, tail="uneven"))
+            for rank in range(world)
+        ]
+
+        assert sorted(flat(in_turn(shares))) == list(range(140))
+        assert in_turn(shares) == list(EpochBatches(keyed, 9, tail="uneven"))
+
+
+def test_drop_says_how_much_it_leaves_out(keyed):
+    shares = [EpochBatches(keyed, 9, rank=rank, world_size=4) for rank in range(4)]
+
+    assert [len(share) for share in shares] == [3, 3, 3, 3]
+    assert [share.left_out for share in shares] == [140 - 12 * 9] * 4
+    assert EpochBatches(keyed, 9, tail="wrap").left_out == 0
+    assert EpochBatches(keyed, 9, tail="uneven").left_out == 0
+
+
+def test_an_epoch_of_which_all_would_be_dropped_is_refused(keyed):
+    with pytest.raises(SelectionError, match=r"drops all of 140 samples.* 64 for each of 3 ranks"):
+        EpochBatches(keyed, 64, rank=0, world_size=3)
+
+
+def test_wrapped_ranks_are_even_and_know_their_padding(keyed):
+    shares = [EpochBatches(keyed, 9, rank=r, world_size=3, tail="wrap") for r in range(3)]
+    batches = in_turn([list(share) for share in shares])
+    padding = flat(shares[0].is_padding(number).tolist() for number in range(18))
+
+    assert [len(batch) for batch in batches] == [9] * 18
+    numbers = flat(batches)
+    assert padding == [False] * 140 + [True] * 22
+    assert sorted(numbers[:140]) == list(range(140))
+    assert numbers[140:] == numbers[:22]
+
+
+def test_the_seed_is_the_datasets_unless_another_is_given(small_index):
+    pairs = StereoPairs(small_index, fields=("__key__",), frames="all", seed=5)
+    others = StereoPairs(small_index, fields=("__key__",), frames="all")
+
+    assert list(EpochBatches(pairs, 4)) == list(EpochBatches(others, 4, seed=5))
+    assert list(EpochBatches(pairs, 4)) != list(EpochBatches(others, 4))
+
+
+def test_the_epoch_is_the_datasets(keyed):
+    batches = EpochBatches(keyed, 4)
+    first = list(batches)
+    batches.set_epoch(1)
+    second = list(batches)
+
+    assert keyed.epoch == 1
+    assert first != second
+    assert sorted(flat(first)) == sorted(flat(second))
+    keyed.set_epoch(0)
+    assert list(batches) == first
+
+
+def test_a_position_is_flat_json_and_says_what_it_belongs_to(keyed):
+    batches = EpochBatches(keyed, 4, rank=1, world_size=2, seed=3)
+    given = iter(batches)
+    next(given)
+    next(given)
+    state = batches.state_dict()
+
+    assert json.loads(json.dumps(state)) == state
+    assert state == {
+        "version": 1,
+        "epoch": 0,
+        "batches_consumed": 4,
+        "seed": 3,
+        "batch_size": 4,
+        "lanes": 4,
+        "open_scenes": 16,
+        "order": "shuffled",
+        "tail": "drop",
+        "selection": keyed.plan.digest,
+        "index": keyed.index.digest,
+    }
+
+
+def test_what_is_loaded_goes_on_once_and_then_epochs_are_whole(keyed):
+    batches = EpochBatches(keyed, 4)
+    whole = list(batches)
+    batches.load_state_dict(batches.state_at(0, 30))
+
+    assert list(batches) == whole[30:]
+    assert list(batches) == whole
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"batch_size": 5}, "batch_size is 5 here and 4 there"),
+        ({"seed": 1}, "seed is 1 here and 0 there"),
+        ({"lanes": 2}, "lanes is 2 here and 4 there"),
+        ({"open_scenes": 3}, "open_scenes is 3 here and 16 there"),
+        ({"order": "sequential"}, "order is 'sequential' here and 'shuffled' there"),
+        ({"tail": "wrap"}, "tail is 'wrap' here and 'drop' there"),
+        ({"tail": "wrap", "seed": 2}, "seed is 2 here.*; tail is 'wrap' here"),
+    ],
+    ids=str,
+)
+def test_a_position_in_another_order_is_refused_by_name(keyed, options, message):
+    state = EpochBatches(keyed, 4).state_dict()
+
+    with pytest.raises(StateError, match=message):
+        EpochBatches(keyed, **({"batch_size": 4} | options)).load_state_dict(state)
+
+
+def test_a_position_in_another_selection_is_refused_by_name(keyed, small_index):
+    state = EpochBatches(keyed, 4).state_dict()
+    options = {"fields": ("__key__",), "frames": "all"}
+    for other in (
+        StereoPairs(small_index, pairs="all", **options),
+        StereoPairs(small_index, pairs="adjacent", direction="right_to_left", **options),
+        StereoPairs(small_index, pairs="adjacent", fields=("__key__",), frames=list(range(1, 7))),
+        StereoPairs(small_index, pairs="adjacent", split="train", **options),
+    ):
+        with pytest.raises(StateError, match=r"selection is '[0-9a-f]{64}' here and"):
+            EpochBatches(other, 4, seed=0).load_state_dict(state)
+
+
+def test_a_position_in_another_index_is_refused_by_name(keyed):
+    state = EpochBatches(keyed, 4).state_dict() | {"index": "0" * 64}
+
+    with pytest.raises(StateError, match=r"index is '[0-9a-f]{64}' here and '0{64}' there"):
+        EpochBatches(keyed, 4).load_state_dict(state)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"batches_consumed": -1}, "batches_consumed is -1, no whole number"),
+        ({"epoch": "2"}, "epoch is '2', no whole number"),
+        ({"version": 0}, "version is 1 here and 0 there"),
+    ],
+)
+def test_a_damaged_position_is_refused(keyed, change, message):
+    batches = EpochBatches(keyed, 4)
+
+    with pytest.raises(StateError, match=message):
+        batches.load_state_dict(batches.state_dict() | change)
+
+
+def test_something_else_than_a_position_is_refused(keyed):
+    with pytest.raises(StateError, match=r"has no batch_size, .* \(it has model\)"):
+        EpochBatches(keyed, 4).load_state_dict({"model": 1})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rank": 2, "world_size": 2}, "got rank=2, world_size=2"),
+        ({"rank": 1}, "got rank=1, world_size=None"),
+        ({"tail": "keep"}, "tail must be"),
+        ({"drop_last": True}, "there is no option 'drop_last'; there are seed, rank"),
+    ],
+    ids=str,
+)
+def test_options_that_no_epoch_has_are_refused(keyed, options, message):
+    with pytest.raises(SelectionError, match=message):
+        EpochBatches(keyed, 4, **options)
+
+
+def test_batches_made_before_the_process_group_are_refused_in_it(keyed, tmp_path):
+    early, told = EpochBatches(keyed, 4), EpochBatches(keyed, 4, rank=1, world_size=2)
+    torch.distributed.init_process_group(
+        "gloo", init_method=f"file://{tmp_path}/group", rank=0, world_size=1
+    )
+    try:
+        assert len(early) == 35
+        early.rank, early.world_size = 1, 2
+        with pytest.raises(SelectionError, match=r"made for rank 1 of 2, .* after init_process_gr"):
+            iter(early)
+        assert len(told) == 17
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_it_serves_torchs_own_loader(keyed, workers):
+    batches = EpochBatches(keyed, 16, tail="uneven")
+    loader = DataLoader(keyed, batch_sampler=batches, num_workers=workers)
+
+    assert len(loader) == 9
+    assert [len(batch["__key__"]) for batch in loader] == [16] * 8 + [12]
+
+
+@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("stop", [0, 1, 4, 9])
+def test_torchdatas_loader_saves_and_loads_its_position(keyed, workers, stop):
+    keyed.set_epoch(2)
+
+    def loader():
+        batches = EpochBatches(keyed, 16, tail="uneven")
+        return StatefulDataLoader(keyed, batch_sampler=batches, num_workers=workers)
+
+    unbroken = keys_of(loader())
+    broken = loader()
+    before = keys_of(itertools.islice(broken, stop))
+    state = broken.state_dict()
+    keyed.set_epoch(0)
+    resumed = loader()
+    resumed.load_state_dict(state)
+    after = keys_of(resumed)
+
+    assert keyed.epoch == 2
+    assert before + after == unbroken
+    assert keys_of(resumed) == unbroken
+    resumed.batch_sampler.set_epoch(3)
+    assert sorted(flat(keys_of(resumed))) == sorted(flat(unbroken))
+
+
+@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")
+@pytest.mark.parametrize("workers", [0, 1])
+def test_torchdatas_loader_begins_a_whole_epoch_after_a_finished_one(keyed, workers):
+    def loader():
+        batches = EpochBatches(keyed, 16, tail="uneven")
+        return StatefulDataLoader(keyed, batch_sampler=batches, num_workers=workers)
+
+    finished = loader()
+    whole = keys_of(finished)
+    resumed = loader()
+    resumed.load_state_dict(finished.state_dict())
+
+    assert keys_of(resumed) == whole

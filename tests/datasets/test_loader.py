@@ -1,0 +1,313 @@
+"""The loader: the same order whatever ranks and workers, saved and loaded at any batch."""
+
+import itertools
+import json
+import os
+import signal
+from collections import Counter
+
+import pytest
+import torch
+
+from stereogenbench_data import PairsLoader, SceneViews, SelectionError, StateError, StereoPairs
+from stereogenbench_data.datasets.open_videos import OpenVideosWarning, videos_per_scene
+from stereogenbench_data.samples import streams
+from stereogenbench_data.samples.fields import streams_of
+from tests.datasets.conftest import flat, in_turn, keys_of
+
+# More workers than this machine has cores are no matter here.
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
+
+
+@pytest.mark.parametrize(("world", "workers"), [(1, 0), (1, 3), (2, 1), (3, 2)])
+def test_ranks_and_workers_load_the_same_epoch(keyed, world, workers):
+    keyed.set_epoch(1)
+    alone = keys_of(keyed.loader(9, tail="uneven"))
+    shares = [
+        keys_of(keyed.loader(9, num_workers=workers, rank=r, world_size=world, tail="uneven"))
+        for r in range(world)
+    ]
+
+    assert in_turn(shares) == alone
+    assert len(set(flat(alone))) == 140
+
+
+def test_it_is_a_torch_loader_of_known_length(keyed):
+    loader = keyed.loader(9, num_workers=1, pin_memory=False, prefetch_factor=1)
+
+    assert isinstance(loader, PairsLoader)
+    assert isinstance(loader, torch.utils.data.DataLoader)
+    assert len(loader) == 15 == len(list(loader))
+
+
+def test_epochs_and_seeds_differ_and_repeat(keyed):
+    def epoch(number, **options):
+        loader = keyed.loader(9, tail="uneven", **options)
+        loader.set_epoch(number)
+        return flat(keys_of(loader))
+
+    orders = [epoch(0), epoch(1), epoch(2), epoch(0, seed=1), epoch(1, seed=1)]
+
+    assert len(set(map(tuple, orders))) == 5
+    assert len({tuple(sorted(order)) for order in orders}) == 1
+    assert epoch(1) == orders[1]
+
+
+def test_workers_that_persist_follow_the_epoch(keyed):
+    loader = keyed.loader(9, num_workers=2, persistent_workers=True, tail="uneven")
+    alone = keyed.loader(9, tail="uneven")
+    for epoch in range(3):
+        loader.set_epoch(epoch)
+        assert keys_of(loader) == keys_of(alone)
+
+
+def test_a_sequential_order_is_that_of_the_dataset(keyed):
+    loader = keyed.loader(9, order="sequential", tail="uneven", num_workers=2)
+
+    assert flat(keys_of(loader)) == [sample["__key__"] for sample in keyed]
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [((1, 0), (1, 2)), ((2, 3), (4, 1)), ((3, 0), (2, 0)), ((4, 0), (1, 0))],
+    ids=str,
+)
+@pytest.mark.parametrize("steps", [0, 1, 3])
+def test_a_run_goes_on_under_other_ranks_and_workers(keyed, before, after, steps):
+    keyed.set_epoch(4)
+    unbroken = keys_of(keyed.loader(9, tail="uneven"))
+    taken, texts = [], set()
+    for rank in range(before[0]):
+        loader = keyed.loader(
+            9, num_workers=before[1], rank=rank, world_size=before[0], tail="uneven"
+        )
+        taken.append(keys_of(itertools.islice(loader, steps)))
+        texts.add(json.dumps(loader.state_dict()))
+    assert len(texts) == 1
+
+    left = []
+    for rank in range(after[0]):
+        loader = keyed.loader(
+            9, num_workers=after[1], rank=rank, world_size=after[0], tail="uneven"
+        )
+        loader.load_state_dict(json.loads(next(iter(texts))))
+        assert loader.epoch == 4
+        left.append(loader)
+    start = steps * before[0]
+    turned = [left[(start + step) % after[0]] for step in range(after[0])]
+
+    assert in_turn(taken) + in_turn([keys_of(loader) for loader in turned]) == unbroken
+
+
+def test_every_batch_is_a_place_to_stop(keyed):
+    unbroken = keys_of(keyed.loader(9, tail="uneven"))
+    loader = keyed.loader(9, tail="uneven")
+    states = [loader.state_dict(), *(loader.state_dict() for _ in loader)]
+
+    assert [state["batches_consumed"] for state in states] == list(range(17))
+    for taken, state in enumerate(states):
+        resumed = keyed.loader(9, tail="uneven")
+        resumed.load_state_dict(state)
+        assert resumed.state_dict() == state
+        assert keys_of(resumed) == unbroken[taken:]
+        assert resumed.state_dict()["batches_consumed"] == 16
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("persistent", [False, True])
+def test_the_epochs_after_a_resumed_one_are_whole(keyed, workers, persistent):
+    options = {"num_workers": workers, "persistent_workers": persistent and workers > 0}
+    first, second = [], []
+    for epoch, found in ((0, first), (1, second)):
+        keyed.set_epoch(epoch)
+        found += keys_of(keyed.loader(9))
+    loader = keyed.loader(9, **options)
+    loader.set_epoch(0)
+    next(iter(loader))
+    loader.load_state_dict(loader.state_dict() | {"batches_consumed": 6})
+    loader.set_epoch(loader.epoch)
+
+    assert keys_of(loader) == first[6:]
+    assert keys_of(loader) == first
+    loader.set_epoch(1)
+    assert keys_of(loader) == second
+
+
+def test_going_to_another_epoch_leaves_a_loaded_position_behind(keyed):
+    loader = keyed.loader(9)
+    loader.load_state_dict(loader.state_dict() | {"batches_consumed": 6})
+    loader.set_epoch(1)
+
+    assert loader.state_dict()["batches_consumed"] == 0
+    assert len(list(loader)) == 15
+
+
+def test_what_workers_read_ahead_does_not_count(keyed):
+    loader = keyed.loader(9, num_workers=2, prefetch_factor=3)
+    batches = iter(loader)
+    for taken in range(1, 4):
+        next(batches)
+        assert loader.state_dict()["batches_consumed"] == taken
+
+
+def test_samples_of_a_resumed_run_are_the_same_to_the_bit(small_index):
+    from stereogenbench_data import ColorJitter, Compose, HorizontalFlip, RandomCrop
+
+    pairs = StereoPairs(
+        small_index,
+        fields=("left", "disparity", "__key__"),
+        frames=("random", 3),
+        transform=Compose([HorizontalFlip(), RandomCrop(32, 32), ColorJitter()]),
+    )
+    pairs.set_epoch(2)
+    unbroken = list(pairs.loader(4))
+    loader = pairs.loader(4, num_workers=1)
+    loader.load_state_dict(pairs.loader(4).state_dict() | {"batches_consumed": 1})
+
+    for one, other in zip(unbroken[1:], loader, strict=True):
+        assert one["__key__"] == other["__key__"]
+        assert torch.equal(one["left"], other["left"])
+        assert torch.equal(one["disparity"], other["disparity"])
+    pairs.close()
+
+
+def test_padding_is_flagged_and_ranks_are_even(keyed):
+    shares = [
+        list(keyed.loader(9, rank=rank, world_size=3, tail="wrap", num_workers=rank))
+        for rank in range(3)
+    ]
+    batches = in_turn(shares)
+    own = [
+        key
+        for batch in batches
+        for key, padding in zip(batch["__key__"], batch["is_padding"].tolist(), strict=True)
+        if not padding
+    ]
+
+    assert [len(share) for share in shares] == [6, 6, 6]
+    assert batches[0]["is_padding"].dtype == torch.bool
+    assert {tuple(batch["is_padding"].shape) for batch in batches} == {(9,)}
+    assert len(own) == len(set(own)) == 140
+    assert "is_padding" not in next(iter(keyed.loader(9)))
+
+
+def test_a_state_of_something_else_is_refused(keyed, small_index):
+    state = keyed.loader(9).state_dict()
+    views = SceneViews(small_index, cameras=(0, 1), fields=("__key__",))
+
+    with pytest.raises(StateError, match=r"batch_size is 4 here and 9 there; selection is"):
+        views.loader(4).load_state_dict(state)
+
+
+def test_an_option_that_does_not_exist_is_refused(keyed):
+    with pytest.raises(SelectionError, match=r"tail must be .*, got 'even'"):
+        keyed.loader(9, tail="even")
+    with pytest.raises(TypeError, match="batchsize"):
+        keyed.loader(9, batchsize=3)
+
+
+def test_a_killed_worker_ends_the_loop_with_an_error_that_says_so(keyed):
+    import multiprocessing
+
+    loader = keyed.loader(1, num_workers=2, prefetch_factor=1)
+    batches = iter(loader)
+    next(batches)
+    victim = multiprocessing.active_children()[0]
+    os.kill(victim.pid, signal.SIGKILL)
+
+    with pytest.raises(RuntimeError, match=rf"worker \(pid.* {victim.pid}\).* (killed|exited)"):
+        list(batches)
+    assert loader.state_dict()["batches_consumed"] < 140
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """Count how often each video is opened, and which of its frames are read, in order."""
+    counts, frames = Counter(), {}
+
+    class Counting(streams.VideoReader):
+        def __init__(self, file, *, name, **options):
+            counts[name] += 1
+            super().__init__(file, name=name, **options)
+            self._called = name
+
+        def frame(self, index):
+            frames.setdefault(self._called, []).append(index)
+            return super().frame(index)
+
+    monkeypatch.setattr(streams, "VideoReader", Counting)
+    return counts, frames
+
+
+@pytest.mark.parametrize(("world", "lanes"), [(1, 1), (1, 2), (2, 2), (2, 4)])
+def test_each_video_is_opened_once_and_each_frame_decoded_once(small_index, opened, world, lanes):
+    counts, frames = opened
+    for rank in range(world):
+        pairs = StereoPairs(small_index, pairs="all", frames="all")
+        loader = pairs.loader(2, lanes=lanes, rank=rank, world_size=world, tail="uneven")
+        assert loader.batches.order(0).lanes == min(lanes, 2)
+        for _ in loader:
+            pass
+        pairs.close()
+
+    assert len(counts) == 4 * 11
+    assert set(counts.values()) == {1}
+    assert set(map(tuple, frames.values())) == {tuple(range(7))}
+
+
+@pytest.mark.parametrize(("workers", "lanes"), [(1, 2), (2, 2), (2, 4)])
+def test_workers_among_which_lanes_are_dealt_open_each_video_once(
+    small_index, monkeypatch, tmp_path, workers, lanes
+):
+    log = tmp_path / "opened"
+
+    class Logging(streams.VideoReader):
+        def __init__(self, file, *, name, **options):
+            with log.open("a") as lines:
+                lines.write(f"{name}\n")
+            super().__init__(file, name=name, **options)
+
+    monkeypatch.setattr(streams, "VideoReader", Logging)
+    pairs = StereoPairs(small_index, pairs="adjacent", frames="all")
+    loader = pairs.loader(
+        2, lanes=lanes, num_workers=workers, multiprocessing_context="fork", tail="uneven"
+    )
+    assert loader.batches.order(0).lanes == 2
+    batches = list(loader)
+
+    assert len(batches) == 70
+    assert set(Counter(log.read_text().split()).values()) == {1}
+
+
+def test_videos_are_closed_after_their_scenes_last_sample(small_index):
+    pairs = StereoPairs(small_index, pairs="all", frames="all")
+    loader = pairs.loader(2, lanes=1, open_scenes=1, tail="uneven")
+    most = 0
+    for _ in loader:
+        most = max(most, len(pairs._loader._streams._open))
+
+    assert most == 11
+    assert len(pairs._loader._streams._open) == 0
+
+
+def test_a_scene_needs_the_videos_that_its_fields_are_made_from(small_index):
+    def videos(fields, **selection):
+        pairs = StereoPairs(small_index, fields=fields, **selection)
+        known = pairs._loader._request.known
+        return videos_per_scene(pairs.plan, streams_of(fields, known=known))
+
+    assert videos(("left", "right", "disparity")) == 3
+    assert videos(("left", "right", "disparity"), pairs="all") == 11
+    assert videos(("left", "right", "visible"), pairs="all") == 12
+    assert videos(("left", "right", "visible"), pairs="sweep") == 12
+    assert videos(("left",), pairs="adjacent") == 5
+    assert videos(("__key__",)) == 0
+
+
+def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):
+    monkeypatch.setattr("stereogenbench_data.datasets.open_videos._most_files", lambda: 160)
+    pairs = StereoPairs(small_index, pairs="all", frames="all")
+
+    with pytest.warns(OpenVideosWarning, match=r"up to 55 videos .* may open 32.*ulimit -n 183"):
+        pairs.loader(4)
+    assert pairs._loader._streams._limit == 32

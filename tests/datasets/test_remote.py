@@ -1,0 +1,279 @@
+"""The same samples from shards, beside you or behind a URL, with few bytes and through faults."""
+
+import functools
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from stereogenbench_data import PAIR_FIELDS, SceneIndex, SceneViews, StereoPairs
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.schema.release import depth_name, rgb_name
+from stereogenbench_data.storage import remote
+from stereogenbench_data.storage.cache import ShardCache
+from stereogenbench_data.storage.retry import Patience
+from tests.servers.fault import Answer, serving
+from tests.servers.hub import REPOSITORY
+from tests.servers.nginx import nginx_serving
+from tests.servers.tools import require_tool
+
+FIELDS = tuple(name for name in PAIR_FIELDS if name != "__url__")
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    """Waits of no time between tries."""
+    patience = functools.partial(Patience, first_wait_s=0.001)
+    monkeypatch.setattr(remote, "Patience", patience)
+
+
+@pytest.fixture
+def shards_served(web, small_shards):
+    """The address of a server, that can be told to fail, with `small_shards`."""
+    shutil.copytree(small_shards, web.folder, dirs_exist_ok=True)
+    return web
+
+
+@pytest.fixture
+def root_of(request, small_shards):
+    """Where `small_shards` is, at a kind of place."""
+
+    def find(kind):
+        if kind == "folder":
+            return str(small_shards)
+        server = request.getfixturevalue("shards_served" if kind == "web" else kind)
+        if kind == "hub":
+            return f"hf://datasets/{REPOSITORY}"
+        return server if kind == "s3" else server.url
+
+    return find
+
+
+@pytest.fixture(params=["folder", "web", "nginx", "hub", "s3"])
+def root(request, root_of):
+    """`small_shards` at every kind of place."""
+    return root_of(request.param)
+
+
+def same(one, other):
+    assert one.keys() == other.keys()
+    return all(
+        torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
+        for name, value in one.items()
+    )
+
+
+def bytes_of_primary_pair(folder):
+    index = SceneIndex.open(folder)
+    scene = index.scene(0)
+    left, right = scene.rig.primary_pair
+    names = (rgb_name(left), rgb_name(right), depth_name(left))
+    return sum(scene.members[name].size for name in names)
+
+
+def test_shards_give_what_the_released_files_give(root, small_release):
+    expected = StereoPairs(small_release, fields=FIELDS, pairs="adjacent", frames=[0, 3])
+    pairs = StereoPairs(root, fields=FIELDS, pairs="adjacent", frames=[0, 3])
+
+    assert len(pairs) == len(expected)
+    assert all(same(pairs[number], expected[number]) for number in range(0, len(pairs), 3))
+    expected.close()
+    pairs.close()
+
+
+def test_a_sample_names_the_shard_that_it_comes_from(root):
+    pairs = StereoPairs(root, fields=("__url__",), family="IPD_Gaussian")
+
+    assert pairs[0]["__url__"] == f"{root}/train-IPD_Gaussian-000000.tar"
+
+
+def test_views_come_from_a_url_too(shards_served, small_release):
+    expected = SceneViews(small_release, cameras=(0, 5), frames=2)[1]
+    views = SceneViews(shards_served.url, cameras=(0, 5), frames=2)
+
+    assert same(views[1], expected)
+    views.close()
+
+
+@pytest.mark.parametrize("server", ["counting", "nginx"])
+def test_a_pass_over_a_pair_transfers_little_more_than_its_three_members(
+    server, large_shards, tmp_path
+):
+    needed = bytes_of_primary_pair(large_shards)
+    if server == "counting":
+        with serving(large_shards) as web:
+            pairs = StereoPairs(web.url, frames="all")
+            web.asked.clear()
+            assert all("disparity" in pairs[number] for number in range(len(pairs)))
+            sent = web.sent
+    else:
+        program = require_tool("nginx")
+        with nginx_serving(large_shards, home=tmp_path / "nginx", program=program) as nginx:
+            pairs = StereoPairs(nginx.url, frames="all")
+            before = nginx.sent(requests=2)
+            assert all("disparity" in pairs[number] for number in range(len(pairs)))
+            sent = nginx.sent(requests=6) - before
+    pairs.close()
+
+    assert needed <= sent <= 1.1 * needed
+
+
+def test_the_first_frame_alone_transfers_a_part(large_shards):
+    with serving(large_shards) as web:
+        pairs = StereoPairs(web.url, frames="first")
+        web.asked.clear()
+        assert "disparity" in pairs[0]
+        pairs.close()
+
+        assert web.sent < 0.5 * bytes_of_primary_pair(large_shards)
+
+
+@pytest.mark.parametrize(
+    ("context", "place"), [("fork", "web"), ("spawn", "web"), ("fork", "hub"), ("fork", "s3")]
+)
+def test_workers_read_over_connections_of_their_own(context, place, root_of, small_release):
+    expected = StereoPairs(small_release, fields=FIELDS, frames=[0, 1])
+    pairs = StereoPairs(root_of(place), fields=FIELDS, frames=[0, 1])
+    assert same(pairs[0], expected[0])
+    loader = DataLoader(
+        pairs, batch_size=None, num_workers=2, multiprocessing_context=context, timeout=60
+    )
+
+    for loaded, sample in zip(loader, expected, strict=True):
+        assert same(loaded, sample)
+    assert same(pairs[1], expected[1])
+    pairs.close()
+    expected.close()
+
+
+def test_a_server_that_fails_now_and_then_changes_nothing(shards_served, small_release, impatient):
+    expected = StereoPairs(
+        small_release, frames="all", scenes="train/Uniform/SynthStage/scene_000000"
+    )
+    pairs = StereoPairs(
+        shards_served.url, frames="all", scenes="train/Uniform/SynthStage/scene_000000"
+    )
+    shards_served.answers = [
+        Answer(status=503),
+        Answer(stop_after=0),
+        Answer(stop_after=1500),
+        Answer(status=429),
+        Answer(stop_after=2000),
+        Answer(stop_after=100),
+    ]
+
+    assert all(same(pairs[number], expected[number]) for number in range(len(pairs)))
+    assert shards_served.answers == []
+    pairs.close()
+    expected.close()
+
+
+def test_a_server_that_dies_in_the_middle_is_told(large_shards, impatient):
+    with serving(large_shards) as web:
+        pairs = StereoPairs(web.url, frames="all")
+        assert "disparity" in pairs[0]
+    with pytest.raises(
+        StorageError,
+        match=rf"scene_000000, frames \(6,\): {web.url}/train-Uniform-000000.tar: cannot be read, "
+        r"at byte \d+ of \d+ \(.*Connection refused; 6 tries\). Check the network",
+    ):
+        pairs[6]
+    pairs.close()
+
+
+@pytest.mark.parametrize("video", ["rgb.mp4", "depth.mkv"])
+def test_bytes_that_never_come_are_no_damaged_video(video, shards_served, impatient):
+    """FFmpeg takes an error for the end of the file: the cause must be told all the same."""
+    pairs = StereoPairs(shards_served.url, family="IPD_Gaussian", frames="all")
+    scene = pairs.index.scene(pairs.plan.locate(0, epoch=0).row)
+    left = scene.rig.primary_pair[0]
+    member = scene.members[f"cam_{left:02d}_{video}"]
+    shard = f"{shards_served.url}/{member.path}"
+    whole = (shards_served.folder / member.path).read_bytes()
+    shards_served.always[member.path] = Answer(
+        change=lambda body: b"" if whole[member.offset : member.offset + 9] in body else body
+    )
+
+    with pytest.raises(StorageError, match=rf"{shard}: cannot be read, at byte \d+ of \d+"):
+        pairs[0]
+    del shards_served.always[member.path]
+    assert "disparity" in pairs[0]
+    pairs.close()
+
+
+def test_an_index_of_another_pack_is_told(shards_served):
+    shard = shards_served.folder / "train-IPD_Gaussian-000000.tar"
+    with shard.open("ab") as file:
+        file.write(bytes(512))
+    pairs = StereoPairs(shards_served.url, family="IPD_Gaussian")
+
+    with pytest.raises(
+        ShardError, match=r"scene_000000, frames \(0,\): .*000000.tar: has \d+ bytes, and the index"
+    ):
+        pairs[0]
+
+
+def test_a_shard_that_is_missing_is_told(shards_served):
+    (shards_served.folder / "train-IPD_Gaussian-000000.tar").unlink()
+    pairs = StereoPairs(shards_served.url, family="IPD_Gaussian")
+
+    with pytest.raises(StorageError, match=r"000000.tar: the server answers 404 Not Found. Check"):
+        pairs[0]
+
+
+def test_a_second_pass_comes_from_the_cache(shards_served, small_release, tmp_path):
+    cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
+    expected = StereoPairs(small_release, fields=FIELDS, frames="first")
+    for _ in range(2):
+        pairs = StereoPairs(shards_served.url, fields=FIELDS, frames="first", cache=cache)
+        assert all(same(pairs[number], expected[number]) for number in range(len(pairs)))
+        pairs.close()
+        sent = [asked.path for asked in shards_served.asked]
+        shards_served.asked.clear()
+
+    assert sent == ["index.parquet", "index.parquet"]
+    expected.close()
+
+
+def test_workers_share_a_cache(shards_served, small_release, tmp_path):
+    cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
+    expected = StereoPairs(small_release, frames="first")
+    pairs = StereoPairs(shards_served.url, frames="first", cache=cache)
+    loader = DataLoader(pairs, batch_size=None, num_workers=2, timeout=60)
+
+    assert all(same(one, other) for one, other in zip(loader, expected, strict=True))
+    expected.close()
+
+
+def damage(path: Path) -> None:
+    """Change bytes in the middle of a file and leave its size."""
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 400] = bytes(400)
+    path.write_bytes(data)
+
+
+def test_a_cache_that_was_damaged_on_disk_is_filled_again(shards_served, small_release, tmp_path):
+    cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
+    expected = StereoPairs(small_release, frames="all", family="IPD_Gaussian")
+    pairs = StereoPairs(shards_served.url, frames="all", family="IPD_Gaussian", cache=cache)
+    assert same(pairs[0], expected[0])
+    pairs.close()
+    for item in (tmp_path / "cache").rglob("*.member"):
+        damage(item)
+
+    assert all(same(pairs[number], expected[number]) for number in range(len(pairs)))
+    pairs.close()
+    expected.close()
+
+
+def test_a_shard_that_is_damaged_itself_is_told_with_its_checksum(shards_served, tmp_path):
+    cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
+    pairs = StereoPairs(shards_served.url, family="IPD_Gaussian", cache=cache)
+    shard = shards_served.folder / "train-IPD_Gaussian-000000.tar"
+    shard.write_bytes(bytes(shard.stat().st_size))
+
+    with pytest.raises(ShardError, match=r"have crc32 [0-9a-f]{8}, and the index says [0-9a-f]{8}"):
+        pairs[0]

@@ -1,0 +1,178 @@
+"""The stream: the loader's batches, sample by sample."""
+
+import itertools
+import json
+
+import pytest
+import torch
+from torch.utils.data import DataLoader, IterableDataset
+from torchdata.stateful_dataloader import StatefulDataLoader
+
+from stereogenbench_data import PAIR_FIELDS, StateError, StereoPairs, StereoPairStream, collate
+from tests.datasets.conftest import flat, keys_of
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:This DataLoader will create"),
+    pytest.mark.filterwarnings("ignore:'set_vital' is deprecated"),
+]
+SELECTION = {"fields": ("__key__",), "pairs": "adjacent", "frames": "all"}
+
+
+@pytest.fixture
+def stream_of(small_index):
+    def made(batch_size=9, **options):
+        return StereoPairStream(
+            small_index, batch_size, **({"tail": "uneven"} | SELECTION | options)
+        )
+
+    return made
+
+
+def loaded(stream, workers=0, **options):
+    return DataLoader(
+        stream, batch_size=stream.batches.rule.batch_size, num_workers=workers, **options
+    )
+
+
+@pytest.mark.parametrize("tail", ["drop", "wrap", "uneven"])
+@pytest.mark.parametrize(("world", "workers"), [(1, 0), (1, 3), (2, 2), (3, 1)])
+def test_its_batches_are_those_of_the_loader(keyed, stream_of, world, workers, tail):
+    for rank in range(world):
+        options = {"rank": rank, "world_size": world, "tail": tail}
+        stream = stream_of(**options)
+        stream.set_epoch(1)
+        keyed.set_epoch(1)
+        expected = list(keyed.loader(9, **options))
+        found = list(loaded(stream, workers))
+
+        assert keys_of(found) == keys_of(expected)
+        assert len(stream) == len(flat(keys_of(found)))
+        if tail == "wrap":
+            for one, other in zip(found, expected, strict=True):
+                assert torch.equal(one["is_padding"], other["is_padding"])
+
+
+def test_more_workers_than_batches_or_scenes_lose_and_repeat_nothing(small_index):
+    options = {"fields": ("__key__",), "tail": "uneven"}
+    for size in (1, 2, 3):
+        stream = StereoPairStream(small_index, size, **options)
+        keys = flat(keys_of(loaded(stream, 6)))
+
+        assert len(keys) == len(set(keys)) == 4
+
+
+def test_it_is_an_iterable_dataset_with_every_field(small_release):
+    stream = StereoPairStream(
+        small_release, 2, fields=tuple(PAIR_FIELDS), size=(32, 48), family="Uniform", seed=3
+    )
+    pairs = StereoPairs(
+        small_release, fields=tuple(PAIR_FIELDS), size=(32, 48), family="Uniform", seed=3
+    )
+    assert isinstance(stream, IterableDataset)
+    for one, other in zip(loaded(stream, collate_fn=collate), pairs.loader(2), strict=True):
+        assert one.keys() == other.keys()
+        assert all(
+            torch.equal(one[name], other[name])
+            if isinstance(one[name], torch.Tensor)
+            else one[name] == other[name]
+            for name in one
+        )
+    stream.close()
+    pairs.close()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("persistent", [False, True])
+def test_a_position_goes_on_under_other_ranks_and_workers_once(stream_of, workers, persistent):
+    unbroken = keys_of(loaded(stream_of()))
+    first = stream_of(rank=0, world_size=2)
+    taken = keys_of(itertools.islice(loaded(first, 1), 3))
+    state = json.loads(json.dumps(first.state_dict(batches=3)))
+    assert state["batches_consumed"] == 6
+    assert taken == unbroken[0:6:2]
+
+    stream = stream_of()
+    stream.load_state_dict(state)
+    loader = loaded(stream, workers, persistent_workers=persistent and workers > 0)
+
+    assert keys_of(loader) == unbroken[6:]
+    assert keys_of(loader) == unbroken
+    stream.set_epoch(1)
+    assert sorted(flat(keys_of(loader))) == sorted(flat(unbroken))
+
+
+def test_a_stream_iterated_in_this_process_counts_by_itself(stream_of, keyed):
+    stream = stream_of()
+    batches = iter(loaded(stream))
+    for taken in range(1, 5):
+        next(batches)
+        assert stream.state_dict()["batches_consumed"] == taken
+
+    loader = keyed.loader(9, tail="uneven")
+    loader.load_state_dict(stream.state_dict())
+    assert keys_of(loader) == keys_of(batches)
+
+
+def test_a_stream_iterated_by_workers_asks_how_far_the_loop_is(stream_of):
+    stream = stream_of()
+    assert stream.state_dict()["batches_consumed"] == 0
+    next(iter(loaded(stream, 1)))
+
+    with pytest.raises(StateError, match=r"read ahead: tell state_dict\(batches=\.\.\.\)"):
+        stream.state_dict()
+    assert stream.state_dict(batches=1)["batches_consumed"] == 1
+
+
+def test_a_position_of_other_samples_is_refused(stream_of):
+    state = stream_of(pairs="all").state_dict()
+
+    with pytest.raises(StateError, match="selection is"):
+        stream_of().load_state_dict(state)
+
+
+@pytest.mark.parametrize("context", ["spawn", "forkserver"])
+def test_workers_of_every_kind_begin_where_a_loaded_position_says(stream_of, context):
+    unbroken = keys_of(loaded(stream_of()))
+    stream = stream_of()
+    stream.load_state_dict(stream.batches.state_at(0, 5))
+    loader = loaded(stream, 2, multiprocessing_context=context)
+
+    assert keys_of(loader) == unbroken[5:]
+    assert keys_of(loader) == unbroken
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("stop", [0, 1, 4, 15])
+def test_torchdatas_loader_saves_and_loads_its_position(stream_of, workers, stop):
+    def loader():
+        return StatefulDataLoader(stream_of(), batch_size=9, num_workers=workers)
+
+    unbroken = keys_of(loader())
+    broken = loader()
+    before = keys_of(itertools.islice(broken, stop))
+    resumed = loader()
+    resumed.load_state_dict(broken.state_dict())
+
+    assert before + keys_of(resumed) == unbroken
+    assert keys_of(resumed) == unbroken
+
+
+def test_a_workers_own_position_is_refused_by_another_worker(stream_of):
+    samples = iter(stream_of(rank=0, world_size=2))
+    next(samples)
+    state = samples.state_dict()
+
+    with pytest.raises(StateError, match="rank is 1 here and 0 there"):
+        iter(stream_of(rank=1, world_size=2)).load_state_dict(state)
+    same = iter(stream_of(rank=0, world_size=2))
+    same.load_state_dict(state)
+    assert [s["__key__"] for s in same] == [s["__key__"] for s in samples]
+
+
+def test_the_shares_of_many_ranks_and_workers_are_the_selection(stream_of):
+    for world in range(1, 6):
+        shares = [stream_of(rank=rank, world_size=world) for rank in range(world)]
+        keys = [[sample["__key__"] for sample in share] for share in shares]
+
+        assert [len(share) for share in shares] == [len(own) for own in keys]
+        assert len(flat(keys)) == len(set(flat(keys))) == 140

@@ -1,0 +1,126 @@
+"""Shards, and servers that serve them on this machine."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import fsspec
+import numpy as np
+import pytest
+
+from stereogenbench_data.storage.pack import pack
+from tests.servers.fault import FaultServer, serving
+from tests.servers.hub import HubHandler
+from tests.servers.nginx import Nginx, nginx_serving
+from tests.servers.tools import require_module, require_tool
+
+BUCKET = "some-bucket"
+NOISE_PX = 320
+
+
+@pytest.fixture(scope="session")
+def small_shards(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scenes of `small_release` in shards."""
+    out = tmp_path_factory.mktemp("packed") / "shards"
+    pack(small_release, out, workers=1)
+    return out
+
+
+@pytest.fixture(scope="session")
+def large_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One scene whose videos are noise: far larger than what is fetched at once."""
+    root = tmp_path_factory.mktemp("large")
+    key = "train/Uniform/SynthStage/scene_000000"
+    folder = Path(shutil.copytree(small_release / key, root / key))
+    rig = folder / "baseline.json"
+    document = json.loads(rig.read_text())
+    rig.write_text(json.dumps(document | {"image_width": NOISE_PX, "image_height": NOISE_PX}))
+    noise = np.random.default_rng(0)
+    for path in (*folder.glob("*.mp4"), *folder.glob("*.mkv")):
+        _write_noise(path, noise)
+    return root
+
+
+def _write_noise(path: Path, noise: np.random.Generator) -> None:
+    is_depth = path.suffix == ".mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1" if is_depth else "libx264", rate=15)
+        stream.height = stream.width = NOISE_PX
+        stream.pix_fmt = "gray16le" if is_depth else "yuv420p"
+        for _ in range(7):
+            if is_depth:
+                units = noise.integers(1, 65535, (NOISE_PX, NOISE_PX), dtype=np.uint16)
+                frame = av.VideoFrame.from_ndarray(units, format="gray16le")
+            else:
+                picture = noise.integers(0, 255, (NOISE_PX, NOISE_PX, 3), dtype=np.uint8)
+                frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+@pytest.fixture(scope="session")
+def large_shards(large_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene of `large_release` in a shard."""
+    out = tmp_path_factory.mktemp("packed_large") / "shards"
+    pack(large_release, out, workers=1)
+    return out
+
+
+@pytest.fixture
+def web(tmp_path: Path) -> Iterator[FaultServer]:
+    """A web server that serves ``tmp_path / "web"``, counts, and fails as it is told."""
+    folder = tmp_path / "web"
+    folder.mkdir()
+    with serving(folder) as server:
+        yield server
+
+
+@pytest.fixture
+def nginx(tmp_path: Path, small_shards: Path) -> Iterator[Nginx]:
+    """An nginx that serves `small_shards`."""
+    program = require_tool("nginx")
+    with nginx_serving(small_shards, home=tmp_path / "nginx", program=program) as server:
+        yield server
+
+
+@pytest.fixture
+def hub(small_shards: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultServer]:
+    """A Hub whose data set is `small_shards`, to which the file system of ``hf://`` is pointed."""
+    require_module("huggingface_hub")
+    with serving(small_shards, handler=HubHandler) as server:
+        conf = {"endpoint": server.url, "token": False}
+        monkeypatch.setitem(fsspec.config.conf, "hf", conf)
+        yield server
+
+
+@pytest.fixture(scope="session")
+def s3_endpoint(small_shards: Path) -> Iterator[str]:
+    """The address of an S3 endpoint with `small_shards` in the folder shards of `BUCKET`."""
+    require_module("s3fs")
+    boto = require_module("boto3")
+    moto = require_module("moto.server")
+    server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    url = f"http://{host}:{port}"
+    store = boto.client(
+        "s3", endpoint_url=url, region_name="us-east-1",
+        aws_access_key_id="key", aws_secret_access_key="word",
+    )  # fmt: skip
+    store.create_bucket(Bucket=BUCKET)
+    for path in sorted(small_shards.iterdir()):
+        if path.is_file():
+            store.upload_file(str(path), BUCKET, f"shards/{path.name}")
+    store.close()
+    yield url
+    server.stop()
+
+
+@pytest.fixture
+def s3(s3_endpoint: str, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The URL of `small_shards` in an S3 store, to which ``s3://`` is pointed."""
+    conf = {"key": "key", "secret": "word", "endpoint_url": s3_endpoint}
+    monkeypatch.setitem(fsspec.config.conf, "s3", conf)
+    return f"s3://{BUCKET}/shards"

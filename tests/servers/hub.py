@@ -1,0 +1,91 @@
+"""What huggingface_hub's client asks of the Hub to read a data set, answered from a folder.
+
+One data set, `REPOSITORY`, with the branch main and one commit; files are redirected to another
+path, as the Hub sends large ones to its content network. What is asked for with the token
+``expired`` is refused, as private data sets are.
+"""
+
+import json
+import re
+from pathlib import Path
+from typing import Final
+from urllib.parse import unquote, urlsplit
+
+from tests.servers.fault import FileHandler
+
+REPOSITORY: Final = "some-group/some-data"
+COMMIT: Final = "0123456789abcdef0123456789abcdef01234567"
+_REVISIONS: Final = ("main", COMMIT)
+
+
+class HubHandler(FileHandler):
+    """Answers as the Hub does, below the server's folder."""
+
+    def do_HEAD(self) -> None:
+        """Answer a question for a file's facts."""
+        self.do_GET()
+
+    def do_POST(self) -> None:
+        """Answer a question for the facts of some paths."""
+        text = self.rfile.read(int(self.headers["Content-Length"])).decode()
+        paths = json.loads(text)["paths"]
+        self._json([self._entry(path) for path in paths if (self.server.folder / path).exists()])
+
+    def do_GET(self) -> None:
+        """Answer a question for the data set, its tree, a file's place, or the file itself."""
+        path = unquote(urlsplit(self.path).path)
+        if "expired" in self.headers.get("Authorization", ""):
+            self._refuse(401, "RepoNotFound")
+        elif path.startswith("/files/"):
+            self.path = path.removeprefix("/files")
+            super().do_GET()
+        elif found := re.fullmatch(rf"/api/datasets/{REPOSITORY}(?:/revision/(.+))?", path):
+            self._known(found[1], lambda: {"id": REPOSITORY, "sha": COMMIT, "siblings": []})
+        elif found := re.fullmatch(rf"/api/datasets/{REPOSITORY}/tree/([^/]+)/?(.*)", path):
+            self._known(found[1], lambda: self._tree(found[2]))
+        elif found := re.fullmatch(rf"/datasets/{REPOSITORY}/resolve/([^/]+)/(.+)", path):
+            self._redirect(found[2])
+        else:
+            self._refuse(404, "RepoNotFound")
+
+    def _tree(self, folder: str) -> list[dict[str, object]]:
+        below = sorted((self.server.folder / folder).iterdir())
+        return [self._entry(str(path.relative_to(self.server.folder))) for path in below]
+
+    def _entry(self, name: str) -> dict[str, object]:
+        path = self.server.folder / name
+        kind = "directory" if path.is_dir() else "file"
+        return {"type": kind, "oid": "0" * 40, "size": path.stat().st_size, "path": name}
+
+    def _known(self, revision: str | None, answer: object) -> None:
+        if revision in (None, *_REVISIONS):
+            self._json(answer())  # type: ignore[operator]
+        else:
+            self._refuse(404, "RevisionNotFound")
+
+    def _redirect(self, name: str) -> None:
+        path: Path = self.server.folder / name
+        if not path.is_file():
+            self._refuse(404, "EntryNotFound")
+            return
+        self.send_response(302)
+        self.send_header("Location", f"{self.server.url}/files/{name}?Signature=secret")
+        self.send_header("X-Repo-Commit", COMMIT)
+        self.send_header("X-Linked-Size", str(path.stat().st_size))
+        self.send_header("X-Linked-ETag", '"0"')
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    def _refuse(self, status: int, code: str) -> None:
+        self.send_response(status)
+        self.send_header("X-Error-Code", code)
+        self.send_header("Content-Length", "0")
+        self.end_headers()
+
+    def _json(self, document: object) -> None:
+        text = json.dumps(document).encode()
+        self.send_response(200)
+        self.send_header("Content-Type", "application/json")
+        self.send_header("Content-Length", str(len(text)))
+        self.end_headers()
+        self.wfile.write(text)

@@ -1,0 +1,86 @@
+"""A real nginx that serves a folder, in a folder of its own and without any rights."""
+
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+_CONFIG = """
+daemon off;
+master_process off;
+pid nginx.pid;
+error_log error.log;
+events {{ worker_connections 64; }}
+http {{
+    log_format counted '$status $body_bytes_sent $http_range';
+    access_log access.log counted;
+    client_body_temp_path body;
+    proxy_temp_path proxy;
+    fastcgi_temp_path fastcgi;
+    uwsgi_temp_path uwsgi;
+    scgi_temp_path scgi;
+    server {{
+        listen 127.0.0.1:{port};
+        root {folder};
+        location /moved/ {{ return 302 /$uri_rest; }}
+        location /forbidden/ {{ return 403; }}
+    }}
+    map $uri $uri_rest {{ ~^/moved/(?<rest>.*)$ $rest; }}
+}}
+"""
+
+
+@dataclass
+class Nginx:
+    """A running nginx."""
+
+    url: str
+    home: Path
+
+    def sent(self, *, requests: int) -> int:
+        """Return the bytes of bodies sent, once there were so many requests."""
+        return sum(int(line.split()[1]) for line in self._lines(requests))
+
+    def statuses(self, *, requests: int) -> list[int]:
+        """Return the status of every answer, once there were so many requests."""
+        return [int(line.split()[0]) for line in self._lines(requests)]
+
+    def _lines(self, count: int) -> list[str]:
+        """Return the lines of the log, which nginx writes just after it has answered."""
+        for _ in range(100):
+            lines = (self.home / "access.log").read_text().splitlines()
+            if len(lines) >= count:
+                break
+            time.sleep(0.02)
+        return lines
+
+
+@contextmanager
+def nginx_serving(folder: Path, *, home: Path, program: str) -> Iterator[Nginx]:
+    """Serve a folder with nginx on a free port of this machine."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    home.mkdir(parents=True, exist_ok=True)
+    (home / "nginx.conf").write_text(_CONFIG.format(port=port, folder=folder))
+    command = [program, "-p", str(home), "-c", "nginx.conf", "-e", "error.log"]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as server:
+        try:
+            _wait_for(port, server, home=home)
+            yield Nginx(f"http://127.0.0.1:{port}", home)
+        finally:
+            server.terminate()
+
+
+def _wait_for(port: int, server: "subprocess.Popen[bytes]", *, home: Path) -> None:
+    for _ in range(100):
+        if server.poll() is not None:
+            break
+        with socket.socket() as probe:
+            if probe.connect_ex(("127.0.0.1", port)) == 0:
+                return
+        time.sleep(0.05)
+    raise RuntimeError(f"nginx did not start: {(home / 'error.log').read_text()}")

@@ -1,0 +1,182 @@
+"""Ranges from real servers of each kind: nginx, an S3 endpoint, and a Hub for its own client."""
+
+import os
+import sys
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.remote import RemoteObject
+from stereogenbench_data.storage.retry import Patience
+from stereogenbench_data.storage.source import read_range, size_of
+from tests.servers.fault import Answer
+from tests.servers.hub import COMMIT, REPOSITORY
+
+
+def shard_of(folder: Path) -> Path:
+    return sorted(folder.glob("*.tar"))[0]
+
+
+def same_index(root, folder):
+    index = SceneIndex.open(root)
+    return index.root == root and index.digest == SceneIndex.open(folder).digest
+
+
+def test_nginx_sends_the_range_asked_for(nginx, small_shards):
+    shard = shard_of(small_shards)
+    url = f"{nginx.url}/{shard.name}"
+
+    assert size_of(url) == shard.stat().st_size
+    assert read_range(url, 1000, 3000) == shard.read_bytes()[1000:3000]
+    assert nginx.sent(requests=2) == 2001
+    assert same_index(nginx.url, small_shards)
+
+
+def test_nginx_redirects(nginx, small_shards):
+    shard = shard_of(small_shards)
+
+    assert read_range(f"{nginx.url}/moved/{shard.name}", 10, 20) == shard.read_bytes()[10:20]
+    assert nginx.statuses(requests=2) == [302, 206]
+
+
+def test_what_nginx_refuses_is_told(nginx, small_shards):
+    size = shard_of(small_shards).stat().st_size
+    with pytest.raises(StorageError, match=r"none.tar: the server answers 404 Not Found. Check"):
+        read_range(f"{nginx.url}/none.tar", 0, 9)
+    with pytest.raises(StorageError, match=r"x.tar: the server answers 403 Forbidden. It may not"):
+        read_range(f"{nginx.url}/forbidden/x.tar", 0, 9)
+    with pytest.raises(StorageError, match=rf"has {size} bytes, and byte {size + 8} is asked for"):
+        read_range(f"{nginx.url}/{shard_of(small_shards).name}", size, size + 9)
+
+
+def test_an_index_behind_a_url_may_be_named_itself(nginx, small_shards):
+    index = SceneIndex.open(f"{nginx.url}/index.parquet")
+
+    assert index.root == nginx.url
+    assert index.digest == SceneIndex.open(small_shards).digest
+
+
+def test_the_hub_sends_the_range_asked_for(hub, small_shards):
+    shard = shard_of(small_shards)
+    for revision in ("", "@main", f"@{COMMIT}"):
+        root = f"hf://datasets/{REPOSITORY}{revision}"
+        hub.asked.clear()
+
+        assert size_of(f"{root}/{shard.name}") == shard.stat().st_size
+        assert read_range(f"{root}/{shard.name}", 1000, 3000) == shard.read_bytes()[1000:3000]
+        assert hub.sent == 2000
+        assert same_index(root, small_shards)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        f"hf://datasets/{REPOSITORY}/none.tar",
+        f"hf://datasets/{REPOSITORY}@other/x.tar",
+        "hf://datasets/nobody/nothing/x.tar",
+    ],
+)
+def test_what_the_hub_does_not_have_is_told_at_once(hub, url):
+    with pytest.raises(StorageError, match=rf"{url}: does not exist, or is private. Check the URL"):
+        read_range(url, 0, 9)
+
+
+def test_a_private_data_set_is_told_without_the_token(hub, small_shards, monkeypatch):
+    conf = fsspec.config.conf["hf"] | {"token": "hf_expired"}
+    monkeypatch.setitem(fsspec.config.conf, "hf", conf)
+    url = f"hf://datasets/{REPOSITORY}/{shard_of(small_shards).name}"
+
+    with pytest.raises(StorageError, match="does not exist, or is private") as caught:
+        read_range(url, 0, 9)
+    assert "expired" not in str(caught.value)
+
+
+def test_a_hub_that_is_busy_is_asked_again_by_its_own_client(hub, small_shards):
+    shard = shard_of(small_shards)
+    url = f"hf://datasets/{REPOSITORY}/{shard.name}"
+    hub.answers = [Answer(status=503)]
+
+    assert read_range(url, 0, 9) == shard.read_bytes()[:9]
+    assert len(hub.asked) == 2
+
+
+def test_a_hub_that_sends_too_much_is_refused(hub, small_shards):
+    url = f"hf://datasets/{REPOSITORY}/{shard_of(small_shards).name}"
+    hub.answers = [Answer(whole=True)]
+
+    with pytest.raises(StorageError, match=r"sent more than the 9 bytes asked for from byte 0 on"):
+        read_range(url, 0, 9)
+
+
+def test_s3_sends_the_range_asked_for(s3, small_shards):
+    shard = shard_of(small_shards)
+
+    assert size_of(f"{s3}/{shard.name}") == shard.stat().st_size
+    assert read_range(f"{s3}/{shard.name}", 1000, 3000) == shard.read_bytes()[1000:3000]
+    assert same_index(s3, small_shards)
+
+
+def test_what_s3_does_not_have_is_told_at_once(s3):
+    with pytest.raises(StorageError, match=rf"{s3}/none.tar: does not exist, or is private"):
+        read_range(f"{s3}/none.tar", 0, 9)
+    with pytest.raises(StorageError, match=r"s3://no-bucket/x.tar: does not exist, or is private"):
+        size_of("s3://no-bucket/x.tar")
+
+
+def test_s3_without_a_login_is_told_at_once(s3, monkeypatch):
+    conf = {"endpoint_url": fsspec.config.conf["s3"]["endpoint_url"]}
+    monkeypatch.setitem(fsspec.config.conf, "s3", conf)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_PROFILE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", os.devnull)
+    monkeypatch.setenv("AWS_CONFIG_FILE", os.devnull)
+
+    with pytest.raises(StorageError, match=r"may not be read \(NoCredentialsError\). Log in to"):
+        read_range(f"{s3}/x.tar", 0, 9)
+
+
+def test_a_shard_of_another_size_in_a_store_is_told(s3, small_shards):
+    url = f"{s3}/{shard_of(small_shards).name}"
+
+    with pytest.raises(ShardError, match=r"tar: has \d+ bytes, and the index says 5. The index"):
+        RemoteObject(url, expected_size=5).read(0, 3)
+
+
+def test_a_file_system_that_fails_is_asked_again(monkeypatch):
+    waits_s: list[float] = []
+    files = fsspec.filesystem("memory")
+    files.pipe_file("/shard.tar", b"0123456789")
+    failures = [OSError("connection reset"), TimeoutError()]
+
+    def opened(*args, **how):
+        if failures:
+            raise failures.pop()
+        return type(files).open(files, *args, **how)
+
+    monkeypatch.setattr(files, "open", opened)
+    remote = RemoteObject(
+        "memory://shard.tar", patience=Patience(sleep=waits_s.append, chance=lambda: 0.0)
+    )
+
+    assert remote.read(2, 6) == b"2345"
+    assert waits_s == [0.5, 1.0]
+    files.rm("/shard.tar")
+
+
+def test_a_url_that_no_file_system_opens_is_told():
+    with pytest.raises(StorageError, match=r"nope://a/b: is no URL that fsspec can open. Correct"):
+        read_range("nope://a/b", 0, 9)
+
+
+def test_a_file_system_that_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, "s3", raising=False)
+
+    with pytest.raises(
+        StorageError, match=r"s3://a/b: needs .*: pip install 'stereogenbench-data\[s3\]'"
+    ):
+        read_range("s3://a/b", 0, 9)

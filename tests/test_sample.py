@@ -1,0 +1,82 @@
+"""The sample in the repository: whole, small, made as its README says, the same if packed again."""
+
+import re
+import subprocess
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.pack import pack
+from stereogenbench_data.storage.shard_plan import parse_size
+from stereogenbench_data.storage.verify import verify
+from tests.servers.tools import require_tool
+
+PROJECT = Path(__file__).resolve().parents[1]
+SAMPLE = PROJECT / "shards"
+
+
+@pytest.fixture(scope="module")
+def commands():
+    text = (SAMPLE / "README.md").read_text()
+    return re.findall(r"^stereogenbench (?:synth|pack) .*", text, re.MULTILINE)
+
+
+def test_the_sample_is_small():
+    assert sum(path.stat().st_size for path in SAMPLE.rglob("*") if path.is_file()) <= 12_000_000
+
+
+def test_the_sample_has_all_families_and_both_subsets_in_81_frames():
+    index = SceneIndex.open(SAMPLE)
+
+    ids = [index.scene(row).id for row in range(len(index))]
+    assert {(scene.split, scene.subset, scene.family) for scene in ids} == {
+        ("train", None, "IPD_Gaussian"),
+        ("train", None, "Uniform"),
+        ("train", None, "Pairwise_Uniform"),
+        ("eval", "seen_map", "IPD_Gaussian"),
+        ("eval", "seen_map", "Uniform"),
+        ("eval", "unseen_map", "IPD_Gaussian"),
+        ("eval", "unseen_map", "Uniform"),
+    }
+    assert set(index.column("frames")) == {81}
+    assert sorted(index.shards) == sorted(path.name for path in SAMPLE.glob("*.tar"))
+
+
+def test_every_byte_and_every_frame_of_the_sample_is_sound():
+    report = verify(SAMPLE, mode="decode", workers=1)
+
+    assert report.problems == ()
+    assert report.videos_decoded == 12 * len(SceneIndex.open(SAMPLE))
+
+
+def test_the_sample_unpacked_and_packed_again_is_the_same(commands, tmp_path):
+    for shard in SAMPLE.glob("*.tar"):
+        with tarfile.open(shard) as tar:
+            for member in tar:
+                key, _, name = member.name.partition(".")
+                target = tmp_path / "release" / key / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(tar.extractfile(member).read())
+
+    again = tmp_path / "again"
+    pack(tmp_path / "release", again, target_bytes=parse_size(commands[-1].split()[-1]), workers=1)
+
+    assert {path.name: path.read_bytes() for path in again.glob("*.tar")} == {
+        path.name: path.read_bytes() for path in SAMPLE.glob("*.tar")
+    }
+    assert SceneIndex.open(again).digest == SceneIndex.open(SAMPLE).digest
+    assert SceneIndex.open(again).shards == SceneIndex.open(SAMPLE).shards
+    for name in ("shards.json", *(f"dali/{path.name}" for path in (SAMPLE / "dali").iterdir())):
+        assert (again / name).read_bytes() == (SAMPLE / name).read_bytes()
+
+
+def test_the_readme_has_the_commands_of_make_sample(commands):
+    planned = subprocess.run(
+        [require_tool("make"), "--dry-run", "--old-file", ".venv/.ready", "sample"],
+        cwd=PROJECT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+
+    run = [line.removeprefix(".venv/bin/") for line in planned.stdout.splitlines()]
+    assert [line for line in run if re.match("stereogenbench (synth|pack)", line)] == commands
