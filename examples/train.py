@@ -1,16 +1,15 @@
-"""Train a small stereo network on scenes made on the spot: `make demo` runs this.
+"""Draw scenes, train a small stereo network, look at the data: `make demo` runs this.
 
-It draws six scenes of two families, trains for a few steps through a DataLoader with two workers,
-and writes a contact sheet of what the network was shown.
+It draws two scenes, trains for a few steps on the sample in shards/ through a DataLoader with two
+workers, and writes a contact sheet of both.
 """
 
 from pathlib import Path
 
 import torch
 from torch import nn
-from torch.utils.data import DataLoader
 
-from stereogenbench_data import Compose, HorizontalFlip, RandomCrop, StereoPairs, collate
+from stereogenbench_data import Compose, HorizontalFlip, RandomCrop, StereoPairs
 from stereogenbench_data.samples.picture import contact_sheet, write_png
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 
@@ -37,33 +36,31 @@ class SmallStereo(nn.Module):
 
 def main() -> None:
     torch.manual_seed(0)
-    scenes = DEMO / "scenes"
-    for family in ("IPD_Gaussian", "Uniform"):
-        synthesise(scenes, SynthRequest(family=family, scenes=3, size_px=160, frames=9, seed=1))
+    synthesise(DEMO / "scenes", SynthRequest(family="Uniform", scenes=2, size_px=160, frames=5))
+    fields = ("left", "right", "disparity", "valid", "visible", "baseline_m", "pair", "__key__")
+    shown = StereoPairs(DEMO / "scenes", pairs=[(0, 1), (2, 4)], frames=[0, 4], fields=fields)
     pairs = StereoPairs(
-        scenes,
+        Path(__file__).parents[1] / "shards",
         split="train",
         baseline_cm=(4, 60),
         pairs="all",
-        frames="all",
-        fields=("left", "right", "disparity", "valid", "visible", "baseline_m", "pair", "__key__"),
-        transform=Compose([HorizontalFlip(), RandomCrop(128, 128)]),
+        frames=("every", 4),
+        fields=fields,
+        transform=Compose([HorizontalFlip(), RandomCrop(64, 64)]),
     )
-    loader = DataLoader(pairs, batch_size=8, shuffle=True, num_workers=2, collate_fn=collate)
     network = SmallStereo()
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
+    loader = pairs.loader(batch_size=16, num_workers=2, seed=0, lanes=2)
     for step, batch in zip(range(24), loader, strict=False):
         error = (network(batch["left"], batch["right"]) - batch["disparity"]).abs()
-        loss = error[batch["valid"] & (batch["disparity"] < 128)].mean()
+        loss = error[batch["valid"] & (batch["disparity"] < 64)].mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         print(f"step {step + 1:2d}  mean disparity error {loss.item():6.2f} px")
     sheet = DEMO / "contact_sheet.png"
-    write_png(
-        sheet, contact_sheet([pairs[number] for number in range(0, len(pairs), len(pairs) // 6)])
-    )
-    print(f"{len(pairs)} samples; contact sheet written to {sheet}")
+    write_png(sheet, contact_sheet([*shown, *(pairs[number] for number in (0, len(pairs) // 2))]))
+    print(f"{len(pairs)} samples in shards/; contact sheet written to {sheet}")
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
 def folder_with_scenes(tmp_path_factory):
     """A folder that holds ``scenes/``, as the README has its reader make."""
     folder = tmp_path_factory.mktemp("readme")
+    (folder / "shards").symlink_to(README.parent / "shards")
     synthesise(
         folder / "scenes", SynthRequest(family="Uniform", scenes=3, size_px=64, frames=5, seed=6)
     )
@@ -25,8 +26,9 @@ def folder_with_scenes(tmp_path_factory):
 @pytest.mark.parametrize("block", BLOCKS, ids=[f"block {n + 1}" for n in range(len(BLOCKS))])
 def test_a_block_of_python_runs(folder_with_scenes, monkeypatch, block):
     monkeypatch.chdir(folder_with_scenes)
+    before = BLOCKS[BLOCKS.index(block) - 1] if "import" not in block else ""
 
-    exec(compile(block, README.name, "exec"), {})
+    exec(compile(before + block, README.name, "exec"), {})
 
 
 def test_there_are_blocks_to_run():
