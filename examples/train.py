@@ -38,7 +38,7 @@ def main() -> None:
     torch.manual_seed(0)
     synthesise(DEMO / "scenes", SynthRequest(family="Uniform", scenes=2, size_px=160, frames=5))
     fields = ("left", "right", "disparity", "valid", "visible", "baseline_m", "pair", "__key__")
-    shown = StereoPairs(DEMO / "scenes", pairs=[(0, 1), (2, 4)], frames=[0, 4], fields=fields)
+    shown = StereoPairs(DEMO / "scenes", pairs=[(0, 1), (2, 4)], fields=fields)
     pairs = StereoPairs(
         Path(__file__).parents[1] / "shards",
         split="train",

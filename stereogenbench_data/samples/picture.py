@@ -56,23 +56,25 @@ def contact_sheet(samples: Sequence[Sample]) -> Picture:
     rows = [_row(sample) for sample in samples]
     if not rows or not rows[0]:
         raise FieldError(f"a contact sheet needs one of the fields {', '.join(_TILES)}.")
-    width = max(tile.shape[1] for row in rows for _, tile in row)
-    enlarge = math.ceil(_NARROWEST_PX / width)
-    width *= enlarge
-    height = enlarge * max(tile.shape[0] for row in rows for _, tile in row) + _CAPTION_PX
-    columns = max(map(len, rows))
-    sheet = Image.new(
-        "RGB", (columns * (width + _GAP_PX), len(rows) * (height + _GAP_PX)), (255, 255, 255)
-    )
+    rows = [[(caption, _enlarged(tile)) for caption, tile in row] for row in rows]
+    width = max(tile.shape[1] for row in rows for _, tile in row) + _GAP_PX
+    heights = [_CAPTION_PX + _GAP_PX + max(tile.shape[0] for _, tile in row) for row in rows]
+    sheet = Image.new("RGB", (max(map(len, rows)) * width, sum(heights)), (255, 255, 255))
     draw = ImageDraw.Draw(sheet)
     font = ImageFont.load_default(size=13)
-    for place, row in enumerate(rows):
+    top = 0
+    for row, height in zip(rows, heights, strict=True):
         for column, (caption, tile) in enumerate(row):
-            corner = (column * (width + _GAP_PX), place * (height + _GAP_PX))
-            enlarged = tile.repeat(enlarge, axis=0).repeat(enlarge, axis=1)
-            sheet.paste(Image.fromarray(enlarged), (corner[0], corner[1] + _CAPTION_PX))
-            draw.text((corner[0] + 2, corner[1] + 2), caption, fill=(0, 0, 0), font=font)
+            sheet.paste(Image.fromarray(tile), (column * width, top + _CAPTION_PX))
+            draw.text((column * width + 2, top + 2), caption, fill=(0, 0, 0), font=font)
+        top += height
     return np.asarray(sheet)
+
+
+def _enlarged(tile: Picture) -> Picture:
+    """Return a tile that is wide enough for its caption."""
+    factor = math.ceil(_NARROWEST_PX / tile.shape[1])
+    return tile.repeat(factor, axis=0).repeat(factor, axis=1)
 
 
 def write_png(path: Path, picture: Picture) -> None:
