@@ -1,4 +1,4 @@
-"""Work on files shared among processes: counted in bytes, told when to stop, missed if they die."""
+"""Work shared among processes: counted as it is done, told when to stop, missed if they die."""
 
 import multiprocessing
 import os

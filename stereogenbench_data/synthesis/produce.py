@@ -56,7 +56,7 @@ def synthesise(
             progress(drawn, request.scenes * per_scene)
 
     left = dict.fromkeys(missing, CAMERA_COUNT)
-    jobs = _jobs(root, request, missing=missing)
+    jobs = list(_jobs(root, request, missing=missing))
     needed = min(workers, max(1, len(missing) * CAMERA_COUNT))
     after_frames(0)
     try:
