@@ -76,12 +76,23 @@ class PairsLoader(DataLoader[Any]):
         batches = self.batches
         epoch, start = self._position = batches.next_position()
         end, consumed = batches.end(start), start
-        for number, batch in zip(batches.share(start), super().__iter__(), strict=True):
+        for number, batch in zip(batches.share(start), self._loaded(), strict=True):
             consumed += batches.world_size
             self._position = epoch, min(consumed, end)
             if batches.tail == "wrap":
                 batch["is_padding"] = torch.from_numpy(batches.is_padding(number))
             yield batch
+
+    def _loaded(self) -> Iterator[Any]:
+        """Yield batches as torch loads them; name a worker that died, however torch noticed."""
+        try:
+            yield from super().__iter__()
+        except (ConnectionError, EOFError) as error:
+            raise RuntimeError(
+                f"a DataLoader worker died ({type(error).__name__}: {error}): it was killed, "
+                "perhaps for want of memory. Load the last state, and use fewer workers or open "
+                "scenes."
+            ) from error
 
     def state_dict(self) -> State:
         """Return the position after the last batch that the loop has taken."""

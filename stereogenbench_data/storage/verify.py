@@ -148,9 +148,10 @@ def _expected_of(index: SceneIndex) -> dict[str, _Expected]:
 def _folder_problems(index: SceneIndex, expected: dict[str, _Expected]) -> Iterator[Problem]:
     there = {path.name for path in Path(index.root).iterdir()}
     for each in expected.values():
-        if each.shard not in there:
+        if not Path(each.root, each.shard).is_file():
             scenes = len({name.partition(".")[0] for name in each.members})
-            yield each.problem("", f"is missing, with {scenes} scenes", _FETCH)
+            what = "is no file" if each.shard in there else "is missing"
+            yield each.problem("", f"{what}, with {scenes} scenes", _FETCH)
     for name in sorted(there - expected.keys()):
         if name.endswith(".tar"):
             yield Problem(name, "", "", "is there, and the index does not know it", _WRONG_INDEX)

@@ -496,3 +496,13 @@ def test_the_command_ends_with_2_where_there_is_nothing_to_verify(tmp_path):
 
     assert ended.returncode == 2
     assert "ShardError" in ended.stderr
+
+
+def test_a_link_to_nowhere_is_no_shard(shards):
+    shard = sorted(shards.glob("*.tar"))[0]
+    shard.unlink()
+    shard.symlink_to("/nonexistent")
+
+    [line] = lines(shards)
+
+    assert line.startswith(f"{shard.name}: is no file, with ")
