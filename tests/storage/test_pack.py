@@ -525,7 +525,8 @@ def test_a_full_disk_is_named_and_holds_no_half_shard(release, packed, small_dis
     with pytest.raises(ShardError, match=match):
         pack(release, small_disk, target_bytes=ONE_EACH, workers=workers)
 
-    assert 1 <= len(tars(small_disk)) < 4
+    # two workers that write at once may fill the disk before either is done
+    assert (1 if workers == 1 else 0) <= len(tars(small_disk)) < 4
     for name in tars(small_disk):
         assert (small_disk / name).read_bytes() == (packed / name).read_bytes()
 
