@@ -46,7 +46,7 @@ class PairsLoader(DataLoader[Any]):
         """Load batches of a dataset; ``options`` are those of `DataLoader`."""
         options.setdefault("collate_fn", collate)
         super().__init__(
-            dataset,  # type: ignore[arg-type]
+            dataset,  # type: ignore[arg-type]  # a protocol: torch asks for len and [] alone
             batch_sampler=batches,
             num_workers=num_workers,
             **options,
@@ -71,7 +71,7 @@ class PairsLoader(DataLoader[Any]):
         """
         self.batches.set_epoch(epoch)
 
-    def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
+    def __iter__(self) -> Iterator[Any]:  # type: ignore[override]  # torch names a private class
         """Yield the batches of the current epoch, or what a loaded state left of it."""
         batches = self.batches
         epoch, start = self._position = batches.next_position()
@@ -114,4 +114,4 @@ def split_options(options: Mapping[str, Any]) -> tuple[EpochOptions, dict[str, A
     names = EpochOptions.__annotations__
     ordering = {name: value for name, value in options.items() if name in names}
     others = {name: value for name, value in options.items() if name not in names}
-    return EpochOptions(**ordering), others  # type: ignore[typeddict-item]
+    return EpochOptions(**ordering), others  # type: ignore[typeddict-item]  # keys are its own

@@ -43,4 +43,5 @@ def collate(samples: Sequence[Sample]) -> dict[str, Any]:
                     f"{tuple(first[name].shape)} in {first.get('__key__', 'the first')}: give "
                     "size=(height, width), or batch sweeps one by one."
                 )
-    return default_collate(list(samples))  # type: ignore[no-any-return]
+    batch: dict[str, Any] = default_collate(list(samples))
+    return batch

@@ -7,7 +7,7 @@ the file is checked too; nothing is returned to a caller once a problem was note
 import math
 import re
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 from stereogenbench_data.schema.problems import Problems, brief, child_path, names
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -112,7 +112,7 @@ class Node:
         return index
 
 
-def is_number(value: object) -> bool:
+def is_number(value: object) -> TypeGuard[int | float]:
     """Return whether a JSON value is a finite number (a bool is not)."""
     if type(value) is int:
         return abs(value) < _LARGEST_INT
@@ -123,7 +123,7 @@ def as_integer(value: object) -> int | None:
     """Return a JSON number that is an integer, None where it is something else."""
     if not is_number(value):
         return None
-    number = float(value)  # type: ignore[arg-type]
+    number = float(value)
     return int(number) if number.is_integer() else None
 
 

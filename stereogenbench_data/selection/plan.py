@@ -140,7 +140,7 @@ def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selectio
     chosen = {
         name: options.pop(name) for name in ("pairs", "direction", "baseline_cm") if name in options
     }
-    rows = filter_scenes(index, SceneFilters(**options))  # type: ignore[typeddict-item]
+    rows = filter_scenes(index, SceneFilters(**options))  # type: ignore[typeddict-item]  # checked inside
     pairs = choose_pairs(index, rows, **chosen)
     if balance is not None:
         if pairs.targets.shape[1] != 1:

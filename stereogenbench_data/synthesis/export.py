@@ -159,7 +159,8 @@ def _rotation(
     if contract.rotation == "rotator":
         return dict(zip(("pitch", "yaw", "roll"), rotator_deg.tolist(), strict=True))
     if contract.rotation == "matrix":
-        return rotation_from_rotator(rotator_deg).tolist()  # type: ignore[no-any-return]
+        rows: list[list[float]] = rotation_from_rotator(rotator_deg).tolist()
+        return rows
     x, y, z, w = quaternion_from_rotator(rotator_deg).tolist()
     return [x, y, z, w] if contract.rotation == "quaternion_xyzw" else [w, x, y, z]
 
