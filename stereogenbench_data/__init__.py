@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from stereogenbench_data.datasets.streamed import StereoPairStream
     from stereogenbench_data.datasets.tensors import collate
     from stereogenbench_data.errors import (
+        DescriptorError,
+        EvaluationError,
+        ExtraError,
         FieldError,
         GeometryError,
         MediaError,
@@ -52,6 +55,9 @@ _HOMES = {
     "datasets.streamed": ("StereoPairStream",),
     "datasets.tensors": ("collate",),
     "errors": (
+        "DescriptorError",
+        "EvaluationError",
+        "ExtraError",
         "FieldError",
         "GeometryError",
         "MediaError",
@@ -88,8 +94,11 @@ __all__ = [
     "Compose",
     "Crop",
     "DepthEncoding",
+    "DescriptorError",
     "EpochBatches",
     "Eraser",
+    "EvaluationError",
+    "ExtraError",
     "FieldError",
     "GeometryError",
     "HorizontalFlip",

@@ -9,7 +9,10 @@ StereoGenBenchError
 ├── SelectionError (LookupError)  a filter, a pair or a window that no sample can satisfy
 ├── FieldError     (ValueError)   fields or transforms that cannot be had together
 ├── StateError     (ValueError)   a saved position of other samples or of another order
-└── SynthesisError (ValueError)   a scene that cannot be drawn as asked
+├── SynthesisError (ValueError)   a scene that cannot be drawn as asked
+├── DescriptorError (ValueError)  a Croissant descriptor or dataset card that does not fit its data
+├── EvaluationError (ValueError)  predictions, metrics or a protocol that cannot be scored
+└── ExtraError     (ImportError)  an optional dependency or its weights are not installed
 
 Each takes one message: so a DataLoader worker's error is rebuilt as itself in the main process.
 """
@@ -53,3 +56,15 @@ class StateError(StereoGenBenchError, ValueError):
 
 class SynthesisError(StereoGenBenchError, ValueError):
     """A scene that cannot be drawn as asked."""
+
+
+class DescriptorError(StereoGenBenchError, ValueError):
+    """A Croissant descriptor or a dataset card that does not fit its data."""
+
+
+class EvaluationError(StereoGenBenchError, ValueError):
+    """Predictions, metrics or a protocol that cannot be scored as asked."""
+
+
+class ExtraError(StereoGenBenchError, ImportError):
+    """A feature's optional dependency, or the weights it needs, are not installed."""
