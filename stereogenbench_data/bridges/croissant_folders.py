@@ -1,0 +1,142 @@
+"""The files and record sets of the release as it stands in a repository: folders of scenes.
+
+Loose JSON files can be parsed, so scenes and pairs are read from each scene's ``baseline.json``;
+nothing depends on how many scenes there are.
+"""
+
+from typing import Any, Final
+
+from stereogenbench_data.bridges.croissant_enumerations import enumerations
+from stereogenbench_data.bridges.croissant_media import text_records, video_records
+from stereogenbench_data.bridges.croissant_terms import (
+    GIT,
+    GIT_CHECKSUM,
+    TEXT,
+    Node,
+    field,
+    file_object,
+    file_set,
+    of_file,
+    record_set,
+)
+from stereogenbench_data.schema.release import (
+    BASELINE_JSON,
+    COMPLETE_JSON,
+    DESCRIPTION_TXT,
+    TRAJECTORY_JSON,
+)
+from stereogenbench_data.storage.index import SceneIndex
+
+REPOSITORY: Final = "repository"
+_KEY: Final = r"^.*?((?:train|eval)/.+?/[^/.]+?)(?:/[^/]*\.[^/]*)?$"
+"""The scene of a file in a folder: it leaves a key as it is, so that a join may apply it twice."""
+
+_FILES: Final[dict[str, tuple[str | list[str], str, str]]] = {
+    "scene-files": ("application/json", BASELINE_JSON, "Intrinsics of the scenes."),
+    "pair-files": ("application/json", BASELINE_JSON, "Baselines of the pairs."),
+    "description-files": (TEXT, DESCRIPTION_TXT, "Descriptions."),
+    "rgb-files": (["video/mp4", TEXT], "cam_??_rgb.mp4", "RGB videos."),
+    "depth-files": (["video/x-matroska", TEXT], "cam_??_depth.mkv", "Depth videos."),
+    "baseline-files": (TEXT, BASELINE_JSON, "Intrinsics and baselines, as text."),
+    "trajectory-files": (TEXT, TRAJECTORY_JSON, "Poses, as text."),
+    "scene_complete-files": (TEXT, COMPLETE_JSON, "Marks of completion, as text."),
+}
+"""Id: encodings, name and meaning. mlcroissant has no reader of videos: as text they are bytes."""
+
+
+def folder_nodes(index: SceneIndex | None, *, repository_url: str) -> tuple[list[Node], list[Node]]:
+    """Return the files and the record sets of a tree in the released layout.
+
+    Args:
+        index: Of such a tree, for the names of families and maps; None for those of the paper.
+        repository_url: URL of the git repository that holds it.
+    """
+    files = [
+        file_object(
+            REPOSITORY,
+            url=repository_url,
+            encoding=GIT,
+            sha256=GIT_CHECKSUM,
+            about="The repository that holds the scenes as folders.",
+        )
+    ]
+    files += [
+        file_set(name, within=[REPOSITORY], encoding=encoding, includes=f"**/{file}", about=about)
+        for name, (encoding, file, about) in _FILES.items()
+    ]
+    records = [
+        *enumerations(index),
+        _scenes(),
+        _pairs(),
+        _descriptions(),
+        video_records("rgb", key=_KEY),
+        video_records("depth", key=_KEY),
+        *text_records(scene_of=_KEY),
+    ]
+    return files, records
+
+
+def _in_json(files: str, path: str, *, then: str | None = None) -> dict[str, Any]:
+    source: Node = {"fileSet": {"@id": files}, "extract": {"jsonPath": path}}
+    if then is not None:
+        source["transform"] = {"jsonPath": then}
+    return {"source": source}
+
+
+def _scenes() -> Node:
+    fields = [
+        field(
+            "scenes/scene_id", "sc:Text", "Path of the scene: split, subset, family, map, number.",
+            **of_file("scene-files", "fullpath", regex=_KEY),
+        ),
+        field(
+            "scenes/focal_mm", "sc:Float", "Focal length of all six cameras, in mm.",
+            **_in_json("scene-files", "$.camera_intrinsics.focal_length_mm"),
+        ),
+        field(
+            "scenes/sensor_width_mm", "sc:Float", "Width of the sensor, in mm.",
+            **_in_json("scene-files", "$.camera_intrinsics.sensor_width_mm"),
+        ),
+    ]  # fmt: skip
+    return record_set("scenes", "Every scene once.", fields, key={"@id": "scenes/scene_id"})
+
+
+def _pairs() -> Node:
+    fields = [
+        field(
+            "pairs/scene_id", "sc:Text", "Path of the scene.",
+            **of_file("pair-files", "fullpath", regex=_KEY),
+        ),
+        *(
+            field(f"pairs/{name}", kind, text, **_in_json("pair-files", path))
+            for name, kind, text, path in (
+                (
+                    "camera_left", "sc:Integer", "Number of the left camera.",
+                    "$.pairwise_pairs[*].camera_index_a",
+                ),
+                (
+                    "camera_right", "sc:Integer", "Number of the right camera.",
+                    "$.pairwise_pairs[*].camera_index_b",
+                ),
+                (
+                    "baseline_cm", "sc:Float", "Distance of the two cameras, in cm.",
+                    "$.pairwise_pairs[*].baseline_cm",
+                ),
+            )
+        ),
+    ]  # fmt: skip
+    return record_set("pairs", "Every stereo pair once: 15 a scene.", fields)
+
+
+def _descriptions() -> Node:
+    fields = [
+        field(
+            "descriptions/scene_id", "sc:Text", "Path of the scene.",
+            **of_file("description-files", "fullpath", regex=_KEY),
+        ),
+        field(
+            "descriptions/text", "sc:Text", "What a model says of the scene.",
+            **of_file("description-files", "content"),
+        ),
+    ]  # fmt: skip
+    return record_set("descriptions", "Machine-written descriptions, where there are any.", fields)

@@ -1,0 +1,53 @@
+"""Load every record set of a descriptor as mlcroissant does, and print what came, as JSON.
+
+A process of its own, because mlcroissant takes the place of its cache when it is imported, and
+keeps what it unpacked by URL alone.
+"""
+
+import json
+import sys
+import zlib
+from pathlib import Path
+
+import mlcroissant as mlc
+
+MEDIA = ("rgb_videos", "depth_videos", "baseline_json", "trajectory_json", "scene_complete_json")
+
+
+def main(path: str, mapping: dict[str, str]) -> None:
+    """Print the records of every set, in both orders, and whether a dict gives a first of each."""
+    document = json.loads(Path(path).read_text())
+    names = [records["@id"] for records in document["recordSet"]]
+    local = {name: Path(place) for name, place in mapping.items()} or None
+    forwards = mlc.Dataset(jsonld=path, mapping=local)
+    backwards = mlc.Dataset(jsonld=path, mapping=local)
+    found = {name: list(forwards.records(name)) for name in names}
+    again = {name: len(list(backwards.records(name))) for name in reversed(names)}
+    told = {
+        "counts": {name: len(records) for name, records in found.items()},
+        "backwards": again,
+        "contents": {
+            name: sorted(
+                [_text(row[f"{name}/scene_id"]), row.get(f"{name}/camera"), _crc(row, name)]
+                for row in found[name]
+            )
+            for name in MEDIA
+        },
+        "scenes": [{key: _text(value) for key, value in row.items()} for row in found["scenes"]],
+        "baselines": [row["pairs/baseline_cm"] for row in found["pairs"]],
+    }
+    if all("://" in each.get("contentUrl", "://") for each in document["distribution"]):
+        strict = mlc.Dataset(jsonld=document, mapping=local)
+        told["first_of_each"] = [bool(next(iter(strict.records(name)))) for name in names]
+    print(json.dumps(told))  # noqa: T201 - the process tells its parent
+
+
+def _crc(row: dict, name: str) -> int:
+    return zlib.crc32(row[f"{name}/content"])
+
+
+def _text(value: object) -> object:
+    return value.decode() if isinstance(value, bytes) else value
+
+
+main(sys.argv[1], json.loads(sys.argv[2]))

@@ -1,0 +1,191 @@
+"""Descriptors, as mlcroissant validates and loads them."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from datetime import date
+from pathlib import Path
+
+import pytest
+
+from stereogenbench_data import SceneIndex
+from stereogenbench_data.bridges.croissant import Publication, write_descriptor
+from stereogenbench_data.errors import DescriptorError
+from stereogenbench_data.storage.pack import pack
+
+HOME = Path(__file__).resolve().parents[2]
+SHIPPED = HOME / "croissant"
+LOADER = Path(__file__).with_name("load_records.py")
+DAY = Publication(published=date(2026, 11, 21))
+
+
+def validated(*paths):
+    """The exit codes of `mlcroissant validate`, and what it says beyond news."""
+    program = Path(sys.executable).with_name("mlcroissant")
+    said = []
+    for path in paths:
+        done = subprocess.run(
+            [str(program), "validate", "--jsonld", str(path)],
+            capture_output=True, text=True, check=False, timeout=120,
+        )  # fmt: skip
+        lines = [line for line in done.stderr.splitlines() if line and not line.startswith("I")]
+        said.append((done.returncode, lines))
+    return said
+
+
+def loaded(path, cache, mapping=None):
+    done = subprocess.run(
+        [sys.executable, str(LOADER), str(path), json.dumps(mapping or {})],
+        capture_output=True, text=True, check=False, timeout=300,
+        env=os.environ | {"CROISSANT_CACHE": str(cache)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    return json.loads(done.stdout)
+
+
+def stored(index, *names):
+    """(scene, camera or None, crc32) of members, as the index has them."""
+    found = []
+    for row in range(len(index)):
+        scene = index.scene(row)
+        for camera, name in names:
+            found.append([scene.id.key, camera, scene.members[name].crc32])
+    return sorted(found)
+
+
+@pytest.fixture(scope="module")
+def index(small_shards):
+    return SceneIndex.open(small_shards)
+
+
+def test_the_shipped_descriptors_are_valid_without_a_warning():
+    paths = sorted(SHIPPED.glob("*.json"))
+
+    assert [path.name for path in paths] == ["hub.json", "metadata.json", "sample.json"]
+    assert validated(*paths) == [(0, [])] * 3
+
+
+def test_the_shipped_descriptor_of_the_sample_loads_every_record_in_both_orders(tmp_path):
+    sample = SceneIndex.open(HOME / "shards")
+
+    told = loaded(SHIPPED / "sample.json", tmp_path)
+
+    assert told["counts"] == {
+        "splits": 2, "eval_subsets": 2, "families": 3, "maps": 2, "scenes": 8,
+        "scene_categories": 8, "pairs": 120, "shards": 7, "descriptions": 8, "media_files": 96,
+        "rgb_videos": 48, "depth_videos": 48, "baseline_json": 8, "trajectory_json": 8,
+        "scene_complete_json": 8,
+    }  # fmt: skip
+    assert told["backwards"] == told["counts"]
+    cameras = range(6)
+    rgb = stored(sample, *((camera, f"cam_{camera:02d}_rgb.mp4") for camera in cameras))
+    assert told["contents"]["rgb_videos"] == rgb
+    depth = stored(sample, *((camera, f"cam_{camera:02d}_depth.mkv") for camera in cameras))
+    assert told["contents"]["depth_videos"] == depth
+    assert told["contents"]["baseline_json"] == stored(sample, (None, "baseline.json"))
+    assert told["baselines"] == sample.column("baselines_cm").reshape(-1).tolist()
+
+
+def test_the_shipped_descriptors_are_those_that_the_sample_gives(tmp_path):
+    copied = tmp_path / "croissant"
+    shutil.copytree(HOME / "shards", tmp_path / "shards")
+    packed = SceneIndex.open(tmp_path / "shards")
+    sample = {"published": date(2026, 11, 21), "name": "StereoGenBench sample"}
+    address = json.loads((SHIPPED / "metadata.json").read_text())["url"]
+
+    write_descriptor(packed, copied / "sample.json", publication=Publication(**sample))
+    write_descriptor(
+        packed, copied / "metadata.json", publication=Publication(**sample, data_url=address)
+    )
+    write_descriptor(None, copied / "hub.json", publication=DAY)
+
+    written = {path.relative_to(copied) for path in copied.rglob("*") if path.is_file()}
+    assert written == {path.relative_to(SHIPPED) for path in SHIPPED.rglob("*") if path.is_file()}
+    for path in written:
+        assert (copied / path).read_bytes() == (SHIPPED / path).read_bytes(), path
+
+
+def test_absolute_addresses_pass_the_steps_of_the_conference_checker(web, index, tmp_path):
+    """It takes a dict, so paths must be URLs, and reads the first record of every set."""
+    shutil.copytree(index.root, web.folder / "rev1" / "shards")
+    place = web.folder / "rev1" / "metadata.json"
+    publication = Publication(
+        published=date(2026, 11, 21), data_url=f"{web.url}/rev1/shards",
+        tables_url=f"{web.url}/rev1/metadata",
+    )  # fmt: skip
+    write_descriptor(index, place, publication=publication)
+
+    told = loaded(place, tmp_path / "cache")
+
+    assert told["counts"]["scenes"] == len(index)
+    assert told["counts"]["pairs"] == 15 * len(index)
+    assert told["backwards"] == told["counts"]
+    assert told["first_of_each"] == [True] * len(told["counts"])
+
+
+def test_a_released_tree_is_read_from_its_own_files(small_release, tmp_path):
+    tree = SceneIndex.open(small_release)
+    path = tmp_path / "hub.json"
+    write_descriptor(tree, path, publication=DAY)
+
+    told = loaded(path, tmp_path / "cache", {"repository": str(small_release)})
+
+    assert validated(path) == [(0, [])]
+    assert told["counts"]["scenes"] == len(tree)
+    assert told["counts"]["pairs"] == 15 * len(tree)
+    assert told["counts"]["rgb_videos"] == told["counts"]["depth_videos"] == 6 * len(tree)
+    assert told["backwards"] == told["counts"]
+    assert {row["scenes/scene_id"]: row["scenes/focal_mm"] for row in told["scenes"]} == dict(
+        zip(tree.column("key"), tree.column("focal_mm"), strict=True)
+    )
+    assert sorted(told["baselines"]) == sorted(tree.column("baselines_cm").reshape(-1).tolist())
+
+
+def test_shards_of_any_folder_are_named_relative_to_the_descriptor(index, tmp_path):
+    path = tmp_path / "deep" / "down" / "data.json"
+
+    written = write_descriptor(index, path, publication=DAY)
+
+    for file in written["distribution"]:
+        if file["@type"] == "cr:FileObject":
+            assert (path.parent / file["contentUrl"]).is_file()
+
+
+def test_many_shards_are_listed_in_a_file(index, tmp_path, monkeypatch):
+    for module in ("croissant_tables", "croissant_packed"):
+        monkeypatch.setattr(f"stereogenbench_data.bridges.{module}.MOST_SHARD_FILES", 1)
+    monkeypatch.setattr("stereogenbench_data.bridges.croissant_packed.MOST_MEDIA_BYTES", 1)
+    path = tmp_path / "many.json"
+
+    written = write_descriptor(index, path, publication=DAY)
+
+    assert validated(path) == [(0, [])]
+    assert (tmp_path / "many" / "shards.txt").read_text().split() == sorted(index.shards)
+    assert [file["@id"] for file in written["distribution"]][-1] == "shard-files"
+    assert loaded(path, tmp_path / "cache")["counts"]["shards"] == len(index.shards)
+
+
+def test_a_fifteen_baseline_row_stands_in_every_scene(index, tmp_path):
+    write_descriptor(index, tmp_path / "data.json", publication=DAY)
+
+    rows = loaded(tmp_path / "data.json", tmp_path / "cache")["scenes"]
+
+    expected = dict(zip(index.column("key"), index.column("baselines_cm").tolist(), strict=True))
+    assert {row["scenes/scene_id"]: row["scenes/pairwise_baselines_cm"] for row in rows} == expected
+
+
+def test_shards_behind_a_url_need_an_address_to_name(small_release, web, tmp_path):
+    pack(small_release, web.folder / "shards", workers=1)
+    remote = SceneIndex.open(f"{web.url}/shards")
+
+    with pytest.raises(DescriptorError, match=r"lie behind a URL: give the URL .*--base-url"):
+        write_descriptor(remote, tmp_path / "data.json", publication=DAY)
+
+
+def test_a_descriptor_that_cannot_be_written_says_where(index, tmp_path):
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(DescriptorError, match=r"file/data: tables cannot be written"):
+        write_descriptor(index, tmp_path / "file" / "data.json", publication=DAY)

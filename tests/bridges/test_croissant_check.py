@@ -1,0 +1,162 @@
+"""The check of a descriptor: what mlcroissant's own validation lets through is caught by name."""
+
+import json
+import re
+
+import pytest
+from typer.testing import CliRunner
+
+from stereogenbench_data import SceneIndex
+from stereogenbench_data.bridges.croissant import write_descriptor
+from stereogenbench_data.bridges.croissant_check import check_descriptor
+from stereogenbench_data.cli.main import app
+from stereogenbench_data.errors import DescriptorError
+
+
+@pytest.fixture
+def written(small_shards, tmp_path):
+    path = tmp_path / "data.json"
+    write_descriptor(SceneIndex.open(small_shards), path)
+    return path
+
+
+def node(document, name):
+    """A file, set, record set or field, by its id."""
+    nodes = [*document["distribution"], *document["recordSet"]]
+    nodes += [field for records in document["recordSet"] for field in records["field"]]
+    return next(each for each in nodes if each["@id"] == name)
+
+
+def first_tar(document):
+    return next(
+        each for each in document["distribution"] if each["encodingFormat"] == "application/x-tar"
+    )
+
+
+def test_what_is_written_has_no_problem(written):
+    assert check_descriptor(written) == []
+
+
+MUTATIONS = {
+    "missing file": (
+        lambda d: first_tar(d).update(contentUrl="nowhere.tar"), r"nowhere\.tar does not exist",
+    ),
+    "wrong sha256": (lambda d: first_tar(d).update(sha256="0" * 64), "was replaced or damaged"),
+    "short sha256": (lambda d: first_tar(d).update(sha256="abc"), "must have 64 hex digits"),
+    "wrong size": (lambda d: first_tar(d).update(contentSize="1 B"), "the descriptor says 1 B"),
+    "unknown column": (
+        lambda d: node(d, "scenes/map")["source"]["extract"].update(column="maps"),
+        r"scenes/map: is the column 'maps' of scenes\.parquet; there are",
+    ),
+    "dangling key": (
+        lambda d: node(d, "scenes").update(key={"@id": "scenes/number"}),
+        "scenes: has the key scenes/number, which is no field of it",
+    ),
+    "dangling reference": (
+        lambda d: node(d, "pairs/scene_id").update(references={"field": {"@id": "scenes/key"}}),
+        "pairs/scene_id: refers to 'scenes/key', which is not in the descriptor",
+    ),
+    "reference of the specification's form": (
+        lambda d: node(d, "pairs/scene_id").update(references={"@id": "scenes/scene_id"}),
+        "pairs/scene_id: refers to no field",
+    ),
+    "chained reference": (
+        lambda d: node(d, "scenes/scene_id").update(references={"field": {"@id": "maps/name"}}),
+        "which refers on: chains load wrong rows",
+    ),
+    "misspelt responsible-AI name": (
+        lambda d: d.update({"rai:dataBias": ["none"]}), "rai:dataBias: is no property of RAI 1.0",
+    ),
+    "missing responsible-AI name": (
+        lambda d: d.pop("rai:dataLimitations"), "rai:dataLimitations: is missing",
+    ),
+    "misspelt property": (
+        lambda d: first_tar(d).update(contentURL="x"), "contentURL: is no property of Croissant",
+    ),
+    "context of another version": (
+        lambda d: d["@context"].pop("containedIn"), "@context: containedIn is None and must be",
+    ),
+    "context by address": (
+        lambda d: d.update({"@context": "https://example.org/context"}), "must be an object",
+    ),
+    "another version": (
+        lambda d: d.update(conformsTo="http://mlcommons.org/croissant/1.0"),
+        "conformsTo: lacks http://mlcommons.org/croissant/1.1",
+    ),
+    "no licence": (lambda d: d.pop("license"), "license: is missing"),
+    "no version": (lambda d: d.update(version="v1"), "must be MAJOR.MINOR.PATCH"),
+    "pattern that finds nothing": (
+        lambda d: node(d, "rgb-files").update(includes="**/*.cam_??_colour.mp4"),
+        "matches none of its files",
+    ),
+    "set in no file": (
+        lambda d: node(d, "rgb-files").update(containedIn={"@id": "other.tar"}),
+        "is contained in 'other.tar', which is not in the descriptor",
+    ),
+    "regex without a group": (
+        lambda d: node(d, "rgb_videos/camera")["source"].update(transform={"regex": ".*"}),
+        "which has none",
+    ),
+    "two nodes of one name": (
+        lambda d: node(d, "depth-files").update({"@id": "rgb-files"}),
+        "rgb-files: is the @id of two nodes",
+    ),
+    "branch for a revision": (
+        lambda d: first_tar(d).update(
+            contentUrl="https://huggingface.co/datasets/a/b/resolve/main/x.tar"
+        ),
+        "is a branch, which moves: pin a revision",
+    ),
+    "inline data of no field": (
+        lambda d: node(d, "splits")["data"][0].update({"splits/url": "x"}),
+        "splits: has data for splits/url",
+    ),
+    "not shaped as one": (lambda d: d.update(recordSet=[1]), "is not shaped as a descriptor is"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_a_mutation_is_caught_by_name(written, name):
+    change, message = MUTATIONS[name]
+    document = json.loads(written.read_text())
+    change(document)
+    written.write_text(json.dumps(document))
+
+    problems = check_descriptor(written)
+
+    assert any(re.search(message, problem) for problem in problems), problems
+
+
+def test_a_file_named_by_url_is_checked_where_it_is_at_hand(written, small_shards):
+    document = json.loads(written.read_text())
+    tar = first_tar(document)
+    tar.update(contentUrl="https://example.org/data.tar", sha256="0" * 64)
+    written.write_text(json.dumps(document))
+
+    assert check_descriptor(written) == []
+    told = check_descriptor(written, mapping={tar["@id"]: small_shards / tar["@id"]})
+    assert "was replaced or damaged" in " ".join(told)
+
+
+def test_what_is_no_json_is_refused(tmp_path):
+    path = tmp_path / "data.json"
+    path.write_text("{")
+
+    with pytest.raises(DescriptorError, match=r"data\.json: is no JSON file"):
+        check_descriptor(path)
+
+
+def test_the_command_writes_and_checks(small_shards, tmp_path):
+    path = tmp_path / "out" / "data.json"
+
+    written = CliRunner().invoke(app, ["croissant", str(small_shards), "-o", str(path)])
+    checked = CliRunner().invoke(app, ["croissant", "--check", str(path), "--json"])
+    document = json.loads(path.read_text())
+    del document["rai:dataBiases"]
+    path.write_text(json.dumps(document))
+    found = CliRunner().invoke(app, ["croissant", "--check", str(path)])
+
+    assert written.exit_code == 0, written.output
+    assert json.loads(checked.output)["problems"] == []
+    assert found.exit_code == 1
+    assert "rai:dataBiases: is missing" in found.output
