@@ -1,0 +1,130 @@
+"""Stereo samples as a Hugging Face ``datasets.IterableDataset``, and the features of raw shards."""
+
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Unpack
+
+from stereogenbench_data.bridges.scene_bytes import SampleOptions, samples_of
+from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.errors import ExtraError, FieldError, SelectionError
+from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS
+from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.schema.release import DESCRIPTION_TXT, METADATA_FILES, VIDEO_FILES
+
+if TYPE_CHECKING:
+    from datasets import Features
+
+    from stereogenbench_data.bridges.huggingface_iterable import SampleIterable
+
+
+def iterable(data: Data, **options: Any) -> "SampleIterable":
+    """Return the samples of `StereoPairs` as an iterable dataset of Hugging Face ``datasets``.
+
+    Every scene is one shard of it: ``split_dataset_by_node``, worker processes, ``shuffle`` and
+    ``state_dict`` deal with scenes. Samples are flat dicts of numpy arrays with the dtypes of the
+    fields' table. Leave the format as it is: ``with_format("numpy")`` and ``with_format("torch")``
+    turn uint8 into int64 and float64 into float32; torch's own collate makes tensors.
+
+    ``shuffle(seed=0, buffer_size=1)`` orders the scenes anew; a larger buffer holds whole samples
+    in memory. The loader of `StereoPairs` mixes scenes without one, and resumes without decoding
+    again what was seen.
+
+    Args:
+        data: As for `StereoPairs`.
+        **options: As for `StereoPairs`.
+
+    Raises:
+        ExtraError: If ``datasets`` is not installed.
+        StereoGenBenchError: As `StereoPairs` does.
+    """
+    try:
+        from stereogenbench_data.bridges.huggingface_iterable import SampleIterable
+    except ImportError as error:
+        raise _missing(error) from error
+    return SampleIterable.of(StereoPairs(data, **options))
+
+
+def features(*, depth_suffix: str = "mkv") -> "Features":
+    """Return the features of raw shards, for ``load_dataset("webdataset", features=...)``.
+
+    Without them ``datasets`` infers them from the first scenes, decodes videos to 8 bits, which
+    destroys depth, and narrows numbers in JSON. With them a row holds every file of a scene as
+    bytes, JSON as parsed.
+
+    Args:
+        depth_suffix: How the names of depth members end: "mkv" as released.
+
+    Raises:
+        ExtraError: If ``datasets`` is not installed.
+    """
+    try:
+        from datasets import Features, Json, Value
+    except ImportError as error:
+        raise _missing(error) from error
+    kinds: dict[str, Any] = {
+        name: Value("string") if name == DESCRIPTION_TXT else Json() for name in METADATA_FILES
+    }
+    for name in VIDEO_FILES:
+        kinds[name.replace("depth.mkv", f"depth.{depth_suffix}")] = Value("binary")
+    return Features(kinds | {"__key__": Value("string"), "__url__": Value("string")})
+
+
+def decode(
+    fields: Iterable[str] = DEFAULT_PAIR_FIELDS, **options: Unpack[SampleOptions]
+) -> Callable[[dict[str, Any]], dict[str, Any]]:
+    """Return a function for ``map`` that turns rows of raw shards into samples.
+
+    Where every scene gives one sample, ``dataset.map(decode(...), remove_columns=...)``. Where it
+    gives several, ``map(..., batched=True, batch_size=1)``: they are all in memory at once, so
+    prefer `iterable` for many frames or pairs.
+
+    Args:
+        fields: Names of the fields wanted.
+        **options: pairs, frames, direction, baseline_cm, size, transform, depth, seed, as
+            `StereoPairs` takes them.
+    """
+    return _RowDecoder(tuple(fields), options)
+
+
+class _RowDecoder:
+    def __init__(self, fields: tuple[str, ...], options: SampleOptions) -> None:
+        self._fields = fields
+        self._options = options
+
+    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
+        if isinstance(row["__key__"], str):
+            samples = self._samples(row)
+            if len(samples) != 1:
+                raise SelectionError(
+                    f"{row['__key__']}: gives {len(samples)} samples, and map takes one a row: "
+                    "pass batched=True, batch_size=1."
+                )
+            return samples[0]
+        rows = [dict(zip(row, values, strict=True)) for values in zip(*row.values(), strict=True)]
+        found = [sample for each in rows for sample in self._samples(each)]
+        return {name: [sample[name] for sample in found] for name in self._fields}
+
+    def _samples(self, row: dict[str, Any]) -> list[Sample]:
+        found = samples_of(row["__key__"], row, fields=self._fields, epoch=0, options=self._options)
+        return [to_arrays(sample) for sample in found]
+
+
+def to_arrays(sample: Sample) -> Sample:
+    """Return a sample whose tensors are numpy arrays of the same dtype; texts stay.
+
+    Raises:
+        FieldError: If a field's tensor has no numpy counterpart.
+    """
+    try:
+        return {
+            name: value if isinstance(value, str) else value.numpy()
+            for name, value in sample.items()
+        }
+    except TypeError as error:
+        raise FieldError(f"a field cannot be given as a numpy array ({error}).") from error
+
+
+def _missing(error: ImportError) -> ExtraError:
+    return ExtraError(
+        f"Hugging Face datasets cannot be imported ({error}): "
+        "pip install 'stereogenbench-data[huggingface]'."
+    )

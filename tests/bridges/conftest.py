@@ -1,0 +1,30 @@
+"""Shards as other libraries are given them."""
+
+import numpy as np
+import pytest
+import torch
+
+
+@pytest.fixture(scope="session")
+def urls(small_shards):
+    return sorted(str(path) for path in small_shards.glob("*.tar"))
+
+
+@pytest.fixture
+def equal_samples():
+    """Tell whether two flat samples have the same fields, dtypes and values."""
+
+    def equal(one, other):
+        assert one.keys() == other.keys()
+        for name, value in one.items():
+            if isinstance(value, str):
+                assert value == other[name], name
+                continue
+            a, b = (
+                each.numpy() if torch.is_tensor(each) else each for each in (value, other[name])
+            )
+            assert a.dtype == b.dtype, name
+            np.testing.assert_array_equal(a, b, err_msg=name)
+        return True
+
+    return equal

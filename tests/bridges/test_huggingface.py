@@ -1,0 +1,190 @@
+"""Samples through Hugging Face datasets: the same fields and dtypes, shared, resumed."""
+
+import subprocess
+import sys
+
+import datasets
+import numpy as np
+import pytest
+import torch
+from datasets.distributed import split_dataset_by_node
+from torch.utils.data import DataLoader
+from torchdata.stateful_dataloader import StatefulDataLoader
+
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.bridges import huggingface
+from stereogenbench_data.errors import SelectionError, StorageError
+
+FIELDS = ("left", "right", "disparity", "valid", "intrinsics", "pair", "scene", "__key__")
+SELECTION = {"fields": FIELDS, "pairs": "adjacent", "frames": [0, 6]}
+
+
+@pytest.fixture(scope="module")
+def expected(small_shards):
+    return StereoPairs(small_shards, **SELECTION)
+
+
+@pytest.fixture
+def stream(small_shards):
+    return huggingface.iterable(small_shards, **SELECTION)
+
+
+def keys(samples):
+    return [sample["__key__"] for sample in samples]
+
+
+def test_the_samples_are_those_of_the_map_style_dataset(stream, expected, equal_samples):
+    found = list(stream)
+
+    assert isinstance(stream, datasets.IterableDataset)
+    assert stream.num_shards == 4
+    assert len(found) == len(expected)
+    for sample, other in zip(found, expected, strict=True):
+        assert all(isinstance(value, np.ndarray | str) for value in sample.values())
+        assert equal_samples(sample, other)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_torchs_loader_and_its_own_collate_keep_dtypes_and_lose_nothing(stream, expected, workers):
+    batches = list(DataLoader(stream, batch_size=4, num_workers=workers))
+
+    assert sorted(key for batch in batches for key in batch["__key__"]) == sorted(keys(expected))
+    assert batches[0]["left"].dtype == torch.uint8
+    assert batches[0]["disparity"].dtype == torch.float32
+    assert batches[0]["intrinsics"].dtype == torch.float64
+    assert batches[0]["valid"].dtype == torch.bool
+
+
+@pytest.mark.parametrize("world", [2, 3])
+def test_ranks_share_the_samples_without_overlap(stream, expected, world):
+    shares = [
+        keys(split_dataset_by_node(stream, rank=rank, world_size=world)) for rank in range(world)
+    ]
+
+    assert sorted(key for share in shares for key in share) == sorted(keys(expected))
+
+
+def test_a_state_resumes_where_it_was_taken(small_shards, stream, expected):
+    taken = []
+    for sample in stream:
+        taken.append(sample["__key__"])
+        if len(taken) == 13:
+            state = stream.state_dict()
+            break
+    resumed = huggingface.iterable(small_shards, **SELECTION)
+    resumed.load_state_dict(state)
+
+    assert taken + keys(resumed) == keys(expected)
+
+
+@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated:UserWarning")
+def test_torchdatas_loader_resumes_with_workers(small_shards, stream, expected):
+    loader = StatefulDataLoader(stream, batch_size=2, num_workers=2)
+    taken = []
+    for batch in loader:
+        taken += batch["__key__"]
+        if len(taken) == 10:
+            state = loader.state_dict()
+            break
+    resumed = StatefulDataLoader(
+        huggingface.iterable(small_shards, **SELECTION), batch_size=2, num_workers=2
+    )
+    resumed.load_state_dict(state)
+
+    assert sorted(taken + [key for batch in resumed for key in batch["__key__"]]) == sorted(
+        keys(expected)
+    )
+
+
+def test_an_epoch_draws_frames_anew_and_orders_scenes_anew(small_shards):
+    stream = huggingface.iterable(
+        small_shards, fields=("frame_index", "scene"), frames=("random", 3)
+    )
+
+    def drawn(epoch):
+        stream.set_epoch(epoch)
+        return [(sample["scene"], int(sample["frame_index"])) for sample in stream]
+
+    assert drawn(0) == drawn(0)
+    assert set(drawn(0)) != set(drawn(1))
+    orders = {tuple(scene for scene, _ in drawn(epoch)) for epoch in range(4)}
+    assert len(orders) > 1
+
+
+def test_running_workers_follow_the_epoch(small_shards):
+    stream = huggingface.iterable(
+        small_shards, fields=("frame_index", "scene"), frames=("random", 3)
+    )
+    loader = DataLoader(stream, batch_size=None, num_workers=1, persistent_workers=True)
+
+    def drawn(epoch):
+        stream.set_epoch(epoch)
+        return {(sample["scene"], int(sample["frame_index"])) for sample in loader}
+
+    assert drawn(0) != drawn(1)
+    assert drawn(0) == drawn(0)
+
+
+def raw(urls):
+    return datasets.load_dataset(
+        "webdataset", data_files={"train": urls}, features=huggingface.features(),
+        streaming=True, split="train",
+    )  # fmt: skip
+
+
+def test_raw_shards_are_read_as_bytes_and_mapped_to_samples(urls, small_shards, equal_samples):
+    rows = raw(urls)
+    expected = {each["__key__"]: each for each in StereoPairs(small_shards, fields=FIELDS)}
+
+    mapped = rows.map(huggingface.decode(FIELDS), remove_columns=rows.column_names)
+
+    found = list(mapped)
+    assert len(found) == len(expected)
+    for sample in found:
+        other = dict(expected[sample["__key__"]])
+        # Datasets writes JSON anew, with 15 digits of a number: cameras differ by 1e-12 of theirs.
+        np.testing.assert_allclose(sample["intrinsics"], other["intrinsics"], rtol=1e-11)
+        np.testing.assert_allclose(sample["disparity"], other["disparity"], rtol=1e-6)
+        for name in ("intrinsics", "disparity"):
+            other[name] = torch.from_numpy(sample[name])
+        assert equal_samples(sample, other)
+
+
+def test_a_scene_of_many_samples_is_mapped_in_batches_of_one(urls):
+    rows = raw(urls)
+    decoder = huggingface.decode(("disparity", "__key__"), pairs="all", frames=[0, 3])
+
+    mapped = rows.map(decoder, remove_columns=rows.column_names, batched=True, batch_size=1)
+
+    assert len(set(keys(mapped))) == 4 * 15 * 2
+    with pytest.raises(SelectionError, match=r"gives 30 samples, and map takes one a row"):
+        next(iter(rows.map(decoder)))
+
+
+def test_raw_bytes_are_the_released_ones(urls, small_release):
+    row = next(iter(raw(urls)))
+
+    folder = small_release / row["__key__"]
+    assert row["cam_05_depth.mkv"] == (folder / "cam_05_depth.mkv").read_bytes()
+    assert row["baseline.json"]["pairwise_pairs"][14]["camera_index_b"] == 5
+
+
+def test_videos_that_datasets_decoded_are_refused(urls):
+    row = next(iter(raw(urls))) | {"cam_00_depth.mkv": object()}
+
+    with pytest.raises(StorageError, match=r"is a object and not bytes"):
+        huggingface.decode(FIELDS)(row)
+
+
+def test_without_datasets_the_extra_is_named():
+    code = (
+        "import sys; sys.modules['datasets'] = None\n"
+        "from stereogenbench_data.bridges import huggingface\n"
+        "from stereogenbench_data.errors import ExtraError\n"
+        "try:\n    huggingface.features()\n"
+        "except ExtraError as error:\n    print(error)\n"
+    )
+
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert "pip install 'stereogenbench-data[huggingface]'" in said.stdout

@@ -1,0 +1,133 @@
+"""The pipeline stage for webdataset: the samples of `StereoPairs`, out of plain tars."""
+
+import gc
+import json
+import tempfile
+
+import numpy as np
+import pytest
+import webdataset
+
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.bridges.webdataset import decode
+from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
+
+FIELDS = ("left", "right", "disparity", "valid", "baseline_m", "pair", "scene", "__key__")
+
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
+)
+"""Webdataset leaves its files to the garbage collector, which warns of them."""
+
+
+@pytest.fixture(autouse=True)
+def collected():
+    yield
+    gc.collect()
+
+
+@pytest.fixture
+def scenes(urls):
+    """Every scene as webdataset reads it: a dict of bytes."""
+    return list(webdataset.WebDataset(urls, shardshuffle=False))
+
+
+def test_the_stage_gives_the_samples_of_the_map_style_dataset(urls, small_shards, equal_samples):
+    expected = StereoPairs(small_shards, fields=FIELDS, pairs="adjacent", frames=[0, 6])
+    pipeline = webdataset.WebDataset(urls, shardshuffle=False).compose(
+        decode(FIELDS, pairs="adjacent", frames=[0, 6])
+    )
+
+    found = {sample["__key__"]: sample for sample in pipeline}
+
+    assert len(found) == len(expected) == 4 * 5 * 2
+    for sample in expected:
+        assert equal_samples(found[sample["__key__"]], sample)
+
+
+def test_the_url_is_that_of_the_shard(scenes, urls):
+    sample = next(decode(("left", "__url__"))(scenes))
+
+    assert sample["__url__"] in urls
+
+
+def test_a_baseline_leaves_out_scenes_without_such_a_pair(scenes):
+    narrow = list(decode(("baseline_m",), pairs="all", baseline_cm=(0, 8))(scenes))
+
+    assert 0 < len(narrow) < 60
+    assert all(sample["baseline_m"] <= 0.08 for sample in narrow)
+
+
+def test_random_frames_differ_among_scenes_and_epochs_and_repeat_by_seed(scenes):
+    def frames(seed, epoch):
+        stage = decode(("frame_index",), frames=("random", 2), seed=seed)
+        stage.set_epoch(epoch)
+        return [int(sample["frame_index"]) for sample in stage(scenes)]
+
+    assert frames(0, 0) == frames(0, 0)
+    assert frames(0, 0) != frames(0, 1)
+    assert frames(0, 0) != frames(1, 0)
+
+
+def test_nothing_is_left_in_the_temporary_folder(scenes, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    next(decode(("left",))(scenes))
+    list(decode(("left",))(scenes))
+    gc.collect()
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_member_is_named(scenes):
+    del scenes[0]["cam_02_depth.mkv"]
+
+    with pytest.raises(StorageError, match=r"is marked as complete and has no cam_02_depth\.mkv"):
+        list(decode(("left",))(scenes[:1]))
+
+
+def test_a_damaged_video_is_named(scenes):
+    video = scenes[0]["cam_00_depth.mkv"]
+    scenes[0]["cam_00_depth.mkv"] = video[: len(video) // 2]
+
+    with pytest.raises(StorageError, match=r"cam_00_depth\.mkv has 3\. Fetch those again"):
+        list(decode(("disparity",), frames="all")(scenes[:1]))
+
+
+@pytest.mark.parametrize("key", ["../../etc/scene", "/train/A/B/c", "train/a.b/c/d", "scene"])
+def test_a_key_that_is_no_scenes_path_is_refused(scenes, key):
+    scenes[0]["__key__"] = key
+
+    with pytest.raises(SchemaError, match="scene"):
+        list(decode(("left",))(scenes[:1]))
+
+
+def test_a_video_that_was_decoded_before_is_refused(scenes):
+    scenes[0]["cam_00_depth.mkv"] = np.zeros((7, 64, 64), dtype=np.uint8)
+
+    with pytest.raises(StorageError, match=r"is a ndarray and not bytes: a decoder took it before"):
+        list(decode(("left",))(scenes[:1]))
+
+
+def test_a_sample_without_a_key_is_refused():
+    with pytest.raises(StorageError, match="a scene has no __key__"):
+        list(decode(("left",))([{"cam_00_rgb.mp4": b""}]))
+
+
+def test_an_unknown_option_is_named():
+    with pytest.raises(
+        SelectionError, match=r"there is no option 'split'; there are pairs, frames"
+    ):
+        decode(("left",), split="train")
+
+
+def test_json_that_webdataset_parsed_on_the_way_is_taken(urls, small_shards, equal_samples):
+    expected = StereoPairs(small_shards, fields=FIELDS)
+    pipeline = webdataset.WebDataset(urls, shardshuffle=False).decode(
+        webdataset.handle_extension("json", json.loads)
+    )
+
+    found = {sample["__key__"]: sample for sample in decode(FIELDS)(pipeline)}
+
+    for sample in expected:
+        assert equal_samples(found[sample["__key__"]], sample)
