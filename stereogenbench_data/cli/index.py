@@ -1,23 +1,32 @@
 """``stereogenbench index``: walk a released tree once, and keep what training asks of it."""
 
-from collections.abc import Mapping
+import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
 
+from stereogenbench_data.cli.options import FamilyOption, JsonOption, MapOption, SplitOption
 from stereogenbench_data.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from stereogenbench_data.schema.records import SceneId
 
 _INDEX_NAME = "index.parquet"
 
 
-def index(
-    root: Annotated[Path, typer.Argument(help="Folder that holds train/ and eval/.")],
+def index(  # noqa: PLR0913 - one parameter an option
+    root: Annotated[
+        str, typer.Argument(help="Folder that holds train/ and eval/, or its URL (hf://, s3://).")
+    ],
     *,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help=f"Index file to write [ROOT/{_INDEX_NAME}]."),
+        typer.Option(
+            "--out", "-o", help=f"Index file to write [ROOT/{_INDEX_NAME}; for a URL here]."
+        ),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that read scenes [one a core].")
@@ -30,19 +39,31 @@ def index(
             "of measured pixels.",
         ),
     ] = False,
+    split: SplitOption = None,
+    family: FamilyOption = None,
+    map_name: MapOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Index a released tree, so that it opens at once.
 
     The walk goes on where it stopped if it is run again after an interruption. Incomplete scenes
-    are listed and left out. Broken ones too, and then the exit status is 1.
+    are listed and left out. Broken ones too, and then the exit status is 1. With --split,
+    --family or --map only such scenes are read.
     """
     from stereogenbench_data.storage.index import SceneIndex
     from stereogenbench_data.storage.journal import Journal
+    from stereogenbench_data.storage.location import is_remote, shown
     from stereogenbench_data.storage.walk import walk
 
     console = Console(stderr=True)
-    target = root / _INDEX_NAME if out is None else out
+    place = "." if is_remote(root) else root
+    target = Path(place, _INDEX_NAME) if out is None else out
     mode: Literal["skip", "sample"] = "sample" if valid_depth else "skip"
+    wanted = _passing(split, family or [], map_name or [])
+    if wanted is not None and out is None:
+        raise typer.BadParameter(
+            "an index of a part is named by you: --out FILE", param_hint="--out"
+        )
     if target.is_dir():
         raise typer.BadParameter(
             f"{target} is a folder: name a file, such as {target / _INDEX_NAME}."
@@ -50,11 +71,16 @@ def index(
     done_before = target.with_name(f"{target.name}.journal")
     try:
         with (
-            Journal(done_before, walk=f"{root.resolve()} valid_depth={mode}") as journal,
+            Journal(done_before, walk=f"{_whole(root)} valid_depth={mode}") as journal,
             progress_bar("indexing", unit="scenes") as progress,
         ):
             report = walk(
-                root, workers=workers, progress=progress, journal=journal, valid_depth=mode
+                root,
+                workers=workers,
+                progress=progress,
+                journal=journal,
+                valid_depth=mode,
+                wanted=wanted,
             )
             if report.scenes:
                 SceneIndex.from_report(report).write(target)
@@ -62,15 +88,40 @@ def index(
     except KeyboardInterrupt:
         console.print("stopped; run the same command again to go on from here")
         raise typer.Exit(130) from None
+    if as_json:
+        found = {"scenes": len(report.scenes), "incomplete": dict(report.incomplete)}
+        found |= {"broken": dict(report.broken), "notes": list(report.notes)}
+        written = {"index": str(target) if report.scenes else None}
+        typer.echo(json.dumps(written | found, indent=2))
+        raise typer.Exit(1 if report.broken or not report.scenes else 0)
     _list(console, "incomplete, left out", report.incomplete)
     _list(console, "broken, left out", report.broken)
     _list(console, "to know", {note: note for note in report.notes})
     if not report.scenes:
-        console.print(f"{root}: no scene is whole, so there is nothing to index")
+        console.print(f"{shown(root)}: no scene is whole, so there is nothing to index")
         raise typer.Exit(1)
     typer.echo(f"{target}: {len(report.scenes)} scenes")
     if report.broken:
         raise typer.Exit(1)
+
+
+def _whole(root: str) -> str:
+    from stereogenbench_data.storage.location import is_remote, local_path
+
+    return root if is_remote(root) else str(local_path(root).resolve())
+
+
+def _passing(
+    split: str | None, families: list[str], maps: list[str]
+) -> "Callable[[SceneId], bool] | None":
+    """Return whether a scene is asked for, by what its path says."""
+    if not (split or families or maps):
+        return None
+    return lambda scene: (
+        (not split or scene.split == split)
+        and (not families or scene.family in families)
+        and (not maps or scene.map_name in maps)
+    )
 
 
 def _list(console: Console, title: str, reasons: Mapping[str, str]) -> None:

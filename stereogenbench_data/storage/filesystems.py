@@ -31,6 +31,10 @@ _SETUP_ERRORS: Final = (("botocore.exceptions", "BotoCoreError"),)
 """What file systems raise where they are not set up: without a login, for example."""
 
 
+class MissingObject(StorageError):
+    """What a URL names is not there."""
+
+
 class FilesystemTransport:
     """One object of whatever fsspec opens. Logins are the file system's own business."""
 
@@ -49,6 +53,22 @@ class FilesystemTransport:
         if not isinstance(size, int):
             raise StorageError(f"{self._where}: has no size ({size!r}): is it a folder?")
         return size
+
+    def entries(self) -> dict[str, int | None]:
+        """Return what a folder holds: names, with the size of a file and None for a folder."""
+        with self._named_errors():
+            files, path = self._filesystem()
+            listed = files.ls(path, detail=True)
+        names = [str(entry["name"]).rstrip("/").rpartition("/")[2] for entry in listed]
+        sizes = [
+            None if entry["type"] == "directory" else int(entry["size"] or 0) for entry in listed
+        ]
+        own = path.rstrip("/").rpartition("/")[2]
+        return {
+            name: size
+            for name, size, entry in zip(names, sizes, listed, strict=True)
+            if name and (name != own or str(entry["name"]).strip("/") != path.strip("/"))
+        }
 
     def part(self, start: int, stop: int) -> Iterator[bytes]:
         """Yield the bytes from start to stop."""
@@ -81,7 +101,7 @@ class FilesystemTransport:
         try:
             yield
         except FileNotFoundError:
-            raise StorageError(
+            raise MissingObject(
                 f"{self._where}: does not exist, or is private. {_MISSING}"
             ) from None
         except PermissionError as error:

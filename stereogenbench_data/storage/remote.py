@@ -106,6 +106,19 @@ class RemoteObject:
                 failures = 1 if start > begin else failures + 1
                 self._wait(fault, failures=failures, doing=f"at byte {start} of {stop}")
 
+    def entries(self) -> dict[str, int | None]:
+        """Return what it holds as a folder: names, with a file's size, and None for a folder.
+
+        Raises:
+            StorageError: If it cannot be listed; plain web servers have no lists.
+        """
+        if not isinstance(self._transport, FilesystemTransport):
+            raise StorageError(
+                f"{self.where}: a web server does not list its folders. Pass a folder with an "
+                "index.parquet, or an index that names this URL as its root."
+            )
+        return self._persist(self._transport.entries)
+
     def _require_expected_size(self) -> None:
         if self._is_checked:
             return

@@ -6,7 +6,6 @@ videos; no picture is decoded, unless the share of measured depth is asked for.
 
 import hashlib
 import math
-import os
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -55,13 +54,13 @@ from stereogenbench_data.schema.release import (
     COMPLETE_JSON,
     DESCRIPTION_JSON,
     DESCRIPTION_TXT,
-    METADATA_FILES,
     TRAJECTORY_JSON,
     VIDEO_FILES,
     depth_name,
     rgb_name,
 )
-from stereogenbench_data.storage.source import read_text_file
+from stereogenbench_data.storage.ranged_file import MemberFile
+from stereogenbench_data.storage.scene_files import SceneFiles, files_of
 
 ValidDepth = Literal["skip", "sample"]
 
@@ -77,25 +76,6 @@ class IncompleteScene(StorageError):
     """A scene that is not finished, or of which only the metadata were fetched."""
 
 
-def scene_files(root: str | Path, key: str) -> dict[str, tuple[int, int]]:
-    """Return the size in bytes and the time of change in ns of each of a scene's files.
-
-    Raises:
-        StorageError: If the folder cannot be read.
-    """
-    folder = Path(root, key)
-    wanted = {*METADATA_FILES, *VIDEO_FILES}
-    try:
-        with os.scandir(folder) as entries:
-            found = {entry.name: entry.stat() for entry in entries if entry.name in wanted}
-    except OSError as error:
-        raise StorageError(
-            f"{folder}: cannot be read ({error.strerror}). Give read permission, or fetch the "
-            f"scene again."
-        ) from error
-    return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
-
-
 def stamp_of(files: Mapping[str, tuple[int, int]]) -> str:
     """Return a short text that changes when one of a scene's files does."""
     return hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:32]
@@ -105,7 +85,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     """Return the index row of a finished scene.
 
     Args:
-        root: The folder that holds ``train`` and ``eval``.
+        root: The folder that holds ``train`` and ``eval``, or its URL.
         key: The scene's path below it.
         valid_depth: "sample" decodes the first, the middle and the last depth picture of each
             camera, to tell the share of pixels that have a depth.
@@ -116,24 +96,18 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         SchemaError: If a metadata file does not follow the format.
         MediaError: If a video is not what its header says.
     """
-    files = scene_files(root, key)
+    folder = files_of(root, key)
+    files = folder.stamps()
     _require_finished(key, files)
-    folder = Path(root, key)
-    rig, labels = parse_rig(_text(folder, key, BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
-    marked = parse_complete(_text(folder, key, COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
-    trajectory = parse_trajectory(
-        _text(folder, key, TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}"
-    )
-    caption = _caption(folder, key, files)
-    depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
-    facts = {
-        name: probe(
-            folder / name,
-            name=f"{key}/{name}",
-            pixel_format="needed" if name in depth_names else "later",
-        )
-        for name in VIDEO_FILES
+    rig, labels = parse_rig(folder.text(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
+    marked = parse_complete(folder.text(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
+    trajectory = parse_trajectory(folder.text(TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}")
+    described: dict[str, bytes] = {
+        name: folder.text(name) for name in (DESCRIPTION_JSON, DESCRIPTION_TXT) if name in files
     }
+    caption = caption_of(described, key=key)
+    depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
+    facts = {name: _probed(folder, key, name) for name in VIDEO_FILES}
     frames = _common_frames(key, facts, trajectory)
     rig = _sized_as_videos(key, rig, facts)
     poses = CameraPoses.from_trajectory(trajectory)
@@ -145,7 +119,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
     return Scene(
         id=parse_scene_key(key),
-        labels=_merged(labels, marked),
+        labels=merged_labels(labels, marked),
         caption=caption,
         rig=rig,
         frames=frames,
@@ -161,8 +135,17 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     )
 
 
-def _text(folder: Path, key: str, name: str) -> bytes:
-    return read_text_file(folder / name, where=f"{key}/{name}")
+def _probed(folder: SceneFiles, key: str, name: str) -> StreamFacts:
+    video = folder.video(name)
+    try:
+        return probe(
+            video,
+            name=f"{key}/{name}",
+            pixel_format="later" if name.endswith(".mp4") else "needed",
+        )
+    finally:
+        if isinstance(video, MemberFile):
+            video.close()
 
 
 def _require_finished(key: str, files: Mapping[str, object]) -> None:
@@ -180,23 +163,27 @@ def _require_finished(key: str, files: Mapping[str, object]) -> None:
         )
 
 
-def _caption(folder: Path, key: str, files: Mapping[str, object]) -> str:
-    """Return the detailed caption, or the short one where there is no detailed one."""
-    if DESCRIPTION_JSON in files:
-        description = parse_description(
-            _text(folder, key, DESCRIPTION_JSON), where=f"{key}/{DESCRIPTION_JSON}"
-        )
+def caption_of(texts: Mapping[str, bytes], *, key: str) -> str:
+    """Return a scene's caption from its files: the detailed one, else the short one.
+
+    Args:
+        texts: File name to bytes, with the descriptions that there are.
+        key: The scene's, for messages.
+
+    Raises:
+        SchemaError: If a description does not follow the format.
+    """
+    if DESCRIPTION_JSON in texts:
+        description = parse_description(texts[DESCRIPTION_JSON], where=f"{key}/{DESCRIPTION_JSON}")
         written = description.detailed_caption or description.short_caption
         if written:
             return written
-    if DESCRIPTION_TXT in files:
-        return parse_text(
-            _text(folder, key, DESCRIPTION_TXT), where=f"{key}/{DESCRIPTION_TXT}"
-        ).strip()
+    if DESCRIPTION_TXT in texts:
+        return parse_text(texts[DESCRIPTION_TXT], where=f"{key}/{DESCRIPTION_TXT}").strip()
     return ""
 
 
-def _merged(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
+def merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
     """Return the labels of baseline.json, and for those it lacks the ones of the mark."""
     missing = {
         name: getattr(marked, name)
@@ -286,11 +273,12 @@ def _depth_unit(facts: StreamFacts, *, name: str) -> tuple[float, DepthUnitSourc
     return encoding.known_unit_m, "tag" if encoding.source == "tag" else "default"
 
 
-def _valid_ratio(folder: Path, key: str, frames: int) -> float:
+def _valid_ratio(folder: SceneFiles, key: str, frames: int) -> float:
     shares = []
     encoding = DepthEncoding()
     for name in map(depth_name, range(CAMERA_COUNT)):
-        with VideoReader(folder / name, name=f"{key}/{name}", frames=frames) as reader:
+        video = folder.video(name)
+        with VideoReader(video, name=f"{key}/{name}", frames=frames) as reader:
             for frame in sorted({0, frames // 2, frames - 1}):
                 units = read_depth_units(reader, frame, encoding=encoding)
                 known = measured(units, encoding=encoding, pixel_format=reader.facts.pixel_format)

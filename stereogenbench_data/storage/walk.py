@@ -10,13 +10,15 @@ from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Scene, SceneId
 from stereogenbench_data.schema.release import TRAIN_MAPS
 from stereogenbench_data.storage.journal import Journal
+from stereogenbench_data.storage.location import is_remote, shown
 from stereogenbench_data.storage.pool import AfterBytes, run_tasks
 from stereogenbench_data.storage.release_tree import SceneFolders, find_scene_folders
+from stereogenbench_data.storage.remote_tree import find_remote_scenes
+from stereogenbench_data.storage.scene_files import files_of
 from stereogenbench_data.storage.scene_folder import (
     IncompleteScene,
     ValidDepth,
     describe_scene,
-    scene_files,
     stamp_of,
 )
 
@@ -63,24 +65,29 @@ def walk(
     progress: Progress | None = None,
     journal: Journal | None = None,
     valid_depth: ValidDepth = "skip",
+    wanted: Callable[[SceneId], bool] | None = None,
 ) -> TreeReport:
     """Return every scene of a tree in the released layout, and what is wrong with the others.
 
     Args:
-        root: The folder that holds ``train`` and ``eval``.
+        root: The folder that holds ``train`` and ``eval``, or its URL, of which folders can be
+            listed (``hf://datasets/...``, ``s3://...``).
         workers: Processes that read at the same time; None is one a core. With few scenes this
             process reads them all.
         progress: Called with the number of scenes done and that of all, after each.
         journal: Where described scenes are kept, and found again by a later walk.
         valid_depth: "sample" decodes some depth pictures of each scene, to tell the share of
             pixels that have a depth.
+        wanted: Which scenes to describe, by what their paths say; None is all.
 
     Raises:
-        StorageError: If there is no scene below the root, or a worker process died.
+        StorageError: If there is no such scene below the root, or a worker process died.
     """
     if workers is not None and workers < 1:
         raise StorageError(f"workers must be at least 1, got {workers}.")
-    folders = find_scene_folders(root)
+    folders = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
+    if wanted is not None:
+        folders = _chosen(root, folders, wanted)
     outcomes = _reused(root, folders.keys, journal)
     total = len(folders.keys)
     if progress is not None:
@@ -96,6 +103,15 @@ def walk(
     return _report(root, folders, [outcomes[key] for key in folders.keys])
 
 
+def _chosen(
+    root: str | Path, folders: SceneFolders, wanted: Callable[[SceneId], bool]
+) -> SceneFolders:
+    keys = tuple(key for key in folders.keys if wanted(parse_scene_key(key)))
+    if not keys:
+        raise StorageError(f"{shown(str(root))}: none of its {len(folders.keys)} scenes is wanted.")
+    return SceneFolders(keys, folders.refused)
+
+
 @dataclass(frozen=True, slots=True)
 class _Task:
     """Describes a scene by its key; travels to worker processes."""
@@ -105,7 +121,7 @@ class _Task:
 
     def __call__(self, key: str) -> _Outcome:
         try:
-            stamp = stamp_of(scene_files(self.root, key))
+            stamp = stamp_of(files_of(self.root, key).stamps())
             scene = describe_scene(self.root, key, valid_depth=self.valid_depth)
         except IncompleteScene as error:
             return _Outcome(key, "incomplete", reason=str(error))
@@ -118,7 +134,7 @@ def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> d
     outcomes: dict[str, _Outcome] = {}
     for key in keys if journal is not None and len(journal) else ():
         try:
-            stamp = stamp_of(scene_files(root, key))
+            stamp = stamp_of(files_of(root, key).stamps())
         except StorageError:
             continue
         scene = journal.find(key, stamp=stamp) if journal is not None else None

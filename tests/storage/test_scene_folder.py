@@ -7,10 +7,10 @@ import pytest
 
 from stereogenbench_data.errors import MediaError, SchemaError, StorageError
 from stereogenbench_data.schema.records import Member
+from stereogenbench_data.storage.scene_files import files_of
 from stereogenbench_data.storage.scene_folder import (
     IncompleteScene,
     describe_scene,
-    scene_files,
     stamp_of,
 )
 
@@ -219,11 +219,11 @@ def test_a_folder_that_is_gone_is_named(root):
 
 def test_the_stamp_changes_with_a_files_size_and_time(make_scene, root):
     path = make_scene() / "trajectory.json"
-    first = stamp_of(scene_files(root, KEY))
+    first = stamp_of(files_of(root, KEY).stamps())
 
     os.utime(path, (1, 1))
-    second = stamp_of(scene_files(root, KEY))
+    second = stamp_of(files_of(root, KEY).stamps())
     path.unlink()
-    third = stamp_of(scene_files(root, KEY))
+    third = stamp_of(files_of(root, KEY).stamps())
 
     assert len({first, second, third}) == 3

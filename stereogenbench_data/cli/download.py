@@ -1,0 +1,101 @@
+"""``stereogenbench download``: the part of a release that a selection needs, onto this disk."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from stereogenbench_data.cli.options import (
+    CaptionOption,
+    DataArgument,
+    FamilyOption,
+    FocalOption,
+    JsonOption,
+    MapOption,
+    SceneOption,
+    SplitOption,
+    SubsetOption,
+    scene_filters,
+)
+from stereogenbench_data.cli.progress import progress_bar
+
+_MEGABYTE = 1_000_000
+
+
+def download(  # noqa: PLR0913 - one parameter an option
+    data: DataArgument,
+    *,
+    dest: Annotated[Path, typer.Option("--dest", help="Folder to write into.")],
+    cameras: Annotated[
+        str, typer.Option(help="Numbers of the cameras wanted, such as 0,1.")
+    ] = "0,1,2,3,4,5",
+    streams: Annotated[
+        Literal["both", "rgb", "depth"], typer.Option(help="Which videos.")
+    ] = "both",
+    split: SplitOption = None,
+    subset: SubsetOption = None,
+    family: FamilyOption = None,
+    map_name: MapOption = None,
+    scene: SceneOption = None,
+    focal_mm: FocalOption = None,
+    caption: CaptionOption = None,
+    workers: Annotated[int, typer.Option(min=1, help="Files fetched at a time.")] = 8,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say how much it would be, and fetch nothing.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Fetch only what a selection needs, laid out as it was released.
+
+    Every file is checked as it comes; a run that was stopped goes on if it is run again. The folder
+    then opens with `StereoPairs(DEST)`, for the cameras that were fetched.
+    """
+    from stereogenbench_data.selection.filters import filter_scenes
+    from stereogenbench_data.storage.download import download as fetched
+    from stereogenbench_data.storage.download import plan_download
+    from stereogenbench_data.storage.index import SceneIndex
+
+    numbers = _cameras(cameras)
+    index = SceneIndex.open(data)
+    filters = scene_filters(
+        split=split,
+        subset=subset,
+        family=family,
+        map=map_name,
+        scenes=scene,
+        focal_mm=focal_mm,
+        caption=caption,
+    )
+    rows = filter_scenes(index, filters)  # type: ignore[arg-type]  # its keys are those of SceneFilters
+    kinds = ("rgb", "depth") if streams == "both" else (streams,)
+    wanted = plan_download(index, rows.tolist(), cameras=numbers, streams=kinds)
+    size = wanted.size_bytes / _MEGABYTE
+    typer.echo(f"{len(rows)} scenes, {len(wanted.files)} files, {size:,.1f} MB", err=True)
+    if not dry_run:
+        try:
+            with progress_bar("downloading", unit="MB") as bar:
+                fetched(
+                    index,
+                    wanted,
+                    dest,
+                    workers=workers,
+                    progress=lambda done, total: bar(-(-done // _MEGABYTE), -(-total // _MEGABYTE)),
+                )
+        except KeyboardInterrupt:
+            typer.echo("stopped; run the same command again to go on from here", err=True)
+            raise typer.Exit(130) from None
+    told = {"scenes": len(rows), "files": len(wanted.files), "bytes": wanted.size_bytes}
+    if as_json:
+        typer.echo(json.dumps(told | {"dest": None if dry_run else str(dest)}, indent=2))
+    elif not dry_run:
+        typer.echo(f"{dest}: {len(rows)} scenes, {size:,.1f} MB")
+
+
+def _cameras(text: str) -> list[int]:
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part in set("012345") for part in parts):
+        raise typer.BadParameter(
+            f"{text!r}: write numbers from 0 to 5, such as 0,1", param_hint="--cameras"
+        )
+    return sorted({int(part) for part in parts})
