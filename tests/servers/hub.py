@@ -7,6 +7,7 @@ path, as the Hub sends large ones to its content network. What is asked for with
 
 import json
 import re
+import zlib
 from pathlib import Path
 from typing import Final
 from urllib.parse import unquote, urlsplit
@@ -23,7 +24,20 @@ class HubHandler(FileHandler):
 
     def do_HEAD(self) -> None:
         """Answer a question for a file's facts."""
-        self.do_GET()
+        path = self.server.folder / unquote(urlsplit(self.path).path).removeprefix("/files/")
+        if self.path.startswith("/files/") and path.is_file():
+            self.send_response(200)
+            self.send_header("Content-Length", str(path.stat().st_size))
+            self.send_header("ETag", f'"{zlib.crc32(path.read_bytes()):08x}"')
+            self.end_headers()
+        else:
+            self.do_GET()
+
+    def end_headers(self) -> None:
+        """Name the commit, as every answer of the Hub does."""
+        if self.path.startswith("/files/"):
+            self.send_header("X-Repo-Commit", COMMIT)
+        super().end_headers()
 
     def do_POST(self) -> None:
         """Answer a question for the facts of some paths."""

@@ -1,0 +1,252 @@
+"""The dataset card of packed shards: the ``README.md`` that the Hub shows and ``datasets`` obeys.
+
+Its YAML head tells ``load_dataset("ORG/NAME", "Uniform", split="train", streaming=True)`` which
+shards these are, and that their videos stay bytes; the rest is for people.
+"""
+
+import fnmatch
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from stereogenbench_data.bridges import about
+from stereogenbench_data.errors import DescriptorError
+from stereogenbench_data.schema.release import (
+    ADJACENT_PAIRS,
+    CAMERA_COUNT,
+    CAMERA_PAIRS,
+    DESCRIPTION_TXT,
+    METADATA_FILES,
+)
+from stereogenbench_data.storage.index import SceneIndex
+
+CARD_NAME: Final = "README.md"
+MARK: Final = "<!-- made by stereogenbench card -->"
+"""What a card of ours holds, so that nobody's own text is overwritten."""
+_SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
+_ADJACENT: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
+
+
+def card(index: SceneIndex, *, repository: str) -> str:
+    """Return the card of some shards.
+
+    Args:
+        index: Of the shards.
+        repository: "ORG/NAME" on the Hub.
+
+    Raises:
+        DescriptorError: If the data are no shards.
+    """
+    if not index.shards:
+        raise DescriptorError(f"{index.root}: is no folder of shards: pack the data first.")
+    return "\n".join([_head(index), MARK, "", *_body(index, repository)]) + "\n"
+
+
+def write_card(index: SceneIndex, folder: Path, *, repository: str) -> Path:
+    """Write the card beside the shards.
+
+    Raises:
+        DescriptorError: If it cannot be written, or a README.md is there that is no such card.
+    """
+    path = folder / CARD_NAME
+    text = card(index, repository=repository)
+    try:
+        if path.exists() and MARK not in path.read_text():
+            raise DescriptorError(
+                f"{path}: is there and was not made by this package: move it away, or add "
+                f"{MARK!r} to it if it may be replaced."
+            )
+        path.write_text(text)
+    except OSError as error:
+        raise DescriptorError(f"{path}: cannot be written ({error.strerror}).") from error
+    return path
+
+
+def _head(index: SceneIndex) -> str:
+    """Return the YAML head; JSON texts are YAML too."""
+    names = _configs(index)
+    lines = [
+        "---",
+        f"pretty_name: {about.TITLE}",
+        "license: cc-by-4.0",
+        "task_categories:",
+        "- depth-estimation",
+        "- image-to-image",
+        "tags:",
+        *(f"- {tag}" for tag in (*about.KEYWORDS, "webdataset", "croissant")),
+        "size_categories:",
+        f"- {next((name for most, name in _SIZES if len(index) < most), '100K<n<1M')}",
+        "configs:",
+    ]
+    for config, splits in names.items():
+        lines += [f"- config_name: {config}", "  data_files:"]
+        for split, paths in splits.items():
+            lines += [f"  - split: {split}", f"    path: {json.dumps(paths)}"]
+    lines.append("dataset_info:")
+    for config in names:
+        lines += [f"- config_name: {config}", "  features:"]
+        for name, kind in _features(index).items():
+            lines += [f"  - name: {name}", f"    dtype: {kind}"]
+    return "\n".join([*lines, "---"])
+
+
+def _features(index: SceneIndex) -> dict[str, str]:
+    kinds = {name: "string" if name == DESCRIPTION_TXT else "json" for name in METADATA_FILES}
+    videos = sorted(name for name in index.scene(0).members if name.startswith("cam_"))
+    return kinds | dict.fromkeys(videos, "binary") | {"__key__": "string", "__url__": "string"}
+
+
+def _configs(index: SceneIndex) -> dict[str, dict[str, list[str]]]:
+    """Return config name to split name to shards: one config a family, and one for all."""
+    found: dict[str, dict[str, set[str]]] = {}
+    for row in range(len(index)):
+        scene = index.scene(row)
+        subset = scene.id.subset
+        split = scene.id.split if subset is None else f"{scene.id.split}_{subset}"
+        path = next(iter(scene.members.values())).path
+        for config in ("all", scene.id.family):
+            found.setdefault(config, {}).setdefault(split, set()).add(path)
+    return {
+        config: {
+            split: _patterns(paths, index)
+            for split, paths in sorted(
+                splits.items(), key=lambda item: (item[0] != "train", item[0])
+            )
+        }
+        for config, splits in sorted(found.items(), key=lambda item: (item[0] != "all", item[0]))
+    }
+
+
+def _patterns(paths: set[str], index: SceneIndex) -> list[str]:
+    """Return few patterns that match these shards and no other."""
+    patterns: set[str] = set()
+    for path in paths:
+        pattern = f"{path.rpartition('-')[0]}-*.tar"
+        matched = set(fnmatch.filter(index.shards, pattern))
+        patterns.add(pattern if matched <= paths else path)
+    return sorted(patterns)
+
+
+def _body(index: SceneIndex, repository: str) -> list[str]:
+    config = next(name for name in _configs(index) if name != "all")
+    split = next(iter(_configs(index)[config]))
+    return [
+        f"# {about.TITLE}",
+        "",
+        about.DESCRIPTION,
+        "",
+        "## How to load",
+        "",
+        "With stereogenbench-data (`pip install 'stereogenbench-data[hub]'`), which reads only the",
+        "bytes that a sample needs, derives disparity from depth and keeps one order of samples:",
+        "",
+        "```python",
+        "from stereogenbench_data import StereoPairs",
+        "",
+        f'pairs = StereoPairs("hf://datasets/{repository}", split="{split.partition("_")[0]}",',
+        f'                    family="{config}", pairs="all", frames="all", size=(480, 832))',
+        "loader = pairs.loader(batch_size=8, num_workers=2, seed=0)",
+        "```",
+        "",
+        "With `datasets`, as bytes (videos are not decoded: that would cut depth to 8 bits):",
+        "",
+        "```python",
+        "from datasets import load_dataset",
+        "",
+        f'rows = load_dataset("{repository}", "{config}", split="{split}", streaming=True)',
+        "```",
+        "",
+        "The shards are plain WebDataset tars, one scene a sample: `webdataset`, Ray and `tar`",
+        "read them as they are. `index.parquet` holds where every file lies, with its checksum.",
+        "",
+        "## What is in it",
+        "",
+        *_counts(index),
+        "",
+        *_facts(index),
+        "",
+        "## Depth",
+        "",
+        *_depth(index),
+        "",
+        "## Licence",
+        "",
+        about.LICENCE_NOTE,
+        "",
+        "## Responsible use",
+        "",
+        *(f"- {text}" for text in _texts("rai:dataUseCases")),
+        *(f"- {text}" for text in _texts("rai:dataLimitations")),
+        *(f"- {text}" for text in _texts("rai:dataBiases")),
+        *(f"- {text}" for text in _texts("rai:personalSensitiveInformation")),
+        "",
+        "## Citation",
+        "",
+        "```bibtex",
+        about.CITATION,
+        "```",
+    ]
+
+
+def _texts(name: str) -> list[str]:
+    texts: Any = about.RESPONSIBLE_USE[name]
+    return list(texts)
+
+
+def _counts(index: SceneIndex) -> list[str]:
+    kinds = list(
+        zip(
+            index.column("split"), index.column("subset"), index.column("family"), strict=True
+        )
+    )  # fmt: skip
+    scenes = Counter(kinds)
+    adjacent_cm = index.column("baselines_cm")[:, _ADJACENT]
+    lines = [
+        "| split | subset | family | scenes | pairs | adjacent baselines, cm |",
+        "|---|---|---|---:|---:|---|",
+    ]
+    for kind in sorted(scenes, key=lambda each: (each[0] != "train", str(each[1]), each[2])):
+        rows = [number for number, each in enumerate(kinds) if each == kind]
+        low, high = adjacent_cm[rows].min(), adjacent_cm[rows].max()
+        split, subset, family = kind
+        count = scenes[kind]
+        lines.append(
+            f"| {split} | {subset or ''} | {family} | {count} | {count * len(CAMERA_PAIRS)} "
+            f"| {low:.2f} to {high:.2f} |"
+        )
+    return lines
+
+
+def _facts(index: SceneIndex) -> list[str]:
+    sizes = Counter(
+        zip(index.column("image_width_px"), index.column("image_height_px"), strict=True)
+    )
+    frames = Counter(index.column("frames").tolist())
+    focal_mm = index.column("focal_mm")
+    bytes_ = sum(shard.size for shard in index.shards.values())
+    listed = ", ".join(f"{width}x{height}" for (width, height), _ in sizes.most_common())
+    counts = ", ".join(str(count) for count, _ in frames.most_common())
+    return [
+        f"- {len(index)} scenes on {len(set(index.column('map_name')))} maps, in "
+        f"{len(index.shards)} shards of {bytes_ / 1e9:.3g} GB together",
+        f"- {CAMERA_COUNT} cameras a scene: pictures of {listed}, {counts} frames",
+        f"- focal lengths of {focal_mm.min():.1f} to {focal_mm.max():.1f} mm",
+    ]
+
+
+def _depth(index: SceneIndex) -> list[str]:
+    units = sorted(set(index.column("depth_unit_m").ravel().tolist()))
+    codecs = sorted(set(index.column("depth_codec").ravel().tolist()))
+    formats = sorted(set(index.column("depth_pixel_format").ravel().tolist()))
+    sources = set(np.asarray(index.column("depth_unit_source")).ravel().tolist())
+    told = "each file's own tag" if sources == {"tag"} else "each file's tag, else 0.1 m"
+    return [
+        f"Depth videos hold whole numbers ({', '.join(codecs)}, {', '.join(formats)}).",
+        f"Metres along the optical axis are the number times {told}",
+        f"({', '.join(f'{unit:g}' for unit in units)} m here); 0 and the largest number mean that",
+        "nothing was measured. Decode them in their own pixel format: a decoder that gives 8 bits",
+        "destroys them.",
+    ]

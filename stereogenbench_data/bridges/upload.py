@@ -1,0 +1,121 @@
+"""Packed shards onto the Hub: with their index, card and descriptor, by the Hub's own client.
+
+Logins, offline mode and retries are huggingface_hub's; nothing here sees a token.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from stereogenbench_data.bridges import about
+from stereogenbench_data.bridges.card import CARD_NAME, write_card
+from stereogenbench_data.bridges.croissant import Publication, write_descriptor
+from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
+from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
+from stereogenbench_data.storage.location import local_path
+
+DESCRIPTOR_NAME: Final = "croissant.json"
+_COMPANIONS: Final = (INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "croissant/*.parquet")
+
+
+@dataclass(frozen=True, slots=True)
+class Uploaded:
+    """What an upload left on the Hub.
+
+    Attributes:
+        url: ``hf://datasets/ORG/NAME@REVISION``, to be opened as data.
+        revision: The commit that holds the shards.
+        files: How many files belong to it.
+    """
+
+    url: str
+    revision: str
+    files: int
+
+
+def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uploaded:
+    """Upload a folder of packed shards.
+
+    The card and the descriptor's tables are written into the folder first. The descriptor itself
+    names the files of the commit that holds them, so it comes in a commit of its own. A run that
+    was stopped goes on if it is run again.
+
+    Args:
+        shards: The folder, as ``pack`` made it.
+        repository: "ORG/NAME" of a dataset on the Hub; made if it is not there.
+        branch: The branch to commit to.
+
+    Raises:
+        ExtraError: If huggingface_hub is not installed.
+        DescriptorError: If a README.md is there that this package did not make.
+        StorageError: If the folder holds no shards, lacks one of them, or the Hub refuses.
+    """
+    try:
+        from huggingface_hub import HfApi
+        from huggingface_hub.errors import HfHubHTTPError
+    except ImportError as error:
+        raise ExtraError(
+            f"huggingface_hub cannot be imported ({error}): pip install 'stereogenbench-data[hub]'."
+        ) from error
+    folder = local_path(shards)
+    index = SceneIndex.open(folder)
+    _require_whole(index, folder)
+    write_card(index, folder, repository=repository)
+    write_descriptor(index, folder / DESCRIPTOR_NAME)
+    api = HfApi(library_name="stereogenbench-data")
+    patterns = [*sorted(index.shards), *_COMPANIONS]
+    try:
+        api.create_repo(repository, repo_type="dataset", exist_ok=True)
+        api.upload_folder(
+            repo_id=repository,
+            repo_type="dataset",
+            folder_path=folder,
+            revision=branch,
+            allow_patterns=patterns,
+            commit_message=f"{about.TITLE}: {len(index)} scenes in {len(index.shards)} shards",
+        )
+        revision = str(api.dataset_info(repository, revision=branch).sha)
+        address = f"{api.endpoint}/datasets/{repository}/resolve/{revision}"
+        pinned = Publication(data_url=address, tables_url=f"{address}/croissant")
+        write_descriptor(index, folder / DESCRIPTOR_NAME, publication=pinned)
+        api.upload_file(
+            path_or_fileobj=folder / DESCRIPTOR_NAME,
+            path_in_repo=DESCRIPTOR_NAME,
+            repo_id=repository,
+            repo_type="dataset",
+            revision=branch,
+            commit_message=f"Croissant descriptor of {revision[:12]}",
+        )
+    except (HfHubHTTPError, ValueError, OSError) as error:
+        if isinstance(error, StorageError | DescriptorError):
+            raise
+        raise StorageError(
+            f"{repository}: the Hub did not take the upload ({_reason(error)}). Log in with "
+            "`hf auth login` if it asks for it, and run the same command again to go on."
+        ) from None
+    files = [path for pattern in patterns for path in folder.glob(pattern)]
+    return Uploaded(f"hf://datasets/{repository}@{revision}", revision, len(files) + 1)
+
+
+def _require_whole(index: SceneIndex, folder: Path) -> None:
+    """Refuse a folder that is no whole pack, by the sizes of its shards."""
+    if not index.shards:
+        raise StorageError(f"{folder}: holds no shards: pack the data first.")
+    for path, facts in sorted(index.shards.items()):
+        place = folder / path
+        found = place.stat().st_size if place.is_file() else None
+        if found != facts.size:
+            says = "is missing" if found is None else f"has {found} bytes"
+            raise StorageError(
+                f"{place}: {says}, and the index says {facts.size}. Pack it again, and run "
+                "`stereogenbench verify` before an upload."
+            )
+
+
+def _reason(error: Exception) -> str:
+    """Return what happened without an address, which may hold secrets."""
+    status = getattr(getattr(error, "response", None), "status_code", None)
+    if status is not None:
+        return f"it answers {status}"
+    text = str(error).partition("\n")[0]
+    return type(error).__name__ if "://" in text else f"{type(error).__name__}: {text}"

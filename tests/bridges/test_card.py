@@ -1,0 +1,116 @@
+"""The dataset card: read by people, obeyed by `datasets`."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from stereogenbench_data import SceneIndex
+from stereogenbench_data.bridges.card import MARK, card, write_card
+from stereogenbench_data.errors import DescriptorError
+from tests.servers.fault import serving
+from tests.servers.hub import REPOSITORY, HubHandler
+from tests.servers.tools import require_module
+
+SAMPLE = Path(__file__).resolve().parents[2] / "shards"
+LOAD = """
+import json, sys
+from datasets import load_dataset
+
+found = {}
+for name, split in json.loads(sys.argv[2]):
+    rows = list(load_dataset(sys.argv[1], name, split=split, streaming=True))
+    found[f"{name} {split}"] = [
+        [row["__key__"], type(row["cam_00_depth.mkv"]).__name__, len(row["cam_00_depth.mkv"])]
+        for row in rows
+    ]
+print(json.dumps(found))
+"""
+WITHOUT_TORCHCODEC = "import sys; sys.modules['torchcodec'] = None\n"
+
+
+@pytest.fixture(scope="module")
+def head():
+    return yaml.safe_load(card(SceneIndex.open(SAMPLE), repository="a/b").split("---")[1])
+
+
+def test_every_family_is_a_config_with_its_splits(head):
+    configs = {each["config_name"]: each["data_files"] for each in head["configs"]}
+
+    assert list(configs) == ["all", "IPD_Gaussian", "Pairwise_Uniform", "Uniform"]
+    splits = [each["split"] for each in configs["Uniform"]]
+    assert splits == ["train", "eval_seen_map", "eval_unseen_map"]
+    assert configs["Pairwise_Uniform"] == [
+        {"split": "train", "path": ["train-Pairwise_Uniform-*.tar"]}
+    ]
+
+
+def test_the_patterns_of_all_find_every_shard_once(head):
+    patterns = [pattern for each in head["configs"][0]["data_files"] for pattern in each["path"]]
+
+    found = sorted(path.name for pattern in patterns for path in SAMPLE.glob(pattern))
+    assert found == sorted(path.name for path in SAMPLE.glob("*.tar"))
+
+
+def test_the_counts_are_those_of_the_index():
+    text = card(SceneIndex.open(SAMPLE), repository="a/b")
+
+    assert "| train |  | Uniform | 2 | 30 |" in text
+    assert "| eval | unseen_map | IPD_Gaussian | 1 | 15 |" in text
+    assert "- 8 scenes on 2 maps, in 7 shards" in text
+    assert "(0.01 m here)" in text
+
+
+@pytest.mark.parametrize("torchcodec", ["present", "absent"])
+def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_path, torchcodec):
+    require_module("datasets")
+    folder = shutil.copytree(SAMPLE, tmp_path / "hub")
+    write_card_over(folder)
+    asked = [["Uniform", "train"], ["IPD_Gaussian", "eval_unseen_map"]]
+    code = LOAD if torchcodec == "present" else WITHOUT_TORCHCODEC + LOAD
+
+    with serving(folder, handler=HubHandler) as server:
+        settings = {"HF_ENDPOINT": server.url, "HF_HOME": str(tmp_path / "home")}
+        done = subprocess.run(
+            [sys.executable, "-c", code, REPOSITORY, json.dumps(asked)],
+            capture_output=True, text=True, check=False, timeout=120, env=os.environ | settings,
+        )  # fmt: skip
+
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = json.loads(done.stdout)
+    index = SceneIndex.open(SAMPLE)
+    scenes = {index.scene(row).id.key: index.scene(row) for row in range(len(index))}
+    assert [row[0] for row in found["Uniform train"]] == [
+        f"train/Uniform/SynthStage/scene_{number:06d}" for number in range(2)
+    ]
+    for key, kind, size in (row for rows in found.values() for row in rows):
+        assert kind == "bytes"
+        assert size == scenes[key].members["cam_00_depth.mkv"].size
+
+
+def write_card_over(folder):
+    (folder / "README.md").unlink()
+    write_card(SceneIndex.open(folder), folder, repository=REPOSITORY)
+
+
+def test_a_card_is_written_again_but_no_other_text_is_replaced(tmp_path):
+    index = SceneIndex.open(SAMPLE)
+
+    write_card(index, tmp_path, repository="a/b")
+    write_card(index, tmp_path, repository="a/c")
+
+    assert MARK in (tmp_path / "README.md").read_text()
+    assert "a/c" in (tmp_path / "README.md").read_text()
+    (tmp_path / "README.md").write_text("mine")
+    with pytest.raises(DescriptorError, match="was not made by this package"):
+        write_card(index, tmp_path, repository="a/b")
+
+
+def test_a_tree_of_folders_has_no_card(small_release):
+    with pytest.raises(DescriptorError, match="is no folder of shards: pack the data first"):
+        card(SceneIndex.open(small_release), repository="a/b")
