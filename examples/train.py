@@ -1,8 +1,4 @@
-"""Draw scenes, train a small stereo network, look at the data: `make demo` runs this.
-
-It draws two scenes, trains for a few steps on the sample in shards/ through a DataLoader with two
-workers, and writes a contact sheet of both.
-"""
+"""Plain PyTorch: draw scenes, train on the sample shards, write a contact sheet (`make demo`)."""
 
 from pathlib import Path
 
@@ -13,7 +9,8 @@ from stereogenbench_data import Compose, HorizontalFlip, RandomCrop, StereoPairs
 from stereogenbench_data.samples.picture import contact_sheet, write_png
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 
-DEMO = Path("demo")
+DEMO, SHARDS = Path("demo"), Path(__file__).parents[1] / "shards"
+FIELDS = ("left", "right", "disparity", "valid", "visible", "baseline_m", "pair", "__key__")
 
 
 class SmallStereo(nn.Module):
@@ -21,9 +18,8 @@ class SmallStereo(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.features = nn.Sequential(
-            nn.Conv2d(3, 16, 5, 2, 2), nn.ReLU(), nn.Conv2d(16, 16, 5, 2, 2)
-        )
+        first, second = nn.Conv2d(3, 16, 5, 2, 2), nn.Conv2d(16, 16, 5, 2, 2)
+        self.features = nn.Sequential(first, nn.ReLU(), second)
         self.head = nn.Sequential(nn.Conv2d(48, 48, 3, 1, 1), nn.ReLU(), nn.Conv2d(48, 1, 3, 1, 1))
 
     def forward(self, left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
@@ -37,17 +33,12 @@ class SmallStereo(nn.Module):
 def main() -> None:
     torch.manual_seed(0)
     synthesise(DEMO / "scenes", SynthRequest(family="Uniform", scenes=2, size_px=160, frames=5))
-    fields = ("left", "right", "disparity", "valid", "visible", "baseline_m", "pair", "__key__")
-    shown = StereoPairs(DEMO / "scenes", pairs=[(0, 1), (2, 4)], fields=fields)
+    shown = StereoPairs(DEMO / "scenes", pairs=[(0, 1), (2, 4)], fields=FIELDS)
+    augment = Compose([HorizontalFlip(), RandomCrop(64, 64)])
     pairs = StereoPairs(
-        Path(__file__).parents[1] / "shards",
-        split="train",
-        baseline_cm=(4, 60),
-        pairs="all",
-        frames=("every", 4),
-        fields=fields,
-        transform=Compose([HorizontalFlip(), RandomCrop(64, 64)]),
-    )
+        SHARDS, split="train", pairs="all", baseline_cm=(4, 60), frames=("every", 4),
+        fields=FIELDS, transform=augment,
+    )  # fmt: skip
     network = SmallStereo()
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
     loader = pairs.loader(batch_size=16, num_workers=2, seed=0, lanes=2)
