@@ -3,9 +3,10 @@
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, Unpack
 
+from stereogenbench_data.bridges.arrays import to_arrays
 from stereogenbench_data.bridges.scene_bytes import SampleOptions, samples_of
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.errors import ExtraError, FieldError, SelectionError
+from stereogenbench_data.errors import ExtraError, SelectionError
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS
 from stereogenbench_data.samples.load import Sample
 from stereogenbench_data.schema.release import DESCRIPTION_TXT, METADATA_FILES, VIDEO_FILES
@@ -106,21 +107,6 @@ class _RowDecoder:
     def _samples(self, row: dict[str, Any]) -> list[Sample]:
         found = samples_of(row["__key__"], row, fields=self._fields, epoch=0, options=self._options)
         return [to_arrays(sample) for sample in found]
-
-
-def to_arrays(sample: Sample) -> Sample:
-    """Return a sample whose tensors are numpy arrays of the same dtype; texts stay.
-
-    Raises:
-        FieldError: If a field's tensor has no numpy counterpart.
-    """
-    try:
-        return {
-            name: value if isinstance(value, str) else value.numpy()
-            for name, value in sample.items()
-        }
-    except TypeError as error:
-        raise FieldError(f"a field cannot be given as a numpy array ({error}).") from error
 
 
 def _missing(error: ImportError) -> ExtraError:

@@ -5,7 +5,7 @@ from typing import Any
 
 from datasets import IterableDataset
 
-from stereogenbench_data.bridges.huggingface import to_arrays
+from stereogenbench_data.bridges.arrays import to_arrays
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.samples.load import Sample
 

@@ -16,13 +16,14 @@ from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.samples.load import Sample
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.release import METADATA_FILES, VIDEO_FILES
+from stereogenbench_data.schema.release import METADATA_FILES, PACKED_DEPTH_NAMES, VIDEO_FILES
 from stereogenbench_data.selection.pairs import PairsSpec
 from stereogenbench_data.selection.windows import FramesSpec
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.scene_folder import describe_scene
 
-FILES: Final = (*METADATA_FILES, *VIDEO_FILES)
+VIDEOS: Final = (*VIDEO_FILES, *PACKED_DEPTH_NAMES.values())
+FILES: Final = (*METADATA_FILES, *VIDEOS)
 
 
 class SampleOptions(TypedDict, total=False):
@@ -109,7 +110,7 @@ def _bytes(key: str, name: str, content: Any) -> bytes:
         return content
     if isinstance(content, str):
         return content.encode()
-    if name in VIDEO_FILES:
+    if name in VIDEOS:
         inner = content.get("bytes") if isinstance(content, dict) else None
         if isinstance(inner, bytes):
             return inner

@@ -1,10 +1,12 @@
-"""A journal of described scenes, so that a walk that was killed goes on where it stopped.
+"""Journals of what was done for each scene, so that work that was killed goes on where it stopped.
 
-One JSON object a line: the first says what the walk is, each further one holds a scene's row and
-a stamp of its files. A line that a kill cut short is passed over, and so its scene read again.
+One JSON object a line: the first says what the work is, each further one holds what became of a
+scene and a stamp of its files. A line that a kill cut short is passed over, and so its scene read
+again.
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, TextIO
@@ -13,23 +15,27 @@ from stereogenbench_data.errors import StorageError
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.storage.rows import SCHEMA, row_of, scene_of
 
-_FORMAT: Final = 1
+_FORMAT: Final = 2
 
 
-class Journal:
-    """Scenes described so far, on disk; leaving its block keeps the file, `delete` removes it."""
+class RecordJournal:
+    """JSON values by scene, on disk; leaving its block keeps the file, `delete` removes it."""
 
-    def __init__(self, path: Path, *, walk: str) -> None:
-        """Read what a journal holds; that of another walk is begun anew.
+    def __init__(self, path: Path, *, work: Mapping[str, Any]) -> None:
+        """Read what a journal holds; that of other work is begun anew.
 
-        Nothing is written before the first scene is added.
+        Nothing is written before the first value is added.
+
+        Args:
+            path: The journal's file.
+            work: What the work is, as JSON: two runs that say the same share their values.
 
         Raises:
             StorageError: If the file is there and cannot be read.
         """
         self._path = path
         self._file: TextIO | None = None
-        self._head = json.dumps({"journal": _FORMAT, "walk": walk, "columns": SCHEMA.names})
+        self._head = json.dumps({"journal": _FORMAT, **work})
         try:
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
         except (FileNotFoundError, NotADirectoryError):
@@ -37,27 +43,27 @@ class Journal:
         except OSError as error:
             raise StorageError(
                 f"{path}: the journal of an earlier run cannot be read ({error.strerror}). "
-                f"Remove it, or write the index to another folder."
+                f"Remove it, or write the result to another folder."
             ) from error
         self._is_same = bool(lines) and lines[0] == self._head
         self._known = _known(lines[1:]) if self._is_same else {}
 
     def __len__(self) -> int:
-        """The number of scenes that were described before this walk."""
+        """The number of scenes that earlier runs have done."""
         return len(self._known)
 
-    def find(self, key: str, *, stamp: str) -> Scene | None:
-        """Return a scene described before, None if it was not or its files have changed."""
+    def value(self, key: str, *, stamp: str) -> Any:
+        """Return what was noted of a scene; None if nothing was, or its files have changed."""
         known = self._known.get(key)
         return known[1] if known is not None and known[0] == stamp else None
 
-    def add(self, scene: Scene, *, stamp: str) -> None:
-        """Note a scene, so that it outlives this process.
+    def note(self, key: str, value: Any, *, stamp: str) -> None:
+        """Note a scene's value, any JSON but null, so that it outlives this process.
 
         Raises:
             StorageError: If the file cannot be written.
         """
-        line = json.dumps({"stamp": stamp, "row": row_of(scene)})
+        line = json.dumps({"key": key, "stamp": stamp, "value": value})
         try:
             if self._file is None:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +74,7 @@ class Journal:
         except OSError as error:
             raise StorageError(
                 f"{self._path}: the journal cannot be written ({error.strerror}). Give write "
-                f"permission there, or write the index to another folder."
+                f"permission there, or write the result to another folder."
             ) from error
 
     def delete(self) -> None:
@@ -80,7 +86,7 @@ class Journal:
         if self._file is not None:
             self._file.close()
 
-    def __enter__(self) -> "Journal":
+    def __enter__(self) -> "RecordJournal":
         """Return the journal itself."""
         return self
 
@@ -94,13 +100,40 @@ class Journal:
         self._close()
 
 
-def _known(lines: list[str]) -> dict[str, tuple[str, Scene]]:
-    known: dict[str, tuple[str, Scene]] = {}
+class Journal(RecordJournal):
+    """A journal of scenes that were described."""
+
+    def __init__(self, path: Path, *, walk: str) -> None:
+        """Read what a journal of this walk holds; see `RecordJournal`."""
+        super().__init__(path, work={"walk": walk, "columns": SCHEMA.names})
+
+    def __enter__(self) -> "Journal":
+        """Return the journal itself."""
+        return self
+
+    def find(self, key: str, *, stamp: str) -> Scene | None:
+        """Return a scene described before, None if it was not or its files have changed."""
+        row = self.value(key, stamp=stamp)
+        try:
+            return None if row is None else scene_of(row)
+        except (ValueError, KeyError, TypeError, IndexError, AttributeError):
+            return None
+
+    def add(self, scene: Scene, *, stamp: str) -> None:
+        """Note a scene, so that it outlives this process.
+
+        Raises:
+            StorageError: If the file cannot be written.
+        """
+        self.note(scene.id.key, row_of(scene), stamp=stamp)
+
+
+def _known(lines: list[str]) -> dict[str, tuple[str, Any]]:
+    known: dict[str, tuple[str, Any]] = {}
     for line in lines:
         try:
             entry: Any = json.loads(line)
-            scene = scene_of(entry["row"])
-            known[scene.id.key] = (entry["stamp"], scene)
-        except (ValueError, KeyError, TypeError, IndexError, AttributeError):
+            known[str(entry["key"])] = (entry["stamp"], entry["value"])
+        except (ValueError, KeyError, TypeError):
             continue
     return known

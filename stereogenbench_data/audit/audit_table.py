@@ -1,0 +1,315 @@
+"""The audit's table and its Markdown: our figures, the paper's beside them, and the limits."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Final
+
+import numpy as np
+
+from stereogenbench_data.audit.audit_records import (
+    QUANTILES,
+    AuditLimits,
+    AuditReport,
+    CameraAudit,
+    Finding,
+    PairAudit,
+    Row,
+    SceneAudit,
+    ToleranceAudit,
+)
+from stereogenbench_data.audit.paper_figures import AUDIT, AUDIT_TABLE, FRAMES_A_SCENE
+from stereogenbench_data.audit.reprojection import TOLERANCES
+from stereogenbench_data.audit.scene_audit import LONG_PAIR
+from stereogenbench_data.schema.release import ADJACENT_PAIRS
+
+_LISTED: Final = 500
+_CHECKS: Final = (
+    "broken", "unreadable", "missing frames", "invalid depth", "too dark", "flat", "frozen",
+    "copied view", "occluder",
+)  # fmt: skip
+
+
+def table_rows(
+    scenes: Sequence[SceneAudit], limits: AuditLimits, *, findings: Sequence[Finding]
+) -> tuple[Row, ...]:
+    """Return the table of an audit over scenes."""
+    return (
+        *_rig_rows(scenes, limits),
+        *_depth_rows(scenes, limits),
+        *_reprojection_rows(scenes, limits),
+        *_frame_rows(scenes, limits),
+        *_picture_rows(scenes, limits),
+        *_finding_rows(findings),
+    )
+
+
+def _rig_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
+    rigs = [scene.rig for scene in scenes]
+    recorded = sum(rig.intrinsics_recorded for rig in rigs)
+    told = f"{recorded} numbers recorded in px" if recorded else "none recorded in px"
+    yield Row(
+        "intrinsics",
+        f"largest deviation of fx, fy, cx, cy from f / s W ({told})",
+        f"{_number(_largest(rig.intrinsics_px for rig in rigs))} px",
+        AUDIT["intrinsics"],
+        f"{limits.intrinsics_px:g} px",
+    )
+    for name, mean, most, paper in (
+        ("adjacent", "adjacent_mean_cm", "adjacent_max_cm", ""),
+        ("all 15 pairs", "pairs_mean_cm", "pairs_max_cm", AUDIT["baseline"]),
+    ):
+        mean_cm = _mean(getattr(rig, mean) for rig in rigs)
+        largest_cm = _largest(getattr(rig, most) for rig in rigs)
+        yield Row(
+            "pose/baseline",
+            f"pose-derived less recorded, {name}: mean / largest",
+            f"{_number(mean_cm)} cm / {_number(largest_cm)} cm",
+            paper,
+            f"{limits.baseline_cm:g} cm",
+        )
+    turned_deg = _largest(rig.rotation_deg for rig in rigs)
+    turned_px = _largest(rig.rotation_px for rig in rigs)
+    yield Row(
+        "rig rotation",
+        "largest turn of a camera against camera 0, and what it moves",
+        f"{_number(turned_deg)} deg / {_number(turned_px)} px",
+        "",
+        f"{limits.rectified_px:g} px",
+    )
+    yield Row(
+        "lateral residual",
+        "largest shift by cameras off the rig's line",
+        f"{_number(_largest(rig.lateral_px for rig in rigs))} px",
+        "",
+        f"{limits.rectified_px:g} px",
+    )
+
+
+def _depth_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
+    cameras = [camera for scene in scenes for camera in scene.cameras]
+    valid = _mean(camera.valid_depth for camera in cameras)
+    least = _least(camera.least_valid_depth.value for camera in cameras)
+    yield Row(
+        "depth validity",
+        "mean valid-depth ratio over audited frames and cameras (least of a picture)",
+        f"{_percent(valid)} ({_percent(least)})",
+        AUDIT["valid_depth"],
+        _percent(limits.valid_depth),
+    )
+    units = _distinct(camera.depth_unit_m for camera in cameras)
+    steps = _distinct(camera.depth_step_units * camera.depth_unit_m for camera in cameras)
+    yield Row(
+        "depth quantum",
+        f"step of stored depth, estimated from the numbers (unit: {units})",
+        steps,
+        "0.1 m without a tag",
+    )
+
+
+def _reprojection_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
+    primary = [scene.pairs[0] for scene in scenes]
+    long = _named_pairs(scenes, [LONG_PAIR])
+    long_name = f"{LONG_PAIR[0]}-{LONG_PAIR[1]}"
+    both = [pair for scene in scenes for pair in scene.pairs if pair.tolerances]
+    for name, pairs in (("both pairs", both), ("primary pair", primary), (long_name, long)):
+        comparable = sum(pair.comparable for pair in pairs)
+        for place, tolerance in enumerate(TOLERANCES):
+            audits = [pair.tolerances[place] for pair in pairs]
+            median_px, p95_px = pooled_px(audits, 0.5), pooled_px(audits, 0.95)
+            kept = _percent(_ratio(sum(each.kept for each in audits), comparable))
+            is_limited = name == "primary pair" and tolerance is TOLERANCES[-1]
+            yield Row(
+                "reprojection",
+                f"{name}, {tolerance.name}: median / 95th percentile (pixels kept)",
+                f"{_number(median_px)} px / {_number(p95_px)} px ({kept})",
+                AUDIT["reprojection"] if name == "both pairs" else "",
+                f"median {limits.reprojection_px:g} px" if is_limited else "",
+            )
+    adjacent = _named_pairs(scenes, ADJACENT_PAIRS)
+    for name, pairs in (("primary pair", primary), ("adjacent pairs", adjacent), (long_name, long)):
+        agreement = _ratio(sum(p.agreeing for p in pairs), sum(p.unhidden for p in pairs))
+        yield Row(
+            "agreement",
+            f"{name}: pixels that nothing hides whose two depths agree (least of a scene)",
+            f"{_percent(agreement)} ({_percent(_least(p.agreement for p in pairs))})",
+            "",
+            "" if pairs is long else _percent(limits.agreement),
+        )
+
+
+def _named_pairs(
+    scenes: Sequence[SceneAudit], cameras: Sequence[tuple[int, int]]
+) -> list[PairAudit]:
+    return [pair for scene in scenes for pair in scene.pairs if (pair.left, pair.right) in cameras]
+
+
+def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
+    for name, count_of in (("RGB", _rgb_frames), ("depth", _depth_frames)):
+        counts = [count for scene in scenes for camera in scene.cameras
+                  if (count := count_of(camera)) >= 0]  # fmt: skip
+        expected = [int(limits.frames) or scene.frames for scene in scenes for _ in scene.cameras]
+        found = [max(0, count_of(camera)) for scene in scenes for camera in scene.cameras]
+        missing = sum(max(0, most - got) for most, got in zip(expected, found, strict=True))
+        span = _span(counts)
+        yield Row(
+            "frames",
+            f"{name} frames in all (of a video), missing",
+            f"{sum(counts):,} ({span}), {missing:,} missing",
+            f"{FRAMES_A_SCENE} of a video, 0 missing",
+            f"{limits.frames:g}" if limits.frames else "as poses",
+        )
+
+
+def _rgb_frames(camera: CameraAudit) -> int:
+    return camera.rgb_frames
+
+
+def _depth_frames(camera: CameraAudit) -> int:
+    return camera.depth_frames
+
+
+def _picture_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
+    cameras = [camera for scene in scenes for camera in scene.cameras]
+    for check, quantity, value, limit in (
+        (
+            "too dark",
+            "least 95th percentile of luma",
+            _least(camera.brightness.value for camera in cameras),
+            f"{limits.brightness:g}",
+        ),
+        (
+            "flat",
+            "least span of luma (5th to 95th percentile)",
+            _least(camera.contrast.value for camera in cameras),
+            f"{limits.contrast:g}",
+        ),
+        (
+            "frozen",
+            "least mean change of luma while the camera moves",
+            _least(camera.change.value for camera in cameras),
+            f"{limits.change:g}",
+        ),
+    ):
+        yield Row("pictures", f"{check}: {quantity}", f"{_number(value)} of 255", "", limit)
+    hidden = _largest(camera.occluder.value for camera in cameras)
+    yield Row(
+        "pictures",
+        "occluder: largest share of a picture hidden from its border",
+        _percent(hidden),
+        "",
+        _percent(limits.occluder),
+    )
+
+
+def _finding_rows(findings: Sequence[Finding]) -> Iterator[Row]:
+    checks = dict.fromkeys([*_CHECKS, *(finding.check for finding in findings)])
+    told = [
+        f"{check} {count}"
+        for check in checks
+        if (count := len({each.scene for each in findings if each.check == check}))
+    ]
+    yield Row("findings", "scenes with", ", ".join(told) or "none", "none", "none")
+
+
+def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:
+    """Return a quantile of the errors of several scenes together, nan where there is none.
+
+    It is that of the mixture of the scenes' own quantile functions, each by its number of pixels.
+    """
+    kept = [each for each in audits if each.kept]
+    if not kept:
+        return math.nan
+    if len(kept) == 1:
+        return float(np.interp(share, QUANTILES, kept[0].errors_px))
+    values = np.array([each.errors_px for each in kept])
+    middles = ((values[:, 1:] + values[:, :-1]) / 2).ravel()
+    weights = np.repeat([each.kept for each in kept], values.shape[1] - 1)
+    order = np.argsort(middles)
+    reached = np.cumsum(weights[order]) / weights.sum()
+    place = min(int(np.searchsorted(reached, share)), len(order) - 1)
+    return float(middles[order][place])
+
+
+def audit_markdown(report: AuditReport) -> str:
+    """Return a report as Markdown: the table, the definitions that it needs, and the findings."""
+    frames = "all frames" if report.frames == 0 else f"up to {report.frames} frames"
+    lines = [
+        f"# Audit of {report.root}",
+        "",
+        f"{report.scenes_audited} of {report.scenes_there} scenes, {frames} of each. Under paper: "
+        f"{AUDIT_TABLE}.",
+        "",
+        "| check | quantity | here | paper | limit |",
+        "|---|---|---|---|---|",
+        *(
+            "| "
+            + " | ".join([row.check, row.quantity, row.ours, row.paper or "-", row.limit or "-"])
+            + " |"
+            for row in report.rows
+        ),
+        "",
+        "Reprojection: left depth to the right camera, and back by the right depth; pixels whose "
+        "two depths differ by more than the tolerance (share of depth + steps of stored depth) "
+        "count as occluded. The paper does not tell its tolerance.",
+    ]
+    lines += _listed("Findings", [str(finding) for finding in report.findings])
+    lines += _listed("Notes", list(report.notes))
+    return "\n".join(lines) + "\n"
+
+
+def _listed(title: str, texts: list[str]) -> list[str]:
+    if not texts:
+        return []
+    more = [f"- and {len(texts) - _LISTED} more"] if len(texts) > _LISTED else []
+    return ["", f"## {title} ({len(texts)})", "", *(f"- {each}" for each in texts[:_LISTED]), *more]
+
+
+def _finite(values: Iterable[float]) -> list[float]:
+    return [value for value in values if not math.isnan(value)]
+
+
+def _reduced(values: Iterable[float], reduce: Callable[[list[float]], float]) -> float:
+    finite = _finite(values)
+    return float(reduce(finite)) if finite else math.nan
+
+
+def _largest(values: Iterable[float]) -> float:
+    return _reduced(values, max)
+
+
+def _least(values: Iterable[float]) -> float:
+    return _reduced(values, min)
+
+
+def _mean(values: Iterable[float]) -> float:
+    return _reduced(values, lambda finite: float(np.mean(finite)))
+
+
+def _ratio(part: int, whole: int) -> float:
+    return part / whole if whole else math.nan
+
+
+def _number(value: float) -> str:
+    """Return three significant digits; a dash where there is no number."""
+    return "-" if math.isnan(value) else f"{value:.3g}"
+
+
+def _percent(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value * 100:.4g} %"
+
+
+def _span(counts: Sequence[int]) -> str:
+    if not counts:
+        return "-"
+    low, high = min(counts), max(counts)
+    return f"{low}" if low == high else f"{low} to {high}"
+
+
+def _distinct(values: Iterable[float]) -> str:
+    """Return lengths in m, each once; their range where there are many."""
+    found = sorted({float(f"{value:.6g}") for value in _finite(values)})
+    if not found:
+        return "-"
+    if len(found) > 4:
+        return f"{found[0]:g} to {found[-1]:g} m"
+    return ", ".join(f"{value:g}" for value in found) + " m"

@@ -1,0 +1,306 @@
+"""The audit of any data: the paper's geometry table and quality checks, measured scene by scene."""
+
+import hashlib
+import json
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final, Unpack
+
+import numpy as np
+from jaxtyping import Int64
+
+from stereogenbench_data.audit.audit_records import (
+    AuditLimits,
+    AuditReport,
+    SceneAudit,
+    plain,
+)
+from stereogenbench_data.audit.audit_table import table_rows
+from stereogenbench_data.audit.findings import broken_finding, findings_of
+from stereogenbench_data.audit.scene_audit import SceneTask, audit_scene, spread_frames
+from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
+from stereogenbench_data.schema.parse import parse_scene_key
+from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
+from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.storage.filesystems import MissingObject
+from stereogenbench_data.storage.index import INDEX_NAME, IncompleteSceneWarning, SceneIndex
+from stereogenbench_data.storage.journal import RecordJournal
+from stereogenbench_data.storage.location import is_remote, joined, local_path
+from stereogenbench_data.storage.pool import run_tasks
+from stereogenbench_data.storage.remote import RemoteObject
+from stereogenbench_data.storage.rows import row_of
+from stereogenbench_data.storage.scene_files import files_of
+from stereogenbench_data.storage.walk import walk
+
+Progress = Callable[[int, int], None]
+
+DEFAULT_FRAMES: Final = 5
+_FORMAT: Final = 1
+_KEY_FILTERS: Final = {"split": "split", "subset": "subset", "family": "family",
+                       "map": "map_name", "scenes": "key"}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class AuditRequest:
+    """How much is audited, and against what.
+
+    Attributes:
+        sample: How many scenes, drawn at random by ``seed``; None for all.
+        frames: How many frames of each, evenly spread from the first to the last; 0 for all, as
+            the paper did.
+        seed: What the sample is drawn with.
+        depth: A depth contract that overrides what the files say, or None.
+        limits: Beyond which figures a scene is a finding.
+
+    Raises:
+        SelectionError: If a number is below its least.
+    """
+
+    sample: int | None = None
+    frames: int = DEFAULT_FRAMES
+    seed: int = 0
+    depth: DepthEncoding | None = None
+    limits: AuditLimits = field(default_factory=AuditLimits)
+
+    def __post_init__(self) -> None:
+        """Refuse what no audit can do."""
+        for name, value, least in (
+            ("sample", self.sample, 1), ("frames", self.frames, 0), ("seed", self.seed, 0),
+        ):  # fmt: skip
+            if value is not None and value < least:
+                raise SelectionError(f"{name} must be at least {least}, got {value}.")
+
+
+def open_for_audit(
+    data: str | Path,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    **filters: Unpack[SceneFilters],
+) -> SceneIndex:
+    """Return the index of some data of which scenes may be broken; those are told by the index.
+
+    Args:
+        data: Whatever `SceneIndex.open` opens.
+        workers: Processes that walk a tree that has no index.
+        progress: Called with the scenes walked, and all there are.
+        **filters: Scenes of a tree that their paths tell to be none of these are not described.
+
+    Raises:
+        StorageError: If there is no such data, or no such scene in it, whole or not.
+    """
+    if _is_plain_tree(data):
+        is_concerned = _Concerned(filters)
+        report = walk(
+            data if is_remote(data) else local_path(data),
+            workers=workers,
+            progress=progress,
+            wanted=is_concerned.matches if is_concerned.wanted else None,
+        )
+        return SceneIndex.from_report(report)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", IncompleteSceneWarning)
+        return SceneIndex.open(data)
+
+
+def _is_plain_tree(data: str | Path) -> bool:
+    """Return whether data are a folder without an index, here or behind a URL."""
+    if not is_remote(data):
+        path = local_path(data)
+        return path.is_dir() and not (path / INDEX_NAME).is_file()
+    if str(data).endswith(".parquet"):
+        return False
+    try:
+        RemoteObject(joined(str(data).rstrip("/"), INDEX_NAME)).size()
+    except MissingObject:
+        return True
+    return False
+
+
+def audit(
+    data: str | Path | SceneIndex,
+    request: AuditRequest | None = None,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    journal: RecordJournal | None = None,
+    **filters: Unpack[SceneFilters],
+) -> AuditReport:
+    """Measure whether data are right: the paper's geometry audit, and its quality checks.
+
+    The reprojection error is defined in `reprojection`. Broken scenes do not stop the audit: they
+    are findings.
+
+    Args:
+        data: A released tree, shards, an index file, the URL of either, or an index.
+        request: How much is audited, and against what limits.
+        workers: Processes that work at the same time; None is one a core.
+        progress: Called now and then with the frames audited, and all there are.
+        journal: Where what was found of each scene is kept, so that an audit that was killed
+            goes on, see `audit_journal`; None keeps nothing.
+        **filters: Which scenes, see `SceneFilters`.
+
+    Raises:
+        StorageError: If there are no such data, or a worker process died.
+        SelectionError: If no scene passes the filters.
+
+    Source: the StereoGenBench paper, section on geometry conventions and sanity checks, and on
+    quality control.
+    """
+    request = request or AuditRequest()
+    if isinstance(data, SceneIndex):
+        index = data
+    else:
+        index = open_for_audit(data, workers=workers, **filters)
+    is_concerned = _Concerned(filters)
+    broken = {key: text for key, text in index.broken.items() if is_concerned(key)}
+    incomplete = {key: text for key, text in index.incomplete.items() if is_concerned(key)}
+    rows = _chosen(index, request, filters, left_out=broken | incomplete)
+    scenes = [index.scene(int(row)) for row in rows]
+    audited = _audited(index, scenes, request, workers=workers, progress=progress, journal=journal)
+    findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
+    for scene in audited:
+        findings += findings_of(scene, request.limits)
+    return AuditReport(
+        root=index.root,
+        scenes_there=len(index) + len(index.broken) + len(index.incomplete),
+        scenes_audited=len(audited),
+        frames=request.frames,
+        seed=request.seed,
+        limits=request.limits,
+        rows=table_rows(audited, request.limits, findings=findings),
+        findings=tuple(findings),
+        notes=tuple(f"incomplete, not audited: {text}" for text in incomplete.values()),
+        scenes=tuple(audited),
+    )
+
+
+class _Concerned:
+    """Whether a scene that could not be indexed is one that the filters ask for, by its key."""
+
+    def __init__(self, filters: Mapping[str, Any]) -> None:
+        self.wanted = {
+            attribute: [wanted] if isinstance(wanted, str) else list(wanted)
+            for name, attribute in _KEY_FILTERS.items()
+            if (wanted := filters.get(name)) is not None
+        }
+
+    def __call__(self, key: str) -> bool:
+        try:
+            return self.matches(parse_scene_key(key))
+        except SchemaError:
+            return not self.wanted
+
+    def matches(self, scene: SceneId) -> bool:
+        """Return whether nothing that the path tells rules a scene out."""
+        return all(getattr(scene, name) in (*told, None) for name, told in self.wanted.items())
+
+
+def _chosen(
+    index: SceneIndex, request: AuditRequest, filters: SceneFilters, *, left_out: Mapping[str, str]
+) -> Int64[np.ndarray, " n"]:
+    """Return the rows to audit, ascending; none only where what was left out is all there is."""
+    wanted = filters.get("scenes")
+    if wanted is not None:
+        keys = [wanted] if isinstance(wanted, str) else list(wanted)
+        kept = [key for key in keys if key not in left_out]
+        filters = {**filters, "scenes": kept or keys}
+    try:
+        rows = filter_scenes(index, filters)
+    except SelectionError:
+        if not left_out:
+            raise
+        return np.empty(0, dtype=np.int64)
+    if request.sample is None or request.sample >= len(rows):
+        return rows
+    drawn = np.random.default_rng(request.seed).choice(rows, request.sample, replace=False)
+    return np.sort(drawn)
+
+
+def _audited(
+    index: SceneIndex,
+    scenes: list[Scene],
+    request: AuditRequest,
+    *,
+    workers: int | None,
+    progress: Progress | None,
+    journal: RecordJournal | None,
+) -> list[SceneAudit]:
+    """Return what was found of each scene, in their order."""
+    total = sum(len(spread_frames(scene.frames, request.frames)) for scene in scenes)
+    stamps: dict[str, str] = {}
+    found: dict[str, SceneAudit] = {}
+    done = 0
+
+    def after_frames(count: int) -> None:
+        nonlocal done
+        done += count
+        if progress is not None:
+            progress(min(done, total), total)
+
+    if journal is not None:
+        stamps = {scene.id.key: _stamp(index, scene) for scene in scenes}
+        found = _known(journal, stamps)
+    after_frames(sum(len(known.audited_frames) for known in found.values()))
+    tasks = [_task(index, scene, request) for scene in scenes if scene.id.key not in found]
+    for audited in run_tasks(audit_scene, tasks, workers=workers, after_bytes=after_frames):
+        found[audited.key] = audited
+        if journal is not None:
+            journal.note(audited.key, plain(asdict(audited)), stamp=stamps[audited.key])
+    return [found[scene.id.key] for scene in scenes]
+
+
+def _task(index: SceneIndex, scene: Scene, request: AuditRequest) -> SceneTask:
+    places = {member.path for member in scene.members.values()}
+    return SceneTask(
+        root=index.root,
+        shards={path: index.shards[path] for path in places if path in index.shards},
+        revision=index.digest,
+        scene=scene,
+        frames=request.frames,
+        depth=request.depth,
+    )
+
+
+def audit_journal(path: Path, index: SceneIndex, request: AuditRequest) -> RecordJournal:
+    """Return the journal of an audit.
+
+    That of another root, depth contract or choice of frames is begun anew; limits, filters and
+    the number of scenes may differ.
+
+    Raises:
+        StorageError: If the file is there and cannot be read.
+    """
+    work = {
+        "audit": _FORMAT,
+        "root": index.root,
+        "frames": request.frames,
+        "depth": repr(request.depth),
+    }
+    return RecordJournal(path, work=work)
+
+
+def _known(journal: RecordJournal, stamps: Mapping[str, str]) -> dict[str, SceneAudit]:
+    """Return what earlier runs found of scenes that have not changed since."""
+    known: dict[str, SceneAudit] = {}
+    for key, stamp in stamps.items():
+        value = journal.value(key, stamp=stamp)
+        try:
+            if value is not None:
+                known[key] = SceneAudit.revived(value)
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError):
+            continue
+    return known
+
+
+def _stamp(index: SceneIndex, scene: Scene) -> str:
+    """Return a short text that changes when a scene's row or one of its local files does."""
+    told: list[Any] = [row_of(scene)]
+    if not index.shards and not is_remote(index.root):
+        try:
+            told.append(files_of(index.root, scene.id.key).stamps())
+        except StorageError as error:
+            told.append(str(error))
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:32]

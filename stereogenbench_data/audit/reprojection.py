@@ -1,0 +1,207 @@
+"""The paper's reprojection error: left depth to the right camera, and back by the right depth.
+
+A left pixel's centre u with depth z is the point X = z K^-1 u; the recorded poses take it to the
+right camera, X' = R X + t, where it lands at u' with depth z'. The right camera's own depth z" is
+that of the pixel in which u' falls. Where z" is measured and differs from z' by no more than a
+tolerance the pixel counts as not occluded, and there the point at u' with depth z" is taken back
+to the left camera: the distance in pixels between where it lands and u is the error. It is 0 where
+both cameras saw the same point, and B fx |1/z' - 1/z"| for a rectified pair.
+
+A tolerance bounds the error that it lets through, so the median alone proves little: it goes with
+the share of pixels that were kept. ``agreement`` is stricter: of the pixels that nothing in the
+left view hides from the right camera, the share of which the right depth agrees.
+
+Source: the StereoGenBench paper, table of the geometry consistency audit and appendix on geometry
+derivation. The paper does not tell its tolerance; ours are `TOLERANCES`.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from stereogenbench_data.audit.audit_records import QUANTILES, PairAudit, ToleranceAudit
+from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.geometry.projection import Projection
+from stereogenbench_data.geometry.visibility import visible_from_source
+
+_SIGNIFICANT: Final = 7
+
+Map = Float64[np.ndarray, "h w"]
+Mask = Bool[np.ndarray, "h w"]
+
+MOST_PIXELS: Final = 250_000
+"""Pixels of a picture that are projected: of a larger one every k-th row is taken."""
+
+FEWER_PIXELS: Final = 32_000
+"""The same where only the agreement of depths is wanted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """How far two depths may differ: a share of the depth plus a number of stored steps."""
+
+    name: str
+    share: float
+    steps: float
+
+
+TOLERANCES: Final = (
+    Tolerance("same step", 0.0, 0.5),
+    Tolerance("2 steps", 0.0, 2.0),
+    Tolerance("0.5 % + 2 steps", 0.005, 2.0),
+    Tolerance("2 % + 2 steps", 0.02, 2.0),
+)
+"""From strict to that of the field ``visible``, which is the last."""
+
+STANDARD: Final = TOLERANCES[-1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredDepth:
+    """One camera's depth of one frame.
+
+    Attributes:
+        depth_m: (h, w) float64 along the optical axis, 0 where not measured.
+        measured: (h, w) bool.
+        step_m: The step in which depth is stored: a number, or with inverse depth the number by
+            which depth squared is divided.
+        form: "depth" or "inverse".
+    """
+
+    depth_m: Map
+    measured: Mask
+    step_m: float
+    form: str = "depth"
+
+    def steps_m(self, depth_m: Map) -> Any:
+        """Return the step in metres at each depth."""
+        return self.step_m if self.form == "depth" else depth_m**2 / self.step_m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PairErrors:
+    """What came of one pair in one frame.
+
+    Attributes:
+        measured: Left pixels with depth.
+        comparable: Those that land inside the right picture where depth was measured.
+        errors_px: For each of `TOLERANCES`, (n,) float64 errors of the pixels kept.
+        unhidden: Comparable pixels that nothing in the left view hides.
+        agreeing: Those of them kept at the last tolerance.
+    """
+
+    measured: int
+    comparable: int
+    errors_px: tuple[Float64[np.ndarray, " n"], ...]
+    unhidden: int
+    agreeing: int
+
+
+def row_step(height_px: int, width_px: int, *, most_pixels: int) -> int:
+    """Return k so that every k-th row of a picture makes at most about so many pixels."""
+    return max(1, math.ceil(height_px * width_px / most_pixels))
+
+
+def reproject(
+    left: MeasuredDepth,
+    right: MeasuredDepth,
+    *,
+    intrinsics: Intrinsics,
+    right_from_left: Float64[np.ndarray, "4 4"],
+    most_pixels: int = MOST_PIXELS,
+) -> PairErrors:
+    """Return the reprojection errors of a left camera's pixels, all in float64.
+
+    Args:
+        left: The camera whose pixels are taken.
+        right: The camera to which they go and from which they come back.
+        intrinsics: Of both pictures.
+        right_from_left: The motion between the cameras' axes, in metres.
+        most_pixels: How many pixels to take, whole rows evenly spread.
+    """
+    height_px, width_px = left.depth_m.shape
+    step = row_step(height_px, width_px, most_pixels=most_pixels)
+    first = step // 2
+    depth_m, measured = left.depth_m[first::step], left.measured[first::step]
+    u_px = np.broadcast_to(np.arange(width_px) + 0.5, depth_m.shape)
+    v_px = np.broadcast_to(np.arange(first, height_px, step)[:, None] + 0.5, depth_m.shape)
+    forth_u, forth_v, expected_m = _moved(u_px, v_px, depth_m, intrinsics, right_from_left)
+    inside = measured & (expected_m > 0)
+    inside &= (forth_u >= 0) & (forth_u < width_px) & (forth_v >= 0) & (forth_v < height_px)
+    column = np.where(inside, forth_u, 0).astype(np.intp)
+    row = np.where(inside, forth_v, 0).astype(np.intp)
+    found_m = right.depth_m[row, column]
+    comparable = inside & right.measured[row, column]
+    back_u, back_v, _ = _moved(
+        forth_u, forth_v, found_m, intrinsics, np.linalg.inv(right_from_left)
+    )
+    error_px = np.hypot(back_u - u_px, back_v - v_px)
+    away_m = np.abs(found_m - expected_m)
+    steps_m = np.maximum(left.steps_m(expected_m), right.steps_m(expected_m))
+    kept = [
+        comparable & (away_m <= each.share * expected_m + each.steps * steps_m)
+        for each in TOLERANCES
+    ]
+    unhidden = comparable & visible_from_source(
+        Projection(u_px=forth_u, v_px=None, depth_m=np.where(inside, expected_m, 1.0)),
+        measured=inside,
+        quantum_m=steps_m,
+        tolerance=STANDARD.share,
+    )
+    return PairErrors(
+        measured=int(measured.sum()),
+        comparable=int(comparable.sum()),
+        errors_px=tuple(error_px[each] for each in kept),
+        unhidden=int(unhidden.sum()),
+        agreeing=int((unhidden & kept[-1]).sum()),
+    )
+
+
+def _moved(
+    u_px: Map,
+    v_px: Map,
+    depth_m: Map,
+    intrinsics: Intrinsics,
+    target_from_source: Float64[np.ndarray, "4 4"],
+) -> tuple[Map, Map, Map]:
+    """Return where points of one camera land in the other, and how deep; nan behind its plane."""
+    x_m = (u_px - intrinsics.cx_px) / intrinsics.fx_px * depth_m
+    y_m = (v_px - intrinsics.cy_px) / intrinsics.fy_px * depth_m
+    moved = [
+        row[0] * x_m + row[1] * y_m + row[2] * depth_m + row[3] for row in target_from_source[:3]
+    ]
+    ahead_m = np.where(moved[2] > 0, moved[2], np.nan)
+    return (
+        intrinsics.fx_px * (moved[0] / ahead_m) + intrinsics.cx_px,
+        intrinsics.fy_px * (moved[1] / ahead_m) + intrinsics.cy_px,
+        moved[2],
+    )
+
+
+def pair_audit(
+    pair: tuple[int, int], found: list[PairErrors], *, keep: Literal["errors", "agreement"]
+) -> PairAudit:
+    """Return the figures of a pair over all audited frames, with or without its errors."""
+    return PairAudit(
+        left=pair[0],
+        right=pair[1],
+        frames=len(found),
+        measured=sum(each.measured for each in found),
+        comparable=sum(each.comparable for each in found),
+        unhidden=sum(each.unhidden for each in found),
+        agreeing=sum(each.agreeing for each in found),
+        tolerances=() if keep == "agreement" else tuple(_tolerance_audits(found)),
+    )
+
+
+def _tolerance_audits(found: list[PairErrors]) -> Iterator[ToleranceAudit]:
+    for place, tolerance in enumerate(TOLERANCES):
+        errors = [each.errors_px[place] for each in found]
+        errors_px = np.concatenate(errors) if errors else np.empty(0)
+        quantiles = np.quantile(errors_px, QUANTILES).tolist() if len(errors_px) else []
+        rounded = tuple(float(f"{each:.{_SIGNIFICANT}g}") for each in quantiles)
+        yield ToleranceAudit(tolerance.name, len(errors_px), rounded)

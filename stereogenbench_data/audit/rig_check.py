@@ -1,0 +1,85 @@
+"""What a scene's metadata say of its cameras, held against each other; no picture is needed."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from stereogenbench_data.audit.audit_records import RigAudit
+from stereogenbench_data.audit.recorded_intrinsics import deviations_px
+from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
+from stereogenbench_data.geometry.pose import CameraPoses, rotation_angle_rad
+from stereogenbench_data.geometry.rig import rectification_residual_px
+from stereogenbench_data.schema.records import Rig
+from stereogenbench_data.schema.release import ADJACENT_PAIRS, CAMERA_PAIRS
+
+
+def rig_audit(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -> RigAudit:
+    """Return the figures of a scene's rig.
+
+    Args:
+        rig: What ``baseline.json`` records.
+        poses: What ``trajectory.json`` records, over all frames.
+        documents: Both files as parsed from JSON, to be searched for intrinsics in pixels.
+
+    Source: the StereoGenBench paper, fx = f_mm / sensor_width_mm * width_px, and its table of the
+    geometry consistency audit.
+    """
+    intrinsics = rig_intrinsics(rig)
+    fx_px = rig.focal_mm / rig.sensor_width_mm * rig.image_width_px
+    fy_px = rig.focal_mm / rig.sensor_height_mm * rig.image_height_px
+    recorded = deviations_px(documents, replace(intrinsics, fx_px=fx_px, fy_px=fy_px))
+    deviations = [abs(intrinsics.fx_px - fx_px), abs(intrinsics.fy_px - fy_px), *recorded]
+    left, right = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
+    posed_cm = np.linalg.norm(poses.centres[:, right] - poses.centres[:, left], axis=-1)
+    away_cm = np.abs(posed_cm * (poses.unit_m * 100) - np.array(rig.baselines_cm))
+    adjacent_cm = away_cm[:, [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]]
+    rotations = poses.world_from_cam_rotations
+    in_one_place = replace(poses, centres=np.zeros_like(poses.centres))
+    looking_alike = replace(
+        poses, world_from_cam_rotations=np.repeat(rotations[:, :1], rotations.shape[1], axis=1)
+    )
+    turned_rad = rotation_angle_rad(rotations, np.broadcast_to(rotations[:, :1], rotations.shape))
+    return RigAudit(
+        fx_px=fx_px,
+        fy_px=fy_px,
+        intrinsics_px=float(max(deviations)),
+        intrinsics_recorded=len(recorded),
+        adjacent_mean_cm=float(adjacent_cm.mean()),
+        adjacent_max_cm=float(adjacent_cm.max()),
+        pairs_mean_cm=float(away_cm.mean()),
+        pairs_max_cm=float(away_cm.max()),
+        rotation_deg=float(np.rad2deg(turned_rad).max()),
+        rotation_px=rectification_residual_px(in_one_place, intrinsics),
+        lateral_px=rectification_residual_px(looking_alike, intrinsics),
+    )
+
+
+def motion_px(
+    poses: CameraPoses,
+    camera: int,
+    frames: tuple[int, int],
+    *,
+    intrinsics: Intrinsics,
+    far_m: float,
+) -> float:
+    """Return about how far a camera's motion between frames moves the middle of its picture.
+
+    Its turn and its way are each taken whole, as if they were across the line of sight.
+
+    Args:
+        poses: All cameras' poses.
+        camera: Which camera.
+        frames: Two frames.
+        intrinsics: Of the picture.
+        far_m: How far away its subject is; nan for a motion that only turns.
+    """
+    first, second = frames
+    turned_rad = rotation_angle_rad(
+        poses.world_from_cam_rotations[first, camera],
+        poses.world_from_cam_rotations[second, camera],
+    )
+    way = np.linalg.norm(poses.centres[second, camera] - poses.centres[first, camera])
+    shift = 0.0 if math.isnan(far_m) else float(way) * poses.unit_m / far_m
+    return intrinsics.fx_px * (float(turned_rad) + shift)

@@ -1,0 +1,252 @@
+"""The audit of one scene: each video is decoded once, forwards, and only at the audited frames.
+
+Nothing that a scene's files hold stops the audit: what cannot be read is noted, and the rest is
+measured.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from stereogenbench_data.audit.audit_records import At, CameraAudit, RigAudit, SceneAudit
+from stereogenbench_data.audit.audited_files import SceneFiles
+from stereogenbench_data.audit.picture_check import (
+    MOVED_SHARE,
+    LightCheck,
+    PayloadCheck,
+    border_occluder,
+    subject_m,
+)
+from stereogenbench_data.audit.reprojection import (
+    FEWER_PIXELS,
+    MOST_PIXELS,
+    MeasuredDepth,
+    PairErrors,
+    pair_audit,
+    reproject,
+)
+from stereogenbench_data.audit.rig_check import motion_px, rig_audit
+from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.schema.document import parse_object
+from stereogenbench_data.schema.parse import parse_trajectory
+from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
+from stereogenbench_data.schema.release import (
+    ADJACENT_PAIRS,
+    BASELINE_JSON,
+    CAMERA_COUNT,
+    TRAJECTORY_JSON,
+    depth_name,
+    rgb_name,
+)
+from stereogenbench_data.storage.pool import AfterBytes
+from stereogenbench_data.storage.source import MemberSource
+
+LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
+"""The non-adjacent pair that the paper audits beside the primary one."""
+
+_METADATA: Final = (BASELINE_JSON, TRAJECTORY_JSON)
+
+
+@dataclass(frozen=True, slots=True)
+class SceneTask:
+    """What is to be audited; travels to worker processes.
+
+    Attributes:
+        root: The folder or URL that members' paths are relative to.
+        shards: What the index knows of the shards that hold the scene.
+        revision: The index's digest.
+        scene: The scene.
+        frames: How many frames to audit, evenly spread; 0 for all.
+        depth: The depth contract, None for what the files say.
+    """
+
+    root: str
+    shards: dict[str, ShardFacts]
+    revision: str
+    scene: Scene
+    frames: int
+    depth: DepthEncoding | None = None
+
+
+def spread_frames(frames: int, wanted: int) -> tuple[int, ...]:
+    """Return the numbers of ``wanted`` frames, evenly spread from the first to the last; 0 is all.
+
+    >>> spread_frames(81, 5), spread_frames(2, 5)
+    ((0, 20, 40, 60, 80), (0, 1))
+    """
+    if wanted == 0 or wanted >= frames:
+        return tuple(range(frames))
+    if wanted == 1:
+        return (frames // 2,)
+    return tuple(round(step * (frames - 1) / (wanted - 1)) for step in range(wanted))
+
+
+def audit_scene(task: SceneTask, after_bytes: AfterBytes) -> SceneAudit:
+    """Return what is found of a scene; nothing that is wrong with it is raised.
+
+    Args:
+        task: The scene, and how it is audited.
+        after_bytes: Called with 1 after each frame, where the work may be interrupted.
+    """
+    return _SceneCheck(task).run(after_bytes)
+
+
+class _SceneCheck:
+    """The state of one scene's audit: open videos, and what was found so far."""
+
+    def __init__(self, task: SceneTask) -> None:
+        self.scene = task.scene
+        self.frames = spread_frames(task.scene.frames, task.frames)
+        self.intrinsics = rig_intrinsics(task.scene.rig)
+        source = MemberSource(task.root, shards=task.shards, revision=task.revision)
+        self.files = SceneFiles(source, task.scene, contract=task.depth or DepthEncoding())
+        self.light = [LightCheck() for _ in range(CAMERA_COUNT)]
+        self.payload = [PayloadCheck() for _ in range(CAMERA_COUNT)]
+        self.occluders = [(At(0.0), "")] * CAMERA_COUNT
+        self.same: dict[tuple[int, int], bool] = {}
+        self.measured_pairs = (task.scene.rig.primary_pair, LONG_PAIR)
+        pairs = dict.fromkeys([*self.measured_pairs, *ADJACENT_PAIRS])
+        self.errors: dict[tuple[int, int], list[PairErrors]] = {pair: [] for pair in pairs}
+
+    def run(self, after_bytes: AfterBytes) -> SceneAudit:
+        """Audit the scene."""
+        try:
+            rig, poses = self._metadata()
+            counts = [self.files.counted(camera) for camera in range(CAMERA_COUNT)]
+            before: int | None = None
+            for frame in self.frames:
+                self._frame(frame, before, poses)
+                before = frame
+                after_bytes(1)
+        finally:
+            self.files.close()
+        return SceneAudit(
+            key=self.scene.id.key,
+            frames=self.scene.frames,
+            audited_frames=self.frames,
+            rig=rig,
+            cameras=tuple(self._camera(camera, counts[camera]) for camera in range(CAMERA_COUNT)),
+            pairs=tuple(
+                pair_audit(
+                    pair, found, keep="errors" if pair in self.measured_pairs else "agreement"
+                )
+                for pair, found in self.errors.items()
+            ),
+            problems=tuple(sorted(self.files.problems.items())),
+        )
+
+    def _metadata(self) -> tuple[RigAudit, CameraPoses | None]:
+        texts = {name: self.files.attempt(name, self.files.text, name) for name in _METADATA}
+        documents = [
+            self.files.attempt(name, parse_object, text, where=name)
+            for name, text in texts.items()
+            if text is not None
+        ]
+        text = texts[TRAJECTORY_JSON]
+        poses = None if text is None else self.files.attempt(TRAJECTORY_JSON, _poses, text)
+        if poses is None:
+            return RigAudit(fx_px=self.intrinsics.fx_px, fy_px=self.intrinsics.fy_px), None
+        rig = rig_audit(self.scene.rig, poses, [each for each in documents if each is not None])
+        if poses.frame_count >= self.scene.frames:
+            return rig, poses
+        self.files.problems[TRAJECTORY_JSON] = (
+            f"has poses of {poses.frame_count} frames, and the index says {self.scene.frames}"
+        )
+        return rig, None
+
+    def _frame(self, frame: int, before: int | None, poses: CameraPoses | None) -> None:
+        """Decode one frame of all cameras, and take it into account."""
+        depths: dict[int, MeasuredDepth] = {}
+        stored: dict[int, Any] = {}
+        for camera in range(CAMERA_COUNT):
+            name = depth_name(camera)
+            found = self.files.attempt(name, self.files.depth, camera, frame)
+            if found is not None:
+                stored[camera], depths[camera] = found
+        far_m = subject_m([(each.depth_m, each.measured) for each in depths.values()])
+        pictures: dict[int, np.ndarray] = {}
+        for camera in range(CAMERA_COUNT):
+            moved = self._has_moved(camera, frame, before, poses=poses, far_m=far_m)
+            if camera in depths:
+                self._hide(camera, frame, depths[camera], far_m=far_m)
+                self.payload[camera].take(
+                    stored[camera], depths[camera].measured, frame, moved=moved
+                )
+            picture = self.files.attempt(rgb_name(camera), self.files.picture, camera, frame)
+            if picture is not None:
+                pictures[camera] = picture
+                self.light[camera].take(picture, frame, moved=moved)
+        self._compare(pictures)
+        if poses is not None:
+            self._reproject(frame, depths, poses)
+
+    def _reproject(self, frame: int, depths: dict[int, MeasuredDepth], poses: CameraPoses) -> None:
+        for (left, right), found in self.errors.items():
+            is_measured = (left, right) in self.measured_pairs
+            if left in depths and right in depths:
+                motion = poses.cam_from_cam(frame, target=right, source=left)
+                found.append(
+                    reproject(
+                        depths[left],
+                        depths[right],
+                        intrinsics=self.intrinsics,
+                        right_from_left=motion,
+                        most_pixels=MOST_PIXELS if is_measured else FEWER_PIXELS,
+                    )
+                )
+
+    def _hide(self, camera: int, frame: int, depth: MeasuredDepth, *, far_m: float) -> None:
+        share, side = border_occluder(depth.depth_m, depth.measured, far_m=far_m)
+        if share > self.occluders[camera][0].value:
+            self.occluders[camera] = (At(share, frame), side)
+
+    def _has_moved(
+        self,
+        camera: int,
+        frame: int,
+        before: int | None,
+        *,
+        poses: CameraPoses | None,
+        far_m: float,
+    ) -> bool:
+        """Return whether a camera moved so far since a frame that its picture must differ."""
+        if before is None or poses is None:
+            return False
+        moved_px = motion_px(
+            poses, camera, (before, frame), intrinsics=self.intrinsics, far_m=far_m
+        )
+        return moved_px >= MOVED_SHARE * self.intrinsics.width_px
+
+    def _compare(self, pictures: dict[int, np.ndarray]) -> None:
+        for first in pictures:
+            for second in pictures:
+                if first < second and self.same.get((first, second), True):
+                    alike = np.array_equal(pictures[first], pictures[second])
+                    self.same[first, second] = alike
+
+    def _camera(self, camera: int, counts: tuple[int, int]) -> CameraAudit:
+        light, payload = self.light[camera], self.payload[camera]
+        occluder, side = self.occluders[camera]
+        twins = [a for (a, b), alike in self.same.items() if b == camera and alike]
+        return CameraAudit(
+            rgb_frames=counts[0],
+            depth_frames=counts[1],
+            depth_unit_m=self.files.unit_m(camera),
+            depth_step_units=payload.step_units,
+            depth_levels=payload.levels,
+            valid_depth=payload.valid,
+            least_valid_depth=payload.least_valid.at,
+            brightness=light.brightness.at,
+            contrast=light.contrast.at,
+            change=light.change.at,
+            still_depth=payload.still_from,
+            occluder=occluder,
+            occluder_side=side,
+            twin=twins[0] if twins else -1,
+        )
+
+
+def _poses(text: bytes) -> CameraPoses:
+    return CameraPoses.from_trajectory(parse_trajectory(text, where=TRAJECTORY_JSON))

@@ -1,0 +1,146 @@
+"""``stereogenbench audit``: is this data right? The paper's geometry table for any data."""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from stereogenbench_data.cli.options import (
+    CaptionOption,
+    DataArgument,
+    FamilyOption,
+    FocalOption,
+    JsonOption,
+    MapOption,
+    OutOption,
+    SceneOption,
+    SplitOption,
+    SubsetOption,
+    WorkersOption,
+    scene_filters,
+)
+from stereogenbench_data.cli.outcome import FINDINGS, STOPPED
+from stereogenbench_data.cli.progress import progress_bar
+
+_ALL = "all"
+
+
+def audit(  # noqa: PLR0913 - one parameter an option
+    data: DataArgument,
+    *,
+    scenes: Annotated[
+        int | None, typer.Option("--scenes", min=1, help="Audit so many, drawn at random [all].")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="What they are drawn with.")] = 0,
+    frames: Annotated[
+        str, typer.Option(help="Frames of each scene, evenly spread; 'all' as the paper did.")
+    ] = "5",
+    split: SplitOption = None,
+    subset: SubsetOption = None,
+    family: FamilyOption = None,
+    map_name: MapOption = None,
+    scene: SceneOption = None,
+    focal_mm: FocalOption = None,
+    caption: CaptionOption = None,
+    depth_unit_m: Annotated[
+        float | None, typer.Option(help="Metres in a stored unit of depth [as tagged, else 0.1].")
+    ] = None,
+    depth_kind: Annotated[str, typer.Option(help="planar or ray.")] = "planar",
+    accept: Annotated[
+        list[str] | None,
+        typer.Option(help="Depth that lost something: 8-bit, lossy, chroma; may be given again."),
+    ] = None,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=NUMBER, such as baseline_cm=0.01; may be given again."),
+    ] = None,
+    out: OutOption = None,
+    journal: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where a stopped audit is kept until it is finished [beside --out, "
+            "else ~/.cache/stereogenbench]."
+        ),
+    ] = None,
+    as_json: JsonOption = False,
+    workers: WorkersOption = None,
+) -> None:
+    """Measure whether data are right, and list what is not.
+
+    Intrinsics, baselines, poses and depth are held against each other, as in the paper's audit,
+    with the paper's figures beside; frames are counted; dark, flat and frozen pictures, invalid
+    depth and occluders at the border are looked for. Prints Markdown; --out also writes it to a
+    file (as JSON if that ends with .json). An audit that was stopped goes on if it is run again.
+    The exit status is 1 if anything is beyond its limit.
+    """
+    from stereogenbench_data.audit.audit_records import AuditLimits
+    from stereogenbench_data.audit.audit_table import audit_markdown
+    from stereogenbench_data.audit.geometry_audit import (
+        AuditRequest,
+        audit_journal,
+        open_for_audit,
+    )
+    from stereogenbench_data.audit.geometry_audit import audit as audited
+
+    if out is not None and out.is_dir():
+        raise typer.BadParameter(f"{out} is a folder: name a file, such as {out / 'audit.md'}.")
+    request = AuditRequest(
+        sample=scenes,
+        frames=_frames(frames),
+        seed=seed,
+        depth=_contract(depth_unit_m, depth_kind, accept),
+        limits=AuditLimits.parse(limit or []),
+    )
+    filters = scene_filters(
+        split=split,
+        subset=subset,
+        family=family,
+        map=map_name,
+        scenes=scene,
+        focal_mm=focal_mm,
+        caption=caption,
+    )
+    try:
+        with progress_bar("reading the index", unit="scenes") as progress:
+            index = open_for_audit(data, workers=workers, progress=progress, **filters)
+        kept = audit_journal(journal or _journal(out, data, request), index, request)
+        with kept, progress_bar("auditing", unit="frames") as progress:
+            report = audited(
+                index, request, workers=workers, progress=progress, journal=kept, **filters
+            )
+    except KeyboardInterrupt:
+        typer.echo("stopped; run the same command again to go on from here", err=True)
+        raise typer.Exit(STOPPED) from None
+    document, markdown = json.dumps(report.to_json(), indent=1), audit_markdown(report)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(document if out.suffix == ".json" else markdown, encoding="utf-8")
+    typer.echo(document if as_json else markdown.rstrip())
+    kept.delete()
+    if report.findings:
+        raise typer.Exit(FINDINGS)
+
+
+def _frames(text: str) -> int:
+    if text == _ALL:
+        return 0
+    if not text.isdecimal() or int(text) < 1:
+        raise typer.BadParameter(f"{text!r} is no number of frames, nor 'all'")
+    return int(text)
+
+
+def _contract(unit_m: float | None, kind: Any, accept: Any) -> Any:
+    from stereogenbench_data.schema.records import DepthEncoding
+
+    contract = DepthEncoding(unit_m=unit_m, kind=kind, accept=frozenset(accept or ()))
+    return None if contract == DepthEncoding() else contract
+
+
+def _journal(out: Path | None, data: str, request: Any) -> Path:
+    if out is not None:
+        return out.with_name(f"{out.name}.journal")
+    place = data if "://" in data else str(Path(data).resolve())
+    name = hashlib.sha256(repr((place, request.frames, request.depth)).encode()).hexdigest()[:16]
+    return Path.home() / ".cache" / "stereogenbench" / f"audit-{name}.journal"

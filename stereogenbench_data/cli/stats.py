@@ -1,0 +1,92 @@
+"""``stereogenbench stats``: the paper's tables of any data, from their index alone."""
+
+import json
+import warnings
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from stereogenbench_data.cli.options import (
+    CaptionOption,
+    DataArgument,
+    FamilyOption,
+    FocalOption,
+    JsonOption,
+    MapOption,
+    OutOption,
+    SceneOption,
+    SplitOption,
+    SubsetOption,
+    scene_filters,
+)
+from stereogenbench_data.cli.outcome import FINDINGS
+
+
+def stats(  # noqa: PLR0913 - one parameter an option
+    data: DataArgument,
+    *,
+    split: SplitOption = None,
+    subset: SubsetOption = None,
+    family: FamilyOption = None,
+    map_name: MapOption = None,
+    scene: SceneOption = None,
+    focal_mm: FocalOption = None,
+    caption: CaptionOption = None,
+    compare: Annotated[
+        Literal["auto", "always", "never"],
+        typer.Option(
+            help="The paper's figures beside: auto for splits of about the release's size."
+        ),
+    ] = "auto",
+    plots: Annotated[
+        Path | None, typer.Option(help="Folder to write histograms into (extra 'plots').")
+    ] = None,
+    out: OutOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Count scenes, maps, baselines and focal lengths, as the paper's tables do.
+
+    Only the index is read. With --compare always the exit status is 1 if a figure differs from
+    the paper's.
+    """
+    from stereogenbench_data.audit.paper_comparison import compared, release_sized_splits
+    from stereogenbench_data.audit.paper_figures import SPLITS
+    from stereogenbench_data.audit.statistics import statistics
+    from stereogenbench_data.audit.statistics_table import statistics_markdown
+    from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", IncompleteSceneWarning)
+        index = SceneIndex.open(data)
+    for warning in told:
+        typer.echo(str(warning.message), err=True)
+    filters = scene_filters(
+        split=split,
+        subset=subset,
+        family=family,
+        map=map_name,
+        scenes=scene,
+        focal_mm=focal_mm,
+        caption=caption,
+    )
+    found = statistics(index, **filters)
+    splits = {"always": tuple(SPLITS), "never": ()}.get(compare)
+    lines = compared(found, splits=release_sized_splits(found) if splits is None else splits)
+    document = found.to_json() | {
+        "paper": [asdict(line) | {"agrees": line.agrees} for line in lines]
+    }
+    text = json.dumps(document, indent=1)
+    markdown = statistics_markdown(found, lines)
+    if plots is not None:
+        from stereogenbench_data.audit.statistics_plots import write_plots
+
+        for path in write_plots(index, plots, **filters):
+            typer.echo(str(path), err=True)
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(text if out.suffix == ".json" else markdown, encoding="utf-8")
+    typer.echo(text if as_json else markdown.rstrip())
+    if compare == "always" and not all(line.agrees for line in lines):
+        raise typer.Exit(FINDINGS)

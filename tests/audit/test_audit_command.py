@@ -1,0 +1,126 @@
+"""``stereogenbench audit``: what it prints, writes and returns."""
+
+import json
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from stereogenbench_data.audit import geometry_audit
+from stereogenbench_data.cli.audit import audit
+from tests.audit.corruption import copied, rewrite_rgb
+
+SCENE = "train/Uniform/SynthStage/scene_000000"
+FEW = ("--workers", "1", "--frames", "1", "--scene", SCENE)
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Run the command with a home of its own; several commands in one app, as the real one has."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    app = typer.Typer()
+    app.command()(audit)
+    app.command("other")(lambda: None)
+
+    def invoke(*words):
+        return CliRunner().invoke(app, ["audit", *map(str, words)], catch_exceptions=False)
+
+    return invoke
+
+
+def test_data_that_are_right_are_told_as_a_table_with_exit_code_0(small_shards, run):
+    result = run(small_shards, *FEW)
+
+    assert result.exit_code == 0
+    assert "1 of 4 scenes, up to 1 frames of each." in result.stdout
+    assert "| 0 px | 0 px | 0.001 px |" in result.stdout
+    assert "1/1 frames" in result.stderr
+
+
+def test_a_finding_is_listed_with_exit_code_1(small_release, run, tmp_path):
+    rewrite_rgb(copied(small_release / SCENE, tmp_path / "data"), 0, lambda frames: frames // 30)
+
+    result = run(tmp_path / "data", *FEW)
+
+    assert result.exit_code == 1
+    assert f"- {SCENE}/cam_00_rgb.mp4: too dark: frame 3: " in result.stdout
+
+
+def test_json_is_all_that_stdout_gets(small_shards, run):
+    result = run(small_shards, *FEW, "--json", "--limit", "frames=81")
+
+    document = json.loads(result.stdout)
+    assert result.exit_code == 1
+    assert document["limits"]["frames"] == 81
+    assert len(document["findings"]) == 12
+    assert document["findings"][0]["check"] == "missing frames"
+
+
+def test_the_report_can_be_written_as_markdown_or_json(small_shards, run, tmp_path):
+    told = run(small_shards, *FEW, "-o", tmp_path / "new" / "audit.md")
+    run(small_shards, *FEW, "-o", tmp_path / "new" / "audit.json")
+
+    written = (tmp_path / "new" / "audit.md").read_text()
+    assert written == told.stdout
+    assert json.loads((tmp_path / "new" / "audit.json").read_text())["scenes_audited"] == 1
+    assert sorted(path.name for path in (tmp_path / "new").iterdir()) == ["audit.json", "audit.md"]
+
+
+def test_the_depth_contract_can_be_overridden(small_shards, run):
+    options = ("--depth-unit-m", "0.002", "--depth-kind", "ray", "--accept", "8-bit", "--json")
+
+    document = json.loads(run(small_shards, *FEW, *options).stdout)
+
+    assert document["scenes"][0]["cameras"][0]["depth_unit_m"] == 0.002
+
+
+@pytest.mark.parametrize("journal", ["given", "default"])
+def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(
+    small_shards, run, monkeypatch, tmp_path, journal
+):
+    place = ("--journal", tmp_path / "kept") if journal == "given" else ()
+    plain = geometry_audit.audit_scene
+    audited = []
+
+    def stop_at_the_second(task, after_bytes):
+        if audited:
+            raise KeyboardInterrupt
+        audited.append(task.scene.id.key)
+        return plain(task, after_bytes)
+
+    monkeypatch.setattr(geometry_audit, "audit_scene", stop_at_the_second)
+    stopped = run(small_shards, "--workers", "1", "--frames", "1", *place)
+    written = (tmp_path / "kept", *(tmp_path / "home").rglob("audit-*.journal"))
+    kept = [path for path in written if path.is_file()]
+    monkeypatch.setattr(
+        geometry_audit,
+        "audit_scene",
+        lambda task, told: audited.append(task.scene.id.key) or plain(task, told),
+    )
+    again = run(small_shards, "--workers", "1", "--frames", "1", *place)
+
+    assert stopped.exit_code == 130
+    assert "stopped; run the same command again to go on from here" in stopped.stderr
+    assert len(kept) == 1
+    assert again.exit_code == 0
+    assert len(audited) == len(set(audited)) == 4
+    assert not kept[0].exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [(("--frames", "some"), "'some' is no number of frames"), (("--frames", "0"), "no number of"),
+     (("-o", "."), "is a folder: name a file")],
+)  # fmt: skip
+def test_an_option_that_is_off_is_a_usage_error(small_shards, run, words, told):
+    result = run(small_shards, *words)
+
+    assert result.exit_code == 2
+    assert told in " ".join(result.stderr.replace("│", " ").split())
+
+
+def test_all_frames_can_be_audited(small_shards, run):
+    result = run(small_shards, "--workers", "1", "--scene", SCENE, "--frames", "all")
+
+    assert "1 of 4 scenes, all frames of each." in result.stdout
+    assert "7/7 frames" in result.stderr

@@ -1,0 +1,484 @@
+"""The audit of whole scenes: exact ones, the same ones in shards, and ones made wrong."""
+
+import json
+import shutil
+import warnings
+
+import fsspec
+import numpy as np
+import pytest
+
+from stereogenbench_data.audit import geometry_audit as audit_module
+from stereogenbench_data.audit.audit_records import AuditLimits, ToleranceAudit
+from stereogenbench_data.audit.audit_table import audit_markdown, pooled_px
+from stereogenbench_data.audit.geometry_audit import (
+    AuditRequest,
+    audit,
+    audit_journal,
+    open_for_audit,
+)
+from stereogenbench_data.audit.scene_audit import spread_frames
+from stereogenbench_data.errors import SelectionError, StorageError
+from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.storage.pack import pack
+from tests.audit.corruption import (
+    copied,
+    edit_baseline,
+    exchange,
+    read_depth,
+    rewrite_depth,
+    rewrite_rgb,
+    write_depth,
+)
+
+SCENE = "train/Uniform/SynthStage/scene_000000"
+THREE = AuditRequest(frames=3)
+
+
+@pytest.fixture(scope="module")
+def exact(small_release):
+    """The audit of three frames of each of four scenes that are exact."""
+    return audit(small_release, THREE, workers=1)
+
+
+def made_wrong(small_release, root, change):
+    """Return the audit of one scene after change(folder)."""
+    change(copied(small_release / SCENE, root))
+    return audit(root, THREE, workers=1)
+
+
+def test_exact_scenes_have_no_finding(exact):
+    assert exact.findings == ()
+    assert (exact.scenes_there, exact.scenes_audited) == (4, 4)
+    assert all(scene.audited_frames == (0, 3, 6) for scene in exact.scenes)
+
+
+def test_exact_scenes_agree_with_themselves_to_rounding(exact):
+    for scene in exact.scenes:
+        assert scene.rig.intrinsics_px == 0.0
+        assert scene.rig.pairs_max_cm <= 1e-9
+        assert scene.rig.rotation_px <= 1e-9
+        assert scene.rig.lateral_px <= 1e-6
+        for pair in scene.pairs[:2]:
+            assert pair.tolerances[0].median_px <= 1e-6
+            assert pair.tolerances[-1].kept > 0.3 * pair.comparable
+            assert pair.frames == 3
+
+
+def test_frames_units_and_payloads_are_those_that_were_written(exact, small_release):
+    for scene in exact.scenes:
+        units = read_depth(small_release / scene.key, 2)[0][[0, 3, 6]]
+        known = (units > 0) & (units < 65535)
+        camera = scene.cameras[2]
+
+        assert (camera.rgb_frames, camera.depth_frames) == (7, 7)
+        assert (camera.depth_unit_m, camera.depth_step_units) == (0.001, 1.0)
+        assert camera.depth_levels == len(np.unique(units[known]))
+        assert camera.valid_depth == pytest.approx(known.mean())
+        assert camera.least_valid_depth.value == pytest.approx(known.mean(axis=(1, 2)).min())
+
+
+def test_shards_give_the_same_figures_as_the_folder(exact, small_shards):
+    packed = audit(small_shards, THREE, workers=1)
+
+    assert packed.to_json() | {"root": ""} == exact.to_json() | {"root": ""}
+
+
+def test_depth_that_was_packed_by_blosc2_gives_the_same_figures(exact, small_release, tmp_path):
+    pack(small_release, tmp_path / "packed", depth_codec="blosc2", workers=1)
+
+    found = audit(tmp_path / "packed", THREE, workers=1, scenes=SCENE)
+
+    (expected,) = [scene for scene in exact.to_json()["scenes"] if scene["key"] == SCENE]
+    assert found.to_json()["scenes"] == [expected]
+
+
+def test_a_tree_behind_a_url_is_walked_with_its_broken_scenes(small_release):
+    store = fsspec.filesystem("memory")
+    key = "eval/MapSeenInTrain/Uniform/SynthStage/scene_000000"
+    for path in (small_release / key).iterdir():
+        content = path.read_bytes()
+        store.pipe(f"/tree/{key}/{path.name}", content)
+        short = content[:-200] if path.name == "cam_04_depth.mkv" else content
+        store.pipe(f"/tree/{SCENE}/{path.name}", short)
+
+    report = audit("memory://tree", AuditRequest(frames=1), workers=1)
+    of_eval = audit("memory://tree", AuditRequest(frames=1), workers=1, split="eval")
+    store.rm("/tree", recursive=True)
+
+    (finding,) = report.findings
+    assert (finding.scene, finding.check) == (SCENE, "broken")
+    assert "cam_04_depth.mkv" in finding.member + finding.found
+    assert report.scenes_audited == of_eval.scenes_audited == 1
+    assert of_eval.findings == ()
+
+
+def test_a_url_gives_the_same_figures_as_the_folder(exact, small_shards, web):
+    shutil.copytree(small_shards, web.folder, dirs_exist_ok=True)
+
+    found = audit(web.url, THREE, workers=1, scenes=SCENE)
+
+    (expected,) = [scene for scene in exact.to_json()["scenes"] if scene["key"] == SCENE]
+    assert found.to_json()["scenes"] == [expected]
+
+
+def test_worker_processes_give_the_same_report(small_release):
+    index = open_for_audit(small_release)
+    rows = {"workers": 2, "split": "train"}
+
+    several = audit(index, AuditRequest(frames=1), **rows)
+
+    assert (
+        several.to_json() == audit(index, AuditRequest(frames=1), **rows | {"workers": 1}).to_json()
+    )
+
+
+def test_the_table_has_the_papers_figures_beside(exact):
+    rows = {row.quantity: row for row in exact.rows}
+
+    fx = "largest deviation of fx, fy, cx, cy from f / s W (none recorded in px)"
+    assert (rows[fx].ours, rows[fx].paper) == ("0 px", "0 px")
+    both = rows["both pairs, same step: median / 95th percentile (pixels kept)"]
+    assert both.paper == "1.20e-06 px / 4.39e-03 px"
+    frames = rows["RGB frames in all (of a video), missing"]
+    assert (frames.ours, frames.paper) == ("168 (7), 0 missing", "81 of a video, 0 missing")
+
+
+def test_the_report_is_json_and_markdown(exact):
+    document = json.loads(json.dumps(exact.to_json(), allow_nan=False))
+    markdown = audit_markdown(exact)
+
+    assert document["limits"]["baseline_cm"] == 1e-3
+    assert len(document["scenes"]) == 4
+    assert all(f"| {row.check} | {row.quantity} | " in markdown for row in exact.rows)
+    assert "## Findings" not in markdown
+
+
+def dark(folder):
+    rewrite_rgb(folder, 2, lambda pictures: (pictures * 0.05).astype(np.uint8))
+
+
+def flat(folder):
+    rewrite_rgb(folder, 4, lambda pictures: np.full_like(pictures, 128))
+
+
+def frozen(folder):
+    rewrite_rgb(folder, 1, lambda pictures: pictures[[0, 1, 2, 3, 3, 3, 3]])
+
+
+def one_view_twice(folder):
+    shutil.copy(folder / "cam_02_rgb.mp4", folder / "cam_03_rgb.mp4")
+
+
+def changed_depth(camera, change):
+    def rewrite(folder):
+        units, tags = read_depth(folder, camera)
+        write_depth(folder, camera, change(units), tags)
+
+    return rewrite
+
+
+def without_depth(units):
+    units[3] = 0
+    return units
+
+
+def hidden(units):
+    units[:, :, :20] = 300
+    return units
+
+
+def other_unit(folder):
+    units, _ = read_depth(folder, 3)
+    write_depth(folder, 3, units, {"DEPTH_SCALE": "0.002"})
+
+
+def rounded(folder):
+    rewrite_depth(folder, lambda units: np.where(units < 65535, units // 20 * 20, units))
+
+
+def longer_baseline(folder):
+    def change(document):
+        for pairs in ("adjacent_pairs", "pairwise_pairs"):
+            for pair in document[pairs]:
+                if (pair["camera_index_a"], pair["camera_index_b"]) == (2, 3):
+                    pair["baseline_cm"] += 0.05
+
+    edit_baseline(folder, change)
+
+
+def focal_in_pixels(folder):
+    edit_baseline(folder, lambda document: document["camera_intrinsics"].update(fx=1.0))
+
+
+def turned(folder):
+    path = folder / "trajectory.json"
+    document = json.loads(path.read_text())
+    for frame in document["frames"]:
+        frame["cameras"][1]["rotation"]["yaw"] += 1.0
+    path.write_text(json.dumps(document))
+
+
+def contradicting(folder):
+    units, _ = read_depth(folder, 5)
+    write_depth(folder, 5, units, {"DEPTH_SCALE": "0.001", "other_scale": "0.1"})
+
+
+@pytest.mark.parametrize(
+    ("change", "where", "check", "found"),
+    [
+        (dark, "cam_02_rgb.mp4", "too dark", "95 % of the picture are darker than"),
+        (flat, "cam_04_rgb.mp4", "flat", "the picture's grey levels span 0 of 255"),
+        (frozen, "cam_01_rgb.mp4", "frozen", "from frame 3 to the next audited one the camera"),
+        (one_view_twice, "cam_03_rgb.mp4", "copied view", "the same pictures as cam_02_rgb.mp4"),
+        (changed_depth(0, without_depth), "cam_00_depth.mkv", "invalid depth",
+         "frame 3 has depth at 0.0% of its pixels"),
+        (changed_depth(0, lambda units: units * 0 + 900), "cam_00_depth.mkv", "invalid depth",
+         "holds 1 different depths"),
+        (changed_depth(1, lambda units: units[[0] * 7]), "cam_01_depth.mkv", "frozen",
+         "from frame 0 to the next audited one the camera moves and depth stays the same"),
+        (changed_depth(5, hidden), "cam_05_depth.mkv", "occluder", "31% of the picture, from the"),
+        (other_unit, "", "agreement", "camera 2 that nothing hides from camera 3"),
+        (rounded, "cam_00_depth.mkv", "depth quantum", "20 units apart, so that depth was rounded"),
+        (longer_baseline, "", "pose/baseline", "differ by 0.05 cm (limit 0.001)"),
+        (focal_in_pixels, "", "intrinsics", "recorded intrinsics deviate"),
+        (turned, "", "rig rotation", "turned against camera 0 by 1 deg"),
+        (contradicting, "cam_05_depth.mkv", "unreadable", "its tags do not tell one positive"),
+    ],
+    ids=lambda value: getattr(value, "__name__", None),
+)  # fmt: skip
+def test_what_is_wrong_is_a_finding(small_release, tmp_path, change, where, check, found):
+    report = made_wrong(small_release, tmp_path, change)
+
+    (finding, *_) = [each for each in report.findings if each.check == check]
+    assert (finding.scene, finding.member) == (SCENE, where)
+    assert found in finding.found
+    assert report.scenes_audited == 1
+    assert any(check in row.ours for row in report.rows if row.check == "findings")
+    assert f"## Findings ({len(report.findings)})" in audit_markdown(report)
+
+
+def test_8_bit_depth_is_a_finding_unless_it_is_meant(small_release, tmp_path):
+    import av
+
+    folder = copied(small_release / SCENE, tmp_path)
+    with av.open(str(folder / "cam_03_depth.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=15)
+        stream.width = stream.height = 64
+        stream.pix_fmt = "gray"
+        for _ in range(7):
+            picture = np.tile(np.arange(1, 65, dtype=np.uint8), (64, 1))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray")))
+        container.mux(stream.encode(None))
+
+    refused = audit(tmp_path, AuditRequest(frames=2), workers=1)
+    contract = DepthEncoding(accept=frozenset({"8-bit"}))
+    meant = audit(tmp_path, AuditRequest(frames=2, depth=contract), workers=1)
+
+    (finding,) = refused.findings
+    assert (finding.check, finding.member) == ("unreadable", "cam_03_depth.mkv")
+    assert "(8-bit), which does not keep depth whole" in finding.found
+    assert "unreadable" not in {each.check for each in meant.findings}
+    assert meant.scenes[0].cameras[3].depth_levels == 64
+
+
+def test_scenes_that_cannot_be_indexed_are_findings_or_notes(small_release, tmp_path):
+    cut = copied(small_release / SCENE, tmp_path) / "cam_02_rgb.mp4"
+    cut.write_bytes(cut.read_bytes()[:-500])
+    for path in copied(small_release / SCENE.replace("000000", "000001"), tmp_path).glob("cam*"):
+        path.unlink()
+    copied(small_release / "train/IPD_Gaussian/SynthStage/scene_000000", tmp_path)
+
+    report = audit(tmp_path, workers=1)
+    of_family = audit(tmp_path, workers=1, family="IPD_Gaussian")
+    of_scene = audit(tmp_path, workers=1, scenes=SCENE)
+
+    (finding,) = report.findings
+    assert (finding.scene, finding.member, finding.check) == (SCENE, "cam_02_rgb.mp4", "broken")
+    assert report.notes[0].startswith("incomplete, not audited: train/Uniform")
+    assert (report.scenes_there, report.scenes_audited) == (3, 1)
+    assert (of_family.findings, of_family.scenes_audited) == ((), 1)
+    assert (of_scene.findings, of_scene.scenes_audited) == ((finding,), 0)
+
+
+def test_a_file_that_changed_after_its_index_is_a_finding(small_release, tmp_path):
+    folder = copied(small_release / SCENE, tmp_path)
+    index = open_for_audit(tmp_path)
+    (folder / "cam_00_rgb.mp4").unlink()
+    (folder / "cam_01_depth.mkv").write_bytes(b"nothing")
+    (folder / "trajectory.json").write_text("{")
+
+    report = audit(index, workers=1)
+
+    assert {(each.member, each.check) for each in report.findings} == {
+        ("cam_00_rgb.mp4", "unreadable"),
+        ("cam_01_depth.mkv", "unreadable"),
+        ("trajectory.json", "unreadable"),
+    }
+    assert report.scenes[0].cameras[0].rgb_frames == -1
+    assert np.isnan(report.scenes[0].rig.pairs_max_cm)
+    assert audit_markdown(report)
+
+
+def test_exchanged_cameras_disagree_in_depth(small_release, tmp_path):
+    report = made_wrong(small_release, tmp_path, lambda folder: exchange(folder, {1: 4, 4: 1}))
+
+    assert {each.check for each in report.findings} == {"agreement"}
+
+
+def test_limits_decide_what_is_a_finding(exact, small_release):
+    strict = AuditLimits.parse(["frames=81", "brightness=256"])
+
+    report = audit(small_release, AuditRequest(frames=1, limits=strict), workers=1, scenes=SCENE)
+
+    assert {each.check for each in report.findings} == {"missing frames", "too dark"}
+    assert "has 7 frames of 81" in report.findings[0].found + report.findings[1].found
+    with pytest.raises(SelectionError, match=r"limit 'frame=1' is not NAME=NUMBER with a name of"):
+        AuditLimits.parse(["frame=1"])
+    with pytest.raises(SelectionError, match="limit 'frames=many' is not NAME=NUMBER"):
+        AuditLimits.parse(["frames=many"])
+
+
+def test_a_sample_is_drawn_by_its_seed_and_filters_hold(small_release):
+    index = open_for_audit(small_release)
+
+    def keys(seed, **filters):
+        request = AuditRequest(sample=2, frames=1, seed=seed)
+        return [scene.key for scene in audit(index, request, workers=1, **filters).scenes]
+
+    drawn = {seed: keys(seed, split="train") for seed in range(4)}
+
+    assert keys(0, split="train") == drawn[0]
+    assert all(len(found) == 2 and sorted(found) == found for found in drawn.values())
+    assert len({tuple(found) for found in drawn.values()}) > 1
+    with pytest.raises(SelectionError, match="matches none of 4 scenes"):
+        keys(0, map="Nowhere")
+
+
+def test_an_audit_that_was_stopped_goes_on_where_it_was(
+    exact, small_release, tmp_path, monkeypatch
+):
+    index, request = open_for_audit(small_release), THREE
+
+    def stop(done, total):
+        if done >= 6:
+            raise KeyboardInterrupt
+
+    with audit_journal(tmp_path / "j", index, request) as journal, pytest.raises(KeyboardInterrupt):
+        audit(index, request, workers=1, progress=stop, journal=journal)
+    done = []
+    plain_audit = audit_module.audit_scene
+    monkeypatch.setattr(
+        audit_module, "audit_scene", lambda task, told: done.append(1) or plain_audit(task, told)
+    )
+    with audit_journal(tmp_path / "j", index, request) as journal:
+        known = len(journal)
+        report = audit(index, request, workers=1, journal=journal)
+
+    assert known >= 1
+    assert len(done) == 4 - known
+    assert report.to_json() == exact.to_json()
+
+
+def test_a_journal_of_other_frames_or_changed_files_is_not_used(small_release, tmp_path):
+    folder = copied(small_release / SCENE, tmp_path / "data")
+    index = open_for_audit(tmp_path / "data")
+
+    def run(frames):
+        request = AuditRequest(frames=frames)
+        with audit_journal(tmp_path / "j", index, request) as journal:
+            return len(journal), audit(index, request, workers=1, journal=journal)
+
+    first = run(2)
+    again = run(2)
+    flat(folder)
+    index = open_for_audit(tmp_path / "data")
+    changed = run(2)
+    others = run(3)
+
+    assert [first[0], again[0], changed[0], others[0]] == [0, 1, 1, 0]
+    assert again[1].to_json() == first[1].to_json()
+    assert first[1].findings == ()
+    assert [each.check for each in changed[1].findings] == ["flat"]
+
+
+def test_a_damaged_journal_is_passed_over(exact, small_release, tmp_path):
+    index, request = open_for_audit(small_release), THREE
+    with audit_journal(tmp_path / "j", index, request) as journal:
+        audit(index, request, workers=1, journal=journal, scenes=SCENE)
+    text = (tmp_path / "j").read_text()
+    (tmp_path / "j").write_text(text.replace('"cameras": [{', '"cameras": [{"odd": 1, '))
+
+    with audit_journal(tmp_path / "j", index, request) as journal:
+        report = audit(index, request, workers=1, journal=journal, scenes=SCENE)
+
+    (expected,) = [scene for scene in exact.to_json()["scenes"] if scene["key"] == SCENE]
+    assert report.to_json()["scenes"] == [expected]
+
+
+def test_progress_counts_frames(small_release):
+    told = []
+
+    audit(
+        small_release, AuditRequest(frames=2), workers=1, scenes=SCENE,
+        progress=lambda done, total: told.append((done, total)),
+    )  # fmt: skip
+
+    assert told == [(0, 2), (1, 2), (2, 2)]
+
+
+@pytest.mark.parametrize("wrong", [{"sample": 0}, {"frames": -1}, {"seed": -1}])
+def test_a_request_that_cannot_be_met_is_refused(wrong):
+    with pytest.raises(SelectionError, match="must be at least"):
+        AuditRequest(**wrong)
+
+
+def test_data_that_are_not_there_are_an_error(tmp_path):
+    with pytest.raises(StorageError, match="does not exist"):
+        audit(tmp_path / "nowhere")
+
+
+def test_opening_for_an_audit_does_not_warn_of_what_becomes_a_finding(small_release, tmp_path):
+    (copied(small_release / SCENE, tmp_path) / "_scene_complete.json").unlink()
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        report = audit(tmp_path, workers=1)
+
+    assert len(report.notes) == 1
+
+
+@pytest.mark.parametrize(
+    ("frames", "wanted", "chosen"),
+    [(81, 5, (0, 20, 40, 60, 80)), (81, 1, (40,)), (3, 0, (0, 1, 2)), (4, 9, (0, 1, 2, 3))],
+)
+def test_frames_are_spread_from_the_first_to_the_last(frames, wanted, chosen):
+    assert spread_frames(frames, wanted) == chosen
+
+
+def test_quantiles_of_scenes_are_pooled_by_their_pixels():
+    rng = np.random.default_rng(0)
+    parts = [rng.exponential(1.0, 4000), rng.exponential(30.0, 12000), np.empty(0)]
+    audits = [
+        ToleranceAudit(
+            "any", len(part),
+            tuple(np.quantile(part, np.linspace(0, 1, 41)).tolist()) if len(part) else (),
+        )
+        for part in parts
+    ]  # fmt: skip
+
+    everything = np.concatenate(parts)
+    assert pooled_px(audits, 0.5) == pytest.approx(np.quantile(everything, 0.5), rel=0.05)
+    assert pooled_px(audits, 0.95) == pytest.approx(np.quantile(everything, 0.95), rel=0.1)
+    assert pooled_px(audits[:1], 0.5) == pytest.approx(np.median(parts[0]))
+    assert np.isnan(pooled_px(audits[2:], 0.5))
+
+
+def test_the_shared_scene_is_right_by_its_metadata_and_depth(shared_scenes):
+    report = audit(shared_scenes, AuditRequest(frames=2), workers=1)
+
+    (scene,) = report.scenes
+    assert report.findings == ()
+    assert scene.rig.pairs_max_cm <= 1e-9
+    assert scene.pairs[0].tolerances[0].median_px <= 1e-6
+    assert scene.pairs[0].agreement > 0.98

@@ -1,0 +1,135 @@
+"""Payloads, light, motion and occluders, on pictures made by hand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from stereogenbench_data.audit.audit_records import At
+from stereogenbench_data.audit.picture_check import (
+    LightCheck,
+    PayloadCheck,
+    border_occluder,
+    reduced_size,
+    stored_step,
+    subject_m,
+)
+
+
+def grey(level, *, size=(24, 32)):
+    return np.full((3, *size), level, np.uint8)
+
+
+def stripes(low, high):
+    picture = grey(low)
+    picture[:, :, ::2] = high
+    return picture
+
+
+def test_the_darkest_and_the_flattest_picture_are_told_with_their_frames():
+    check = LightCheck()
+    check.take(stripes(20, 200), 0, moved=False)
+    check.take(stripes(0, 10), 7, moved=True)
+    check.take(grey(90), 9, moved=True)
+
+    assert check.brightness.at == At(pytest.approx(10, abs=0.01), 7)
+    assert check.contrast.at == At(pytest.approx(0, abs=0.01), 9)
+
+
+def test_change_counts_only_while_the_camera_moves():
+    check = LightCheck()
+    check.take(stripes(20, 200), 0, moved=False)
+    check.take(stripes(20, 200), 5, moved=False)
+    check.take(stripes(24, 204), 10, moved=True)
+    check.take(stripes(24, 206), 15, moved=True)
+
+    # Half of the pixels change by 2 grey levels.
+    assert check.change.at == At(pytest.approx(1.0, abs=0.01), 10)
+
+
+def test_a_payload_tells_its_share_its_numbers_and_where_it_stands_still():
+    check = PayloadCheck()
+    first = np.arange(48, dtype=np.uint16).reshape(6, 8) * 10
+    half = first.copy()
+    half[:3] = 0
+    for frame, units, moved in ((0, first, False), (4, half, True), (8, half, True)):
+        check.take(units, units > 0, frame, moved=moved)
+
+    assert check.valid == pytest.approx((47 / 48 + 0.5 + 0.5) / 3)
+    assert check.least_valid.at == At(0.5, 4)
+    assert (check.levels, check.step_units, check.still_from) == (47, 10.0, 4)
+
+
+def test_a_payload_may_stand_still_while_the_camera_does():
+    check = PayloadCheck()
+    units = np.ones((4, 4), np.uint16)
+    for frame in range(3):
+        check.take(units, units > 0, frame, moved=False)
+
+    assert check.still_from == -1
+
+
+def test_nothing_taken_is_nothing_known():
+    check = PayloadCheck()
+
+    assert math.isnan(check.valid)
+    assert math.isnan(check.step_units)
+    assert check.levels == 0
+
+
+def test_numbers_that_were_stretched_from_10_bits_are_64_apart():
+    stretched = np.unique(np.rint(np.arange(1, 1024) * 65535 / 1023).astype(int))
+
+    assert stored_step(stretched) == 64.0
+    assert stored_step(np.arange(1, 1024) * 100) == 100.0
+    assert stored_step(np.arange(5, 400)) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("size", "reduced"),
+    [((1280, 1280), (320, 320)), ((480, 832), (160, 277)), ((64, 64), (64, 64))],
+)
+def test_light_is_judged_on_at_most_320_pixels_a_side(size, reduced):
+    assert reduced_size(*size) == reduced
+
+
+def scene(depth_m=10.0):
+    return np.full((100, 100), depth_m), np.ones((100, 100), bool)
+
+
+def test_the_subject_is_as_far_as_the_nearer_part_of_the_middle_of_most_cameras():
+    plain, covered = scene(10.0), scene(0.5)
+    with_subject = scene(20.0)
+    with_subject[0][30:70, 30:70] = 6.0
+
+    assert subject_m([plain] * 5 + [covered]) == 10.0
+    assert subject_m([with_subject] * 6) == 6.0
+    assert math.isnan(subject_m([(plain[0], ~plain[1])]))
+
+
+@pytest.mark.parametrize(
+    ("where", "share", "side"),
+    [
+        pytest.param((slice(None), slice(0, 25)), 0.25, "left", id="left"),
+        pytest.param((slice(20, 80), slice(70, 100)), 0.18, "right", id="part of the right"),
+        pytest.param((slice(0, 12), slice(10, 90)), 0.096, "top", id="top"),
+        pytest.param((slice(40, 60), slice(40, 60)), 0.0, "", id="not at a border"),
+        pytest.param((slice(70, 100), slice(None)), 0.0, "", id="the ground"),
+        pytest.param((slice(0, 95), slice(None)), 0.95, "all", id="everywhere"),
+    ],
+)
+def test_what_hides_a_border_is_told_with_its_share_and_side(where, share, side):
+    depth_m, measured = scene()
+    depth_m[where] = 1.0
+
+    found, on = border_occluder(depth_m, measured, far_m=10.0)
+
+    assert (found, on) == (pytest.approx(share), side)
+
+
+def test_what_is_no_nearer_than_it_should_be_hides_nothing():
+    depth_m, measured = scene()
+    depth_m[:, :40] = 4.0
+
+    assert border_occluder(depth_m, measured, far_m=10.0) == (0.0, "")
+    assert border_occluder(depth_m, measured, far_m=math.nan) == (0.0, "")

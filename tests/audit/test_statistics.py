@@ -1,0 +1,246 @@
+"""Statistics of an index, against numbers worked out by hand and against the paper's."""
+
+import dataclasses
+import json
+import statistics as plain_statistics
+import sys
+
+import numpy as np
+import pytest
+import typer
+from PIL import Image
+from typer.testing import CliRunner
+
+from stereogenbench_data import SceneIndex
+from stereogenbench_data.audit import paper_figures
+from stereogenbench_data.audit.paper_comparison import compared, release_sized_splits
+from stereogenbench_data.audit.statistics import FOCAL_EDGES_MM, statistics
+from stereogenbench_data.audit.statistics_plots import write_plots
+from stereogenbench_data.audit.statistics_table import statistics_markdown
+from stereogenbench_data.cli.stats import stats
+from stereogenbench_data.errors import ExtraError, SelectionError
+from stereogenbench_data.schema.release import CAMERA_PAIRS, FAMILIES, TRAIN_MAPS, UNSEEN_MAPS
+from tests.audit.release_counts import paper_scenes
+
+PLACES_CM = (0.0, 10.0, 25.0, 31.0, 61.0, 211.0)
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory):
+    """The index of 8,493 scenes that are spread as the paper says."""
+    return SceneIndex.from_scenes(paper_scenes(), tmp_path_factory.mktemp("release"))
+
+
+@pytest.fixture(scope="module")
+def written_release(release):
+    """The same as a file."""
+    path = f"{release.root}/index.parquet"
+    release.write(path)
+    return path
+
+
+@pytest.fixture
+def three(small_release):
+    """Three scenes: one whose cameras stand at `PLACES_CM`, two like it twice as far apart."""
+    scene = SceneIndex.open(small_release).scene(0)
+
+    def placed(number, factor, focal_mm):
+        baselines = tuple(factor * (PLACES_CM[b] - PLACES_CM[a]) for a, b in CAMERA_PAIRS)
+        key = f"train/Uniform/Car_Dealer/scene_{number:06d}"
+        return dataclasses.replace(
+            scene,
+            id=dataclasses.replace(scene.id, key=key, split="train", subset=None,
+                                   family="Uniform", map_name="Car_Dealer"),
+            rig=dataclasses.replace(scene.rig, baselines_cm=baselines, focal_mm=focal_mm,
+                                    primary_pair=(1, 2)),
+        )  # fmt: skip
+
+    return SceneIndex.from_scenes(
+        [placed(0, 1.0, 20.0), placed(1, 2.0, 85.0), placed(2, 2.0, 90.0)], small_release
+    )
+
+
+def test_baselines_bins_and_focal_lengths_of_three_scenes(three):
+    found = statistics(three)
+
+    (family,) = found.families
+    gaps = [10.0, 15.0, 6.0, 30.0, 150.0]
+    adjacent = [*gaps, *(2 * gap for gap in gaps), *(2 * gap for gap in gaps)]
+    assert (family.split, family.subset, family.family, family.scenes) == (
+        "train",
+        "",
+        "Uniform",
+        3,
+    )
+    assert family.maps == {"Car_Dealer": 3}
+    assert family.adjacent_cm.count == 15
+    assert family.adjacent_cm.mean == pytest.approx(plain_statistics.mean(adjacent))
+    assert family.adjacent_cm.std == pytest.approx(plain_statistics.pstdev(adjacent))
+    assert family.adjacent_cm.median == plain_statistics.median(adjacent)
+    assert (family.adjacent_cm.min, family.adjacent_cm.max) == (6.0, 300.0)
+    assert family.all_pairs_cm.max == 422.0
+    # Primary 1-2: 15, 30, 30 cm. Of the adjacent ones 150 cm is the last value of its bin.
+    assert family.bins["[10,30)"][:2] == (1, 2 + 4)
+    assert family.bins["[30,60)"][:2] == (2, 1 + 2)
+    assert family.bins["[60,100)"][:2] == (0, 2)
+    assert family.bins["[100,150]"][:2] == (0, 1)
+    assert family.bins["(150,inf)"][:2] == (0, 2)
+    assert sum(every for _, _, every in family.bins.values()) == 45
+    # 20 mm opens a bin, 85 mm is the last of its own, 90 mm is beyond.
+    counts = dict(zip(FOCAL_EDGES_MM.tolist(), family.focal_counts[1:], strict=True))
+    assert (counts[20.0], counts[80.0], counts[85.0]) == (1, 1, 1)
+    assert sum(family.focal_counts) == 3
+
+
+def test_filters_choose_what_is_counted(three):
+    assert statistics(three, focal_mm=(15, 30)).scenes == 1
+    with pytest.raises(SelectionError, match="split='eval' matches none of 3 scenes"):
+        statistics(three, split="eval")
+
+
+def test_what_is_not_of_the_releases_size_is_not_compared_unless_asked_for(three):
+    found = statistics(three)
+
+    assert release_sized_splits(found) == ()
+    counts = [line for line in compared(found) if line.item == "scenes, train Uniform"]
+    assert [(line.paper, line.ours, line.agrees) for line in counts] == [("774", "3", False)]
+
+
+def test_an_index_with_the_papers_counts_agrees_with_the_paper_in_every_figure(release):
+    found = statistics(release)
+    lines = compared(found)
+
+    assert release_sized_splits(found) == ("train", "eval")
+    assert [line for line in lines if not line.agrees] == []
+    assert len(lines) == 154
+    assert {line.table for line in lines} >= {
+        paper_figures.COUNTS_TABLE,
+        paper_figures.ADJACENT_TABLE,
+        paper_figures.ALL_PAIRS_TABLE,
+        paper_figures.BINS_TABLE,
+        paper_figures.TRAIN_MAPS_TABLE,
+        paper_figures.EVAL_MAPS_TABLE,
+    }
+
+
+def test_one_scene_less_is_seen_in_every_figure_that_it_moves(release):
+    keys = release.column("key").tolist()
+    last = max(key for key in keys if "/Scene_Saloon/" in key)
+
+    found = statistics(release, scenes=[key for key in keys if key != last])
+    lines = compared(found)
+    markdown = statistics_markdown(found, lines)
+
+    items = {line.item: line for line in lines if not line.agrees}
+    assert items["scenes, train IPD_Gaussian Scene_Saloon"].ours == "11"
+    assert items["scenes, train IPD_Gaussian"].ours == "3288"
+    assert items["adjacent, train IPD_Gaussian: count"].ours == "16440"
+    assert not any("eval" in item for item in items)
+    assert f"## Against the paper: {154 - len(items)} of 154 figures agree" in markdown
+    assert markdown.rindex("| **differs** | ") < markdown.index("| same | ")
+
+
+def test_a_split_by_itself_is_compared_by_itself(release):
+    found = statistics(release, split="eval")
+
+    lines = compared(found, splits=release_sized_splits(found))
+
+    assert release_sized_splits(found) == ("eval",)
+    assert len(lines) > 60
+    assert all(line.agrees for line in lines)
+
+
+def test_the_papers_tables_close():
+    counts, maps = paper_figures.COUNTS, paper_figures.map_counts()
+
+    assert sum(counts.values()) == 8493
+    for split, total in paper_figures.SPLITS.items():
+        assert sum(count for (of, _, _), count in counts.items() if of == split) == total
+        for family in FAMILIES:
+            of_maps = sum(n for (of, by, _), n in maps.items() if (of, by) == (split, family))
+            assert of_maps == sum(
+                n for (of, _, by), n in counts.items() if (of, by) == (split, family)
+            )
+    assert set(paper_figures.TRAIN_MAPS) == TRAIN_MAPS
+    assert {name for name, (subset, _, _) in paper_figures.EVAL_MAPS.items()
+            if subset == "unseen_map"} == UNSEEN_MAPS  # fmt: skip
+    assert sum(paper_figures.BINS.values()) == counts["eval", "seen_map", "Uniform"]
+    for (split, family), told in paper_figures.ADJACENT.items():
+        scenes = sum(n for (of, _, by), n in counts.items() if (of, by) == (split, family))
+        assert int(told["count"]) == 5 * scenes
+    assert int(paper_figures.ALL_PAIRS["train", "Pairwise_Uniform"]["count"]) == 15 * 3691
+    assert paper_figures.SHORT_PAIRS["baselines"] == 5 * paper_figures.SHORT_PAIRS["scenes"]
+
+
+def test_markdown_has_the_papers_tables(release):
+    found = statistics(release)
+
+    markdown = statistics_markdown(found, compared(found))
+
+    row = "| train | Uniform | 3,870 | 1.0113 | 149.8906 | 52.7908 | 38.9500 | 43.2916 |"
+    assert row in markdown
+    assert "## Against the paper: 154 of 154 figures agree" in markdown
+    assert "| same | scenes, train Uniform | 774 | 774 |" in markdown
+    assert "Against the paper" not in statistics_markdown(found)
+
+
+def test_plots_show_each_family(release, tmp_path):
+    baselines, focal = write_plots(release, tmp_path / "plots")
+
+    for path in (baselines, focal):
+        picture = np.asarray(Image.open(path).convert("RGB"))
+        colours = {tuple(pixel) for pixel in picture.reshape(-1, 3)[::7].tolist()}
+        assert picture.shape == (640, 1260, 3)
+        assert {(0x44, 0x77, 0xAA), (0xEE, 0x66, 0x77), (0x22, 0x88, 0x33)} <= colours
+
+
+def test_plots_without_matplotlib_name_the_extra(three, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+
+    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[plots\]'"):
+        write_plots(three, tmp_path / "plots")
+
+
+@pytest.fixture
+def run():
+    """Run the command; several commands in one app, as the real one has."""
+    app = typer.Typer()
+    app.command()(stats)
+    app.command("other")(lambda: None)
+    return lambda *words: CliRunner().invoke(
+        app, ["stats", *map(str, words)], catch_exceptions=False
+    )
+
+
+def test_the_command_compares_a_release_by_itself(written_release, run):
+    result = run(written_release)
+
+    assert result.exit_code == 0
+    assert "## Against the paper: 154 of 154 figures agree" in result.stdout
+
+
+def test_the_command_compares_other_data_only_if_asked_to(small_shards, run):
+    plain, asked = run(small_shards), run(small_shards, "--compare", "always")
+
+    assert (plain.exit_code, asked.exit_code) == (0, 1)
+    assert "| train | - | Uniform | 2 |" in plain.stdout
+    assert "Against the paper" not in plain.stdout
+    assert "**differs**" in asked.stdout
+    assert "Against the paper" not in run(small_shards, "--compare", "never").stdout
+
+
+def test_the_command_writes_json_plots_and_files(small_shards, run, tmp_path):
+    words = ("--split", "train", "--plots", tmp_path / "plots")
+
+    told = run(small_shards, *words, "--json", "-o", tmp_path / "out" / "stats.json")
+    run(small_shards, "-o", tmp_path / "out" / "stats.md")
+
+    document = json.loads(told.stdout)
+    assert document == json.loads((tmp_path / "out" / "stats.json").read_text())
+    assert document["scenes"] == 3
+    assert document["paper"] == []
+    assert len(document["focal_edges_mm"]) == len(document["families"][0]["focal_counts"]) - 1
+    assert (tmp_path / "out" / "stats.md").read_text().startswith("# Statistics of ")
+    assert sorted(path.name for path in (tmp_path / "plots").iterdir()) == [
+        "baselines.png", "focal_lengths.png",
+    ]  # fmt: skip
