@@ -1,0 +1,105 @@
+"""The paper's keypoint matcher: DeDoDe with L-upright detector and B-upright descriptor.
+
+The network is kornia's; its weights are read from files, nothing is fetched.
+"""
+
+import importlib
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from jaxtyping import Int64
+
+from stereogenbench_data.errors import ExtraError
+from stereogenbench_data.evaluation.matching import KEYPOINTS, RATIO, mutual_matches
+from stereogenbench_data.evaluation.pictures import require_pictures
+from stereogenbench_data.evaluation.protocols import Keypoints, Picture, Settings
+from stereogenbench_data.evaluation.weights import (
+    Weights,
+    fingerprint,
+    load_into,
+    read_weights,
+    weights_path,
+)
+
+_RELEASE: Final = "https://github.com/Parskatt/DeDoDe/releases/download/dedode_pretrained_models/"
+DETECTOR: Final = Weights(
+    what="DeDoDe's detector L-upright",
+    file="dedode_detector_L.pth",
+    source=f"{_RELEASE}dedode_detector_L.pth",
+    licence="MIT",
+)
+DESCRIPTOR: Final = Weights(
+    what="DeDoDe's descriptor B-upright",
+    file="dedode_descriptor_B.pth",
+    source=f"{_RELEASE}dedode_descriptor_B.pth",
+    licence="MIT",
+)
+
+
+class DeDoDeMatcher:
+    """DeDoDe keypoints, matched as mutual nearest neighbours by the distance of descriptors.
+
+    Attributes:
+        name: What tables call it.
+        settings: Every choice that its answers depend on.
+    """
+
+    def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
+        """Load the networks.
+
+        Args:
+            weights: The folder of the two files; None for that of torch.hub's checkpoints.
+            device: Where to compute.
+
+        Raises:
+            ExtraError: If kornia or a file is missing.
+            EvaluationError: If a file does not hold this network's weights.
+        """
+        try:
+            kornia = importlib.import_module("kornia")
+        except ImportError as error:
+            raise ExtraError(
+                "DeDoDe needs kornia: pip install 'stereogenbench-data[dedode]'; its weights are "
+                f"{DETECTOR.source} and {DESCRIPTOR.source} (licence: {DETECTOR.licence})"
+            ) from error
+        network: Any = kornia.feature.DeDoDe(
+            detector_model="L", descriptor_model="B", amp_dtype=torch.float32
+        )
+        paths = [weights_path(kind, folder=weights) for kind in (DETECTOR, DESCRIPTOR)]
+        for part, path in zip((network.detector, network.descriptor), paths, strict=True):
+            load_into(part, read_weights(path, what="DeDoDe"), path=path)
+        self._network = network.to(device)
+        self._device = device
+        self.name = f"DeDoDe (kornia {kornia.__version__})"
+        self.settings: Settings = {
+            "detector": "L-upright",
+            "detector_sha256": fingerprint(paths[0]),
+            "descriptor": "B-upright",
+            "descriptor_sha256": fingerprint(paths[1]),
+            "keypoints": KEYPOINTS,
+            "ratio": RATIO,
+            "matching": "mutual nearest neighbours, ratio in both directions",
+            "descriptors": "as the network gives them, not normalised",
+            "precision": "float32",
+        }
+
+    def detect(self, picture: Picture) -> Keypoints:
+        """Return the keypoints of a picture that the detector is surest of.
+
+        Raises:
+            EvaluationError: If it is no picture.
+        """
+        require_pictures(picture)
+        image = torch.from_numpy(picture.copy()).to(self._device).float()[None] / 255
+        with torch.inference_mode():
+            xy_px, _, descriptors = self._network(image, n=KEYPOINTS)
+        return Keypoints(
+            xy_px=xy_px[0].cpu().numpy().astype(np.float32),
+            descriptors=descriptors[0].float().cpu().numpy(),
+        )
+
+    def match(self, left: Keypoints, right: Keypoints) -> Int64[np.ndarray, "m 2"]:
+        """Return mutual nearest neighbours."""
+        return mutual_matches(left, right)

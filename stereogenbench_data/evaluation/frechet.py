@@ -1,0 +1,149 @@
+"""The Fréchet distance of two sets of features, gathered bit by bit and by many processes.
+
+No covariance matrix is formed, and no root of one is taken. Of a set is kept its mean and a root
+R of its scatter, with R'R the sum over samples of (x - mean)(x - mean)'. The trace of the root of
+the product of two covariances, which the distance needs, is then the nuclear norm of R1 R2'
+over sqrt((n1 - 1)(n2 - 1)): a sum of singular values, real whatever the ranks, and without the
+loss of half of the digits that squaring brings.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from stereogenbench_data.errors import EvaluationError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Spread:
+    """How many samples a set of features has, where they lie and how they spread, in float64.
+
+    Its arrays may be stored and given back. Sets are merged in any grouping with the same result
+    up to rounding; merged in the same order, to the last digit.
+
+    Attributes:
+        count: How many samples.
+        mean: Their mean.
+        root: A root of their scatter, of at most twice as many rows as there are features.
+    """
+
+    count: int
+    mean: Float64[np.ndarray, " dim"]
+    root: Float64[np.ndarray, "rows dim"]
+
+    @classmethod
+    def empty(cls, dim: int) -> "Spread":
+        """Return the spread of no samples."""
+        return cls(count=0, mean=np.zeros(dim), root=np.zeros((0, dim)))
+
+    @classmethod
+    def of(cls, features: Float[np.ndarray, "n dim"]) -> "Spread":
+        """Return the spread of samples.
+
+        Raises:
+            EvaluationError: If they are no table of finite numbers.
+        """
+        if features.ndim != 2:
+            raise EvaluationError(f"features must be of shape (n, dim), got {features.shape}.")
+        samples = features.astype(np.float64)
+        if not np.isfinite(samples).all():
+            bad = np.flatnonzero(~np.isfinite(samples).all(axis=1))
+            raise EvaluationError(
+                f"{len(bad)} of {len(samples)} samples have features that are not finite, "
+                f"sample {bad[0]} first: the extractor overflowed or its weights are damaged."
+            )
+        if len(samples) == 0:
+            return cls.empty(samples.shape[1])
+        mean = samples.mean(axis=0)
+        root = _compressed(samples - mean, at_most=2 * samples.shape[1])
+        return cls(count=len(samples), mean=mean, root=root)
+
+    @property
+    def dim(self) -> int:
+        """How many features a sample has."""
+        return len(self.mean)
+
+    def merged(self, other: "Spread") -> "Spread":
+        """Return the spread of the samples of both.
+
+        Raises:
+            EvaluationError: If their samples have different numbers of features.
+        """
+        _require_alike(self, other)
+        if self.count == 0 or other.count == 0:
+            return other if self.count == 0 else self
+        count = self.count + other.count
+        between = other.mean - self.mean
+        apart = math.sqrt(self.count * other.count / count) * between
+        return Spread(
+            count=count,
+            mean=self.mean + between * (other.count / count),
+            root=_compressed(np.vstack([self.root, other.root, apart]), at_most=2 * self.dim),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FrechetDistance:
+    """A Fréchet distance, and what one needs to know to read it.
+
+    Attributes:
+        value: The distance (squared, as FID and FVD are); nan below two samples on a side.
+        samples: How many samples the predicted and the target side have.
+        dim: How many features a sample has.
+        underdetermined: The smaller side has no more samples than features, so its covariance
+            has not full rank, and the value is biased upwards by an amount that depends on the
+            number of samples: compare only with values of as many samples.
+    """
+
+    value: float
+    samples: tuple[int, int]
+    dim: int
+    underdetermined: bool
+
+
+def frechet_distance(predicted: Spread, target: Spread) -> FrechetDistance:
+    """Return the Fréchet distance of Gaussians fitted to two sets of features.
+
+    ||m1 - m2||^2 + tr S1 + tr S2 - 2 tr (S1 S2)^(1/2), with covariances over n - 1.
+
+    Raises:
+        EvaluationError: If their samples have different numbers of features.
+
+    Source: Dowson & Landau, Journal of Multivariate Analysis 12(3), 1982; Heusel et al., NIPS 2017.
+    """
+    _require_alike(predicted, target)
+    samples = (predicted.count, target.count)
+    value = math.nan
+    if min(samples) > 1:
+        one, two = (
+            _compressed(side.root, at_most=side.dim) / math.sqrt(side.count - 1)
+            for side in (predicted, target)
+        )
+        between = predicted.mean - target.mean
+        shared = np.linalg.svd(one @ two.T, compute_uv=False).sum()
+        value = float(between @ between + np.sum(one**2) + np.sum(two**2) - 2 * shared)
+    return FrechetDistance(
+        value=max(value, 0.0) if math.isfinite(value) else value,
+        samples=samples,
+        dim=predicted.dim,
+        underdetermined=min(samples) <= predicted.dim,
+    )
+
+
+def _compressed(
+    root: Float64[np.ndarray, "rows dim"], *, at_most: int
+) -> Float64[np.ndarray, "fewer dim"]:
+    """Return a root of the same scatter, with as many rows as features if it has too many."""
+    if len(root) <= at_most:
+        return root
+    return np.asarray(np.linalg.qr(root, mode="r"))
+
+
+def _require_alike(one: Spread, other: Spread) -> None:
+    if one.dim != other.dim:
+        raise EvaluationError(
+            f"sets of {one.dim} and of {other.dim} features cannot be compared: "
+            "they come from different extractors."
+        )

@@ -1,0 +1,191 @@
+"""The features of FVD: the 400 logits of I3D, the inflated Inception trained on Kinetics-400.
+
+Tensors are named as in the file of its weights.
+"""
+
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import nn
+from torch.nn import functional
+
+from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.pictures import require_clips
+from stereogenbench_data.evaluation.protocols import Clips, Settings
+from stereogenbench_data.evaluation.weights import (
+    Weights,
+    fingerprint,
+    load_into,
+    read_weights,
+    weights_path,
+)
+
+I3D: Final = Weights(
+    what="FVD's I3D",
+    file="i3d_pretrained_400.pt",
+    source="https://github.com/songweige/TATS/raw/main/tats/fvd/i3d_pretrained_400.pt",
+    licence="Apache-2.0 (DeepMind's Kinetics-I3D, converted)",
+)
+_SIDE_PX: Final = 224
+_CLASSES: Final = 400
+_MIN_FRAMES: Final = 10
+
+Size = tuple[int, int, int]
+
+
+class I3dFeatures:
+    """FVD's features of clips.
+
+    Attributes:
+        name: What tables call it.
+        distance: What a Fréchet distance of these features is called.
+        dim: How many features there are.
+        min_frames: How many frames a clip needs.
+        settings: Every choice that the features depend on.
+    """
+
+    name = "I3D (Kinetics-400)"
+    distance = "FVD"
+    dim = _CLASSES
+    min_frames = _MIN_FRAMES
+
+    def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
+        """Load the network.
+
+        Args:
+            weights: The folder of its file; None for that of torch.hub's checkpoints.
+            device: Where to compute.
+
+        Raises:
+            ExtraError: If the file is missing.
+            EvaluationError: If it does not hold this network's weights.
+        """
+        path = weights_path(I3D, folder=weights)
+        network = InflatedInception()
+        load_into(network, read_weights(path, what=I3D.what), path=path)
+        self._network = network.to(device)
+        self._device = device
+        self.settings: Settings = {
+            "layer": "logits, mean over time",
+            "resize": "bilinear to 224x224, aspect not kept, no smoothing",
+            "weights": path.name,
+            "weights_sha256": fingerprint(path),
+            "precision": "float32",
+        }
+
+    def __call__(self, clips: Clips) -> Float64[np.ndarray, "n dim"]:
+        """Return the features of each clip.
+
+        Raises:
+            EvaluationError: If they are no clips, or too short.
+        """
+        require_clips(clips)
+        if clips.shape[1] < _MIN_FRAMES:
+            raise EvaluationError(
+                f"I3D needs clips of at least {_MIN_FRAMES} frames, got {clips.shape[1]}."
+            )
+        features = np.empty((len(clips), _CLASSES))
+        with torch.inference_mode():
+            for index, clip in enumerate(clips):
+                frames = torch.from_numpy(clip.copy()).to(self._device).float()
+                small = functional.interpolate(
+                    frames, size=(_SIDE_PX, _SIDE_PX), mode="bilinear", align_corners=False
+                )
+                video = (2 * small / 255 - 1).transpose(0, 1)[None]
+                features[index] = self._network(video)[0].cpu().numpy()
+        return features
+
+
+class InflatedInception(nn.Module):
+    """From clips (n, 3, t, 224, 224) of -1 to 1 to 400 logits each."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.Conv3d_1a_7x7 = _Unit(3, 64, kernel=(7, 7, 7), stride=(2, 2, 2))
+        self.Conv3d_2b_1x1 = _Unit(64, 64)
+        self.Conv3d_2c_3x3 = _Unit(64, 192, kernel=(3, 3, 3))
+        self.Mixed_3b = _Mixed(192, (64, 96, 128, 16, 32, 32))
+        self.Mixed_3c = _Mixed(256, (128, 128, 192, 32, 96, 64))
+        self.Mixed_4b = _Mixed(480, (192, 96, 208, 16, 48, 64))
+        self.Mixed_4c = _Mixed(512, (160, 112, 224, 24, 64, 64))
+        self.Mixed_4d = _Mixed(512, (128, 128, 256, 24, 64, 64))
+        self.Mixed_4e = _Mixed(512, (112, 144, 288, 32, 64, 64))
+        self.Mixed_4f = _Mixed(528, (256, 160, 320, 32, 128, 128))
+        self.Mixed_5b = _Mixed(832, (256, 160, 320, 32, 128, 128))
+        self.Mixed_5c = _Mixed(832, (384, 192, 384, 48, 128, 128))
+        self.logits = _Logits()
+
+    def forward(self, video: torch.Tensor) -> torch.Tensor:
+        """Return logits (n, 400)."""
+        wide, all_ways = (1, 3, 3), (3, 3, 3)
+        x = _max_pool(self.Conv3d_1a_7x7(video), kernel=wide, stride=(1, 2, 2))
+        x = self.Conv3d_2c_3x3(self.Conv3d_2b_1x1(x))
+        x = _max_pool(x, kernel=wide, stride=(1, 2, 2))
+        x = _max_pool(self.Mixed_3c(self.Mixed_3b(x)), kernel=all_ways, stride=(2, 2, 2))
+        x = self.Mixed_4d(self.Mixed_4c(self.Mixed_4b(x)))
+        x = self.Mixed_4f(self.Mixed_4e(x))
+        x = _max_pool(x, kernel=(2, 2, 2), stride=(2, 2, 2))
+        x = functional.avg_pool3d(self.Mixed_5c(self.Mixed_5b(x)), (2, 7, 7), stride=1)
+        logits: torch.Tensor = self.logits(x)
+        return logits.mean(dim=(2, 3, 4))
+
+
+class _Unit(nn.Module):
+    """Convolution, normalisation and rectification, of the input's size over the stride."""
+
+    def __init__(
+        self, inputs: int, outputs: int, *, kernel: Size = (1, 1, 1), stride: Size = (1, 1, 1)
+    ) -> None:
+        super().__init__()
+        self.kernel, self.stride = kernel, stride
+        self.conv3d = nn.Conv3d(inputs, outputs, kernel, stride, bias=False)
+        self.bn = nn.BatchNorm3d(outputs, eps=1e-5)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        padded = _padded(x, kernel=self.kernel, stride=self.stride)
+        return functional.relu(self.bn(self.conv3d(padded)))
+
+
+class _Mixed(nn.Module):
+    def __init__(self, inputs: int, outputs: tuple[int, int, int, int, int, int]) -> None:
+        super().__init__()
+        self.b0 = _Unit(inputs, outputs[0])
+        self.b1a = _Unit(inputs, outputs[1])
+        self.b1b = _Unit(outputs[1], outputs[2], kernel=(3, 3, 3))
+        self.b2a = _Unit(inputs, outputs[3])
+        self.b2b = _Unit(outputs[3], outputs[4], kernel=(3, 3, 3))
+        self.b3b = _Unit(inputs, outputs[5])
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        pooled = _max_pool(x, kernel=(3, 3, 3), stride=(1, 1, 1))
+        branches = [self.b0(x), self.b1b(self.b1a(x)), self.b2b(self.b2a(x)), self.b3b(pooled)]
+        return torch.cat(branches, dim=1)
+
+
+class _Logits(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv3d = nn.Conv3d(1024, _CLASSES, 1)
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        logits: torch.Tensor = self.conv3d(x)
+        return logits
+
+
+def _max_pool(x: torch.Tensor, *, kernel: Size, stride: Size) -> torch.Tensor:
+    return functional.max_pool3d(_padded(x, kernel=kernel, stride=stride), kernel, stride)
+
+
+def _padded(x: torch.Tensor, *, kernel: Size, stride: Size) -> torch.Tensor:
+    """Return x with zeros around it, so that its size over the stride comes out, rounded up.
+
+    TensorFlow's "same": an odd zero goes to the end; and pools see the zeros as values.
+    """
+    padding: list[int] = []
+    for size, window, step in zip(x.shape[:1:-1], kernel[::-1], stride[::-1], strict=True):
+        total = max(window - (size % step or step), 0)
+        padding += [total // 2, total - total // 2]
+    return functional.pad(x, padding)

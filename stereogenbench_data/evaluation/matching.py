@@ -1,0 +1,165 @@
+"""E_match: how the set of left keypoints that are found again to the right changes."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int64
+
+from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.pictures import require_pictures
+from stereogenbench_data.evaluation.protocols import (
+    KeypointMatcher,
+    Keypoints,
+    Picture,
+    Settings,
+)
+
+EPIPOLAR_PX: Final = 2.0
+RATIO: Final = 0.9
+KEYPOINTS: Final = 2048
+
+
+@dataclass(frozen=True, slots=True)
+class MatchScore:
+    """E_match of one prediction.
+
+    Attributes:
+        error: 100 (1 - common / union), in percent; nan if neither right picture has a match.
+        keypoints: How many keypoints the left picture has.
+        target_matches: How many of them are found again in the target.
+        predicted_matches: How many of them are found again in the prediction.
+        common: How many in both.
+    """
+
+    error: float
+    keypoints: int
+    target_matches: int
+    predicted_matches: int
+    common: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetMatches:
+    """The left keypoints, and which are found again in the target: the same for all predictions.
+
+    Attributes:
+        left: Keypoints of the left picture.
+        matched: Which are found again in the target.
+        epipolar_px: How many rows a match may be off.
+        size_px: Height and width of the pictures.
+        matcher: The name of the matcher they were found by.
+    """
+
+    left: Keypoints
+    matched: Bool[np.ndarray, " n"]
+    epipolar_px: float
+    size_px: tuple[int, int]
+    matcher: str
+
+
+def target_matches(
+    left: Picture, target: Picture, *, matcher: KeypointMatcher, epipolar_px: float = EPIPOLAR_PX
+) -> TargetMatches:
+    """Return the left keypoints and which of them the rendered target shows.
+
+    The left keypoints are detected once, so that a keypoint is the same element of both sets
+    exactly if it is the same keypoint.
+
+    Raises:
+        EvaluationError: If the two are no pictures of one size.
+    """
+    require_pictures(left, target)
+    keypoints = matcher.detect(left)
+    return TargetMatches(
+        left=keypoints,
+        matched=_matched(keypoints, target, matcher=matcher, epipolar_px=epipolar_px),
+        epipolar_px=epipolar_px,
+        size_px=(left.shape[1], left.shape[2]),
+        matcher=matcher.name,
+    )
+
+
+def match_error(
+    predicted: Picture, *, against: TargetMatches, matcher: KeypointMatcher
+) -> MatchScore:
+    """Return E_match of a predicted right picture.
+
+    Raises:
+        EvaluationError: If it is no picture of the target's size, or the matcher another.
+    """
+    require_pictures(predicted)
+    if predicted.shape[1:] != against.size_px or matcher.name != against.matcher:
+        raise EvaluationError(
+            f"the target was matched at {against.size_px[1]}x{against.size_px[0]} by "
+            f"{against.matcher}, the prediction is to be at {predicted.shape[2]}x"
+            f"{predicted.shape[1]} by {matcher.name}: both must be the same."
+        )
+    matched = _matched(against.left, predicted, matcher=matcher, epipolar_px=against.epipolar_px)
+    common = int(np.count_nonzero(matched & against.matched))
+    union = int(np.count_nonzero(matched | against.matched))
+    return MatchScore(
+        error=100 * (1 - common / union) if union else float("nan"),
+        keypoints=len(matched),
+        target_matches=int(np.count_nonzero(against.matched)),
+        predicted_matches=int(np.count_nonzero(matched)),
+        common=common,
+    )
+
+
+def match_settings(matcher: KeypointMatcher, *, epipolar_px: float = EPIPOLAR_PX) -> Settings:
+    """Return every choice that E_match depends on."""
+    return {
+        "matcher": matcher.name,
+        "epipolar_px": epipolar_px,
+        "element": "a keypoint of the left picture, detected once",
+        **matcher.settings,
+    }
+
+
+def mutual_matches(
+    left: Keypoints, right: Keypoints, *, ratio: float = RATIO
+) -> Int64[np.ndarray, "m 2"]:
+    """Return indices of keypoints that are each other's nearest, clearly in both directions.
+
+    Clearly: the distance of descriptors to the nearest is at most ``ratio`` times that to the
+    second nearest. As kornia's match_smnn, in float64.
+
+    Returns:
+        Pairs (left, right) in ascending order of the left; none where a side has below two
+        keypoints, as there is no second nearest then.
+    """
+    if min(len(left.xy_px), len(right.xy_px)) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    one, two = (
+        torch.from_numpy(np.asarray(side.descriptors, dtype=np.float64)) for side in (left, right)
+    )
+    squared = (one @ two.T).mul_(-2)
+    squared += (one**2).sum(dim=1)[:, None]
+    squared += (two**2).sum(dim=1)
+    forward, clear = _nearest(squared, ratio=ratio)
+    backward, clear_back = _nearest(squared.T.contiguous(), ratio=ratio)
+    here = torch.arange(len(one))
+    mutual = clear & clear_back[forward] & (backward[forward] == here)
+    pairs: Int64[np.ndarray, "m 2"] = torch.stack([here, forward], dim=1)[mutual].numpy()
+    return pairs
+
+
+def _nearest(squared: torch.Tensor, *, ratio: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return which column is nearest to each row, and whether it is so clearly."""
+    nearest, index = squared.clamp(min=0).topk(2, dim=1, largest=False)
+    clear = (nearest[:, 0] <= ratio**2 * nearest[:, 1]) & (nearest[:, 1] > 0)
+    return index[:, 0], clear
+
+
+def _matched(
+    left: Keypoints, right: Picture, *, matcher: KeypointMatcher, epipolar_px: float
+) -> Bool[np.ndarray, " n"]:
+    """Return which left keypoints are found again in nearly the same row of a right picture."""
+    found = matcher.detect(right)
+    pairs = matcher.match(left, found)
+    rows_apart = np.abs(left.xy_px[pairs[:, 0], 1] - found.xy_px[pairs[:, 1], 1])
+    matched = np.zeros(len(left.xy_px), dtype=bool)
+    matched[pairs[rows_apart <= epipolar_px, 0]] = True
+    return matched

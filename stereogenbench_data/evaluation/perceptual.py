@@ -1,0 +1,168 @@
+"""LPIPS, version 0.1 on AlexNet: a weighted distance of two pictures' normalised activations."""
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import nn
+from torch.nn import functional
+
+from stereogenbench_data.errors import EvaluationError, ExtraError
+from stereogenbench_data.evaluation.pictures import require_batch
+from stereogenbench_data.evaluation.protocols import Pictures, Settings
+from stereogenbench_data.evaluation.weights import (
+    Weights,
+    fingerprint,
+    load_into,
+    read_weights,
+    weights_path,
+)
+
+TRUNK: Final = Weights(
+    what="LPIPS' AlexNet",
+    file="alexnet-owt-7be5be79.pth",
+    source="https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
+    licence="BSD-3-Clause, torchvision",
+)
+HEADS: Final = Path("weights") / "v0.1" / "alex.pth"
+_SHIFT: Final = (-0.030, -0.088, -0.188)
+_SCALE: Final = (0.458, 0.448, 0.450)
+_CHANNELS: Final = (64, 192, 384, 256, 256)
+_BATCH: Final = 8
+
+
+class Lpips:
+    """LPIPS of pictures against their targets.
+
+    Attributes:
+        name: What tables call it.
+        higher_is_better: False.
+        settings: Every choice that the scores depend on.
+    """
+
+    name = "LPIPS"
+    higher_is_better = False
+
+    def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
+        """Load the network.
+
+        Args:
+            weights: The folder of AlexNet's file; None for that of torch.hub's checkpoints. The
+                few numbers on top of it come from the installed package lpips.
+            device: Where to compute.
+
+        Raises:
+            ExtraError: If the package or the file is missing.
+            EvaluationError: If a file does not hold this network's weights.
+        """
+        heads = _heads_path()
+        path = weights_path(TRUNK, folder=weights)
+        trunk = {
+            name: value
+            for name, value in read_weights(path, what=TRUNK.what).items()
+            if name.startswith("features.")
+        }
+        network = PerceptualDistance()
+        load_into(network, trunk | dict(read_weights(heads, what="LPIPS")), path=path)
+        self._network = network.to(device)
+        self._device = device
+        self.settings: Settings = {
+            "network": "AlexNet",
+            "version": "0.1",
+            "size": "as scored",
+            "weights": path.name,
+            "weights_sha256": fingerprint(path),
+            "precision": "float32",
+        }
+
+    def __call__(self, predicted: Pictures, target: Pictures) -> Float64[np.ndarray, " n"]:
+        """Return the distance of each picture from its target.
+
+        Raises:
+            EvaluationError: If they are no pictures of one size and number.
+        """
+        require_batch(predicted)
+        require_batch(target)
+        if predicted.shape != target.shape:
+            raise EvaluationError(
+                f"LPIPS compares pictures one by one: {predicted.shape} against {target.shape}."
+            )
+        scores = np.empty(len(predicted))
+        with torch.inference_mode():
+            for start in range(0, len(predicted), _BATCH):
+                pair = (
+                    torch.from_numpy(side[start : start + _BATCH].copy()).to(self._device).float()
+                    for side in (predicted, target)
+                )
+                one, two = (side / 127.5 - 1 for side in pair)
+                scores[start : start + _BATCH] = self._network(one, two).cpu().numpy()
+        return scores
+
+
+class PerceptualDistance(nn.Module):
+    """From two batches of pictures (n, 3, h, w) of -1 to 1 to n distances.
+
+    Source: Zhang, Isola, Efros, Shechtman & Wang, CVPR 2018.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.features = nn.Sequential(
+            nn.Conv2d(3, 64, 11, stride=4, padding=2),
+            nn.ReLU(),
+            nn.MaxPool2d(3, stride=2),
+            nn.Conv2d(64, 192, 5, padding=2),
+            nn.ReLU(),
+            nn.MaxPool2d(3, stride=2),
+            nn.Conv2d(192, 384, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(384, 256, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(256, 256, 3, padding=1),
+            nn.ReLU(),
+        )
+        for layer, channels in enumerate(_CHANNELS):
+            head = nn.Sequential(nn.Dropout(), nn.Conv2d(channels, 1, 1, bias=False))
+            self.add_module(f"lin{layer}", nn.ModuleDict({"model": head}))
+
+    def forward(self, one: torch.Tensor, two: torch.Tensor) -> torch.Tensor:
+        """Return distances (n,)."""
+        total = one.new_zeros(len(one))
+        for layer, (here, there) in enumerate(
+            zip(self._activations(one), self._activations(two), strict=True)
+        ):
+            head = self.get_submodule(f"lin{layer}.model")
+            total += head((here - there) ** 2).mean(dim=(1, 2, 3))
+        return total
+
+    def _activations(self, pictures: torch.Tensor) -> list[torch.Tensor]:
+        """Return what follows each rectification, of unit length at each pixel."""
+        shift, scale = (
+            torch.tensor(values, device=pictures.device)[:, None, None]
+            for values in (_SHIFT, _SCALE)
+        )
+        x = (pictures - shift) / scale
+        found = []
+        for step in self.features:
+            x = step(x)
+            if isinstance(step, nn.ReLU):
+                found.append(functional.normalize(x, dim=1, eps=1e-10))
+        return found
+
+
+def _heads_path() -> Path:
+    """Return the file of LPIPS' own weights, in its package, which is not imported.
+
+    Raises:
+        ExtraError: If the package is not installed.
+    """
+    package = find_spec("lpips")
+    if package is None or package.origin is None:
+        raise ExtraError(
+            "LPIPS needs the package lpips: pip install 'stereogenbench-data[lpips]'; and the "
+            f"weights of AlexNet, {TRUNK.source} (licence: {TRUNK.licence})"
+        )
+    return Path(package.origin).parent / HEADS

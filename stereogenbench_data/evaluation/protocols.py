@@ -1,0 +1,125 @@
+"""What the protocol asks of the systems it measures with: any object with these members will do.
+
+Pictures are uint8 RGB, channel first. Each system says in ``settings`` every choice that its
+answers depend on, so that a score can be told apart from one that was measured otherwise.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+Picture = UInt8[np.ndarray, "3 h w"]
+Pictures = UInt8[np.ndarray, "n 3 h w"]
+Clips = UInt8[np.ndarray, "n t 3 h w"]
+Settings = Mapping[str, str | int | float | bool | None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keypoints:
+    """Keypoints of one picture.
+
+    Attributes:
+        xy_px: Column and row; the centre of the top-left pixel is (0.5, 0.5).
+        descriptors: One row a keypoint.
+    """
+
+    xy_px: Float32[np.ndarray, "n 2"]
+    descriptors: Float32[np.ndarray, "n d"]
+
+
+class Measured(Protocol):
+    """What every measuring system has.
+
+    Attributes:
+        name: What tables call it, with its version.
+        settings: Every choice that its answers depend on.
+    """
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        ...
+
+    @property
+    def settings(self) -> Settings:
+        """Every choice that its answers depend on."""
+        ...
+
+
+@runtime_checkable
+class KeypointMatcher(Measured, Protocol):
+    """Finds keypoints in one picture, and the same keypoints in another."""
+
+    def detect(self, picture: Picture) -> Keypoints:
+        """Return a picture's keypoints: of the same picture, always the same in the same order."""
+        ...
+
+    def match(self, left: Keypoints, right: Keypoints) -> Int64[np.ndarray, "m 2"]:
+        """Return indices of matched keypoints (left, right), each left keypoint at most once."""
+        ...
+
+
+@runtime_checkable
+class StereoMatcher(Measured, Protocol):
+    """Estimates the disparity of a rectified pair."""
+
+    def __call__(self, left: Picture, right: Picture) -> Float32[np.ndarray, "h w"]:
+        """Return the left picture's disparity in pixels; nan where it has no answer.
+
+        x_right = x_left - disparity: positive in front of the cameras.
+        """
+        ...
+
+
+@runtime_checkable
+class PairMetric(Measured, Protocol):
+    """Scores pictures against their targets, one number each."""
+
+    @property
+    def higher_is_better(self) -> bool:
+        """Which way is better."""
+        ...
+
+    def __call__(self, predicted: Pictures, target: Pictures) -> Float64[np.ndarray, " n"]:
+        """Return the score of each picture."""
+        ...
+
+
+class Features(Measured, Protocol):
+    """What an extractor of features for a Fréchet distance has."""
+
+    @property
+    def distance(self) -> str:
+        """What the Fréchet distance of these features is called: "FID" of Inception's alone."""
+        ...
+
+    @property
+    def dim(self) -> int:
+        """How many features there are."""
+        ...
+
+
+@runtime_checkable
+class ImageFeatures(Features, Protocol):
+    """Describes pictures by numbers."""
+
+    def __call__(self, pictures: Pictures) -> Float64[np.ndarray, "n dim"]:
+        """Return the features of each picture."""
+        ...
+
+
+@runtime_checkable
+class VideoFeatures(Features, Protocol):
+    """Describes clips by numbers."""
+
+    @property
+    def min_frames(self) -> int:
+        """How many frames a clip needs."""
+        ...
+
+    def __call__(self, clips: Clips) -> Float64[np.ndarray, "n dim"]:
+        """Return the features of each clip."""
+        ...

@@ -1,0 +1,210 @@
+"""SD: by which factor the disparity of a predicted pair misses the true one."""
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.protocols import Settings, StereoMatcher
+
+FitMethod = Literal["filtered", "least_squares", "theil_sen"]
+
+_OUTLIER_SIGMAS: Final = 3.0
+_OUTLIER_PX: Final = 1.0
+_MAD_TO_SIGMA: Final = 1.4826
+_FEWEST_PIXELS: Final = 100
+_FEWEST_SHARE: Final = 0.01
+_MEDIAN_PIXELS: Final = 20_000
+"""Of about how many pixels, evenly spaced in reading order, medians are taken for the fit."""
+
+_METHODS: Final[dict[FitMethod, str]] = {
+    "least_squares": "least squares of all answered pixels",
+    "theil_sen": "median slope of half-range pairs (Theil's incomplete method) of every n-th "
+    f"answered pixel, n so that about {_MEDIAN_PIXELS} remain",
+    "filtered": "least squares without outliers: those farther from the theil_sen line than "
+    f"{_OUTLIER_SIGMAS:g} robust standard deviations and {_OUTLIER_PX:g} px",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ScaleFit:
+    """The line true = slope * estimated + offset through the disparities of one pair.
+
+    Attributes:
+        drift: SD, |slope - 1|; nan where there is no line.
+        slope: Below 1 where the predicted pair's disparity is too large.
+        offset_px: True disparity where none is estimated.
+        pixels: How many pixels the line was fitted to.
+        outliers: How many answered pixels were left out of the fit.
+        valid_ratio: The share of the picture's pixels that the line was fitted to.
+        answered_ratio: The share of the scored pixels for which the matcher had an answer.
+        residual_std_px: Root mean squared residual of the fitted pixels.
+        residual_mad_px: Median absolute residual of all answered pixels.
+        r_squared: The share of the fitted pixels' true variance that the line explains.
+        reason: Why there is no line; empty where there is one.
+    """
+
+    drift: float
+    slope: float
+    offset_px: float
+    pixels: int
+    outliers: int
+    valid_ratio: float
+    answered_ratio: float
+    residual_std_px: float
+    residual_mad_px: float
+    r_squared: float
+    reason: str
+
+
+def fit_scale(
+    estimated_px: Float[np.ndarray, "h w"],
+    true_px: Float[np.ndarray, "h w"],
+    *,
+    scored: Bool[np.ndarray, "h w"],
+    method: FitMethod = "filtered",
+) -> ScaleFit:
+    """Return the line through true over estimated disparity, and SD.
+
+    A random prediction has a slope near 0 and so an SD near 1; one whose disparity is twice the
+    true one has a slope of 0.5 and an SD of 0.5; one with half of it, a slope of 2 and an SD of 1.
+    Errors of the matcher alone make the slope smaller, the more the less the disparity varies.
+
+    Args:
+        estimated_px: A matcher's disparity of (left, predicted right); nan where it has none.
+        true_px: The true disparity at the same resolution.
+        scored: Where the truth is known and the point is seen by both cameras.
+        method: How to fit; `scale_settings` says what each does.
+
+    Raises:
+        EvaluationError: If the maps differ in size, or there is no such method.
+    """
+    if method not in _METHODS:
+        raise EvaluationError(f"fit method must be one of {', '.join(_METHODS)}, got {method!r}.")
+    if not estimated_px.shape == true_px.shape == scored.shape:
+        raise EvaluationError(
+            "estimated disparity, true disparity and where to score must be of one size, "
+            f"got {estimated_px.shape}, {true_px.shape} and {scored.shape}."
+        )
+    answered = np.flatnonzero(scored & np.isfinite(estimated_px) & np.isfinite(true_px))
+    estimated, true = (
+        values.reshape(-1)[answered].astype(np.float64) for values in (estimated_px, true_px)
+    )
+    reason = _no_line(estimated, wanted=int(np.count_nonzero(scored)))
+    if reason:
+        return _fitted(estimated, true, None, scored=scored, reason=reason)
+    if method == "least_squares":
+        return _fitted(estimated, true, np.ones(true.size, dtype=bool), scored=scored)
+    some = slice(None, None, max(1, len(answered) // _MEDIAN_PIXELS))
+    if estimated[some].min() == estimated[some].max():
+        some = slice(None)
+    slope, offset = _median_line(estimated[some], true[some])
+    if method == "theil_sen":
+        kept = np.ones(true.size, dtype=bool)
+        return _fitted(estimated, true, kept, scored=scored, line=(slope, offset))
+    apart = np.abs(true - slope * estimated - offset)
+    sigma = _MAD_TO_SIGMA * float(np.median(apart[some]))
+    kept = apart <= max(_OUTLIER_SIGMAS * sigma, _OUTLIER_PX)
+    reason = _no_line(estimated[kept], wanted=int(np.count_nonzero(scored)))
+    return _fitted(estimated, true, None if reason else kept, scored=scored, reason=reason)
+
+
+def scale_settings(matcher: StereoMatcher, *, method: FitMethod = "filtered") -> Settings:
+    """Return every choice that SD depends on."""
+    return {
+        "matcher": matcher.name,
+        "fit": method,
+        "fit_meaning": _METHODS[method],
+        "direction": "true over estimated disparity",
+        "fewest_pixels": _FEWEST_PIXELS,
+        "fewest_share": _FEWEST_SHARE,
+        **matcher.settings,
+    }
+
+
+def _no_line(estimated: Float64[np.ndarray, " n"], *, wanted: int) -> str:
+    """Return why no line can be fitted, or an empty text.
+
+    A line through the few answers that a matcher gives of unlike pictures can have any slope.
+    """
+    if estimated.size < max(_FEWEST_PIXELS, _FEWEST_SHARE * wanted):
+        return (
+            f"{estimated.size} of {wanted} scored pixels to fit, fewer than "
+            f"{_FEWEST_PIXELS} or {_FEWEST_SHARE:.0%}"
+        )
+    if estimated.min() == estimated.max():
+        return f"the estimated disparity is {estimated[0]:g} px everywhere"
+    return ""
+
+
+def _least_squares(
+    estimated: Float64[np.ndarray, " n"], true: Float64[np.ndarray, " n"]
+) -> tuple[float, float]:
+    """Return slope and offset; centred first, so that a common offset costs no digits.
+
+    Summed by numpy, not as a scalar product: that would depend on the number of threads.
+    """
+    mean_estimated, mean_true = estimated.mean(), true.mean()
+    centred = estimated - mean_estimated
+    slope = float(np.sum(centred * (true - mean_true)) / np.sum(centred**2))
+    return slope, float(mean_true - slope * mean_estimated)
+
+
+def _median_line(
+    estimated: Float64[np.ndarray, " n"], true: Float64[np.ndarray, " n"]
+) -> tuple[float, float]:
+    """Return slope and offset by medians.
+
+    In order of the estimate each pixel of the lower half is paired with one of the upper half,
+    half of all pixels further on; the slope is the median of those of the pairs.
+    """
+    order = np.argsort(estimated, kind="stable")
+    half = estimated.size // 2
+    low, high = order[:half], order[-half:]
+    run = estimated[high] - estimated[low]
+    apart = run > 0
+    if not apart.any():
+        return _least_squares(estimated, true)
+    slope = float(np.median((true[high] - true[low])[apart] / run[apart]))
+    return slope, float(np.median(true - slope * estimated))
+
+
+def _fitted(
+    estimated: Float64[np.ndarray, " n"],
+    true: Float64[np.ndarray, " n"],
+    kept: Bool[np.ndarray, " n"] | None,
+    *,
+    scored: Bool[np.ndarray, "h w"],
+    line: tuple[float, float] | None = None,
+    reason: str = "",
+) -> ScaleFit:
+    """Return the record of a fit to the kept pixels, by least squares where no line is given."""
+    nan = float("nan")
+    wanted = int(np.count_nonzero(scored))
+    answered_ratio = estimated.size / wanted if wanted else nan
+    if kept is None:
+        return ScaleFit(
+            drift=nan, slope=nan, offset_px=nan, pixels=0, outliers=0, valid_ratio=0.0,
+            answered_ratio=answered_ratio, residual_std_px=nan, residual_mad_px=nan,
+            r_squared=nan, reason=reason,
+        )  # fmt: skip
+    slope, offset = line or _least_squares(estimated[kept], true[kept])
+    residual = true - slope * estimated - offset
+    pixels = int(np.count_nonzero(kept))
+    variance = float(np.var(true[kept]))
+    mean_squared = float(np.mean(residual[kept] ** 2))
+    return ScaleFit(
+        drift=abs(slope - 1),
+        slope=slope,
+        offset_px=offset,
+        pixels=pixels,
+        outliers=estimated.size - pixels,
+        valid_ratio=pixels / scored.size,
+        answered_ratio=answered_ratio,
+        residual_std_px=float(np.sqrt(mean_squared)),
+        residual_mad_px=float(np.median(np.abs(residual))),
+        r_squared=1 - mean_squared / variance if variance else nan,
+        reason="",
+    )

@@ -1,0 +1,94 @@
+"""Learned weights: files that the user fetches once, and of which only tensors are read."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+
+from stereogenbench_data.errors import EvaluationError, ExtraError
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """A file of learned weights.
+
+    Attributes:
+        what: What they are of, for messages.
+        file: The name of the file.
+        source: Where to fetch it.
+        licence: Under which terms it comes.
+    """
+
+    what: str
+    file: str
+    source: str
+    licence: str
+
+
+def weights_path(weights: Weights, *, folder: Path | None) -> Path:
+    """Return where the file of weights is.
+
+    Args:
+        weights: Which.
+        folder: Where to look; None for the folder of torch.hub's checkpoints.
+
+    Raises:
+        ExtraError: If it is not there; it says where to fetch it and where to put it.
+    """
+    place = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
+    path = place / weights.file
+    if not path.is_file():
+        raise ExtraError(
+            f"the weights of {weights.what} are not at {path}. Fetch {weights.source} "
+            f"(licence: {weights.licence}) and put it there as {weights.file}, or name the folder "
+            "that it is in."
+        )
+    return path
+
+
+def fingerprint(path: Path) -> str:
+    """Return the sha256 of a file of weights, as 64 hexadecimal digits, for the settings."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_weights(path: Path, *, what: str) -> Mapping[str, Any]:
+    """Return the tensors of a file of weights, on the CPU; what else it holds is refused.
+
+    Raises:
+        EvaluationError: If it holds more than tensors and plain values, or is damaged.
+    """
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (UnpicklingError, RuntimeError, EOFError, KeyError, ValueError) as error:
+        raise EvaluationError(
+            f"{path}: these weights of {what} cannot be read as tensors alone "
+            f"({str(error).splitlines()[0] if str(error) else type(error).__name__}). Fetch the "
+            "file again; if you trust it, load it once by its authors' code and store its tensors "
+            "with torch.save."
+        ) from error
+    if not isinstance(content, Mapping):
+        raise EvaluationError(
+            f"{path}: the weights of {what} are a {type(content).__name__}, not a table of tensors."
+        )
+    return content
+
+
+def load_into(network: torch.nn.Module, tensors: Mapping[str, Any], *, path: Path) -> None:
+    """Give a network its weights, make it ready for use and freeze it.
+
+    Raises:
+        EvaluationError: If the tensors are not this network's.
+    """
+    try:
+        network.load_state_dict(tensors)
+    except RuntimeError as error:
+        lines = [line.strip() for line in str(error).splitlines()[1:3]]
+        raise EvaluationError(
+            f"{path}: these are not the weights of {type(network).__name__}: {' '.join(lines)}"
+        ) from error
+    network.eval().requires_grad_(requires_grad=False)
