@@ -1,21 +1,68 @@
 """Options that several commands share: which scenes, JSON output, worker processes."""
 
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from stereogenbench_data.schema.release import FAMILIES, TRAIN_MAPS, UNSEEN_MAPS
+
+
+def complete_from(values: Iterable[str]) -> Callable[[str], list[str]]:
+    """Return what a shell's completion asks: which of the values begin with what was typed."""
+    known = sorted(values)
+    return lambda incomplete: [
+        value for value in known if value.lower().startswith(incomplete.lower())
+    ]
+
+
+def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
+    """Return the keys of scenes that begin with what was typed, where DATA has an index."""
+    from stereogenbench_data.errors import StereoGenBenchError
+    from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
+
+    data = Path(str(context.params.get("data")))
+    if not (data.is_file() or (data / INDEX_NAME).is_file()):
+        return []
+    try:
+        keys = SceneIndex.open(data).column("key")
+    except StereoGenBenchError:
+        return []
+    return complete_from(map(str, keys))(incomplete)
+
+
 DataArgument = Annotated[
     str, typer.Argument(help="Released tree, folder of shards, index file, or the URL of either.")
 ]
-SplitOption = Annotated[str | None, typer.Option("--split", help="train or eval.")]
+SplitOption = Annotated[
+    str | None,
+    typer.Option("--split", help="train or eval.", autocompletion=complete_from(("train", "eval"))),
+]
 SubsetOption = Annotated[
-    str | None, typer.Option("--subset", help="seen_map or unseen_map (of eval scenes).")
+    str | None,
+    typer.Option(
+        "--subset",
+        help="seen_map or unseen_map (of eval scenes).",
+        autocompletion=complete_from(("seen_map", "unseen_map")),
+    ),
 ]
 FamilyOption = Annotated[
-    list[str] | None, typer.Option("--family", help="Baseline family; may be given again.")
+    list[str] | None,
+    typer.Option(
+        "--family",
+        help="Baseline family; may be given again.",
+        autocompletion=complete_from(FAMILIES),
+    ),
 ]
-MapOption = Annotated[list[str] | None, typer.Option("--map", help="Map; may be given again.")]
+MapOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--map",
+        help="Map; may be given again.",
+        autocompletion=complete_from(TRAIN_MAPS | UNSEEN_MAPS),
+    ),
+]
 SceneOption = Annotated[
     list[str] | None, typer.Option("--scene", help="Key of a scene; may be given again.")
 ]
@@ -25,6 +72,13 @@ FocalOption = Annotated[
 ]
 CaptionOption = Annotated[
     str | None, typer.Option("--caption", help="Words that must all be in the description.")
+]
+DepthUnitOption = Annotated[
+    float | None,
+    typer.Option(
+        "--depth-unit-m",
+        help="Metres in a stored unit of depth, whatever the files state [their own tag].",
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")]
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes [one a core].")]

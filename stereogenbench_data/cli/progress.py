@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    MofNCompleteColumn,
     Progress,
     ProgressColumn,
     Task,
@@ -18,6 +17,21 @@ from rich.text import Text
 Report = Callable[[int, int], None]
 
 
+class _DoneColumn(ProgressColumn):
+    """How much is done of how much, as far as it is known."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        """Return 3/8 scenes, or nothing before the total is known."""
+        if task.total is None:
+            return Text("")
+        total = f"{task.total:,.0f}"
+        return Text(f"{task.completed:>{len(total)},.0f}/{total} {self._unit}", style="cyan")
+
+
 class _RateColumn(ProgressColumn):
     """Units a second."""
 
@@ -26,9 +40,9 @@ class _RateColumn(ProgressColumn):
         self._unit = unit
 
     def render(self, task: Task) -> Text:
-        """Return the rate since the start."""
+        """Return the rate since the start, or nothing before there is one."""
         rate = task.finished_speed or task.speed
-        return Text(f"{'?' if rate is None else format(rate, '.1f')} {self._unit}/s")
+        return Text("" if rate is None else f"{rate:,.1f} {self._unit}/s")
 
 
 @contextmanager
@@ -37,9 +51,9 @@ def progress_bar(doing: str, *, unit: str) -> Iterator[Report]:
     columns = (
         TextColumn(doing),
         BarColumn(),
-        MofNCompleteColumn(),
+        _DoneColumn(unit),
         _RateColumn(unit),
-        TimeRemainingColumn(),
+        TimeRemainingColumn(compact=True, elapsed_when_finished=True),
     )
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task(doing, total=None)

@@ -1,11 +1,13 @@
 """``stereogenbench synth``: scenes in the released layout, drawn without Unreal."""
 
+import json
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from stereogenbench_data.cli.options import JsonOption, complete_from
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.release import (
     FAMILIES,
@@ -14,14 +16,23 @@ from stereogenbench_data.schema.release import (
     Split,
     Subset,
 )
-from stereogenbench_data.synthesis.request import ExportContract, RotationForm, SynthRequest
+
+if TYPE_CHECKING:
+    from stereogenbench_data.synthesis.request import SynthRequest
+
+RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
+"""As in `synthesis.request`, which is imported when scenes are drawn, not for the help."""
 
 
 def synth(  # noqa: PLR0913 - one parameter an option
     out: Annotated[Path, typer.Argument(help="Folder to write train/ or eval/ into.")],
     *,
     family: Annotated[
-        str, typer.Option(help=f"How far the cameras stand apart: {', '.join(FAMILIES)}.")
+        str,
+        typer.Option(
+            help=f"How far the cameras stand apart: {', '.join(FAMILIES)}.",
+            autocompletion=complete_from(FAMILIES),
+        ),
     ] = FAMILIES[0],
     scenes: Annotated[int, typer.Option(help="How many scenes, numbered from 0.")] = 1,
     size: Annotated[int, typer.Option(help="Width and height, even.")] = IMAGE_SIZE_PX,
@@ -43,12 +54,15 @@ def synth(  # noqa: PLR0913 - one parameter an option
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that draw (default: one a core).")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Draw scenes with exact depth, poses and intrinsics, in the released layout.
 
     Scenes that the same request wrote before are kept, so a run that was stopped goes on if it
     is run again. Scene i is the same for any number of scenes and workers.
     """
+    from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
+
     request = SynthRequest(
         family=family,
         scenes=scenes,
@@ -68,10 +82,13 @@ def synth(  # noqa: PLR0913 - one parameter an option
     except KeyboardInterrupt:
         typer.echo("stopped; run the same command again to go on from here", err=True)
         raise typer.Exit(130) from None
-    typer.echo(f"{out}: {len(keys)} scenes in {request.folder}")
+    if as_json:
+        typer.echo(json.dumps({"root": str(out), "scenes": keys}, indent=2))
+    else:
+        typer.echo(f"{out}: {len(keys)} scenes in {request.folder}")
 
 
-def _drawn(out: Path, request: SynthRequest, *, workers: int) -> list[str]:
+def _drawn(out: Path, request: "SynthRequest", *, workers: int) -> list[str]:
     from stereogenbench_data.synthesis.produce import synthesise
 
     with progress_bar("drawing", unit="frames") as report:

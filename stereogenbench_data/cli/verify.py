@@ -27,6 +27,7 @@ def verify(
 
     The exit status is 0 if nothing is wrong, 1 if something is, 2 if they cannot be verified.
     """
+    from stereogenbench_data.schema.problems import counted
     from stereogenbench_data.storage.verify import verify as verified
 
     mode: Literal["bytes", "decode"] = "decode" if deep else "bytes"
@@ -45,10 +46,15 @@ def verify(
     else:
         for problem in report.problems:
             typer.echo(str(problem))
-        decoded = f", {report.videos_decoded} videos decoded" if deep else ""
-        typer.echo(
-            f"{report.root}: {report.shards} shards, {report.scenes} scenes, {report.members} "
-            f"members, {report.bytes / _MEGABYTE:.1f} MB{decoded}; {len(report.problems)} problems"
+        decoded = f", {counted(report.videos_decoded, 'video')} decoded" if deep else ""
+        there = ", ".join(
+            (
+                counted(report.shards, "shard"),
+                counted(report.scenes, "scene"),
+                counted(report.members, "member"),
+                f"{report.bytes / _MEGABYTE:.1f} MB{decoded}",
+            )
         )
+        typer.echo(f"{report.root}: {there}; {counted(len(report.problems), 'problem')}")
     if report.problems:
         raise typer.Exit(1)

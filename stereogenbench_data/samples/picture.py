@@ -26,10 +26,18 @@ _GAP_PX: Final = 4
 
 
 def coloured(
-    values: Float[np.ndarray, "h w"], *, measured: Bool[np.ndarray, "h w"], largest: float
+    values: Float[np.ndarray, "h w"],
+    *,
+    measured: Bool[np.ndarray, "h w"],
+    largest: float,
+    smallest: float = 0.0,
 ) -> Picture:
-    """Return a map in colours from 0 (dark blue) to ``largest`` (red), grey where not measured."""
-    place = np.clip(np.abs(values) / max(largest, 1e-12), 0, 1) * (len(COLOUR_STOPS) - 1)
+    """Return the sizes of a map's values as colours, grey where not measured.
+
+    From ``smallest`` (dark blue) to ``largest`` (red); what lies beyond has the colour of the end.
+    """
+    span = max(largest - smallest, 1e-12)
+    place = np.clip((np.abs(values) - smallest) / span, 0, 1) * (len(COLOUR_STOPS) - 1)
     channels = [
         np.interp(place, np.arange(len(COLOUR_STOPS)), COLOUR_STOPS[:, channel])
         for channel in range(3)
@@ -37,6 +45,11 @@ def coloured(
     picture = np.stack(channels, axis=-1).round().astype(np.uint8)
     picture[~measured] = NOT_MEASURED
     return picture
+
+
+def anaglyph(left: UInt8[np.ndarray, "3 h w"], right: UInt8[np.ndarray, "3 h w"]) -> Picture:
+    """Return a picture for red-cyan glasses: red of the left view, green and blue of the right."""
+    return np.stack([left[0], right[1], right[2]], axis=-1)
 
 
 def contact_sheet(samples: Sequence[Sample]) -> Picture:

@@ -8,7 +8,7 @@ import pytest
 
 def run(*arguments, **options):
     return subprocess.run(
-        [sys.executable, "-m", "stereogenbench_data.cli.main", *map(str, arguments)],
+        [sys.executable, "-m", "stereogenbench_data", *map(str, arguments)],
         capture_output=True, text=True, check=False, timeout=120, **options,
     )  # fmt: skip
 
@@ -17,8 +17,9 @@ def test_help_tells_a_newcomer_what_to_do_first():
     shown = run("--help")
 
     assert shown.returncode == 0
-    assert "New here? Draw some scenes with `stereogenbench synth scenes/`" in " ".join(
-        shown.stdout.split()
+    assert (
+        "New here? Draw two small scenes, look at one, browse them all: stereogenbench synth"
+        in (" ".join(shown.stdout.split()))
     )
 
 

@@ -1,0 +1,259 @@
+"""What the page lists: which scenes and pairs a choice leaves, with counts, and its Python line."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from stereogenbench_data.audit.browser.choice import FACETS, Choice
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
+from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.selection.pairs import PairList, baselines_cm, choose_pairs
+from stereogenbench_data.storage.index import SceneIndex
+
+MOST_ROWS: Final = 200
+"""How many scenes one answer lists at most."""
+
+_KEPT_CHOICES: Final = 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chosen:
+    """What a choice leaves.
+
+    Attributes:
+        rows: Rows of scenes of which a pair is left, ascending.
+        pairs: These pairs.
+        reason: Why there is none, empty where there is one.
+    """
+
+    rows: Int64[np.ndarray, " n"]
+    pairs: PairList
+    reason: str = ""
+
+
+class Catalogue:
+    """The scenes of an index as the page asks for them; from any thread."""
+
+    def __init__(
+        self, index: SceneIndex, *, shown_data: str, depth: DepthEncoding | None = None
+    ) -> None:
+        """Take an index.
+
+        Args:
+            index: Of the data.
+            shown_data: What `StereoPairs` is given for these data.
+            depth: The depth contract instead of the files' own, or None.
+        """
+        self.index = index
+        self._data = shown_data
+        self._depth = depth
+        self._row_of = {str(key): row for row, key in enumerate(index.column("key"))}
+        self._chosen = lru_cache(maxsize=_KEPT_CHOICES)(self._choose)
+
+    def row(self, key: str) -> int:
+        """Return the row of a key.
+
+        Raises:
+            SelectionError: If there is no such scene.
+        """
+        if key not in self._row_of:
+            raise SelectionError(f"{key!r} is no key of {len(self.index)} scenes.")
+        return self._row_of[key]
+
+    def about(self) -> dict[str, Any]:
+        """Return what the page says of the data as a whole."""
+        focal_mm = self.index.column("focal_mm")
+        found = baselines_cm(self.index, self._all_pairs())
+        return {
+            "data": self._data,
+            "scenes": len(self.index),
+            "focal_mm": [float(focal_mm.min()), float(focal_mm.max())],
+            "baseline_cm": [float(found.min()), float(found.max())],
+            "depth": ""
+            if self._depth is None
+            else f"depth unit {self._depth.unit_m:g} m, as asked",
+            "left_out": {**self.index.broken, **self.index.incomplete},
+        }
+
+    def choose(self, choice: Choice) -> Chosen:
+        """Return what a choice leaves."""
+        return self._chosen(choice)
+
+    def summary(self, choice: Choice) -> dict[str, Any]:
+        """Return how many scenes and pairs a choice leaves, why none, and the counts of filters.
+
+        The count of a filter's value is of the scenes that all other filters leave; that of a
+        baseline bin is of the pairs.
+        """
+        chosen = self.choose(choice)
+        return {
+            "scenes": len(chosen.rows),
+            "pairs": len(chosen.pairs),
+            "reason": chosen.reason,
+            "line": self.selection_line(choice),
+            "counts": {name: self._counts(choice, name) for name in FACETS}
+            | {"bin": self._bin_counts(choice)},
+        }
+
+    def listed(self, choice: Choice, *, first: int, count: int) -> dict[str, Any]:
+        """Return some of the chosen scenes, in the order of their keys."""
+        rows = self.choose(choice).rows
+        first = min(max(first, 0), len(rows))
+        wanted = rows[first : first + min(max(count, 0), MOST_ROWS)]
+        names = ("key", "subset", "focal_mm", "baselines_cm")
+        columns = {name: self.index.column(name) for name in names}
+        return {
+            "total": len(rows),
+            "first": first,
+            "rows": [
+                {
+                    "key": str(columns["key"][row]),
+                    "subset": columns["subset"][row] or "",
+                    "focal_mm": round(float(columns["focal_mm"][row]), 2),
+                    "baseline_cm": [
+                        round(float(columns["baselines_cm"][row].min()), 2),
+                        round(float(columns["baselines_cm"][row].max()), 2),
+                    ],
+                }
+                for row in wanted.tolist()
+            ],
+        }
+
+    def place(self, choice: Choice, key: str) -> int:
+        """Return the number of a scene among the chosen ones, -1 where it is not one of them."""
+        rows, row = self.choose(choice).rows, self.row(key)
+        place = int(np.searchsorted(rows, row))
+        return place if place < len(rows) and rows[place] == row else -1
+
+    def scene(self, key: str, choice: Choice) -> dict[str, Any]:
+        """Return a scene's facts, and its pairs from the narrowest to the widest."""
+        row = self.row(key)
+        scene, pairs = self.index.scene(row), self.choose(choice).pairs
+        mine = pairs.row == row
+        selected = {
+            (int(left), int(right))
+            for left, right in zip(
+                pairs.source[mine].tolist(), pairs.targets[mine, 0].tolist(), strict=True
+            )
+        }
+        return _facts(scene, depth=self._depth) | {
+            "place": self.place(choice, key),
+            "pairs": [
+                {
+                    "cameras": [left, right],
+                    "baseline_cm": scene.rig.baseline_cm(left, right),
+                    "bin": baseline_bin(scene.rig.baseline_cm(left, right)),
+                    "primary": (left, right) == scene.rig.primary_pair,
+                    "chosen": (left, right) in selected,
+                }
+                for left, right in sorted(
+                    CAMERA_PAIRS, key=lambda pair: (scene.rig.baseline_cm(*pair), pair)
+                )
+            ],
+        }
+
+    def selection_line(self, choice: Choice) -> str:
+        """Return the Python that selects what is chosen, all frames; it runs as it stands."""
+        options = choice.filters() | {"pairs": choice.pairs}
+        if choice.baseline_cm is not None:
+            wanted = choice.baseline_cm
+            is_bins = isinstance(wanted[0], str)
+            options["baseline_cm"] = list(wanted) if is_bins else wanted
+        return self._line("pairs", options | {"frames": "all"})
+
+    def sample_line(self, key: str, *, pair: tuple[int, int], frame: int) -> str:
+        """Return the Python that gives the one sample that is shown; it runs as it stands."""
+        self.row(key)
+        return self._line("sample", {"scenes": key, "pairs": [pair], "frames": frame}) + "[0]"
+
+    def _line(self, name: str, options: Mapping[str, Any]) -> str:
+        imports = "StereoPairs"
+        if self._depth is not None:
+            imports = "DepthEncoding, StereoPairs"
+        given = "".join(f", {option}={value!r}" for option, value in options.items())
+        if self._depth is not None:
+            given += f", depth=DepthEncoding(unit_m={self._depth.unit_m!r})"
+        return (
+            f"from stereogenbench_data import {imports}\n"
+            f"{name} = StereoPairs({self._data!r}{given})"
+        )
+
+    def _choose(self, choice: Choice) -> Chosen:
+        empty = choose_pairs(self.index, np.zeros(0, dtype=np.int64), pairs="all")
+        try:
+            rows = filter_scenes(self.index, SceneFilters(**choice.filters()))  # type: ignore[typeddict-item]  # names are those of the filters
+            pairs = choose_pairs(
+                self.index,
+                rows,
+                pairs=choice.pairs,  # type: ignore[arg-type]  # one of PAIR_KINDS
+                baseline_cm=choice.baseline_cm,
+            )
+        except SelectionError as error:
+            return Chosen(empty.row, empty, str(error))
+        return Chosen(np.unique(pairs.row), pairs)
+
+    def _all_pairs(self) -> PairList:
+        return choose_pairs(self.index, np.arange(len(self.index), dtype=np.int64), pairs="all")
+
+    def _counts(self, choice: Choice, facet: str) -> dict[str, int]:
+        """Return, for each value of a filter, how many scenes the other filters leave."""
+        others = Choice(
+            texts=tuple((name, values) for name, values in choice.texts if name != facet),
+            focal_mm=choice.focal_mm,
+            baseline_cm=choice.baseline_cm,
+            caption=choice.caption,
+            pairs=choice.pairs,
+        )
+        column = self.index.column(FACETS[facet])
+        known = sorted({str(value) for value in column if value is not None})
+        found, counts = np.unique(column[self.choose(others).rows].astype(str), return_counts=True)
+        left = dict(zip(found.tolist(), counts.tolist(), strict=True))
+        return {value: left.get(value, 0) for value in known}
+
+    def _bin_counts(self, choice: Choice) -> dict[str, int]:
+        others = Choice(choice.texts, choice.focal_mm, None, choice.caption, choice.pairs)
+        found = baselines_cm(self.index, self.choose(others).pairs)[:, 0]
+        return {
+            name: int(np.count_nonzero(_in_bin(found, name)))
+            for name in BASELINE_BINS
+        }  # fmt: skip
+
+
+def _in_bin(found: Any, name: str) -> Bool[np.ndarray, " n"]:
+    low, high = BASELINE_BINS[name]
+    inside: Bool[np.ndarray, " n"] = (found >= low) & (found < high)
+    if high == BASELINE_BINS["[100,150]"][1]:
+        inside |= found == high
+    elif low == BASELINE_BINS["[100,150]"][1]:
+        inside &= found != low
+    return inside
+
+
+def _facts(scene: Scene, *, depth: DepthEncoding | None) -> dict[str, Any]:
+    rig, camera = scene.rig, rig_intrinsics(scene.rig)
+    unit_m = scene.depth_unit_m[0] if depth is None else depth.known_unit_m
+    return {
+        "key": scene.id.key,
+        "caption": scene.caption,
+        "split": scene.id.split,
+        "subset": scene.id.subset or "",
+        "family": scene.id.family,
+        "map": scene.id.map_name,
+        "frames": scene.frames,
+        "frame_rate_hz": scene.frame_rate_hz,
+        "width_px": rig.image_width_px,
+        "height_px": rig.image_height_px,
+        "focal_mm": rig.focal_mm,
+        "fx_px": camera.fx_px,
+        "depth_unit_m": unit_m if math.isfinite(unit_m) else None,
+        "depth_unit_source": scene.depth_unit_source[0] if depth is None else "as asked",
+        "rig_residual_px": scene.rig_residual_px,
+    }

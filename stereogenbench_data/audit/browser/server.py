@@ -1,0 +1,154 @@
+"""A web server for one reader: on this machine alone, read-only, for its own page alone."""
+
+import json
+import threading
+from contextlib import suppress
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, Final
+from urllib.parse import parse_qs, urlsplit
+
+from stereogenbench_data.audit.browser.service import Answer, Service
+from stereogenbench_data.errors import SelectionError, StereoGenBenchError
+
+LOOPBACK: Final = "127.0.0.1"
+
+_HEADERS: Final = {
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
+        "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
+_MOST_CONNECTIONS: Final = 32
+_IDLE_S: Final = 60
+
+
+class PageServer(ThreadingHTTPServer):
+    """Serves the page of one `Service` on the loopback interface.
+
+    It answers GET and HEAD of its own paths, to a browser that was sent to it by its own name:
+    another Host (a name that was made to point here), or a request that another site's page
+    makes, is refused.
+    """
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self, service: Service, *, port: int = 0) -> None:
+        """Take a port, 0 for any that is free.
+
+        Raises:
+            OSError: If the port is taken.
+        """
+        self.service = service
+        self.places = threading.BoundedSemaphore(_MOST_CONNECTIONS)
+        super().__init__((LOOPBACK, port), _Handler)
+        port = self.server_address[1]
+        self.hosts = frozenset({f"{LOOPBACK}:{port}", f"localhost:{port}"})
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{LOOPBACK}:{self.server_address[1]}/"
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer in a thread of its own, unless too many are at work."""
+        if not self.places.acquire(blocking=False):
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Answer one connection, and make room for another."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self.places.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing: a browser that went away is no error, and errors are told to the page."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: PageServer
+    server_version = "stereogenbench"
+    sys_version = ""
+    protocol_version = "HTTP/1.1"
+    timeout = _IDLE_S
+
+    def do_GET(self) -> None:
+        """Answer a question."""
+        self._answer(body="send")
+
+    def do_HEAD(self) -> None:
+        """Answer a question without its content."""
+        self._answer(body="leave out")
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Say what is wrong, as JSON: also where the library finds a request malformed."""
+        status = HTTPStatus(code)
+        if status == HTTPStatus.NOT_IMPLEMENTED:
+            status = HTTPStatus.METHOD_NOT_ALLOWED
+        self.close_connection = True
+        self._send(status, _told(message or status.phrase), body="send")
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Keep quiet."""
+
+    def _answer(self, *, body: str) -> None:
+        refusal = self._refusal()
+        if refusal:
+            self.close_connection = True
+            self._send(HTTPStatus.FORBIDDEN, _told(refusal), body=body)
+            return
+        parts = urlsplit(self.path)
+        try:
+            query = parse_qs(parts.query, max_num_fields=200, errors="strict")
+            answer = self.server.service.answer(parts.path, query)
+        except SelectionError as error:
+            self._send(HTTPStatus.BAD_REQUEST, _told(str(error)), body=body)
+        except StereoGenBenchError as error:
+            told = _told(f"{type(error).__name__}: {error}")
+            self._send(HTTPStatus.UNPROCESSABLE_ENTITY, told, body=body)
+        except ValueError:
+            self._send(HTTPStatus.BAD_REQUEST, _told("the question is malformed"), body=body)
+        else:
+            if answer is None:
+                self._send(HTTPStatus.NOT_FOUND, _told("there is nothing here"), body=body)
+            else:
+                self._send(HTTPStatus.OK, answer, body=body)
+
+    def _refusal(self) -> str:
+        """Return why a request is refused, nothing where it is one of this page's own."""
+        hosts = self.headers.get_all("Host") or []
+        if len(hosts) != 1 or hosts[0].lower() not in self.server.hosts:
+            return f"this is {self.server.url}, and was asked for as another host"
+        site = self.headers.get("Sec-Fetch-Site", "none")
+        is_page = self.path == "/" and self.headers.get("Sec-Fetch-Mode") == "navigate"
+        if site not in ("none", "same-origin") and not is_page:
+            return "another site's page asked for this"
+        return ""
+
+    def _send(self, status: HTTPStatus, answer: Answer, *, body: str) -> None:
+        with suppress(ConnectionError, TimeoutError):
+            self.send_response(status)
+            for name, value in _HEADERS.items():
+                self.send_header(name, value)
+            if status == HTTPStatus.METHOD_NOT_ALLOWED:
+                self.send_header("Allow", "GET, HEAD")
+            keep = "private, max-age=600" if answer.keep else "no-store"
+            self.send_header("Cache-Control", keep)
+            self.send_header("Content-Type", answer.kind)
+            self.send_header("Content-Length", str(len(answer.content)))
+            self.end_headers()
+            if body == "send":
+                self.wfile.write(answer.content)
+
+
+def _told(message: str) -> Answer:
+    return Answer(json.dumps({"error": message}).encode(), "application/json")

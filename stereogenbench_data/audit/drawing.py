@@ -1,0 +1,159 @@
+"""A page to draw on: captions that fit, pictures in frames, colour bars with numbers."""
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, Final, Literal
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from stereogenbench_data.audit.colour_scale import ColourScale
+from stereogenbench_data.samples.picture import NOT_MEASURED, Picture
+
+Colour = tuple[int, int, int]
+
+PAPER: Final[Colour] = (250, 250, 248)
+INK: Final[Colour] = (26, 28, 33)
+FAINT: Final[Colour] = (92, 97, 107)
+FRAME: Final[Colour] = (205, 207, 212)
+GREY: Final[Colour] = NOT_MEASURED
+
+Label = tuple[float, str]
+"""Where along a bar (0 to 1), and what is written there."""
+
+
+class Page:
+    """A picture under construction.
+
+    Attributes:
+        font_px: The size of captions, in pixels; all distances follow it.
+        line_px: The height of a line of captions.
+    """
+
+    def __init__(self, width_px: int, height_px: int, *, font_px: int) -> None:
+        """Start with an empty page."""
+        self.font_px = font_px
+        self.line_px = line_height(font_px)
+        self._image = Image.new("RGB", (width_px, height_px), PAPER)
+        self._draw = ImageDraw.Draw(self._image)
+
+    def text(
+        self,
+        place: tuple[int, int],
+        text: str,
+        *,
+        width_px: int,
+        colour: Colour = INK,
+        scale: float = 1.0,
+    ) -> None:
+        """Write one line from its top left corner, shortened to a width."""
+        font = _font(round(self.font_px * scale))
+        self._draw.text(place, fitted(text, font=font, width_px=width_px), fill=colour, font=font)
+
+    def picture(
+        self, place: tuple[int, int], picture: Picture, *, frame: Colour = FRAME, frame_px: int = 1
+    ) -> None:
+        """Put a picture, with a frame around it."""
+        left, top = place
+        height, width = picture.shape[:2]
+        box = (left - frame_px, top - frame_px, left + width + frame_px - 1,
+               top + height + frame_px - 1)  # fmt: skip
+        self._draw.rectangle(box, outline=frame, width=frame_px)
+        self._image.paste(Image.fromarray(picture), place)
+
+    def bar(
+        self, place: tuple[int, int], scale: ColourScale, rows: Sequence[Sequence[Label]], *,
+        width_px: int,
+    ) -> None:  # fmt: skip
+        """Draw a colour bar with rows of labels below it; a label that has no room is left out."""
+        left, top = place
+        height = max(6, round(self.font_px * 0.7))
+        spread = np.geomspace if scale.kind == "log" else np.linspace
+        values = spread(scale.low, scale.high, width_px, dtype=np.float64)
+        strip = np.broadcast_to(values, (height, width_px))
+        self.picture(place, scale.paint(strip, measured=np.ones(strip.shape, dtype=bool)))
+        font = _font(self.font_px)
+        for number, labels in enumerate(rows):
+            line_top = top + height + 4 + number * self.line_px
+            free_from = left - 1.0
+            for at, text in labels:
+                x, length = left + at * (width_px - 1), font.getlength(text)
+                begin = min(max(x - length / 2, left), left + width_px - length)
+                if begin >= free_from:
+                    self._draw.line((x, top + height, x, top + height + 3), fill=INK)
+                    self._draw.text((begin, line_top), text, fill=INK, font=font)
+                    free_from = begin + length + self.font_px * 0.5
+
+    def swatches(
+        self, place: tuple[int, int], entries: Sequence[tuple[Colour, str]], *, width_px: int
+    ) -> None:
+        """Write one line for each colour and what it means."""
+        left, top = place
+        side = round(self.font_px * 0.8)
+        for number, (colour, text) in enumerate(entries):
+            line_top = top + number * self.line_px
+            inset = (self.line_px - side) // 2
+            box = (left, line_top + inset, left + side, line_top + inset + side)
+            self._draw.rectangle(box, fill=colour, outline=FAINT)
+            self.text(
+                (left + round(side * 1.6), line_top), text, width_px=width_px - round(side * 1.6)
+            )
+
+    def finished(self) -> Picture:
+        """Return the page as (h, w, 3) uint8."""
+        return np.asarray(self._image)
+
+
+def line_height(font_px: int) -> int:
+    """Return how far the lines of a font of some size are apart, in pixels."""
+    return round(font_px * 1.4)
+
+
+def fitted(text: str, *, font: Any, width_px: int) -> str:
+    """Return a text that is no wider than so many pixels, cut with three dots if need be."""
+    if font.getlength(text) <= width_px:
+        return text
+    while text and font.getlength(f"{text.rstrip()}...") > width_px:
+        text = text[:-1]
+    return f"{text.rstrip()}..."
+
+
+def resized(
+    picture: Picture, *, width_px: int, shrink: Literal["average", "nearest"] = "average"
+) -> Picture:
+    """Return a picture at another width; what grows has its pixels repeated.
+
+    Args:
+        picture: To be resized, its shape kept.
+        width_px: The new width.
+        shrink: "average" for photographs; "nearest" for maps, whose colours have a meaning.
+    """
+    height, width = picture.shape[:2]
+    size = (width_px, max(1, round(height * width_px / width)))
+    average = shrink == "average" and width_px < width
+    how = Image.Resampling.BOX if average else Image.Resampling.NEAREST
+    return np.asarray(Image.fromarray(picture).resize(size, how))
+
+
+def scale_rows(scale: ColourScale) -> list[list[Label]]:
+    """Return the labels of a bar: one row of round numbers."""
+    return [[(float(scale.place(tick)), f"{tick:g}") for tick in scale.ticks(6)]]
+
+
+def disparity_rows(scale: ColourScale, *, shift_px_m: float) -> list[list[Label]]:
+    """Return the labels of a bar of disparity: in pixels, and below them depth in metres.
+
+    Args:
+        scale: Of the disparities, in pixels.
+        shift_px_m: Focal length in pixels times baseline in metres: disparity times depth.
+    """
+    metres = [
+        (float(scale.place(tick)), f"{abs(shift_px_m) / tick:.3g}" if tick else "inf")
+        for tick in scale.ticks(6)
+    ]
+    return [*scale_rows(scale), metres]
+
+
+@cache
+def _font(size_px: int) -> Any:
+    return ImageFont.load_default(size=size_px)

@@ -1,0 +1,221 @@
+"""A scene on one page: its six views, and one pair's maps, warps and what does not fit."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from stereogenbench_data.audit.colour_scale import ColourScale, scale_of
+from stereogenbench_data.audit.drawing import (
+    FAINT,
+    FRAME,
+    GREY,
+    Colour,
+    Label,
+    Page,
+    disparity_rows,
+    line_height,
+    resized,
+    scale_rows,
+)
+from stereogenbench_data.audit.scene_reader import SceneReader
+from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.picture import Picture, anaglyph
+from stereogenbench_data.schema.records import Scene
+from stereogenbench_data.schema.release import CAMERA_COUNT
+
+SHEET_FIELDS: Final = (
+    "left", "right", "disparity", "valid", "visible", "depth", "warped_right", "hole", "baseline_m",
+)  # fmt: skip
+LEFT: Final[Colour] = (0, 104, 178)
+RIGHT: Final[Colour] = (196, 52, 32)
+HIDDEN: Final[Colour] = (204, 0, 150)
+MOST_DIFFERENT: Final = 64
+"""The difference of two pictures, of 255, that is drawn white."""
+
+_NARROWEST_PX: Final = 200
+_USUAL_PX: Final = 320
+_WIDEST_PX: Final = 2048
+_LEGEND_LINES: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class _Tile:
+    caption: str
+    picture: Picture
+    legend: Callable[[Page, tuple[int, int], int], None]
+    frame: Colour = FRAME
+    shrink: Literal["average", "nearest"] = "average"
+
+
+def tile_width(scene: Scene, wanted_px: int | None) -> int:
+    """Return how wide a tile is drawn: as asked, or a whole multiple of a small picture.
+
+    A tile is never too narrow for its caption: 200 pixels at least.
+    """
+    width = scene.rig.image_width_px
+    if wanted_px is None:
+        wanted_px = _USUAL_PX if width > _USUAL_PX else width * max(1, _USUAL_PX // width)
+    return min(max(wanted_px, _NARROWEST_PX), _WIDEST_PX)
+
+
+def scene_sheet(
+    reader: SceneReader,
+    row: int,
+    *,
+    pair: tuple[int, int] | None = None,
+    frame: int = 0,
+    tile_px: int | None = None,
+) -> Picture:
+    """Return a scene's contact sheet as (h, w, 3) uint8.
+
+    Args:
+        reader: Reads the data.
+        row: The scene's row in the index.
+        pair: The cameras (left, right), None for the pair that the scene records.
+        frame: The frame's number.
+        tile_px: How wide one picture is drawn, None for what suits it. Numbers on the sheet are
+            of the stored pictures, whatever that is.
+
+    Raises:
+        SelectionError: If there is no such pair or frame.
+        StorageError: If a file is missing or is not the one that was indexed.
+        MediaError: If a video does not decode to what the index says.
+    """
+    scene = reader.index.scene(row)
+    pair = pair or scene.rig.primary_pair
+    sample = reader.pair(row, pair=pair, frame=frame, fields=SHEET_FIELDS)
+    views = reader.views(row, frame=frame)
+    width = tile_width(scene, tile_px)
+    rows = [_view_tiles(scene, views, pair), _pair_tiles(scene, sample)]
+    return _laid_out(_title(scene, sample, pair=pair, frame=frame), rows, width_px=width)
+
+
+def _laid_out(title: list[str], rows: list[list[_Tile]], *, width_px: int) -> Picture:
+    font_px = min(max(round(width_px / 21), 13), 30)
+    gap, line = font_px, line_height(font_px)
+    shape = rows[0][0].picture.shape
+    height_px = max(1, round(shape[0] * width_px / shape[1]))
+    legends = [0, _LEGEND_LINES * line + gap // 2]
+    head = round(line * 1.6) + line * (len(title) - 1) + gap
+    total = 2 * gap + head + sum(line + 4 + height_px + gap + legend for legend in legends)
+    page = Page(
+        len(rows[0]) * (width_px + gap) + gap, total - gap // 2, font_px=font_px
+    )  # the last legend needs no gap below
+    inner = len(rows[0]) * (width_px + gap) - gap
+    page.text((gap, gap), title[0], width_px=inner, scale=1.3)
+    for number, text in enumerate(title[1:]):
+        place = (gap, gap + round(line * 1.6) + number * line)
+        page.text(place, text, width_px=inner, colour=FAINT)
+    top = gap + head
+    for tiles, legend in zip(rows, legends, strict=True):
+        for column, tile in enumerate(tiles):
+            left = gap + column * (width_px + gap)
+            page.text((left, top), tile.caption, width_px=width_px)
+            drawn = resized(tile.picture, width_px=width_px, shrink=tile.shrink)
+            thick = 1 if tile.frame is FRAME else 3
+            page.picture((left, top + line + 4), drawn, frame=tile.frame, frame_px=thick)
+            tile.legend(page, (left, top + line + 4 + height_px + gap // 2), width_px)
+        top += line + 4 + height_px + gap + legend
+    return page.finished()
+
+
+def _title(scene: Scene, sample: Sample, *, pair: tuple[int, int], frame: int) -> list[str]:
+    rig, camera = scene.rig, rig_intrinsics(scene.rig)
+    unit_m, source = scene.depth_unit_m[pair[0]], scene.depth_unit_source[pair[0]]
+    baseline_cm = float(sample["baseline_m"]) * 100
+    facts = (
+        f"pair {pair[0]}-{pair[1]}, baseline {baseline_cm:.2f} cm; frame {frame} of "
+        f"{scene.frames} at {scene.frame_rate_hz:g} Hz; {rig.image_width_px} x "
+        f"{rig.image_height_px} px; focal length {rig.focal_mm:.4g} mm, fx {camera.fx_px:.1f} px; "
+        f"depth unit {unit_m:g} m ({source}); rig residual {scene.rig_residual_px:.2g} px"
+    )
+    caption = [scene.caption] if scene.caption else []
+    return [scene.id.key, facts, *caption]
+
+
+def _view_tiles(scene: Scene, views: Any, pair: tuple[int, int]) -> list[_Tile]:
+    tiles = []
+    for camera in range(CAMERA_COUNT):
+        caption, frame = f"camera {camera}, at {scene.lateral_m[camera] * 100:.1f} cm", FRAME
+        if camera in pair:
+            side = "left" if camera == pair[0] else "right"
+            caption += f": {side}"
+            frame = LEFT if side == "left" else RIGHT
+        picture = np.ascontiguousarray(views[camera].transpose(1, 2, 0))
+        tiles.append(_Tile(caption, picture, _no_legend, frame))
+    return tiles
+
+
+def _pair_tiles(scene: Scene, sample: Sample) -> list[_Tile]:
+    shift_px_m = rig_intrinsics(scene.rig).fx_px * float(sample["baseline_m"])
+    valid = sample["valid"][0]
+    disparity = scale_of(sample["disparity"][0], measured=valid)
+    depth = scale_of(sample["depth"][0], measured=valid, kind="log")
+    hidden, holes = _tinted_hidden(sample), _tinted_holes(sample)
+    seen = float(sample["visible"].mean())
+    empty = float(sample["hole"].mean())
+    difference, median = _difference(sample)
+    grey = (GREY, f"depth not measured, {1 - valid.mean():.1%}")
+    return [
+        _Tile("disparity, px (below: m)", disparity.paint(sample["disparity"][0], measured=valid),
+              _bar(disparity, disparity_rows(disparity, shift_px_m=shift_px_m)), shrink="nearest"),
+        _Tile("depth, m", depth.paint(sample["depth"][0], measured=valid),
+              _bar(depth, scale_rows(depth)), shrink="nearest"),
+        _Tile(f"visible in both, {seen:.1%}", hidden,
+              _key([(HIDDEN, f"hidden or outside, {float(valid.mean()) - seen:.1%}"), grey]),
+              shrink="nearest"),
+        _Tile("anaglyph", anaglyph(sample["left"], sample["right"]),
+              _key([(RIGHT, "red of the left view"), ((0, 160, 160), "cyan of the right view")])),
+        _Tile("left warped to right", holes,
+              _key([(HIDDEN, f"holes, {empty:.1%}")]), shrink="nearest"),
+        _Tile("warped less right", difference,
+              _key([((0, 0, 0), f"equal; median {median:.1f} of 255"),
+                    ((255, 255, 255), f"{MOST_DIFFERENT} of 255 apart or more")])),
+    ]  # fmt: skip
+
+
+def _tinted_hidden(sample: Sample) -> Picture:
+    """Return the left view, faint, with what the right one does not see in one colour."""
+    picture = _faint(sample["left"])
+    picture[~sample["visible"][0]] = HIDDEN
+    picture[~sample["valid"][0]] = GREY
+    return picture
+
+
+def _tinted_holes(sample: Sample) -> Picture:
+    picture = np.ascontiguousarray(sample["warped_right"].transpose(1, 2, 0))
+    picture[sample["hole"][0]] = HIDDEN
+    return picture
+
+
+def _faint(picture: Any) -> Picture:
+    grey = picture.astype(np.float32).mean(axis=0) * 0.6 + 90
+    faint: Picture = np.repeat(np.minimum(grey, 255).astype(np.uint8)[..., None], 3, axis=-1)
+    return faint
+
+
+def _difference(sample: Sample) -> tuple[Picture, float]:
+    """Return how far the warped view is from the right one, black where equal; and the median."""
+    landed = ~sample["hole"][0]
+    apart = np.abs(sample["warped_right"].astype(np.int16) - sample["right"]).mean(axis=0)
+    median = float(np.median(apart[landed])) if landed.any() else 0.0
+    level = np.minimum(apart * (255 / MOST_DIFFERENT), 255).astype(np.uint8)
+    level[~landed] = 0
+    return np.repeat(level[..., None], 3, axis=-1), median
+
+
+def _no_legend(page: Page, place: tuple[int, int], width_px: int) -> None:
+    """Draw nothing below a tile."""
+
+
+def _key(entries: list[tuple[Colour, str]]) -> Callable[[Page, tuple[int, int], int], None]:
+    return lambda page, place, width_px: page.swatches(place, entries, width_px=width_px)
+
+
+def _bar(
+    scale: ColourScale, rows: list[list[Label]]
+) -> Callable[[Page, tuple[int, int], int], None]:
+    return lambda page, place, width_px: page.bar(place, scale, rows, width_px=width_px)

@@ -1,0 +1,86 @@
+"""``stereogenbench bench``: runs the benchmark of a checkout."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stereogenbench_data.errors import StorageError
+
+
+def bench(  # noqa: PLR0913 - one parameter an option
+    *,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="Measure this alone, such as all-frames or accuracy; may be repeated."),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="One round of the main things.")] = False,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds of every race.")] = 5,
+    workers: Annotated[
+        str | None, typer.Option(help="Worker processes of every race, such as 2,0,1,4.")
+    ] = None,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Races over all frames, not a window of them.")
+    ] = False,
+    batches: Annotated[int, typer.Option(min=2, help="Batches of the memory run.")] = 400,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep rounds and sections that are there.")
+    ] = False,
+    draw: Annotated[bool, typer.Option("--draw", help="Only draw and pack the data.")] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only compare every contestant's samples with ours.")
+    ] = False,
+    tables: Annotated[
+        bool, typer.Option("--tables", help="Only write tables and plots anew.")
+    ] = False,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder of the data [build/bench of the checkout].")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results [docs/performance].")
+    ] = None,
+) -> None:
+    """Race this package against a bare decoding loop and other loaders; needs a checkout.
+
+    The first run draws four scenes (20 minutes of processor time), and keeps them. Results are
+    written after every round.
+    """
+    checkout = _checkout()
+    flags = {
+        "--quick": quick, "--whole": whole, "--resume": resume, "--draw": draw,
+        "--check": check, "--tables": tables,
+    }  # fmt: skip
+    values = {
+        "--workers": workers,
+        "--data": None if data is None else data.resolve(),
+        "--out": None if out is None else out.resolve(),
+    }
+    command = [sys.executable, "-m", "benchmarks", "--rounds", str(rounds)]
+    command += ["--batches", str(batches)]
+    command += [word for name in only or () for word in ("--only", name)]
+    command += [flag for flag, given in flags.items() if given]
+    for name, value in values.items():
+        command += [] if value is None else [name, str(value)]
+    try:
+        done = subprocess.run(command, cwd=checkout, check=False)
+    except KeyboardInterrupt:
+        raise typer.Exit(130) from None
+    raise typer.Exit(done.returncode)
+
+
+def _checkout() -> Path:
+    """Return the folder that holds this package's benchmark.
+
+    Raises:
+        StorageError: If there is none: an installed package comes without it.
+    """
+    beside = Path(__file__).resolve().parents[2]
+    for folder in (beside, Path.cwd()):
+        if (folder / "benchmarks" / "ffmpeg_links.py").is_file():
+            return folder
+    raise StorageError(
+        f"benchmarks/: is neither in {beside} nor in {Path.cwd()}: the benchmark is part of the "
+        "source, not of the installed package. Run the command in a checkout."
+    )

@@ -1,0 +1,202 @@
+"""``stereogenbench doctor``: the depth contract, found from the pictures themselves."""
+
+import json
+import math
+from dataclasses import asdict, fields, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from stereogenbench_data.cli.opening import open_data
+from stereogenbench_data.cli.options import (
+    CaptionOption,
+    DataArgument,
+    FamilyOption,
+    FocalOption,
+    JsonOption,
+    MapOption,
+    OutOption,
+    SceneOption,
+    SplitOption,
+    SubsetOption,
+    WorkersOption,
+    scene_filters,
+)
+from stereogenbench_data.cli.outcome import FINDINGS
+from stereogenbench_data.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from stereogenbench_data.audit.contract import DoctorReport
+    from stereogenbench_data.audit.contract_statistics import Gain
+    from stereogenbench_data.audit.contract_verdict import Answer, Verdict
+    from stereogenbench_data.schema.records import DepthEncoding
+
+
+def doctor(  # noqa: PLR0913 - one parameter an option
+    data: DataArgument,
+    *,
+    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Look at so many scenes.")] = 6,
+    frames: Annotated[int, typer.Option(min=1, help="Frames of each scene.")] = 4,
+    split: SplitOption = None,
+    subset: SubsetOption = None,
+    family: FamilyOption = None,
+    map_name: MapOption = None,
+    scene: SceneOption = None,
+    focal_mm: FocalOption = None,
+    caption: CaptionOption = None,
+    unit_m: Annotated[
+        float | None,
+        typer.Option(help="Ask about this many metres in a stored unit [as tagged, else 0.1]."),
+    ] = None,
+    kind: Annotated[
+        Literal["planar", "ray"], typer.Option(help="Ask about depth along the axis or the ray.")
+    ] = "planar",
+    form: Annotated[
+        Literal["depth", "inverse"], typer.Option(help="Ask about stored depth, or its inverse.")
+    ] = "depth",
+    frame_lag: Annotated[
+        int, typer.Option(help="Ask about depth frame t + LAG for RGB frame t.")
+    ] = 0,
+    out: OutOption = None,
+    as_json: JsonOption = False,
+    workers: WorkersOption = None,
+) -> None:
+    """Find out from the pictures how stored depth becomes metres, and where it belongs.
+
+    Compares what a scene's cameras see with what depth predicts: metres in a unit, planar or ray,
+    inverse, frame lag, camera order, focal length, flips, offset. -o writes a picture.
+    The exit status is 0 if the declared contract is confirmed or nothing can be told, 1 if another
+    one is clearly better, 2 if it could not be done.
+    """
+    from stereogenbench_data.audit.contract import diagnose
+    from stereogenbench_data.audit.contract_picture import draw_report, require_picture_file
+    from stereogenbench_data.schema.records import DepthEncoding
+
+    if out is not None:
+        require_picture_file(out)
+    depth = DepthEncoding(unit_m=unit_m, kind=kind, form=form, frame_lag=frame_lag)
+    filters = scene_filters(
+        split=split, subset=subset, family=family, map=map_name, scenes=scene,
+        focal_mm=focal_mm, caption=caption,
+    )  # fmt: skip
+    index = open_data(data)
+    with progress_bar("examining", unit="scenes") as progress:
+        report = diagnose(
+            index,
+            scenes=scenes,
+            frames=frames,
+            depth=depth,
+            workers=workers,
+            progress=progress,
+            **filters,
+        )
+    if out is not None:
+        draw_report(out, report, index)
+    typer.echo(_json(report) if as_json else "\n".join(_lines(report)))
+    if out is not None and not as_json:
+        typer.echo(f"\npicture: {out}")
+    if report.is_wrong:
+        raise typer.Exit(FINDINGS)
+
+
+def _lines(report: "DoctorReport") -> list[str]:
+    matches = sum(scene.matches for scene in report.scenes)
+    views = sum(scene.views for scene in report.scenes)
+    lines = [
+        f"{report.data}: {len(report.scenes)} scenes, {views} views, {matches:,} pixels found in "
+        f"both pictures"
+    ]
+    for key, reason in report.left_out.items():
+        lines.append(f"left out: {key}: {reason}")
+    if len(report.verdicts) > 1:
+        lines.append(f"SCENES DIFFER: {len(report.verdicts)} contracts were found.")
+    silent = [scene for scene in report.scenes if scene.problem]
+    if silent and len(silent) < len(report.scenes):
+        lines += [f"{scene.key}: cannot tell: {scene.problem}" for scene in silent]
+    for verdict in report.verdicts:
+        lines += ["", *_verdict_lines(verdict, report)]
+    return lines
+
+
+def _verdict_lines(verdict: "Verdict", report: "DoctorReport") -> list[str]:
+    lines = []
+    if len(report.verdicts) > 1:
+        lines.append(f"{len(verdict.scenes)} scenes: {', '.join(verdict.scenes)}")
+    rows = [_row(answer) for answer in verdict.answers]
+    rows.insert(0, ("question", "declared", "pictures say", "", "next best"))
+    widths = [max(len(row[column]) for row in rows) for column in range(4)]
+    for row in rows:
+        cells = [text.ljust(width) for text, width in zip(row, widths, strict=False)]
+        lines.append("  ".join([*cells, row[4]]).rstrip())
+    lines.append("")
+    if verdict.is_wrong:
+        lines.append(
+            f"Another contract is {_gain_words(verdict.gain)} better than the declared one."
+        )
+        lines.append(f"Paste: {encoding_line(verdict.encoding)}")
+    elif all(answer.status == "cannot tell" for answer in verdict.answers[:2]):
+        lines.append("Cannot tell: the pictures do not decide on the declared contract.")
+    else:
+        lines.append("The declared contract fits; no other is clearly better.")
+        lines.append(f"It is: {encoding_line(verdict.encoding)}")
+    if math.isfinite(verdict.agreement):
+        lines.append(f"It explains {verdict.agreement:.0%} of the matches to a pixel.")
+    return [*lines, *verdict.beside]
+
+
+def _row(answer: "Answer") -> tuple[str, str, str, str, str]:
+    last = answer.note
+    if answer.behind is not None and math.isfinite(answer.behind.mean_db):
+        gain = _gain_words(answer.behind)
+        said = f"declared is {gain} worse" if answer.status == "wrong" else f"{gain} worse"
+        last = f"{said}; {answer.note}" if answer.note else said
+    return answer.topic, answer.declared, answer.found or "?", answer.status.upper() if (
+        answer.status == "wrong"
+    ) else answer.status, last  # fmt: skip
+
+
+def _gain_words(gain: "Gain") -> str:
+    return (
+        f"{gain.mean_db:.2f} dB (95 %: {gain.low_db:.2f} to {gain.high_db:.2f}, over {gain.over})"
+    )
+
+
+def encoding_line(encoding: "DepthEncoding") -> str:
+    """Return the Python expression of a contract, defaults left out."""
+    default = replace(encoding, unit_m=None, kind="planar", form="depth", frame_lag=0)
+    told = [
+        f"{field.name}={getattr(encoding, field.name)!r}"
+        for field in fields(encoding)
+        if getattr(encoding, field.name) != getattr(default, field.name)
+    ]
+    return f"DepthEncoding({', '.join(told)})"
+
+
+def _json(report: "DoctorReport") -> str:
+    document = {
+        "data": report.data,
+        "is_wrong": report.is_wrong,
+        "verdicts": [
+            _plain(asdict(verdict) | {"paste": encoding_line(verdict.encoding)})
+            for verdict in report.verdicts
+        ],
+        "scenes": [_plain(_scene_document(asdict(scene))) for scene in report.scenes],
+        "left_out": report.left_out,
+    }
+    return json.dumps(document, indent=2)
+
+
+def _scene_document(scene: dict[str, Any]) -> dict[str, Any]:
+    offsets_px = [{"pair": pair, "px": px} for pair, px in scene["offsets_px"].items()]
+    return scene | {"offsets_px": offsets_px}
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it: numbers that are none become null."""
+    if isinstance(value, dict):
+        return {str(name): _plain(each) for name, each in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [_plain(each) for each in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

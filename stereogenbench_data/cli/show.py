@@ -1,0 +1,104 @@
+"""``stereogenbench show``: one scene as a picture or a clip."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from stereogenbench_data.cli.opening import open_data
+from stereogenbench_data.cli.options import DataArgument, DepthUnitOption, complete_scene
+from stereogenbench_data.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from stereogenbench_data.audit.scene_reader import SceneReader
+
+_CLIPS = (".mp4", ".gif")
+
+
+def show(  # noqa: PLR0913 - one parameter an option
+    data: DataArgument,
+    scene: Annotated[
+        str | None,
+        typer.Argument(
+            help="Key of a scene, or a part of one that no other has [the first scene].",
+            autocompletion=complete_scene,
+        ),
+    ] = None,
+    *,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="File to write: .png, or .mp4 or .gif for a clip [KEY.png]."
+        ),
+    ] = None,
+    pair: Annotated[
+        str | None, typer.Option("--pair", help="Two cameras, such as 0-5 [the recorded pair].")
+    ] = None,
+    frame: Annotated[int, typer.Option("--frame", min=0, help="Number of the frame.")] = 0,
+    size: Annotated[
+        int | None,
+        typer.Option("--size", min=1, max=2048, help="How wide one picture is drawn, px [320]."),
+    ] = None,
+    clip: Annotated[
+        bool, typer.Option("--clip", help="Write all frames as a clip, .mp4 or .gif [KEY.mp4].")
+    ] = False,
+    depth_unit_m: DepthUnitOption = None,
+) -> None:
+    """Draw one scene: its six views, and a pair's disparity, depth, visibility and warp.
+
+    Disparity has a bar in pixels and in metres; numbers are of the stored pictures. With --clip:
+    left, right, disparity and anaglyph over time.
+    """
+    from stereogenbench_data.audit.scene_reader import SceneReader
+    from stereogenbench_data.schema.records import DepthEncoding
+    from stereogenbench_data.selection.lookup import find_scene
+
+    cameras = None if pair is None else _cameras(pair)
+    clip = clip or (out is not None and out.suffix.lower() in _CLIPS)
+    if out is not None and out.suffix.lower() not in (_CLIPS if clip else (".png",)):
+        wanted = "a clip is .mp4 or .gif" if clip else "a sheet is .png"
+        raise typer.BadParameter(f"{out}: {wanted}, by its ending.", param_hint="--out")
+    index = open_data(data)
+    row = 0 if scene is None else find_scene(index, scene)
+    key = index.scene(row).id.key
+    target = out or Path(key.replace("/", "_") + (".mp4" if clip else ".png"))
+    depth = None if depth_unit_m is None else DepthEncoding(unit_m=depth_unit_m)
+    reader = SceneReader(index, depth=depth)
+    if clip:
+        _write_clip(reader, row, target, pair=cameras, size=size)
+    else:
+        from stereogenbench_data.audit.scene_sheet import scene_sheet
+        from stereogenbench_data.samples.picture import write_png
+
+        write_png(target, scene_sheet(reader, row, pair=cameras, frame=frame, tile_px=size))
+    typer.echo(f"{target}: {key}")
+
+
+def _write_clip(
+    reader: "SceneReader",
+    row: int,
+    target: Path,
+    *,
+    pair: tuple[int, int] | None,
+    size: int | None,
+) -> None:
+    from stereogenbench_data.audit.scene_clip import clip_pages, write_clip
+
+    scene = reader.index.scene(row)
+    with progress_bar("drawing", unit="frames") as progress:
+        write_clip(
+            target,
+            clip_pages(reader, row, pair=pair, tile_px=size),
+            frames=scene.frames,
+            rate_hz=scene.frame_rate_hz,
+            progress=progress,
+        )
+
+
+def _cameras(text: str) -> tuple[int, int]:
+    left, _, right = text.replace(",", "-").partition("-")
+    if not (left.strip().isdecimal() and right.strip().isdecimal()):
+        raise typer.BadParameter(
+            f"{text!r} is no pair: write two cameras, such as 0-5.", param_hint="--pair"
+        )
+    return int(left), int(right)

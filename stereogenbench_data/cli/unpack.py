@@ -1,0 +1,49 @@
+"""``stereogenbench unpack``: shards back into a tree in the released layout."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from stereogenbench_data.cli.options import JsonOption, WorkersOption
+from stereogenbench_data.cli.progress import progress_bar
+
+_MEGABYTE = 1_000_000
+
+
+def unpack(
+    shards: Annotated[Path, typer.Argument(help="Folder of shards, or its index file.")],
+    out: Annotated[Path, typer.Argument(help="Folder for the scenes.")],
+    *,
+    workers: WorkersOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Turn shards back into scenes as they were released, each file held against the index.
+
+    Files that were packed as they are come out byte for byte. Depth that blosc2 packed is written
+    as FFV1 video again, with the same numbers, times and tags. Nothing is overwritten; scenes that
+    are there are kept, so a run that was stopped goes on if it is run again.
+    """
+    from stereogenbench_data.schema.problems import counted
+    from stereogenbench_data.storage.unpack import unpack as unpacked
+
+    try:
+        with progress_bar("unpacking", unit="MB") as bar:
+
+            def progress(done: int, total: int) -> None:
+                bar(-(-done // _MEGABYTE), -(-total // _MEGABYTE))
+
+            report = unpacked(shards, out, workers=workers, progress=progress)
+    except KeyboardInterrupt:
+        typer.echo("stopped; run the same command again to go on from here", err=True)
+        raise typer.Exit(130) from None
+    if as_json:
+        told = {"unpacked": list(report.unpacked), "kept": list(report.kept)}
+        typer.echo(json.dumps({"out": str(out)} | told, indent=2))
+        return
+    were = "was" if len(report.kept) == 1 else "were"
+    typer.echo(
+        f"{out}: {counted(len(report.unpacked), 'scene')} unpacked, {len(report.kept)} {were} "
+        f"there before"
+    )

@@ -1,0 +1,332 @@
+"""The page in a real browser: what it shows is what the data say, by mouse and by keyboard."""
+
+import dataclasses
+import shutil
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.audit.browser.catalogue import Catalogue
+from stereogenbench_data.audit.browser.server import PageServer
+from stereogenbench_data.audit.browser.service import Service
+from stereogenbench_data.audit.scene_reader import SceneReader
+from tests.servers.tools import require_module, require_tool
+
+# The index names a scene that was left out, each time that it is opened.
+pytestmark = pytest.mark.filterwarnings(
+    "ignore::stereogenbench_data.storage.index.IncompleteSceneWarning"
+)
+
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync",
+    "--disable-dev-shm-usage", "--window-size=1400,900",
+)  # fmt: skip
+COPIES = 40
+"""Each of the four scenes is listed so often, so that the list has to be scrolled."""
+WAIT_S = 60
+
+
+@pytest.fixture(scope="module")
+def data(small_release, tmp_path_factory):
+    """A tree with an index of many scenes: the same videos under other keys, and a broken one."""
+    root = tmp_path_factory.mktemp("many") / "data"
+    shutil.copytree(small_release, root)
+    index = SceneIndex.open(root)
+    scenes = []
+    for row in range(len(index)):
+        scene = index.scene(row)
+        for copy in range(COPIES):
+            key = f"{scene.id.key.rpartition('/')[0]}/scene_{row * COPIES + copy:06d}"
+            scenes.append(dataclasses.replace(scene, id=dataclasses.replace(scene.id, key=key)))
+    lost = dataclasses.replace(scenes[-1].members["cam_01_depth.mkv"], path="lost.mkv")
+    members = dict(scenes[-1].members) | {"cam_01_depth.mkv": lost}
+    scenes[-1] = dataclasses.replace(scenes[-1], members=members)
+    many = SceneIndex.from_scenes(scenes, root)
+    many.broken = {"train/Uniform/SynthStage/scene_000999": "cam_00_rgb.mp4: has 6 frames"}
+    many.write(root / "index.parquet")
+    return root
+
+
+@pytest.fixture(scope="module")
+def address(data):
+    with pytest.warns(UserWarning, match="scene_000999"):
+        index = SceneIndex.open(data)
+    service = Service(Catalogue(index, shown_data=str(data)), SceneReader(index))
+    with PageServer(service) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server.url
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    webdriver = require_module("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = require_tool("chromium")
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(flag)
+    service = require_module("selenium.webdriver.chrome.service").Service(
+        executable_path=require_tool("chromedriver")
+    )
+    driver = webdriver.Chrome(options=options, service=service)
+    yield driver
+    driver.quit()
+    service.stop()
+
+
+class Page:
+    """The open page, as a user sees it."""
+
+    def __init__(self, browser, address):
+        self.browser = browser
+        self.address = address
+
+    def open(self, place=""):
+        self.browser.get("about:blank")
+        self.browser.get(f"{self.address}#{place}")
+        self.until(lambda: self.script("return document.body.dataset.ready") == "yes")
+        self.settle()
+
+    def script(self, code, *values):
+        return self.browser.execute_script(code, *values)
+
+    def text(self, name):
+        return self.script("return document.getElementById(arguments[0]).textContent", name)
+
+    def until(self, condition):
+        deadline = time.monotonic() + WAIT_S
+        while not condition():
+            assert time.monotonic() < deadline, "the page did not get there"
+            time.sleep(0.05)
+
+    def settle(self):
+        """Wait until the line of the sample is that of the pair and the frame that are shown."""
+        self.until(lambda: self.frame() in self.text("sample-line") and self.text("readout"))
+
+    def frame(self):
+        return f"frames={self.text('frame-number').partition(' /')[0]})"
+
+    def press(self, *keys):
+        for key in keys:
+            self.browser.switch_to.active_element.send_keys(key)
+
+    def filter(self, name, value):
+        before = self.text("selection-line")
+        self.script(
+            "document.querySelector(`#facet-${arguments[0]} [value='${arguments[1]}']`).click()",
+            name, value,
+        )  # fmt: skip
+        self.until(lambda: self.text("selection-line") != before)
+
+    def point(self, pane, x, y):
+        """Move the mouse to the middle of a picture's pixel."""
+        self.script(
+            "const box = document.querySelector(`[data-pane=${arguments[0]}] canvas`);"
+            "const at = box.getBoundingClientRect();"
+            "box.dispatchEvent(new PointerEvent('pointermove', {bubbles: true,"
+            " clientX: at.left + (arguments[1] + 0.5) * at.width / box.width,"
+            " clientY: at.top + (arguments[2] + 0.5) * at.height / box.height}));",
+            pane, x, y,
+        )  # fmt: skip
+
+
+@pytest.fixture
+def page(browser, address):
+    page = Page(browser, address)
+    page.open()
+    return page
+
+
+def run(line):
+    names = {}
+    exec(line, names)  # what a user copies is to run as it stands
+    return names
+
+
+def keys_listed(page):
+    return page.script(
+        "return [...document.querySelectorAll('.row')].map((row) => row.title).sort()"
+    )
+
+
+def test_filters_count_and_the_copied_selection_gives_the_same_scenes(page):
+    assert page.text("count") == "160 scenes, 2,400 pairs"
+
+    page.filter("split", "train")
+    page.filter("family", "Uniform")
+    counts = page.script(
+        "return [...document.querySelectorAll('#facet-family label')].map((row) => row.textContent)"
+    )
+    pairs = run(page.text("selection-line"))["pairs"]
+
+    assert counts == ["IPD_Gaussian40", "Uniform80"]
+    assert page.text("count") == "80 scenes, 1,200 pairs"
+    assert len(pairs.plan.scene_rows) == 80
+    assert len(pairs.plan.pairs) == 1200
+    chosen = set(pairs.index.column("key")[pairs.plan.scene_rows].tolist())
+    assert set(keys_listed(page)) <= chosen
+    assert page.text("key") in chosen
+
+
+def test_a_baseline_range_dims_the_pairs_outside_and_moves_to_one_inside(page):
+    page.script(
+        "document.getElementById('baseline-low').value = '10';"
+        "document.getElementById('baseline-high').value = '60';"
+        "document.getElementById('filters').dispatchEvent(new Event('input'));"
+    )
+    page.until(lambda: "baseline_cm=(10, 60)" in page.text("selection-line"))
+    page.until(lambda: page.script("return document.querySelector('.pair.off') !== null"))
+    page.settle()
+    pairs = run(page.text("selection-line"))["pairs"]
+    row = pairs.index.column("key").tolist().index(page.text("key"))
+    wanted = np.sort(pairs.index.column("baselines_cm")[row])
+    off = page.script(
+        "return [...document.querySelectorAll('.pair')]"
+        ".map((pair) => pair.classList.contains('off'))"
+    )
+
+    assert off == [not 10 <= cm <= 60 for cm in wanted]
+    assert not page.script(
+        "return document.querySelector('.pair[aria-checked=true]').classList.contains('off')"
+    )
+    assert page.text("count").endswith(f"{len(pairs.plan.pairs):,} pairs")
+
+
+def test_the_numbers_under_the_cursor_are_those_of_the_maps(page):
+    page.open("key=train/Uniform/SynthStage/scene_000120&pair=0-2&frame=3")
+    sample = run(page.text("sample-line"))["sample"]
+
+    assert sample["__key__"] == "train/Uniform/SynthStage/scene_000120/00-02/003"
+    whole = StereoPairs(
+        run(page.text("selection-line"))["pairs"].index, scenes=sample["scene"], pairs=[(0, 2)],
+        frames=3, fields=("disparity", "depth", "valid", "visible"),
+    )[0]  # fmt: skip
+    measured = whole["valid"][0].nonzero().tolist()
+    for pane, (y, x) in (
+        ("disparity", measured[5]),
+        ("left", measured[-1]),
+        ("depth", measured[9]),
+    ):
+        page.point(pane, x, y)
+
+        assert page.text("at") == f"x {x}, y {y}"
+        assert page.text("disparity-here") == f"{float(whole['disparity'][0, y, x]):.3f} px"
+        assert page.text("depth-here") == f"{float(whole['depth'][0, y, x]):.3f} m"
+        seen = bool(whole["visible"][0, y, x])
+        assert page.text("seen-here").startswith("visible" if seen else "hidden")
+    y, x = (~whole["valid"][0]).nonzero().tolist()[0]
+    page.point("left", x, y)
+    assert page.text("disparity-here") == "not measured"
+
+
+def test_pictures_and_maps_are_drawn_as_they_are(page):
+    page.open("key=train/Uniform/SynthStage/scene_000120&pair=0-2&frame=3")
+    sample = run(page.text("sample-line"))["sample"]
+
+    def drawn(pane):
+        flat = page.script(
+            "const box = document.querySelector(`[data-pane=${arguments[0]}] canvas`);"
+            "return [...box.getContext('2d').getImageData(0, 0, box.width, box.height).data]",
+            pane,
+        )
+        return np.array(flat).reshape(64, 64, 4)[..., :3]
+
+    left, right = (sample[name].numpy().transpose(1, 2, 0) for name in ("left", "right"))
+    assert np.abs(drawn("left") - left).mean() < 3
+    assert np.abs(drawn("right") - right).mean() < 3
+    wanted = np.stack([left[..., 0], right[..., 1], right[..., 2]], axis=-1)
+    assert np.abs(drawn("anaglyph") - wanted).mean() < 3
+    from stereogenbench_data.audit.colour_scale import scale_of
+
+    disparity, valid = sample["disparity"][0].numpy(), sample["valid"][0].numpy()
+    painted = scale_of(disparity, measured=valid).paint(disparity, measured=valid)
+    assert np.abs(drawn("disparity") - painted.astype(int)).mean() < 4
+
+
+def test_the_keyboard_alone_flips_frames_pairs_scenes_and_views(page):
+    arrows = require_module("selenium.webdriver.common.keys").Keys
+
+    page.press(arrows.ARROW_RIGHT, arrows.ARROW_RIGHT)
+    page.until(lambda: page.text("frame-number") == "2 / 6")
+    page.press(arrows.END)
+    page.until(lambda: page.text("frame-number") == "6 / 6")
+    page.press(arrows.ARROW_RIGHT, arrows.HOME, arrows.ARROW_RIGHT)
+    page.until(lambda: page.text("frame-number") == "1 / 6")
+    first = page.script("return document.querySelector('.pair[aria-checked=true] b').textContent")
+    page.press(arrows.ARROW_DOWN)
+    shown = "return document.querySelector('.pair[aria-checked=true] b').textContent"
+    page.until(lambda: page.script(shown) != first)
+    before = page.text("key")
+    page.press("j")
+    page.until(lambda: page.text("key") != before)
+    page.press("k")
+    page.until(lambda: page.text("key") == before)
+    page.press("4")
+    panes = "return [...document.querySelectorAll('[data-pane]')].map((box) => box.dataset.pane)"
+    page.until(lambda: page.script(panes) == ["disparity"])
+    page.press("d")
+    page.until(lambda: page.text("at") == "x 33, y 32")
+    page.press("8")
+    page.until(lambda: page.script(panes) == ["wiggle"])
+    caption = "return document.querySelector('.pane figcaption').textContent"
+    page.until(lambda: "right" in page.script(caption))
+    page.until(lambda: "left" in page.script(caption))
+    page.press("/")
+    assert page.script("return document.activeElement.id") == "caption"
+
+
+def test_the_list_holds_few_rows_and_scrolls_to_any(page):
+    assert len(keys_listed(page)) < 60
+
+    page.script("document.getElementById('list').scrollTop = 1e6")
+    page.until(lambda: "train/Uniform/SynthStage/scene_000159" in keys_listed(page))
+    assert len(keys_listed(page)) < 60
+
+
+def test_a_broken_scene_is_named_and_what_can_be_read_is_shown(page):
+    page.open("key=train/Uniform/SynthStage/scene_000159&pair=1-3")
+    shown = page.script(
+        "return [...document.querySelectorAll('.picture')].map((box) =>"
+        " [box.dataset.pane, !box.classList.contains('empty')])"
+    )
+
+    assert "scene_000159" in page.text("error")
+    assert "lost.mkv: cannot be read" in page.text("error")
+    assert dict(shown) == {
+        "left": True, "right": True, "disparity": False, "depth": False, "visible": False,
+        "anaglyph": True,
+    }  # fmt: skip
+    assert page.text("left-out") == "1 scene left out"
+    assert "scene_000999: cam_00_rgb.mp4: has 6 frames" in page.text("left-out-list")
+
+
+def test_nothing_left_says_why(page):
+    page.script(
+        "document.getElementById('caption').value = 'submarine';"
+        "document.getElementById('filters').dispatchEvent(new Event('input'));"
+    )
+    page.until(lambda: "caption='submarine' matches none of 160" in page.text("reason"))
+
+    assert page.text("count") == "0 scenes, 0 pairs"
+    assert keys_listed(page) == []
+
+
+def test_the_page_runs_without_a_word_on_the_console_and_loads_from_itself_alone(page, address):
+    page.press("2")
+    page.settle()
+    loaded = page.script("return performance.getEntriesByType('resource').map((each) => each.name)")
+    said = [
+        entry["message"]
+        for entry in page.browser.get_log("browser")
+        if entry["level"] == "SEVERE" and "422" not in entry["message"]
+    ]
+
+    assert loaded
+    assert all(name.startswith(address) for name in loaded)
+    assert said == []

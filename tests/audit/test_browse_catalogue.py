@@ -1,0 +1,161 @@
+"""What the page lists: scenes, pairs and counts as selection has them, and lines that run."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stereogenbench_data import DepthEncoding, SceneIndex, SelectionError, StereoPairs
+from stereogenbench_data.audit.browser.catalogue import Catalogue
+from stereogenbench_data.audit.browser.choice import Choice, parse_choice
+from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
+
+SCENE = "train/Uniform/SynthStage/scene_000001"
+
+
+@pytest.fixture(scope="module")
+def index(small_release):
+    return SceneIndex.open(small_release)
+
+
+@pytest.fixture(scope="module")
+def catalogue(index, small_release):
+    return Catalogue(index, shown_data=str(small_release))
+
+
+def run(line):
+    names = {}
+    exec(line, names)  # the line under test, which is to run as it stands
+    return names
+
+
+QUERIES = [
+    {},
+    {"family": ["Uniform"]},
+    {"family": ["Uniform", "IPD_Gaussian"], "split": ["train"]},
+    {"subset": ["seen_map"], "pairs": ["primary"]},
+    {"baseline_low": ["10"], "baseline_high": ["60.5"], "pairs": ["adjacent"]},
+    {"bin": ["[10,30)", "(150,inf)"]},
+    {"caption": ["figure  WALKS"], "focal_low": ["18"], "focal_high": ["85"]},
+    {"map": ["SynthStage"], "split": ["eval"]},
+]
+
+
+@pytest.mark.parametrize("query", QUERIES, ids=str)
+def test_the_line_of_a_choice_selects_what_the_page_counts(catalogue, query):
+    choice = parse_choice(query)
+    told = catalogue.summary(choice)
+    pairs = run(told["line"])["pairs"]
+    listed = catalogue.listed(choice, first=0, count=100)
+
+    assert told["reason"] == ""
+    assert told["pairs"] == len(pairs.plan.pairs)
+    assert told["scenes"] == listed["total"] == len(pairs.plan.scene_rows)
+    assert [row["key"] for row in listed["rows"]] == pairs.index.column("key")[
+        pairs.plan.scene_rows
+    ].tolist()
+
+
+def test_the_line_of_a_sample_gives_it(catalogue, small_release):
+    line = catalogue.sample_line(SCENE, pair=(1, 4), frame=5)
+    sample = run(line)["sample"]
+
+    assert sample["__key__"] == f"{SCENE}/01-04/005"
+    assert line.startswith("from stereogenbench_data import StereoPairs\n")
+
+
+def test_the_line_states_the_depth_contract_that_is_shown(index, small_release):
+    shown = Catalogue(index, shown_data=str(small_release), depth=DepthEncoding(unit_m=0.002))
+    mine = run(shown.sample_line(SCENE, pair=(0, 1), frame=0))["sample"]["disparity"]
+    stated = StereoPairs(small_release, scenes=SCENE)[0]["disparity"]
+
+    np.testing.assert_allclose(mine * 2, stated, rtol=1e-5)
+
+
+def test_a_value_counts_what_all_other_filters_leave(catalogue, index):
+    counts = catalogue.summary(parse_choice({"family": ["Uniform"], "split": ["train"]}))["counts"]
+
+    split, family = index.column("split"), index.column("family")
+    assert counts["family"] == {
+        name: int(((split == "train") & (family == name)).sum())
+        for name in ("IPD_Gaussian", "Uniform")
+    }
+    assert counts["split"] == {
+        name: int(((split == name) & (family == "Uniform")).sum()) for name in ("eval", "train")
+    }
+    assert counts["subset"] == {"seen_map": 0}
+
+
+def test_bins_count_the_pairs_that_fall_into_them(catalogue, index):
+    counts = catalogue.summary(parse_choice({"bin": ["[1,10)"]}))["counts"]["bin"]
+    found = [baseline_bin(cm) for cm in index.column("baselines_cm").ravel()]
+
+    assert counts == {name: found.count(name) for name in BASELINE_BINS}
+
+
+def test_the_edges_of_bins_belong_where_the_paper_puts_them(index):
+    scene = index.scene(0)
+    edges = (0.5, 1.0, 9.99, 10.0, 30.0, 60.0, 100.0, 149.0, 150.0, 150.1, 2.0, 3.0, 4.0, 5.0, 6.0)
+    odd = dataclasses.replace(scene, rig=dataclasses.replace(scene.rig, baselines_cm=edges))
+    catalogue = Catalogue(SceneIndex.from_scenes([odd], index.root), shown_data="x")
+
+    found = [baseline_bin(cm) for cm in edges]
+    counts = catalogue.summary(Choice())["counts"]["bin"]
+    assert counts == {name: found.count(name) for name in BASELINE_BINS}
+
+
+def test_nothing_left_says_why_and_what_there_is(catalogue):
+    told = catalogue.summary(parse_choice({"caption": ["submarine"]}))
+
+    assert (told["scenes"], told["pairs"]) == (0, 0)
+    assert "caption='submarine' matches none of 4 scenes" in told["reason"]
+    assert (
+        catalogue.listed(parse_choice({"caption": ["submarine"]}), first=0, count=9)["rows"] == []
+    )
+
+
+def test_a_scenes_pairs_go_from_the_narrowest_to_the_widest(catalogue, index):
+    scene = catalogue.scene(
+        SCENE, parse_choice({"baseline_low": ["100"], "baseline_high": ["150"]})
+    )
+    baselines = [pair["baseline_cm"] for pair in scene["pairs"]]
+    row = catalogue.row(SCENE)
+
+    assert sorted(map(tuple, (pair["cameras"] for pair in scene["pairs"]))) == list(CAMERA_PAIRS)
+    assert baselines == sorted(index.column("baselines_cm")[row].tolist())
+    assert [pair["chosen"] for pair in scene["pairs"]] == [100 <= cm <= 150 for cm in baselines]
+    assert sum(pair["primary"] for pair in scene["pairs"]) == 1
+
+
+def test_a_list_of_thousands_comes_in_parts(index):
+    scene = dataclasses.replace(index.scene(0), members={})
+    scenes = [
+        dataclasses.replace(
+            scene, id=dataclasses.replace(scene.id, key=f"train/scene_{number:06d}")
+        )
+        for number in range(8493)
+    ]
+    catalogue = Catalogue(SceneIndex.from_scenes(scenes, index.root), shown_data="x")
+    listed = catalogue.listed(Choice(), first=8400, count=10_000)
+
+    assert (listed["total"], listed["first"], len(listed["rows"])) == (8493, 8400, 93)
+    assert len(catalogue.listed(Choice(), first=0, count=10_000)["rows"]) == 200
+    assert catalogue.place(Choice(), "train/scene_004321") == 4321
+
+
+def test_a_scene_outside_the_choice_has_no_place_in_the_list(catalogue):
+    assert catalogue.place(parse_choice({"split": ["eval"]}), SCENE) == -1
+
+
+@pytest.mark.parametrize(
+    ("query", "reason"),
+    [
+        ({"bin": ["[1,2)"]}, r"no '\[1,2\)' to choose"),
+        ({"pairs": ["sweep"]}, "no 'sweep' to choose"),
+        ({"focal_low": ["wide"]}, "focal must be of numbers, got 'wide'"),
+        ({"baseline_high": ["inf"]}, "baseline must be of finite numbers, got 'inf'"),
+    ],
+)
+def test_a_choice_that_is_none_is_refused(query, reason):
+    with pytest.raises(SelectionError, match=reason):
+        parse_choice(query)

@@ -1,0 +1,246 @@
+"""The page's server: what it gives, and what it refuses."""
+
+import http.client
+import json
+import socket
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from urllib.parse import urlencode
+
+import numpy as np
+import pytest
+
+from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.audit.browser.catalogue import Catalogue
+from stereogenbench_data.audit.browser.server import PageServer
+from stereogenbench_data.audit.browser.service import STATIC, Service
+from stereogenbench_data.audit.scene_reader import SceneReader
+
+SCENE = "train/Uniform/SynthStage/scene_000001"
+MOMENT = urlencode({"key": SCENE, "left": 0, "right": 3, "frame": 2})
+
+
+@pytest.fixture(scope="module")
+def server(small_release):
+    index = SceneIndex.open(small_release)
+    service = Service(Catalogue(index, shown_data=str(small_release)), SceneReader(index))
+    with PageServer(service) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def ask(server, path, *, method="GET", headers=None, body=None):
+    port = server.server_address[1]
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    try:
+        connection.putrequest(method, path, skip_host=True)
+        for name, value in ({"Host": f"127.0.0.1:{port}"} | (headers or {})).items():
+            if value is not None:
+                connection.putheader(name, value)
+        connection.endheaders(body)
+        answer = connection.getresponse()
+        return answer.status, answer.read(), dict(answer.getheaders())
+    finally:
+        connection.close()
+
+
+@pytest.mark.parametrize("path", STATIC)
+def test_the_page_is_shipped_whole_and_loads_nothing_from_elsewhere(server, path):
+    status, content, headers = ask(server, path)
+
+    assert status == 200
+    assert content
+    assert b"https://" not in content
+    assert b"http://" not in content.replace(b"http://www.w3.org/2000/svg", b"")
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+
+
+@pytest.mark.parametrize("name", ["disparity", "depth"])
+def test_maps_are_the_datasets_own_numbers_with_nan_where_nothing_was_measured(
+    server, small_release, name
+):
+    status, content, _ = ask(server, f"/{name}.f32?{MOMENT}")
+    found = np.frombuffer(content, dtype="<f4").reshape(64, 64)
+    sample = StereoPairs(small_release, scenes=SCENE, pairs=[(0, 3)], frames=2,
+                         fields=(name, "valid"))[0]  # fmt: skip
+    valid = sample["valid"][0].numpy()
+
+    assert status == 200
+    assert np.array_equal(np.isnan(found), ~valid)
+    assert np.array_equal(found[valid], sample[name][0].numpy()[valid])
+
+
+def test_visibility_is_one_byte_a_pixel(server, small_release):
+    _, content, _ = ask(server, f"/visible.u8?{MOMENT}")
+    sample = StereoPairs(small_release, scenes=SCENE, pairs=[(0, 3)], frames=2, fields=["visible"])
+
+    assert content == sample[0]["visible"].numpy().astype(np.uint8).tobytes()
+
+
+def test_pictures_are_the_two_views(server, small_release):
+    import io
+
+    from PIL import Image
+
+    sample = StereoPairs(small_release, scenes=SCENE, pairs=[(0, 3)], frames=2)[0]
+    for name in ("left", "right"):
+        _, content, headers = ask(server, f"/{name}.jpg?{MOMENT}")
+        found = np.asarray(Image.open(io.BytesIO(content))).astype(int)
+        wanted = sample[name].numpy().transpose(1, 2, 0)
+
+        assert headers["Content-Type"] == "image/jpeg"
+        assert np.abs(found - wanted).mean() < 3
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../../../../etc/passwd", "/..%2f..%2f..%2fetc%2fpasswd", "//etc/passwd", "/page.css/..",
+        "/static/index.html", "/server.py", "/page.css%00", "/api", "/index.parquet",
+    ],
+)  # fmt: skip
+def test_no_path_leads_out_of_the_page(server, path):
+    status, content, _ = ask(server, path)
+
+    assert status == 404
+    assert json.loads(content) == {"error": "there is nothing here"}
+
+
+@pytest.mark.parametrize("key", ["../../etc/passwd", "/etc/passwd", "", "train", SCENE + "/"])
+def test_a_scene_is_asked_for_by_its_key_alone(server, key):
+    moment = urlencode({"key": key, "left": 0, "right": 1, "frame": 0})
+
+    status, content, _ = ask(server, f"/left.jpg?{moment}")
+    assert status == 400
+    assert "error" in json.loads(content)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"frame": "7"}, "has no frame 7: its 7 are 0 to 6"),
+        ({"frame": "-1"}, "frame must be a whole number, got '-1'"),
+        ({"left": "3", "right": "0"}, "there is no pair (3, 0)"),
+        ({"right": "9"}, "there is no pair (0, 9)"),
+        ({"frame": "9" * 5000}, "frame must be a whole number"),
+    ],
+)
+def test_a_moment_that_is_not_there_is_refused_with_a_reason(server, change, reason):
+    query = {"key": SCENE, "left": "0", "right": "3", "frame": "2"} | change
+
+    status, content, _ = ask(server, f"/disparity.f32?{urlencode(query)}")
+    assert status == 400
+    assert reason in json.loads(content)["error"]
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1", "", None])
+def test_a_name_that_was_made_to_point_here_is_refused(server, host):
+    port = server.server_address[1]
+
+    told = None if host is None else host.format(port=port)
+    status, content, _ = ask(server, "/api/about", headers={"Host": told})
+    assert status == 403
+    assert b"as another host" in content
+
+
+def test_localhost_is_its_name_too(server):
+    host = f"localhost:{server.server_address[1]}"
+
+    assert ask(server, "/", headers={"Host": host})[0] == 200
+
+
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+def test_what_another_sites_page_asks_for_is_refused(server, site):
+    assert ask(server, f"/left.jpg?{MOMENT}", headers={"Sec-Fetch-Site": site})[0] == 403
+    link = {"Sec-Fetch-Site": site, "Sec-Fetch-Mode": "navigate"}
+    assert ask(server, "/", headers=link)[0] == 200
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE"])
+def test_nothing_but_reading_is_allowed(server, method):
+    status, _, headers = ask(server, "/api/about", method=method)
+
+    assert status == 405
+    assert headers["Allow"] == "GET, HEAD"
+
+
+def test_no_answer_lets_another_origin_read_it(server):
+    origin = {"Origin": "https://evil.example"}
+    for path in ("/", "/api/about", f"/disparity.f32?{MOMENT}", "/nothing"):
+        _, _, headers = ask(server, path, headers=origin)
+
+        assert not [name for name in headers if name.lower().startswith("access-control")]
+        assert headers["Cross-Origin-Resource-Policy"] == "same-origin"
+        assert headers["X-Content-Type-Options"] == "nosniff"
+
+
+def test_head_tells_the_length_and_sends_nothing(server):
+    status, content, headers = ask(server, "/api/about", method="HEAD")
+
+    assert (status, content) == (200, b"")
+    assert int(headers["Content-Length"]) > 100
+
+
+def test_only_the_loopback_interface_listens(server):
+    assert server.server_address[0] == "127.0.0.1"
+    with socket.socket() as other:
+        other.settimeout(5)
+        assert other.connect_ex(("127.0.0.2", server.server_address[1])) != 0
+
+
+def test_a_broken_scene_is_told_by_name(small_release, tmp_path):
+    import shutil
+
+    shutil.copytree(small_release, tmp_path / "data")
+    index = SceneIndex.open(tmp_path / "data")
+    (tmp_path / "data" / SCENE / "cam_03_rgb.mp4").write_bytes(b"cut short")
+    service = Service(Catalogue(index, shown_data="x"), SceneReader(index))
+    with PageServer(service) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            good = ask(server, f"/left.jpg?{MOMENT}")
+            status, content, _ = ask(server, f"/right.jpg?{MOMENT}")
+        finally:
+            server.shutdown()
+            thread.join()
+    told = json.loads(content)["error"]
+
+    assert good[0] == 200
+    assert status == 422
+    assert SCENE in told
+    assert "cam_03_rgb.mp4: has 9 bytes" in told
+
+
+def test_many_threads_get_each_their_own_frame(server, small_release):
+    """Asked at once and in no order, every answer is that of its own question."""
+    wanted = {}
+    pairs = StereoPairs(small_release, scenes=SCENE, pairs=[(0, 3), (2, 4)], frames="all",
+                        fields=("disparity", "valid", "pair", "frame_index"))  # fmt: skip
+    for sample in (pairs[number] for number in range(len(pairs))):
+        left, right = sample["pair"].tolist()
+        measured = sample["disparity"].where(sample["valid"], float("nan")).numpy()
+        wanted[left, right, int(sample["frame_index"])] = measured.tobytes()
+    asked = [place for place in wanted for _ in range(2)]
+    np.random.default_rng(0).shuffle(asked)
+
+    def get(place):
+        left, right, frame = (int(number) for number in place)
+        moment = urlencode({"key": SCENE, "left": left, "right": right, "frame": frame})
+        return ask(server, f"/disparity.f32?{moment}")[1] == wanted[left, right, frame]
+
+    with ThreadPoolExecutor(8) as pool:
+        assert all(pool.map(get, asked))
+
+
+def test_a_malformed_request_is_refused_and_the_server_goes_on(server):
+    port = server.server_address[1]
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+        connection.sendall(b"GET / HTTP/9.x\r\n\r\n")
+        answer = connection.recv(4096)
+
+    assert b"Bad request version" in answer
+    assert ask(server, "/api/about")[0] == 200

@@ -1,0 +1,205 @@
+"""Sheets and clips of a scene: what is drawn is what the data say."""
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereogenbench_data import SceneIndex, SelectionError, StereoPairs
+from stereogenbench_data.audit.colour_scale import ColourScale, scale_of
+from stereogenbench_data.audit.drawing import Page, disparity_rows, fitted, resized, scale_rows
+from stereogenbench_data.audit.scene_clip import clip_pages, write_clip
+from stereogenbench_data.audit.scene_reader import SceneReader
+from stereogenbench_data.audit.scene_sheet import HIDDEN, LEFT, RIGHT, scene_sheet, tile_width
+from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED, anaglyph
+
+SCENE = "train/Uniform/SynthStage/scene_000001"
+
+
+@pytest.fixture(scope="module")
+def reader(small_release):
+    return SceneReader(SceneIndex.open(small_release))
+
+
+@pytest.fixture(scope="module")
+def row(reader):
+    return reader.index.column("key").tolist().index(SCENE)
+
+
+def tile(sheet, *, line, column, width_px):
+    """Return a tile of a sheet, found by the frame that is drawn around each."""
+    gap = font_px = min(max(round(width_px / 21), 13), 30)
+    left = gap + column * (width_px + gap)
+    text_line = round(font_px * 1.4)
+    top = sheet.shape[0] - 2 * gap - 3 * text_line - width_px
+    if line == 0:
+        top -= text_line + 4 + width_px + gap
+    return sheet[top : top + width_px, left : left + width_px]
+
+
+def test_reading_is_the_same_as_the_datasets(small_release, reader, row):
+    fields = ("left", "right", "disparity", "valid", "visible", "depth")
+    sample = StereoPairs(small_release, scenes=SCENE, pairs=[(1, 4)], frames=3, fields=fields)[0]
+    found = reader.pair(row, pair=(1, 4), frame=3, fields=fields)
+
+    for name in fields:
+        assert np.array_equal(found[name], sample[name].numpy()), name
+
+
+@pytest.mark.parametrize("size_px", [None, 64, 200, 333])
+def test_the_views_of_a_sheet_are_the_six_cameras_pictures(reader, row, size_px):
+    sheet = scene_sheet(reader, row, pair=(0, 2), frame=1, tile_px=size_px)
+    width = tile_width(reader.index.scene(row), size_px)
+
+    views = reader.views(row, frame=1)
+    for camera in range(6):
+        wanted = resized(views[camera].transpose(1, 2, 0).copy(), width_px=width)
+        assert np.array_equal(tile(sheet, line=0, column=camera, width_px=width), wanted), camera
+
+
+def test_the_maps_of_a_sheet_are_coloured_as_their_scales_say(reader, row):
+    sheet = scene_sheet(reader, row, pair=(0, 2), tile_px=256)
+    sample = reader.pair(row, pair=(0, 2), frame=0,
+                         fields=("left", "right", "disparity", "valid", "visible"))  # fmt: skip
+    disparity, valid = sample["disparity"][0], sample["valid"][0]
+    painted = scale_of(disparity, measured=valid).paint(disparity, measured=valid)
+    shown = {
+        name: tile(sheet, line=1, column=column, width_px=256)[2::4, 2::4]
+        for column, name in ((0, "disparity"), (2, "visible"), (3, "anaglyph"))
+    }
+
+    assert np.array_equal(shown["disparity"], painted)
+    assert np.array_equal(shown["anaglyph"], anaglyph(sample["left"], sample["right"]))
+    hidden = valid & ~sample["visible"][0]
+    assert hidden.any()
+    assert np.array_equal((shown["visible"] == HIDDEN).all(axis=-1), hidden)
+    assert np.array_equal((shown["visible"] == NOT_MEASURED).all(axis=-1), ~valid)
+
+
+@pytest.mark.parametrize("pair", [(0, 1), (2, 5)])
+def test_the_pairs_cameras_are_framed_in_their_colours(reader, row, pair):
+    sheet = scene_sheet(reader, row, pair=pair, tile_px=200)
+    framed = {}
+    for camera in range(6):
+        edge = 13 + camera * (200 + 13) - 2
+        column = sheet[sheet.shape[0] // 3, edge]
+        framed[camera] = tuple(column.tolist())
+
+    assert [camera for camera in range(6) if framed[camera] == LEFT] == [pair[0]]
+    assert [camera for camera in range(6) if framed[camera] == RIGHT] == [pair[1]]
+
+
+def test_a_frame_or_pair_that_is_not_there_is_named(reader, row):
+    with pytest.raises(SelectionError, match="has no frame 7: its 7 are 0 to 6"):
+        scene_sheet(reader, row, frame=7)
+    with pytest.raises(SelectionError, match=r"there is no pair \(4, 1\)"):
+        scene_sheet(reader, row, pair=(4, 1))
+
+
+def test_a_scale_runs_from_dark_to_red_and_a_log_scale_the_other_way():
+    values, measured = np.array([[2.0, 20.0]]), np.array([[True, True]])
+
+    linear = ColourScale(2.0, 20.0).paint(values, measured=measured)
+    assert linear[0].tolist() == [COLOUR_STOPS[0].tolist(), COLOUR_STOPS[-1].tolist()]
+    log = ColourScale(2.0, 20.0, "log").paint(values, measured=measured)
+    assert log[0].tolist() == [COLOUR_STOPS[-1].tolist(), COLOUR_STOPS[0].tolist()]
+
+
+@pytest.mark.parametrize(
+    ("scale", "ticks"),
+    [
+        (ColourScale(0.0, 87.0), [0, 20, 40, 60, 80]),
+        (ColourScale(0.0, 2.6), [0, 0.5, 1, 1.5, 2, 2.5]),
+        (ColourScale(101.0, 108.0), [102, 104, 106, 108]),
+        (ColourScale(1.5, 120.0, "log"), [2, 5, 10, 20, 50, 100]),
+        (ColourScale(4.0, 26.0, "log"), [5, 7, 10, 15, 20]),
+    ],
+)
+def test_ticks_are_round_numbers_within_the_range(scale, ticks):
+    assert scale.ticks(6) == pytest.approx(ticks)
+
+
+def test_the_bar_of_disparity_says_depth_in_metres_below_pixels():
+    # 600 px of focal length and 10 cm: 60 px at 1 m, 20 px at 3 m.
+    pixels, metres = disparity_rows(ColourScale(0.0, 60.0), shift_px_m=60.0)
+
+    assert [text for _, text in pixels] == ["0", "20", "40", "60"]
+    assert [text for _, text in metres] == ["inf", "3", "1.5", "1"]
+    assert [place for place, _ in metres] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    assert scale_rows(ColourScale(0.0, 60.0)) == [pixels]
+
+
+def test_nothing_measured_has_a_scale_too():
+    nothing = np.zeros((2, 2), dtype=bool)
+
+    scale = scale_of(np.zeros((2, 2)), measured=nothing, kind="log")
+    assert (scale.paint(np.zeros((2, 2)), measured=nothing) == NOT_MEASURED).all()
+
+
+def test_a_caption_never_leaves_its_tile():
+    page = Page(400, 40, font_px=14)
+    page.text((4, 4), "disparity and very much more than there is room for", width_px=90)
+    inked = (page.finished() < 128).any(axis=-1).any(axis=0).nonzero()[0]
+
+    assert 60 < inked.max() < 4 + 90
+
+
+def test_a_text_that_fits_is_not_cut():
+    class Font:
+        def getlength(self, text):
+            return 10.0 * len(text)
+
+    assert fitted("camera 0", font=Font(), width_px=80) == "camera 0"
+    assert fitted("camera 0", font=Font(), width_px=79) == "came..."
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_clip_has_a_page_for_every_frame_at_the_scenes_rate(reader, row, tmp_path, suffix):
+    counted = []
+    path = tmp_path / f"clip{suffix}"
+    write_clip(
+        path, clip_pages(reader, row, tile_px=200), frames=7, rate_hz=15.0,
+        progress=lambda done, total: counted.append((done, total)),
+    )  # fmt: skip
+    pages = list(clip_pages(reader, row, tile_px=200))
+    with av.open(path) as container:
+        shown = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        rate = float(container.streams.video[0].average_rate)
+
+    assert counted == [(number, 7) for number in range(1, 8)]
+    assert [page.shape for page in shown] == [pages[0].shape] * 7
+    assert rate == pytest.approx(15.0 if suffix == ".mp4" else 100 / 7, rel=0.01)
+    for page, drawn in zip(shown, pages, strict=True):
+        assert np.abs(page.astype(int) - drawn).mean() < 6
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_colours_of_a_clip_mean_the_same_in_every_frame(reader, row):
+    pages = list(clip_pages(reader, row, tile_px=200))
+    bars = {page[-60:, 440:640].tobytes() for page in pages}
+
+    assert len(bars) == 1
+    assert not np.array_equal(pages[0], pages[-1])
+
+
+def test_a_clip_that_fails_leaves_no_file(reader, row, tmp_path):
+    def failing():
+        yield np.zeros((4, 4, 3), dtype=np.uint8)
+        raise SelectionError("the second page is not there")
+
+    with pytest.raises(SelectionError, match="the second page"):
+        write_clip(tmp_path / "clip.gif", failing(), frames=2, rate_hz=15.0)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_clip_of_another_kind_is_refused(tmp_path):
+    with pytest.raises(SelectionError, match=r"clip\.avi: a clip is \.mp4 or \.gif"):
+        write_clip(tmp_path / "clip.avi", iter(()), frames=0, rate_hz=15.0)
+
+
+def test_a_sheet_is_a_picture_that_can_be_opened(reader, row, tmp_path):
+    from stereogenbench_data.samples.picture import write_png
+
+    write_png(tmp_path / "sheet.png", scene_sheet(reader, row))
+    with Image.open(tmp_path / "sheet.png") as picture:
+        assert picture.size[0] == 6 * (320 + 15) + 15

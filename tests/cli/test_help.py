@@ -1,0 +1,114 @@
+"""Help, examples and completion: what a newcomer meets first."""
+
+import os
+import shlex
+import subprocess
+import sys
+from typing import get_args
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.synth import RotationForm
+from stereogenbench_data.schema.release import FAMILIES
+
+COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+
+
+def shown(*arguments):
+    result = CliRunner().invoke(app, [*arguments], env={"COLUMNS": "200", "TERMINAL_WIDTH": "200"})
+    return " ".join(result.output.split())
+
+
+def test_help_groups_the_commands_in_the_order_of_use():
+    text = shown("--help")
+    panels = ("Have scenes", "Look at them", "Pack them", "Check them", "Score with them")
+    places = [text.index(f" {panel} ") for panel in panels]
+
+    assert places == sorted(places)
+    assert text.index("synth scenes/") < text.index("show scenes/") < text.index("browse scenes/")
+
+
+def test_help_says_what_each_exit_status_means():
+    text = shown("--help")
+
+    for status in ("0 done", "1 something is wrong with the data", "2 it could", "130 stopped"):
+        assert status in text
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_every_command_has_an_example_that_parses(name):
+    example = COMMANDS[name].epilog
+    assert example in (None, "") or example.startswith("Example: `stereogenbench ")
+    words = shlex.split(example.partition("`stereogenbench ")[2].rstrip("`"))
+
+    assert words[0] == name
+    COMMANDS[name].make_context(name, words[1:], resilient_parsing=False)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_option_of_every_command_says_what_it_is(name):
+    for parameter in COMMANDS[name].params:
+        assert getattr(parameter, "help", ""), f"{name} {parameter.name}"
+
+
+def test_the_forms_of_rotations_are_those_that_can_be_written():
+    from stereogenbench_data.synthesis import request
+
+    assert get_args(RotationForm) == get_args(request.RotationForm)
+
+
+def completed(line, **options):
+    words = shlex.split(line)
+    last = "" if line.endswith(" ") else words.pop()
+    ended = subprocess.run(
+        [sys.executable, "-m", "stereogenbench_data"], capture_output=True, text=True,
+        check=False, timeout=120,
+        env=os.environ | {
+            "_STEREOGENBENCH_COMPLETE": "complete_bash",
+            "COMP_WORDS": " ".join([*words, last]),
+            "COMP_CWORD": str(len(words)),
+        },
+        **options,
+    )  # fmt: skip
+    return ended.stdout.split()
+
+
+def test_completion_knows_commands():
+    assert completed("stereogenbench s") == ["synth", "show", "stats"]
+
+
+def test_completion_knows_the_values_of_family():
+    assert completed("stereogenbench synth --family ") == sorted(FAMILIES)
+
+
+def test_completion_knows_the_scenes_of_data_with_an_index(small_shards):
+    assert completed(f"stereogenbench show {small_shards} train/U") == [
+        "train/Uniform/SynthStage/scene_000000",
+        "train/Uniform/SynthStage/scene_000001",
+    ]
+
+
+def test_a_completion_script_can_be_had():
+    ended = subprocess.run(
+        [sys.executable, "-m", "stereogenbench_data", "--show-completion", "bash"],
+        capture_output=True, text=True, check=False, timeout=120,
+        env=os.environ | {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"},
+    )  # fmt: skip
+
+    assert "_STEREOGENBENCH_COMPLETE=complete_bash" in ended.stdout
+
+
+def test_help_imports_neither_torch_nor_numpy():
+    code = (
+        "import sys; from stereogenbench_data.cli.main import app\n"
+        "try: app(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'torch', 'numpy', 'pyarrow', 'av', 'PIL'} & sys.modules.keys()\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+
+    assert ended.returncode == 0, ended.stderr.decode()

@@ -1,0 +1,173 @@
+"""How commands end: the exit status, and one or two lines on stderr whatever went wrong."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.outcome import OutcomeTold
+from stereogenbench_data.errors import ExtraError, SelectionError
+
+COMMAND = (sys.executable, "-m", "stereogenbench_data")
+
+
+def told(error, capsys):
+    """Return how a command ends that raises an error, and the lines that it says."""
+    with pytest.raises(SystemExit) as ended, OutcomeTold():
+        raise error
+    said = capsys.readouterr()
+    assert said.out == ""
+    return ended.value.code, said.err.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "lines"),
+    [
+        (SelectionError("no pair; take another"), 2, ["SelectionError: no pair; take another"]),
+        (
+            ExtraError("needs matplotlib: pip install 'stereogenbench-data[plots]'"),
+            2,
+            ["ExtraError: needs matplotlib: pip install 'stereogenbench-data[plots]'"],
+        ),
+        (
+            PermissionError(errno.EACCES, "Permission denied", "out/sheet.png"),
+            2,
+            [
+                "PermissionError: out/sheet.png: Permission denied. Give permission, or choose "
+                "another place."
+            ],
+        ),
+        (
+            OSError(errno.ENOSPC, "No space left on device"),
+            2,
+            ["OSError: No space left on device. Make room, or choose another place."],
+        ),
+        (
+            MemoryError(),
+            2,
+            ["MemoryError: memory is short. Use fewer workers or smaller pictures."],
+        ),
+        (KeyboardInterrupt(), 130, ["stopped"]),
+        (BrokenPipeError(errno.EPIPE, "Broken pipe"), 141, []),
+        (
+            KeyError("a bug\nof two lines"),
+            2,
+            [
+                "KeyError: 'a bug\\nof two lines'",
+                "This was not foreseen: run it again as `stereogenbench --debug ...` to see where "
+                "it arose.",
+            ],
+        ),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, BaseException) else "",
+)
+def test_an_error_ends_the_command_with_its_status_and_its_lines(error, status, lines, capfd):
+    assert told(error, capfd) == (status, lines)
+
+
+@pytest.mark.parametrize("error", [typer.Exit(1), typer.BadParameter("no"), SystemExit(3)])
+def test_what_says_itself_how_to_end_passes(error, capsys):
+    with pytest.raises(type(error)), OutcomeTold():
+        raise error
+    assert capsys.readouterr().err == ""
+
+
+def test_a_warning_is_one_line_and_afterwards_looks_as_before(capsys):
+    before = warnings.formatwarning
+    with OutcomeTold(), warnings.catch_warnings():
+        warnings.simplefilter("always")
+        line = warnings.formatwarning("two scenes are odd", UserWarning, "file.py", 3)
+
+    assert line == "UserWarning: two scenes are odd\n"
+    assert warnings.formatwarning is before
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+def test_a_sheet_where_nothing_may_be_written_is_two_lines_at_most(small_shards, tmp_path):
+    shown = invoke("show", small_shards, "-o", tmp_path / "nowhere" / "sheet.png")
+
+    assert shown.exit_code == 2
+    assert "sheet.png: No such file or directory. Check the path." in shown.stderr
+    assert len(shown.stderr.strip().splitlines()) <= 2
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_a_full_disk_is_told(small_shards, tmp_path):
+    (tmp_path / "sheet.png").symlink_to("/dev/full")
+    with Path("/dev/full").open("w") as full:
+        printed = subprocess.run(
+            [*COMMAND, "--version"], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    shown = invoke("show", small_shards, "-o", tmp_path / "sheet.png")
+
+    assert shown.exit_code == 2
+    assert "No space left on device. Make room" in shown.stderr
+    assert printed.returncode == 2
+    assert (
+        printed.stderr == "OSError: No space left on device. Make room, or choose another place.\n"
+    )
+
+
+def test_output_that_nobody_reads_ends_quietly(small_shards, tmp_path):
+    """As `| head` does it: the pipe is closed before anything is written."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as closed:
+        ended = subprocess.run(
+            [*COMMAND, "show", str(small_shards), "-o", str(tmp_path / "sheet.png")],
+            stdout=closed, stderr=subprocess.PIPE, text=True, check=False, timeout=120,
+        )  # fmt: skip
+
+    assert (ended.returncode, ended.stderr) == (141, "")
+
+
+def test_debug_may_stand_after_the_command_too(tmp_path):
+    words = ["index", str(tmp_path / "nowhere"), "--debug"]
+    ended = subprocess.run([*COMMAND, *words], capture_output=True, text=True, check=False)
+
+    assert ended.returncode != 0
+    assert "Traceback" in ended.stderr
+
+
+def test_ctrl_c_ends_the_browser_at_once_with_130(small_shards):
+    with subprocess.Popen(
+        [*COMMAND, "browse", str(small_shards), "--no-open"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    ) as browsing:  # fmt: skip
+        assert browsing.stdout is not None
+        line = browsing.stdout.readline()
+        time.sleep(0.2)
+        browsing.send_signal(signal.SIGINT)
+        _, said = browsing.communicate(timeout=60)
+
+    assert line.startswith("http://127.0.0.1:")
+    assert "4 scenes" in line
+    assert browsing.returncode == 130
+    assert said.strip().splitlines()[-1] == "stopped"
+    assert "Traceback" not in said
+
+
+def test_a_port_that_is_taken_is_told(small_shards):
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        shown = invoke("browse", small_shards, "--no-open", "--port", taken.getsockname()[1])
+
+    assert shown.exit_code == 2
+    assert "Address already in use" in shown.stderr
+    assert "Choose another port." in shown.stderr

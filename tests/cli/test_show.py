@@ -1,0 +1,130 @@
+"""``stereogenbench show`` and JSON reports, as a user calls them."""
+
+import json
+import shutil
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+from rich.progress import Progress
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.progress import _RateColumn
+
+SCENE = "train/Uniform/SynthStage/scene_000001"
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+def test_the_first_scene_is_drawn_under_its_key(small_shards, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shown = run("show", small_shards)
+    name = "eval_MapSeenInTrain_Uniform_SynthStage_scene_000000.png"
+
+    assert shown.exit_code == 0, shown.output
+    assert shown.stdout == f"{name}: eval/MapSeenInTrain/Uniform/SynthStage/scene_000000\n"
+    with Image.open(tmp_path / name) as sheet:
+        assert sheet.size[0] > 1500
+
+
+def test_a_part_of_a_key_a_pair_a_frame_and_a_size_are_taken(small_release, tmp_path):
+    sheets = []
+    for number, options in enumerate(
+        ([], ["--pair", "0-5"], ["--frame", 6], ["--size", 256], ["--depth-unit-m", 0.01])
+    ):
+        out = tmp_path / f"{number}.png"
+        shown = run("show", small_release, "scene_000001", "-o", out, *options)
+        assert (shown.exit_code, shown.stdout) == (0, f"{out}: {SCENE}\n")
+        with Image.open(out) as sheet:
+            sheets.append(np.asarray(sheet))
+
+    first, *others = sheets
+    assert not any(np.array_equal(first, other) for other in others)
+    assert others[2].shape[1] < first.shape[1]
+
+
+@pytest.mark.parametrize("options", [["--clip", "-o", "clip.mp4"], ["-o", "clip.gif"]])
+def test_a_clip_is_written_by_the_ending_of_its_name(small_shards, tmp_path, monkeypatch, options):
+    monkeypatch.chdir(tmp_path)
+    shown = run("show", small_shards, SCENE, *options)
+
+    assert shown.exit_code == 0, shown.output
+    with av.open(tmp_path / options[-1]) as clip:
+        assert sum(1 for _ in clip.decode(video=0)) == 7
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (["scene_00001"], "Did you mean train/Uniform/SynthStage/scene_000001"),
+        (["scene_000000"], "is a part of 3 keys"),
+        ([SCENE, "--pair", "left"], "'left' is no pair: write two cameras"),
+        ([SCENE, "--pair", "5-0"], "there is no pair (5, 0)"),
+        ([SCENE, "--frame", "7"], "has no frame 7: its 7 are 0 to 6"),
+        ([SCENE, "-o", "sheet.jpg"], "a sheet is .png"),
+        ([SCENE, "--clip", "-o", "clip.avi"], "a clip is .mp4 or .gif"),
+        ([SCENE, "--depth-unit-m", "-1"], "unit_m must be a positive number"),
+    ],
+)
+def test_what_cannot_be_shown_is_said(small_shards, tmp_path, monkeypatch, options, reason):
+    monkeypatch.chdir(tmp_path)
+    shown = run("show", small_shards, *options)
+
+    assert shown.exit_code == 2
+    assert reason in " ".join(shown.stderr.replace("│", " ").split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_tree_with_a_broken_scene_shows_the_others(small_release, tmp_path):
+    shutil.copytree(small_release, tmp_path / "data")
+    (tmp_path / "data" / SCENE / "baseline.json").write_text("{}")
+
+    good = run("show", tmp_path / "data", "IPD_Gaussian", "-o", tmp_path / "sheet.png")
+    bad = run("show", tmp_path / "data", SCENE, "-o", tmp_path / "sheet.png")
+    assert (good.exit_code, bad.exit_code) == (0, 2)
+    assert f"'{SCENE}' is no key of 3 scenes" in bad.stderr
+
+
+def test_reports_as_json_are_one_document(small_release, tmp_path):
+    data = tmp_path / "data"
+    shutil.copytree(small_release, data)
+    drawn = run("synth", tmp_path / "drawn", "--size", 32, "--frames", 2, "--workers", 1, "--json")
+    indexed = run("index", data, "--json")
+    packed = run("pack", data, tmp_path / "shards", "--workers", 1, "--json")
+
+    assert json.loads(drawn.stdout) == {
+        "root": str(tmp_path / "drawn"),
+        "scenes": ["train/IPD_Gaussian/SynthStage/scene_000000"],
+    }
+    assert json.loads(indexed.stdout) == {
+        "index": str(data / "index.parquet"), "scenes": 4, "incomplete": {}, "broken": {},
+        "notes": [],
+    }  # fmt: skip
+    report = json.loads(packed.stdout)
+    assert report["scenes"] == 4
+    assert report["packed"] == report["part"]
+    assert report["index"] == str(tmp_path / "shards" / "index.parquet")
+
+
+def test_an_index_without_a_broken_scene_says_so_as_json_with_exit_status_1(
+    small_release, tmp_path
+):
+    data = tmp_path / "data"
+    shutil.copytree(small_release, data)
+    (data / SCENE / "baseline.json").write_text("{}")
+    indexed = run("index", data, "--json")
+
+    assert indexed.exit_code == 1
+    assert list(json.loads(indexed.stdout)["broken"]) == [SCENE]
+
+
+def test_the_rate_is_nothing_before_there_is_one():
+    bar = Progress(console=Console(quiet=True))
+    bar.add_task("packing", total=8)
+
+    assert _RateColumn("MB").render(bar.tasks[0]).plain == ""

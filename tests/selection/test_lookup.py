@@ -1,0 +1,45 @@
+"""One scene by its key, or by a part of it."""
+
+import pytest
+
+from stereogenbench_data import SceneIndex, SelectionError
+from stereogenbench_data.selection.lookup import find_scene
+
+
+@pytest.fixture(scope="module")
+def index(small_release):
+    return SceneIndex.open(small_release)
+
+
+def keys(index):
+    return index.column("key").tolist()
+
+
+def test_every_key_finds_its_own_row(index):
+    assert [find_scene(index, key) for key in keys(index)] == list(range(len(index)))
+
+
+@pytest.mark.parametrize("text", ["scene_000001", "SCENE_000001", "/scene_000001/", "000001"])
+def test_a_part_that_one_key_alone_has_finds_it(index, text):
+    assert keys(index)[find_scene(index, text)] == "train/Uniform/SynthStage/scene_000001"
+
+
+def test_the_end_of_a_key_counts_before_what_stands_in_the_middle_of_others(index):
+    found = find_scene(index, "IPD_Gaussian/SynthStage/scene_000000")
+
+    assert keys(index)[found] == "train/IPD_Gaussian/SynthStage/scene_000000"
+
+
+def test_a_part_of_several_keys_names_them(index):
+    with pytest.raises(SelectionError, match=r"'scene_000000' is a part of 3 keys: eval/.*Give"):
+        find_scene(index, "scene_000000")
+
+
+def test_what_is_no_part_names_the_keys_that_are_close(index):
+    with pytest.raises(SelectionError, match=r"'scene_00001' is no key .* Did you mean .*_000001"):
+        find_scene(index, "scene_00001")
+
+
+def test_what_is_like_nothing_lists_what_there_is(index):
+    with pytest.raises(SelectionError, match=r"'kitchen' is no key of 4 scenes.* There is eval/"):
+        find_scene(index, "kitchen")
