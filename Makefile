@@ -7,7 +7,7 @@ READY := $(VENV)/.ready
 SAMPLE := build/sample
 SYNTH := $(BIN)/stereogenbench synth $(SAMPLE)/release --size 72 --frames 81 --depth-unit-m 0.01
 
-.PHONY: demo test lint sample clean
+.PHONY: demo test lint docs bench sample clean
 .DELETE_ON_ERROR:
 
 demo: $(READY)
@@ -20,6 +20,9 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 # The scenes in shards/: videos are not drawn to the same bytes everywhere, packing is the same.
 sample: $(READY)

@@ -1,0 +1,74 @@
+"""Pages that are made from the code when the site is built: the commands, the tables of fields."""
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import typer
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+from stereogenbench_data.cli.main import app
+from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS, Field
+
+_TABLES: Mapping[str, Mapping[str, Field]] = {"pairs": PAIR_FIELDS, "views": VIEW_FIELDS}
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the page of commands."""
+    files.append(File.generated(config, "commands.md", content=commands_page()))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put a table of fields where a page asks for one: ``<!-- table of fields: pairs -->``."""
+    return re.sub(
+        r"<!-- table of fields: (\w+) -->", lambda found: fields_table(found[1]), markdown
+    )
+
+
+def fields_table(name: str) -> str:
+    """Return the Markdown table of the fields of "pairs" or "views"."""
+    rows = [
+        f"| `{field}` | {about.dtype} {about.shape} | {about.meaning} |"
+        for field, about in _TABLES[name].items()
+    ]
+    return "\n".join(["| field | type | meaning |", "|---|---|---|", *rows])
+
+
+def commands_page() -> str:
+    """Return the reference of all commands, as the program itself describes them."""
+    group: Any = typer.main.get_command(app)
+    parts = ["# Commands", "", _plain(group.help or "")]
+    if group.epilog:
+        parts += ["", _plain(group.epilog)]
+    for name, command in group.commands.items():
+        parts += ["", f"## stereogenbench {name}", "", _plain(command.help or "")]
+        if command.epilog:
+            parts += ["", _plain(command.epilog)]
+        parts += ["", *_parameters(command)]
+    return "\n".join(parts) + "\n"
+
+
+def _parameters(command: Any) -> list[str]:
+    rows = ["| parameter | meaning | default |", "|---|---|---|"]
+    for parameter in command.params:
+        if parameter.name == "help":
+            continue
+        names = ", ".join(f"`{option}`" for option in parameter.opts)
+        if parameter.param_type_name == "argument":
+            names = f"`{parameter.name.upper()}`"
+        default = parameter.default
+        shown = "" if default in (None, False, ()) or callable(default) else f"`{default}`"
+        if parameter.required:
+            shown = "required"
+        rows.append(f"| {names} | {_cell(getattr(parameter, 'help', '') or '')} | {shown} |")
+    return rows
+
+
+def _plain(text: str) -> str:
+    return text.replace("\b\n", "").strip()
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
