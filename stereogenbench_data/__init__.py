@@ -28,6 +28,12 @@ if TYPE_CHECKING:
         StorageError,
         SynthesisError,
     )
+    from stereogenbench_data.evaluation.controls import score_controls
+    from stereogenbench_data.evaluation.evaluate import evaluate
+    from stereogenbench_data.evaluation.inputs import export_inputs
+    from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+    from stereogenbench_data.evaluation.report import write_report
+    from stereogenbench_data.evaluation.tables import tables_of
     from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS
     from stereogenbench_data.samples.transforms import (
         ColorJitter,
@@ -68,6 +74,12 @@ _HOMES = {
         "StorageError",
         "SynthesisError",
     ),
+    "evaluation.controls": ("score_controls",),
+    "evaluation.evaluate": ("evaluate",),
+    "evaluation.inputs": ("export_inputs",),
+    "evaluation.protocol": ("EvaluationProtocol",),
+    "evaluation.report": ("write_report",),
+    "evaluation.tables": ("tables_of",),
     "samples.fields": ("PAIR_FIELDS", "VIEW_FIELDS"),
     "samples.transforms": (
         "ColorJitter",
@@ -98,6 +110,7 @@ __all__ = [
     "EpochBatches",
     "Eraser",
     "EvaluationError",
+    "EvaluationProtocol",
     "ExtraError",
     "FieldError",
     "GeometryError",
@@ -120,9 +133,14 @@ __all__ = [
     "StorageError",
     "SynthesisError",
     "collate",
+    "evaluate",
+    "export_inputs",
     "order_quality",
+    "score_controls",
+    "tables_of",
     "to_raft_stereo",
     "to_torchvision",
+    "write_report",
 ]
 
 

@@ -1,5 +1,6 @@
-"""What the README says is so: its Python runs, its table of fields is the code's."""
+"""What README and documentation say is so: their Python runs, the table of fields is the code's."""
 
+import gc
 import re
 from pathlib import Path
 
@@ -9,7 +10,15 @@ from stereogenbench_data import PAIR_FIELDS
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 
 README = Path(__file__).resolve().parents[1] / "README.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
+PAGES = sorted((README.parent / "docs").glob("*.md"))
+
+
+def blocks_of(path):
+    return re.findall(r"```python\n(.*?)```", path.read_text(), flags=re.DOTALL)
+
+
+BLOCKS = blocks_of(README)
+DOCUMENTED = [(path, block) for path in PAGES for block in blocks_of(path)]
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +40,25 @@ def test_a_block_of_python_runs(folder_with_scenes, monkeypatch, block):
     exec(compile(before + block, README.name, "exec"), {})
 
 
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning"
+)
+@pytest.mark.parametrize(
+    ("path", "block"),
+    DOCUMENTED,
+    ids=[f"{path.stem} {n + 1}" for n, (path, _) in enumerate(DOCUMENTED)],
+)
+def test_a_block_of_the_documentation_runs_by_itself(folder_with_scenes, monkeypatch, path, block):
+    monkeypatch.chdir(folder_with_scenes)
+
+    exec(compile(block, path.name, "exec"), {})
+    # Webdataset leaves its files to the garbage collector, which warns of them.
+    gc.collect()
+
+
 def test_there_are_blocks_to_run():
     assert len(BLOCKS) >= 3
+    assert len(DOCUMENTED) >= 10
 
 
 def test_the_table_of_fields_is_the_codes():

@@ -27,8 +27,9 @@ from stereogenbench_data.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from stereogenbench_data.audit.contract import DoctorReport
+    from stereogenbench_data.audit.contract_answers import Answer
     from stereogenbench_data.audit.contract_statistics import Gain
-    from stereogenbench_data.audit.contract_verdict import Answer, Verdict
+    from stereogenbench_data.audit.contract_verdict import Verdict
     from stereogenbench_data.schema.records import DepthEncoding
 
 
@@ -75,7 +76,7 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     if out is not None:
         require_picture_file(out)
     depth = DepthEncoding(unit_m=unit_m, kind=kind, form=form, frame_lag=frame_lag)
-    filters = scene_filters(
+    filters: Any = scene_filters(
         split=split, subset=subset, family=family, map=map_name, scenes=scene,
         focal_mm=focal_mm, caption=caption,
     )  # fmt: skip
@@ -88,7 +89,7 @@ def doctor(  # noqa: PLR0913 - one parameter an option
             depth=depth,
             workers=workers,
             progress=progress,
-            **filters,
+            filters=filters,
         )
     if out is not None:
         draw_report(out, report, index)

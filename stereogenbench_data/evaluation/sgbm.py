@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float32
 
+from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.pictures import require_opencv, require_pictures
 from stereogenbench_data.evaluation.protocols import Picture, Settings
 
@@ -71,9 +72,14 @@ class Sgbm:
         """Return the left picture's disparity in pixels; nan where it has no answer.
 
         Raises:
-            EvaluationError: If the two are no pictures of one size.
+            EvaluationError: If the two are no pictures of one size, or narrower than the search.
         """
         require_pictures(left, right)
+        if left.shape[-1] <= self._disparities:
+            raise EvaluationError(
+                f"SGBM searches {self._disparities} disparities, and the pictures are "
+                f"{left.shape[-1]} px wide: score wider pictures, or leave out SD."
+            )
         views = (
             self._cv2.cvtColor(
                 np.ascontiguousarray(view.transpose(1, 2, 0)), self._cv2.COLOR_RGB2BGR

@@ -1,0 +1,205 @@
+"""From frames to tables: frames are averaged first, then pairs of a scene, then scenes.
+
+So every scene counts once, however many frames and pairs it has, and intervals are over scenes.
+"""
+
+import math
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any, Final, TypeVar
+
+from stereogenbench_data.errors import EvaluationError, ExtraError
+
+CONFIDENCE: Final = 0.95
+_DISTINCT_VALUES: Final = 6
+_QUARTERS: Final = 4
+
+Group = TypeVar("Group", bound=Hashable)
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """The numbers of one column over the frames of one pair.
+
+    Attributes:
+        mean: Of the finite ones; nan where there is none.
+        finite: How many are finite.
+        infinite: How many are infinite: identical pictures, for PSNR.
+        undefined: How many are nan: no score could be had.
+    """
+
+    mean: float
+    finite: int
+    infinite: int
+    undefined: int
+
+
+@dataclass(frozen=True, slots=True)
+class PairMeans:
+    """The scores of one pair of one scene, averaged over its frames.
+
+    Attributes:
+        row: The scene's row in the index.
+        scene: Its key.
+        pair: Left and right camera.
+        is_primary: Whether it is the scene's primary pair.
+        baseline_cm: The recorded baseline.
+        frames: How many frames are scored.
+        tallies: For each column.
+        fault: "", or why there are no scores.
+    """
+
+    row: int
+    scene: str
+    pair: tuple[int, int]
+    is_primary: bool
+    baseline_cm: float
+    frames: int
+    tallies: Mapping[str, Tally]
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One column of one group of pairs; None where there is no such number.
+
+    Attributes:
+        mean: Of the scenes' means.
+        ci95: Half of the 95 % interval of the mean; None for one scene, and where some frames
+            are infinite.
+        median: Of the scenes' means.
+        scenes: How many scenes have a finite mean.
+        finite: How many frames are averaged.
+        infinite: How many frames are infinite, and not averaged.
+        undefined: How many frames have no score.
+    """
+
+    mean: float | None
+    ci95: float | None
+    median: float | None
+    scenes: int
+    finite: int
+    infinite: int
+    undefined: int
+
+
+def tally(numbers: Iterable[float]) -> Tally:
+    """Return the mean of the finite numbers, and how many there are of each kind.
+
+    >>> tally([1.0, 3.0, math.inf, math.nan])
+    Tally(mean=2.0, finite=2, infinite=1, undefined=1)
+    """
+    found = list(numbers)
+    finite = [number for number in found if math.isfinite(number)]
+    infinite = sum(map(math.isinf, found))
+    mean = math.fsum(finite) / len(finite) if finite else math.nan
+    return Tally(mean, len(finite), infinite, len(found) - len(finite) - infinite)
+
+
+def cell(pairs: Sequence[PairMeans], column: str) -> Cell:
+    """Return a column's mean over the scenes of some pairs, with its interval.
+
+    Raises:
+        ExtraError: If scipy, which knows Student's t, is not installed.
+    """
+    tallies = [each.tallies[column] for each in pairs]
+    of_scene: dict[str, list[float]] = {}
+    for each in pairs:
+        if each.tallies[column].finite:
+            of_scene.setdefault(each.scene, []).append(each.tallies[column].mean)
+    means = [math.fsum(found) / len(found) for found in of_scene.values()]
+    infinite = sum(found.infinite for found in tallies)
+    return Cell(
+        mean=math.fsum(means) / len(means) if means else None,
+        ci95=None if infinite else half_interval(means),
+        median=median(means) if means else None,
+        scenes=len(means),
+        finite=sum(found.finite for found in tallies),
+        infinite=infinite,
+        undefined=sum(found.undefined for found in tallies),
+    )
+
+
+def half_interval(means: Sequence[float]) -> float | None:
+    """Return half of the 95 % interval of the mean: t s / sqrt(n), None for fewer than two.
+
+    Raises:
+        ExtraError: If scipy is not installed.
+
+    >>> round(half_interval([1.0, 2.0, 3.0]), 4)
+    2.4841
+    """
+    count = len(means)
+    if count < 2:
+        return None
+    try:
+        from scipy.stats import t as student_t  # type: ignore[import-untyped]  # scipy has no types
+    except ImportError:
+        raise ExtraError(
+            "intervals need scipy: pip install 'stereogenbench-data[evaluation]'."
+        ) from None
+    centre = math.fsum(means) / count
+    variance = math.fsum((each - centre) ** 2 for each in means) / (count - 1)
+    quantile = float(student_t.ppf((1 + CONFIDENCE) / 2, count - 1))
+    return quantile * math.sqrt(variance / count)
+
+
+def grouped(
+    pairs: Iterable[PairMeans], group_of: Callable[[PairMeans], Group]
+) -> dict[Group, list[PairMeans]]:
+    """Return pairs by group, in the order in which groups first come."""
+    groups: dict[Group, list[PairMeans]] = {}
+    for each in pairs:
+        groups.setdefault(group_of(each), []).append(each)
+    return groups
+
+
+def strata(values: Sequence[Any], *, name: str, edges: Sequence[float] = ()) -> list[str]:
+    """Return for each value of a column the stratum that it falls into.
+
+    Texts and up to 6 different numbers are strata themselves. Other numbers fall between the
+    edges, half-open but for the last, or where none are given into quarters of the scenes.
+
+    Raises:
+        EvaluationError: If no value is known, or edges do not ascend.
+
+    >>> strata([18.0, 50.0, 85.0], name="focal_mm", edges=(18, 35, 85))
+    ['[18,35)', '[35,85]', '[35,85]']
+    """
+    numbers = [value for value in values if isinstance(value, int | float)]
+    known = [number for number in numbers if math.isfinite(number)]
+    if len(numbers) < len(values):
+        return [str(value) or "not recorded" for value in values]
+    if not known:
+        raise EvaluationError(
+            f"{name} is not known for any scene: make the index anew (for valid_depth_ratio with "
+            f"`stereogenbench index ROOT --valid-depth`), or stratify by another column."
+        )
+    if list(edges) != sorted(set(edges)) or len(edges) == 1:
+        raise EvaluationError(f"edges of {name} must be two or more that ascend, got {edges}.")
+    if not edges:
+        if len(set(known)) <= _DISTINCT_VALUES:
+            return [f"{number:g}" if math.isfinite(number) else "not known" for number in numbers]
+        edges = _quarters(known)
+    return [_between(number, edges) for number in numbers]
+
+
+def _quarters(known: Sequence[float]) -> list[float]:
+    ordered = sorted(known)
+    places = [round(part * (len(ordered) - 1) / _QUARTERS) for part in range(_QUARTERS + 1)]
+    return sorted(
+        {float(f"{ordered[place]:.4g}") for place in places[1:-1]} | {ordered[0], ordered[-1]}
+    )
+
+
+def _between(number: float, edges: Sequence[float]) -> str:
+    if not math.isfinite(number):
+        return "not known"
+    if number < edges[0]:
+        return f"(-inf,{edges[0]:g})"
+    if number > edges[-1]:
+        return f"({edges[-1]:g},inf)"
+    last = len(edges) - 2
+    place = next((k for k in range(last) if number < edges[k + 1]), last)
+    return f"[{edges[place]:g},{edges[place + 1]:g}" + ("]" if place == last else ")")

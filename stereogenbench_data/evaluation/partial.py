@@ -1,0 +1,214 @@
+"""Partial results on disk: one file a scene, so that an evaluation that was killed goes on.
+
+A folder belongs to one evaluation: its settings, its data and its right views. Anything else is
+refused by the name of what differs.
+"""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from stereogenbench_data.errors import EvaluationError, StorageError
+from stereogenbench_data.evaluation.frame_scores import PairScores
+from stereogenbench_data.evaluation.frechet import Spread
+from stereogenbench_data.evaluation.predictions import Pair, pair_name
+from stereogenbench_data.evaluation.scoring import SceneScores
+from stereogenbench_data.storage.unfinished import write_whole
+
+Stamps = Mapping[tuple[str, Pair], str]
+
+STATE_JSON: Final = "evaluation.json"
+_FORMAT: Final = 1
+_SCENES: Final = "scenes"
+_ODD: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+
+
+class PartialResults:
+    """The scenes of one evaluation that are scored so far."""
+
+    def __init__(self, folder: Path, *, settings: Mapping[str, Any]) -> None:
+        """Begin in a folder, or go on where an evaluation of the same settings stopped.
+
+        Args:
+            folder: Where partial results are kept; it is made where it is missing.
+            settings: All that scores depend on, as plain values.
+
+        Raises:
+            EvaluationError: If the folder holds results of other settings, naming what differs.
+            StorageError: If the folder cannot be read or written.
+        """
+        self.folder = folder
+        ours = {"format": _FORMAT, **json.loads(json.dumps(settings))}
+        try:
+            (folder / _SCENES).mkdir(parents=True, exist_ok=True)
+            theirs = _read_json(folder / STATE_JSON)
+            if theirs is None:
+                if any((folder / _SCENES).iterdir()):
+                    raise EvaluationError(
+                        f"{folder}: holds scenes without {STATE_JSON}, which tells what they are "
+                        f"of. Remove the folder, or choose another."
+                    )
+                write_whole(folder / STATE_JSON, json.dumps(ours, indent=1).encode())
+        except OSError as error:
+            raise StorageError(
+                f"{folder}: partial results cannot be kept there ({error.strerror or error}). "
+                f"Choose another folder with --out."
+            ) from error
+        if theirs is not None and theirs != ours:
+            name, there, here = next(_differences(theirs, ours))
+            raise EvaluationError(
+                f"{folder}: holds results of another evaluation: {name} was {there} there and is "
+                f"{here} now. Choose another folder with --out, or remove this one."
+            )
+
+    def write(self, scene: str, scores: SceneScores, *, stamps: Stamps) -> None:
+        """Keep the scores of a scene, whole or not at all.
+
+        Args:
+            scene: The scene's key.
+            scores: Its scores by candidate and pair.
+            stamps: What the right views were told by when they were scored.
+
+        Raises:
+            StorageError: If they cannot be written.
+        """
+        document = {
+            "scene": scene,
+            "pairs": {
+                _place_name(place): {
+                    "stamp": stamps[place],
+                    "fault": found.fault,
+                    "columns": {
+                        name: [_plain(number) for number in numbers]
+                        for name, numbers in found.columns.items()
+                    },
+                }
+                for place, found in scores.items()
+            },
+        }
+        arrays = {
+            f"{_place_name(place)}/{whose}/{name}/{part}": getattr(spread, part)
+            for place, found in scores.items()
+            for whose, spreads in (("predicted", found.predicted), ("target", found.target))
+            for name, spread in spreads.items()
+            for part in ("count", "mean", "root")
+        }
+        path = self._path(scene)
+        try:
+            if arrays:
+                packed = BytesIO()
+                np.savez(packed, **arrays)
+                write_whole(path.with_suffix(".npz"), packed.getvalue())
+            write_whole(path, json.dumps(document, allow_nan=False).encode())
+        except OSError as error:
+            raise StorageError(
+                f"{path}: the scores of {scene} cannot be written ({error.strerror or error}). "
+                f"Make room, or choose another folder with --out."
+            ) from error
+
+    def is_done(self, scene: str, *, stamps: Stamps) -> bool:
+        """Return whether a scene was scored with these right views.
+
+        What had no usable right view then and has another now is to be scored again.
+
+        Raises:
+            EvaluationError: If right views that were scored have changed since.
+        """
+        document = _read_json(self._path(scene))
+        if document is None or document.get("scene") != scene:
+            return False
+        pairs = document["pairs"]
+        if pairs.keys() != {_place_name(place) for place in stamps}:
+            return False
+        changed = [place for place in stamps if pairs[_place_name(place)]["stamp"] != stamps[place]]
+        for place in changed:
+            if not pairs[_place_name(place)]["fault"]:
+                raise EvaluationError(
+                    f"{self.folder}: holds scores of other right views of {scene}, cameras "
+                    f"{pair_name(place[1])} ({place[0]}): they were changed since. Choose another "
+                    f"folder with --out, or remove this one."
+                )
+        return not changed
+
+    def faults(self, scene: str) -> list[str]:
+        """Return why pairs of a scene that is done have no scores."""
+        document = _read_json(self._path(scene)) or {"pairs": {}}
+        return [entry["fault"] for entry in document["pairs"].values() if entry["fault"]]
+
+    def read(self, scene: str, places: Iterable[tuple[str, Pair]]) -> SceneScores:
+        """Return the scores of a scene that is done.
+
+        Raises:
+            StorageError: If they cannot be read.
+        """
+        path = self._path(scene)
+        document = _read_json(path)
+        if document is None:
+            raise StorageError(f"{path}: the scores of {scene} are gone. Run the evaluation again.")
+        arrays: dict[str, Any] = {}
+        if path.with_suffix(".npz").exists():
+            with np.load(path.with_suffix(".npz"), allow_pickle=False) as packed:
+                arrays = dict(packed)
+        return {
+            place: _pair_scores(document["pairs"][_place_name(place)], arrays, _place_name(place))
+            for place in places
+        }
+
+    def _path(self, scene: str) -> Path:
+        digest = hashlib.sha256(scene.encode()).hexdigest()[:24]
+        return self.folder / _SCENES / f"{digest}.json"
+
+
+def _pair_scores(entry: Mapping[str, Any], arrays: Mapping[str, Any], place: str) -> PairScores:
+    scores = PairScores(
+        columns={
+            name: [_ODD[each] if isinstance(each, str) else each for each in numbers]
+            for name, numbers in entry["columns"].items()
+        },
+        fault=entry["fault"],
+    )
+    for whose, spreads in (("predicted", scores.predicted), ("target", scores.target)):
+        start = f"{place}/{whose}/"
+        for name in {
+            key.removeprefix(start).rpartition("/")[0] for key in arrays if key.startswith(start)
+        }:
+            count, mean, root = (
+                arrays[f"{start}{name}/{part}"] for part in ("count", "mean", "root")
+            )
+            spreads[name] = Spread(int(count), mean, root)
+    return scores
+
+
+def _place_name(place: tuple[str, Pair]) -> str:
+    return f"{place[0]}/{pair_name(place[1])}"
+
+
+def _plain(number: float) -> float | str:
+    return number if math.isfinite(number) else str(number)
+
+
+def _read_json(path: Path) -> Any:
+    """Return a document, None where there is none or a kill cut it short."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except ValueError:
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _differences(theirs: Any, ours: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield the name of each leaf that differs, with both values."""
+    if isinstance(theirs, dict) and isinstance(ours, dict):
+        for key in sorted({*theirs, *ours}):
+            inner = f"{name}.{key}" if name else key
+            yield from _differences(theirs.get(key), ours.get(key), inner)
+    elif theirs != ours:
+        yield name, theirs, ours

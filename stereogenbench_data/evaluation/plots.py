@@ -1,0 +1,168 @@
+"""Each metric against the baseline: a point for each pair, bins with intervals, the paper's bins.
+
+Methods of one plot are of one tier and scored in one way.
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from stereogenbench_data.errors import ExtraError, StorageError
+from stereogenbench_data.evaluation.aggregate import PairMeans, cell, grouped
+from stereogenbench_data.evaluation.columns import COLUMNS
+from stereogenbench_data.evaluation.reference import reference_rows
+from stereogenbench_data.evaluation.results import CONTROL, Scores, require_comparable
+from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
+
+_SIZE_IN: Final = (9.0, 4.2)
+_DPI: Final = 120
+_COLOURS: Final = ("#1b5e9e", "#c4511d", "#2e7d45", "#7a3b8f", "#8a6d00", "#444444")
+_LONGEST_TICK_CM: Final = 2000
+_LINEAR_SD: Final = 2.0
+_MARGIN: Final = 0.08
+
+
+def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
+    """Write one PNG for each headline metric, and return the files.
+
+    Raises:
+        EvaluationError: If the methods are of different tiers or were scored in different ways.
+        ExtraError: If matplotlib is not installed.
+        StorageError: If a file cannot be written.
+    """
+    require_comparable(results)
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ExtraError(
+            "plots need matplotlib: pip install 'stereogenbench-data[plots]'."
+        ) from None
+    written = []
+    for column, told in COLUMNS.items():
+        if told.better == "neither" or not _points(results, column):
+            continue
+        figure = Figure(figsize=_SIZE_IN, layout="constrained")
+        FigureCanvasAgg(figure)
+        _draw(figure.add_subplot(), results, column)
+        path = folder / f"{column}_by_baseline.png"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            figure.savefig(path, dpi=_DPI)
+        except OSError as error:
+            raise StorageError(
+                f"{path}: the plot cannot be written ({error.strerror or error}). Choose another "
+                f"folder with --out."
+            ) from error
+        written.append(path)
+    return written
+
+
+def _points(results: Sequence[Scores], column: str) -> bool:
+    return any(_scored(one.pairs, column) for one in results)
+
+
+def _scored(pairs: Iterable[PairMeans], column: str) -> list[PairMeans]:
+    return [pair for pair in pairs if column in pair.tallies and pair.tallies[column].finite]
+
+
+def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
+    protocol, told = results[0].protocol, COLUMNS[column]
+    for one, colour in zip(results, _cycle(len(results)), strict=True):
+        pairs = _scored(one.pairs, column)
+        if not pairs:
+            axes.plot([], [], color=colour, label=f"{one.name}: no finite number")
+            continue
+        _draw_sweeps(axes, pairs, column, colour)
+        axes.scatter(
+            [pair.baseline_cm for pair in pairs],
+            [pair.tallies[column].mean for pair in pairs],
+            s=14, alpha=0.45, color=colour, linewidths=0,
+        )  # fmt: skip
+        _draw_bins(axes, pairs, column, colour, name=one.name)
+    heights = [pair.tallies[column].mean for one in results for pair in _scored(one.pairs, column)]
+    if protocol.is_papers(column):
+        heights += _draw_reference(axes, results, column)
+    _draw_edges(axes, results)
+    better = f"{told.better} is better"
+    axes.set_ylabel(f"{protocol.label(column)} ({better})")
+    axes.set_xlabel("baseline in cm")
+    # Intervals of few scenes may reach far beyond all that was seen: they are cut off.
+    low, high = min(heights), max(heights)
+    if column == "sd" and high > _LINEAR_SD:
+        axes.set_yscale("symlog", linthresh=0.1)
+    margin = (high - low) * _MARGIN or _MARGIN
+    axes.set_ylim(0 if column == "sd" else low - margin, high + margin)
+    tier = "calibration controls" if results[0].tier == CONTROL else f"tier {results[0].tier}"
+    axes.set_title(f"{protocol.label(column)} by baseline, {tier}", fontsize=11)
+    axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _cycle(count: int) -> list[str]:
+    return [_COLOURS[place % len(_COLOURS)] for place in range(count)]
+
+
+def _draw_sweeps(axes: Any, pairs: Sequence[PairMeans], column: str, colour: str) -> None:
+    """Join the pairs of one scene that share their left view: same content, wider baseline."""
+    for sweep in grouped(pairs, lambda pair: (pair.scene, pair.pair[0])).values():
+        if len(sweep) > 1:
+            ordered = sorted(sweep, key=lambda pair: pair.baseline_cm)
+            axes.plot(
+                [pair.baseline_cm for pair in ordered],
+                [pair.tallies[column].mean for pair in ordered],
+                color=colour, linewidth=0.6, alpha=0.35,
+            )  # fmt: skip
+
+
+def _draw_bins(
+    axes: Any, pairs: Sequence[PairMeans], column: str, colour: str, *, name: str
+) -> None:
+    groups = grouped(pairs, lambda pair: baseline_bin(pair.baseline_cm))
+    places, means, intervals = [], [], []
+    for bin_name in (each for each in BASELINE_BINS if each in groups):
+        found = cell(groups[bin_name], column)
+        baselines = [pair.baseline_cm for pair in groups[bin_name]]
+        places.append(sum(baselines) / len(baselines))
+        means.append(found.mean)
+        intervals.append(found.ci95 or 0.0)
+    axes.errorbar(
+        places, means, yerr=intervals, fmt="o-", color=colour, markersize=6, linewidth=1.6,
+        capsize=3, label=f"{name}: bins, 95 % intervals",
+    )  # fmt: skip
+
+
+def _draw_reference(axes: Any, results: Sequence[Scores], column: str) -> list[float]:
+    """Draw the paper's bins of the tier, where Uniform scenes are among those scored.
+
+    Returns:
+        How high the points are.
+    """
+    index = results[0].index
+    if not any(
+        index.column("family")[pair.row] == "Uniform" for one in results for pair in one.pairs
+    ):
+        return []
+    rows = reference_rows("bins", tier=results[0].tier)
+    for number, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
+        found = [row for row in rows if row["method"] == method]
+        middles = [sum(BASELINE_BINS[row["baseline_bin_cm"]]) / 2 for row in found]
+        axes.plot(
+            middles, [float(row[column]) for row in found], color="#777777", linewidth=0.9,
+            linestyle=("--", ":", "-.")[number % 3], marker="sDv^<>"[number % 6], markersize=3,
+            label=f"{method} (paper, Uniform)",
+        )  # fmt: skip
+    return [float(row[column]) for row in rows]
+
+
+def _draw_edges(axes: Any, results: Sequence[Scores]) -> None:
+    """Use a logarithmic axis with the bins' edges as its ticks."""
+    baselines = [pair.baseline_cm for one in results for pair in one.pairs]
+    edges = sorted({edge for low, high in BASELINE_BINS.values() for edge in (low, high)})
+    ticks = [edge for edge in edges if 0 < edge < _LONGEST_TICK_CM]
+    axes.set_xscale("log")
+    axes.set_xlim(min(1.0, *baselines) * 0.9, max(150.0, *baselines) * 1.1)
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    axes.grid(axis="x", color="#dddddd", linewidth=0.8)
+    axes.set_axisbelow(True)

@@ -1,0 +1,281 @@
+"""Right views on disk: where each belongs, what it must be, and how its frames are read.
+
+Of the pair of cameras 00 and 01 of a scene, the frames are in one of
+
+    PREDICTIONS/<scene key>/00-01/000.png ...      or PREDICTIONS/<scene key>/00-01.mp4 (.mkv)
+    PREDICTIONS/<item>/000.png ...                 or PREDICTIONS/<item>.mp4 (.mkv)
+
+where <item> is `item_name` of scene and pair, as the exported inputs are called. A PNG is named
+after its frame's number in the scene. A video holds every frame of the scene, or just those that
+are evaluated, in order.
+"""
+
+import hashlib
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+import av
+import numpy as np
+from av.video.reformatter import Interpolation, VideoReformatter
+from PIL import Image
+
+from stereogenbench_data.errors import EvaluationError, MediaError, StorageError
+from stereogenbench_data.media.planes import plane_numbers
+from stereogenbench_data.media.video import VideoReader, probe, read_rgb
+
+Pair = tuple[int, int]
+Size = tuple[int, int]
+
+VIDEO_SUFFIXES: Final = (".mp4", ".mkv")
+_ITEM_DIGITS: Final = 16
+_RED_GREEN_BLUE: Final = (2, 0, 1)
+"""Where the planes of FFmpeg's gbrp are."""
+
+
+class PredictionFault(EvaluationError):
+    """A prediction that is missing, or is not what it must be."""
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What the prediction of one pair must hold.
+
+    Attributes:
+        scene: The scene's key.
+        pair: Left and right camera.
+        frames: The frames that are evaluated, ascending.
+        scene_frames: How many frames the scene has.
+        size: (height, width) that is evaluated.
+        stored_size: (height, width) of the scene's own pictures.
+    """
+
+    scene: str
+    pair: Pair
+    frames: tuple[int, ...]
+    scene_frames: int
+    size: Size
+    stored_size: Size
+
+
+class Frames(Protocol):
+    """The opened frames of one prediction."""
+
+    def read(self, frame: int) -> Any:
+        """Return a frame as uint8 (3, h, w) of the evaluated size."""
+        ...
+
+    def close(self) -> None:
+        """Close what is open."""
+        ...
+
+
+def pair_name(pair: Pair) -> str:
+    """Return a pair as file names have it.
+
+    >>> pair_name((0, 1))
+    '00-01'
+    """
+    return f"{pair[0]:02d}-{pair[1]:02d}"
+
+
+def item_name(scene: str, pair: Pair) -> str:
+    """Return the name of a scene's pair that tells nothing of either: no family, no map, no camera.
+
+    >>> item_name("eval/MapSeenInTrain/Uniform/Town/scene_000001", (0, 1))
+    '0b5ca3b34645553c'
+    """
+    return hashlib.sha256(f"{scene} {pair_name(pair)}".encode()).hexdigest()[:_ITEM_DIGITS]
+
+
+def frame_name(frame: int) -> str:
+    """Return the name of a frame's picture.
+
+    >>> frame_name(7)
+    '007.png'
+    """
+    return f"{frame:03d}.png"
+
+
+def find_prediction(root: Path, wanted: Wanted) -> Path:
+    """Return the folder of pictures or the video that holds a pair's prediction.
+
+    Raises:
+        PredictionFault: If there is none, or more than one.
+    """
+    places = [
+        root / wanted.scene / pair_name(wanted.pair),
+        root / item_name(wanted.scene, wanted.pair),
+    ]
+    named = [
+        candidate
+        for place in places
+        for candidate in (place, *(place.with_name(place.name + end) for end in VIDEO_SUFFIXES))
+    ]
+    found = [path for path in named if path.is_dir() or (path.suffix and path.is_file())]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise PredictionFault(
+            f"{_told(wanted)}: has several predictions, {found[0]} and {found[1]}: keep one."
+        )
+    raise PredictionFault(
+        f"{_told(wanted)}: has no prediction in {root}; expected a folder or video "
+        f"{places[0].relative_to(root)} or {places[1].name}."
+    )
+
+
+def stamp_prediction(path: Path) -> str:
+    """Return a text that changes when the files of a prediction do: names, sizes, times."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    digest = hashlib.sha256()
+    for file in files:
+        facts = file.stat()
+        digest.update(f"{file.name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:_ITEM_DIGITS]
+
+
+def open_prediction(path: Path, wanted: Wanted) -> Frames:
+    """Open a prediction that `find_prediction` found.
+
+    Raises:
+        PredictionFault: If it has another number of frames, or is no video.
+    """
+    if path.is_dir():
+        return _PngFrames(path, wanted)
+    return _VideoFrames(path, wanted)
+
+
+class _PngFrames:
+    def __init__(self, folder: Path, wanted: Wanted) -> None:
+        self._folder = folder
+        self._wanted = wanted
+        self._scaler = VideoReformatter()
+        there = {file.name for file in folder.iterdir()}
+        missing = [frame for frame in wanted.frames if frame_name(frame) not in there]
+        if missing:
+            raise PredictionFault(
+                f"{_told(wanted)}: {folder} lacks {len(missing)} of {len(wanted.frames)} frames, "
+                f"the first is {frame_name(missing[0])}."
+            )
+        known = {frame_name(frame) for frame in range(wanted.scene_frames)}
+        odd = sorted(name for name in there - known if name.endswith(".png"))
+        if odd:
+            raise PredictionFault(
+                f"{_told(wanted)}: {folder} holds {odd[0]}, and the scene has "
+                f"{wanted.scene_frames} frames, {frame_name(0)} to "
+                f"{frame_name(wanted.scene_frames - 1)}."
+            )
+
+    def read(self, frame: int) -> Any:
+        path = self._folder / frame_name(frame)
+        try:
+            with Image.open(path, formats=["PNG"]) as image:
+                self._require(image, path)
+                pixels = np.asarray(image)
+        except (OSError, SyntaxError, ValueError, zlib.error) as error:
+            if isinstance(error, PredictionFault):
+                raise
+            raise PredictionFault(
+                f"{_told(self._wanted)}: {path} is no picture that can be read ({error})."
+            ) from error
+        except Image.DecompressionBombError as error:
+            raise PredictionFault(
+                f"{_told(self._wanted)}: {path} is too large ({error})."
+            ) from error
+        return scaled_rgb(pixels, size=self._wanted.size, scaler=self._scaler)
+
+    def _require(self, image: Image.Image, path: Path) -> None:
+        if image.mode != "RGB":
+            raise PredictionFault(
+                f"{_told(self._wanted)}: {path} has pixels of mode {image.mode}: write 8-bit RGB."
+            )
+        _require_size((image.height, image.width), path, self._wanted)
+
+    def close(self) -> None:
+        """Nothing is kept open."""
+
+
+class _VideoFrames:
+    def __init__(self, path: Path, wanted: Wanted) -> None:
+        self._path = path
+        self._wanted = wanted
+        with self._faults():
+            facts = probe(path, name=str(path))
+            _require_size((facts.height_px, facts.width_px), path, wanted)
+            self._order = self._numbers(facts.frames)
+            self._reader = VideoReader(path, name=str(path), frames=facts.frames)
+
+    def _numbers(self, count: int) -> dict[int, int]:
+        """Return the place of each evaluated frame in the video."""
+        if count == self._wanted.scene_frames:
+            return {frame: frame for frame in self._wanted.frames}
+        if count == len(self._wanted.frames):
+            return {frame: place for place, frame in enumerate(self._wanted.frames)}
+        raise PredictionFault(
+            f"{_told(self._wanted)}: {self._path} holds {count} frames; expected "
+            f"{self._wanted.scene_frames} (the scene's) or {len(self._wanted.frames)} (those "
+            f"evaluated)."
+        )
+
+    def read(self, frame: int) -> Any:
+        with self._faults():
+            return read_rgb(self._reader, self._order[frame], size=self._wanted.size)
+
+    @contextmanager
+    def _faults(self) -> Iterator[None]:
+        try:
+            yield
+        except (MediaError, StorageError) as error:
+            raise PredictionFault(f"{_told(self._wanted)}: {error}") from error
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+def scaled_rgb(pixels: Any, *, size: Size, scaler: VideoReformatter) -> Any:
+    """Return an (h, w, 3) uint8 picture as (3, h, w) of a size, by area as the views are.
+
+    A picture that has the size already is not touched.
+    """
+    if pixels.shape[:2] == size:
+        return np.ascontiguousarray(pixels.transpose(2, 0, 1))
+    shrinks = size[0] * size[1] < pixels.shape[0] * pixels.shape[1]
+    frame = scaler.reformat(
+        av.VideoFrame.from_ndarray(pixels, format="rgb24"),
+        width=size[1],
+        height=size[0],
+        format="gbrp",
+        interpolation=Interpolation.AREA if shrinks else Interpolation.BICUBIC,
+        threads=1,
+    )
+    return np.stack([plane_numbers(frame, plane, dtype="u1") for plane in _RED_GREEN_BLUE])
+
+
+def require_picture(picture: Any, wanted: Wanted, *, where: str) -> None:
+    """Refuse what a method returned unless it is a right view of the evaluated size.
+
+    Raises:
+        PredictionFault: Naming the scene, what was found and what is expected.
+    """
+    if picture.shape != (3, *wanted.size) or picture.dtype != np.uint8:
+        raise PredictionFault(
+            f"{_told(wanted)}: {where} gave {picture.dtype} {tuple(picture.shape)} for a frame; "
+            f"expected uint8 {(3, *wanted.size)}."
+        )
+
+
+def _require_size(found: Size, path: Path, wanted: Wanted) -> None:
+    if found not in (wanted.size, wanted.stored_size):
+        raise PredictionFault(
+            f"{_told(wanted)}: {path} is {found[1]}x{found[0]}; expected "
+            f"{wanted.size[1]}x{wanted.size[0]}, or the scene's own "
+            f"{wanted.stored_size[1]}x{wanted.stored_size[0]}."
+        )
+
+
+def _told(wanted: Wanted) -> str:
+    return f"{wanted.scene}, cameras {pair_name(wanted.pair)}"

@@ -1,0 +1,72 @@
+"""Small scenes to be scored, and right views of them on disk."""
+
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereogenbench_data.evaluation.predictions import frame_name, item_name
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+from stereogenbench_data.samples.load import Request, SampleLoader
+from stereogenbench_data.selection.plan import Address
+from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.synthesis import SynthRequest, synthesise
+
+FRAMES = 4
+SIZE = (48, 64)
+
+
+@pytest.fixture(scope="session")
+def scored_index(tmp_path_factory) -> SceneIndex:
+    """Three scenes of eval, two families and both subsets, 64 px and 4 frames."""
+    root = tmp_path_factory.mktemp("scored")
+    for family, scenes, subset in (
+        ("Uniform", 2, "seen_map"),
+        ("IPD_Gaussian", 1, "unseen_map"),
+    ):
+        request = SynthRequest(
+            family=family, scenes=scenes, size_px=64, frames=FRAMES, seed=7, split="eval",
+            subset=subset, map_name="SynthYard" if subset == "unseen_map" else "SynthStage",
+        )  # fmt: skip
+        synthesise(root, request, workers=1)
+    return SceneIndex.open(root)
+
+
+@pytest.fixture
+def protocol() -> EvaluationProtocol:
+    """Metrics that 64 px suffice for."""
+    return EvaluationProtocol(metrics=("psnr", "ssim", "p_psnr"), size=SIZE, batch_frames=3)
+
+
+def rendered(index: SceneIndex, scene: str, camera: int, frame: int, *, size=SIZE) -> np.ndarray:
+    """Return a view as it is scored, uint8 (3, h, w)."""
+    row = list(index.column("key")).index(scene)
+    request = Request(kind="pairs", fields=("right",), layout="single", size=size)
+    with closing(SampleLoader(index, request)) as loader:
+        address = Address(row, 0 if camera else 1, (camera,), (frame,))
+        return loader.load(address, clip="frame", generator=np.random.default_rng(0))["right"]
+
+
+def write_pngs(folder: Path, index: SceneIndex, *, camera=1, size=SIZE, frames=range(FRAMES)):
+    """Write a camera's views of every scene as predictions of the pair (0, 1)."""
+    for scene in index.column("key"):
+        target = folder / item_name(scene, (0, 1))
+        target.mkdir(parents=True)
+        for frame in frames:
+            view = rendered(index, scene, camera, frame, size=size)
+            Image.fromarray(view.transpose(1, 2, 0)).save(target / frame_name(frame))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def right_views(scored_index, tmp_path_factory) -> Path:
+    """The rendered right views of all scenes as predictions; not to be changed."""
+    return write_pngs(tmp_path_factory.mktemp("right_views"), scored_index)
+
+
+@pytest.fixture(scope="session")
+def other_views(scored_index, tmp_path_factory) -> Path:
+    """The views of camera 2 as predictions of camera 1; not to be changed."""
+    return write_pngs(tmp_path_factory.mktemp("other_views"), scored_index, camera=2)

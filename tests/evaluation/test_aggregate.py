@@ -1,0 +1,128 @@
+"""Averages: frames, then pairs of a scene, then scenes; intervals by hand and by scipy."""
+
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stereogenbench_data import EvaluationError
+from stereogenbench_data.evaluation.aggregate import PairMeans, cell, half_interval, strata, tally
+
+finite = st.floats(-1e6, 1e6)
+
+
+def pair(scene, numbers, *, cameras=(0, 1)):
+    return PairMeans(
+        row=0, scene=scene, pair=cameras, is_primary=cameras == (0, 1), baseline_cm=6.0,
+        frames=len(numbers), tallies={"psnr": tally(numbers)},
+    )  # fmt: skip
+
+
+def test_frames_are_averaged_before_scenes():
+    found = cell([pair("a", [10, 20, 30]), pair("b", [40])], "psnr")
+
+    assert found.mean == 30
+    assert (found.scenes, found.finite) == (2, 4)
+
+
+def test_pairs_of_one_scene_count_as_one_scene():
+    pairs = [pair("a", [10]), pair("a", [30], cameras=(0, 2)), pair("b", [50])]
+
+    assert cell(pairs, "psnr").mean == 35
+    assert cell(pairs, "psnr").scenes == 2
+
+
+def test_identical_frames_are_counted_and_not_averaged():
+    found = cell([pair("a", [10, math.inf]), pair("b", [math.inf, math.inf])], "psnr")
+
+    assert (found.mean, found.infinite, found.scenes) == (10, 3, 1)
+    assert found.ci95 is None
+
+
+def test_frames_without_a_score_are_counted():
+    found = cell([pair("a", [10, math.nan]), pair("b", [math.nan]), pair("c", [20])], "psnr")
+
+    assert (found.mean, found.undefined, found.scenes, found.finite) == (15, 2, 2, 2)
+
+
+def test_where_there_is_no_number_there_is_none_and_not_nan():
+    found = cell([pair("a", [math.nan])], "psnr")
+
+    assert (found.mean, found.ci95, found.median) == (None, None, None)
+
+
+def test_one_scene_has_no_interval():
+    assert cell([pair("a", [10, 20])], "psnr").ci95 is None
+
+
+def test_the_interval_of_three_scenes_is_the_hand_worked_one():
+    found = cell([pair("a", [1]), pair("b", [2]), pair("c", [3])], "psnr")
+
+    # t of 0.975 with 2 degrees of freedom is 4.302653, s is 1.
+    assert found.ci95 == pytest.approx(4.302653 / math.sqrt(3), rel=1e-6)
+    assert found.median == 2
+
+
+@given(st.lists(finite, min_size=2, max_size=40))
+def test_intervals_are_those_of_scipy(means):
+    spread = np.std(means, ddof=1)
+    low, high = scipy.stats.t.interval(
+        0.95, len(means) - 1, loc=0, scale=max(spread, 1e-300) / math.sqrt(len(means))
+    )
+
+    assert half_interval(means) == pytest.approx((high - low) / 2, rel=1e-9, abs=1e-9)
+
+
+@given(st.lists(st.one_of(finite, st.just(math.inf), st.just(math.nan)), max_size=30))
+def test_every_frame_is_counted_once(numbers):
+    found = tally(numbers)
+
+    assert found.finite + found.infinite + found.undefined == len(numbers)
+
+
+@given(st.lists(finite, min_size=1, max_size=30), st.randoms())
+def test_the_mean_does_not_depend_on_the_order(numbers, random):
+    shuffled = random.sample(numbers, len(numbers))
+
+    assert tally(numbers) == tally(shuffled)
+
+
+def test_edges_are_half_open_but_for_the_last():
+    assert strata([18, 35, 50, 85, 10, 90], name="focal_mm", edges=(18, 35, 85)) == [
+        "[18,35)", "[35,85]", "[35,85]", "[35,85]", "(-inf,18)", "(85,inf)",
+    ]  # fmt: skip
+
+
+def test_texts_and_few_numbers_are_strata_themselves():
+    assert strata(["Town", "", "Egypt"], name="map_name") == ["Town", "not recorded", "Egypt"]
+    assert strata([24, 50.5, 24], name="focal_mm") == ["24", "50.5", "24"]
+
+
+def test_many_numbers_fall_into_quarters():
+    found = strata([float(number) for number in range(101)], name="focal_mm")
+
+    assert {each: found.count(each) for each in dict.fromkeys(found)} == {
+        "[0,25)": 25, "[25,50)": 25, "[50,75)": 25, "[75,100]": 26,
+    }  # fmt: skip
+
+
+@given(st.lists(finite, min_size=1, max_size=50))
+def test_every_number_has_a_stratum(numbers):
+    found = strata(numbers, name="focal_mm")
+
+    assert len(found) == len(numbers)
+    assert not any("inf" in each for each in found)
+
+
+def test_a_column_that_is_not_known_is_refused():
+    with pytest.raises(EvaluationError, match="valid_depth_ratio is not known for any scene"):
+        strata([math.nan, math.nan], name="valid_depth_ratio")
+
+
+@pytest.mark.parametrize("edges", [(3, 2), (1,), (1, 1)])
+def test_edges_that_do_not_ascend_are_refused(edges):
+    with pytest.raises(EvaluationError, match="edges of focal_mm must be two or more that ascend"):
+        strata([1.0], name="focal_mm", edges=edges)

@@ -1,0 +1,128 @@
+"""The commands that score, run as a user runs them."""
+
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.main import app
+
+SMALL = ("--metrics", "psnr,ssim", "--size", "64x48", "--workers", "1")
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+@pytest.fixture
+def scenes(scored_index):
+    return scored_index.root
+
+
+def test_predictions_are_scored_and_reported(scenes, other_views, tmp_path):
+    out = tmp_path / "report"
+    shown = run(
+        "evaluate", scenes, other_views, "--tier", "G1", "--split", "eval", "--subset", "seen_map",
+        "--name", "next camera", "--by", "map_name", "--out", out, *SMALL,
+    )  # fmt: skip
+
+    assert shown.exit_code == 0, shown.output
+    assert "# next camera, tier G1: calibrated target camera" in shown.stdout
+    assert "StereoSpace (paper) | seen_map | Uniform" in shown.stdout
+    assert "By map_name" in shown.stdout
+    assert {path.name for path in out.iterdir()} == {
+        "results.json", "report.md", "tables.tex", "tables.csv", "pairs.csv", "plots", "partial",
+    }  # fmt: skip
+    assert {path.name for path in (out / "plots").iterdir()} == {
+        "psnr_by_baseline.png", "ssim_by_baseline.png",
+    }  # fmt: skip
+
+
+def test_json_is_one_document_alone_on_stdout(scenes, right_views, tmp_path):
+    shown = run(
+        "evaluate", scenes, right_views, "--tier", "G2", "--json", "--no-plots",
+        "--out", tmp_path, *SMALL,
+    )  # fmt: skip
+    told = json.loads(shown.stdout)
+
+    assert shown.exit_code == 0
+    assert told["tier"] == "G2"
+    assert told["coverage"][0]["pairs"] == 3
+    assert told["settings"]["size"] == "64x48"
+
+
+def test_a_missing_prediction_ends_with_2_and_is_named(scenes, tmp_path):
+    (tmp_path / "none").mkdir()
+    shown = run(
+        "evaluate", scenes, tmp_path / "none", "--tier", "G0", "--out", tmp_path / "out", *SMALL
+    )
+
+    assert shown.exit_code == 2
+    assert "3 predictions are missing or unusable and 0 are allowed" in shown.stderr
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--size", "832", "is no WIDTHxHEIGHT"),
+        ("--frames", "some", "is not all, first, every:K"),
+        ("--pairs", "0_1", "is not primary, adjacent, all or pairs"),
+        ("--by", "focal_mm:wide", "are no numbers"),
+        ("--metrics", "mse", "there is no metric 'mse'"),
+        ("--stereo-matcher", "eyes", "'eyes'"),
+        ("--tier", "G9", "there is no tier 'G9'"),
+    ],
+)
+def test_an_option_that_is_off_is_told(
+    scenes,
+    right_views,
+    tmp_path,
+    option,
+    value,
+    message,
+):
+    shown = run("evaluate", scenes, right_views, "--tier", "G0", "--out", tmp_path, option, value)
+
+    assert shown.exit_code == 2
+    assert message in " ".join(shown.stderr.replace("│", " ").split())
+
+
+def test_inputs_are_exported(scenes, tmp_path):
+    shown = run("export-inputs", scenes, tmp_path / "in", "--tier", "G2", "--size", "64x48",
+                "--frames", "0,2", "--workers", "1")  # fmt: skip
+
+    assert shown.exit_code == 0, shown.output
+    assert "3 items of tier G2" in shown.stdout
+    assert len(list((tmp_path / "in").glob("*/left/*.png"))) == 6
+
+
+def test_controls_that_hold_end_with_0(scenes, tmp_path):
+    shown = run("controls", scenes, "--frames", "first", "--out", tmp_path, *SMALL)
+
+    assert shown.exit_code == 0, shown.output
+    assert "- holds: every frame of the rendered target is identical (3 of 3)" in shown.stdout
+    assert "rendered target (paper)" in shown.stdout
+
+
+def test_controls_that_do_not_hold_end_with_1(scenes, tmp_path, monkeypatch):
+    from stereogenbench_data.evaluation import relations
+
+    broken = relations.Relation("up is up", False, "down")  # noqa: FBT003
+    monkeypatch.setattr(relations, "relations", lambda results: [broken])
+    shown = run("controls", scenes, "--frames", "first", "--out", tmp_path, *SMALL)
+
+    assert shown.exit_code == 1
+    assert "DOES NOT HOLD: up is up (down)" in shown.stdout
+
+
+def test_a_stop_says_how_to_go_on(scenes, right_views, tmp_path, monkeypatch):
+    from stereogenbench_data.evaluation import evaluate
+
+    def stopped(*arguments, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(evaluate, "evaluate", stopped)
+    shown = run("evaluate", scenes, right_views, "--tier", "G0", "--out", tmp_path, *SMALL)
+
+    assert shown.exit_code == 130
+    assert "run the same command again to go on from here" in shown.stderr

@@ -1,0 +1,108 @@
+"""Calibration controls: what each shows, and the relations that must hold between them."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stereogenbench_data import EvaluationError, EvaluationProtocol, score_controls
+from stereogenbench_data.evaluation.aggregate import cell
+from stereogenbench_data.evaluation.controls import CONTROLS, derangement, wrong_camera
+from stereogenbench_data.evaluation.relations import relations
+from stereogenbench_data.schema.release import CAMERA_PAIRS
+from tests.evaluation.conftest import SIZE
+from tests.evaluation.test_evaluate import numbers, scored
+
+SHARDS = Path(__file__).resolve().parents[2] / "shards"
+
+
+@pytest.fixture(scope="module")
+def on_the_sample():
+    """The controls on the first frames of the shipped sample, at half of the paper's size."""
+    return score_controls(
+        SHARDS, split="eval", frames="first", workers=1,
+        protocol=EvaluationProtocol(size=(240, 416)),
+    )  # fmt: skip
+
+
+@given(st.sets(st.text(min_size=1), min_size=2, max_size=40), st.integers(0, 2**32))
+def test_a_derangement_gives_every_scene_another_one_each_once(keys, seed):
+    donors = derangement(sorted(keys), seed=seed)
+
+    assert set(donors) == set(donors.values()) == keys
+    assert all(scene != donor for scene, donor in donors.items())
+    assert donors == derangement(sorted(keys, reverse=True), seed=seed)
+
+
+def test_derangements_of_other_seeds_differ():
+    keys = [f"scene_{number:06d}" for number in range(20)]
+
+    assert len({tuple(derangement(keys, seed=seed).values()) for seed in range(10)}) == 10
+
+
+def test_one_scene_has_no_derangement():
+    with pytest.raises(EvaluationError, match="takes its views from another scene, and 1 is sel"):
+        derangement(["alone"], seed=0)
+
+
+def test_the_wrong_camera_is_02_for_01_and_always_neither_of_the_pair():
+    assert wrong_camera(0, 1) == 2
+    for left, right in CAMERA_PAIRS:
+        assert wrong_camera(left, right) not in (left, right)
+        assert 0 <= wrong_camera(left, right) < 6
+
+
+def test_every_relation_holds_on_the_shipped_sample(on_the_sample):
+    found = relations(on_the_sample)
+
+    assert [each.what for each in found if not each.holds] == []
+    assert len(found) == 11
+
+
+def test_the_targets_scores_are_those_of_identity(on_the_sample):
+    target = on_the_sample[0]
+
+    assert cell(target.pairs, "psnr").infinite == 4
+    assert cell(target.pairs, "psnr").mean is None
+    assert cell(target.pairs, "ssim").mean == pytest.approx(1, abs=1e-12)
+    assert cell(target.pairs, "e_match").mean == 0
+    assert cell(target.pairs, "sd").median < 0.2
+
+
+def test_a_copied_lefts_match_error_is_what_the_formula_gives(on_the_sample):
+    copied = on_the_sample[1]
+    for pair in copied.pairs:
+        counts = {name: pair.tallies[name].mean for name in ("keypoints", "target_matches")}
+        expected = 100 * (1 - counts["target_matches"] / counts["keypoints"])
+
+        assert pair.tallies["predicted_matches"].mean == counts["keypoints"]
+        assert pair.tallies["e_match"].mean == pytest.approx(expected)
+
+
+def test_the_wrong_baseline_is_camera_02(scored_index, other_views, protocol):
+    wrong = score_controls(scored_index, protocol=protocol, workers=1)[2]
+
+    assert numbers(wrong) == numbers(scored(scored_index, other_views, protocol))
+
+
+def test_a_random_right_depends_on_the_seed_alone(scored_index, tmp_path):
+    protocol = EvaluationProtocol(metrics=("psnr",), size=SIZE)
+
+    def random_right(seed, **options):
+        options = {"frames": "first", "workers": 1} | options
+        return numbers(score_controls(scored_index, protocol=protocol, seed=seed, **options)[3])
+
+    assert random_right(0) == random_right(0, out=tmp_path)
+    assert len({str(random_right(seed)) for seed in range(4)}) == 2
+    with pytest.raises(EvaluationError, match="another evaluation: seed was 0 there and is 1"):
+        random_right(1, out=tmp_path)
+
+
+def test_relations_need_only_the_metrics_that_were_computed(scored_index):
+    protocol = EvaluationProtocol(metrics=("psnr",), size=SIZE)
+    results = score_controls(scored_index, protocol=protocol, frames="first", workers=1)
+
+    assert [one.name for one in results] == list(CONTROLS)
+    assert relations(results)[0].holds is True
+    assert len(relations(results)) == 2

@@ -1,0 +1,410 @@
+"""Scoring what a method wrote or returns: the same both ways, restartable, never silently less."""
+
+import json
+import math
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from stereogenbench_data import EvaluationError, EvaluationProtocol, evaluate
+from stereogenbench_data.evaluation.predictions import PredictionFault, frame_name, item_name
+from stereogenbench_data.schema.release import rgb_name
+from tests.evaluation.conftest import FRAMES, SIZE, rendered, write_pngs
+
+
+def scored(index, predictions, protocol, **options):
+    options = {"tier": "G1", "workers": 1} | options
+    return evaluate(index, predictions, protocol=protocol, **options)
+
+
+def numbers(scores):
+    """Return all that was scored as text that is equal only for equal last digits."""
+    return [
+        (pair.scene, pair.pair, pair.fault, repr(sorted(pair.tallies.items())))
+        for pair in scores.pairs
+    ]
+
+
+def keys(index):
+    return [str(key) for key in index.column("key")]
+
+
+@pytest.fixture
+def copied(right_views, tmp_path):
+    """The rendered right views, free to be changed."""
+    return Path(shutil.copytree(right_views, tmp_path / "copied"))
+
+
+def test_the_rendered_right_views_are_identical_in_every_frame(scored_index, right_views, protocol):
+    scores = scored(scored_index, right_views, protocol)
+
+    assert len(scores.pairs) == 3
+    for pair in scores.pairs:
+        assert pair.tallies["psnr"].infinite == FRAMES
+        assert math.isnan(pair.tallies["psnr"].mean)
+        assert pair.tallies["ssim"].mean == pytest.approx(1, abs=1e-12)
+        assert pair.tallies["p_psnr"] == pair.tallies["p_psnr_ceiling"]
+
+
+def test_scores_are_those_of_scikit_image_averaged_over_frames(scored_index, other_views, protocol):
+    pair = scored(scored_index, other_views, protocol).pairs[0]
+    psnr, ssim = [], []
+    for frame in range(FRAMES):
+        views = [
+            rendered(scored_index, pair.scene, camera, frame).transpose(1, 2, 0)
+            for camera in (1, 2)
+        ]
+        psnr.append(peak_signal_noise_ratio(*views, data_range=255))
+        ssim.append(
+            structural_similarity(
+                *views, data_range=255, channel_axis=2, gaussian_weights=True, sigma=1.5,
+                use_sample_covariance=False,
+            )
+        )  # fmt: skip
+
+    assert pair.tallies["psnr"].mean == pytest.approx(np.mean(psnr), abs=1e-9)
+    assert pair.tallies["ssim"].mean == pytest.approx(np.mean(ssim), abs=1e-6)
+
+
+def test_one_and_two_processes_give_the_same_last_digits(scored_index, other_views, tmp_path):
+    protocol = EvaluationProtocol(metrics=("psnr", "ssim", "e_match", "fd-colour"), size=SIZE)
+    results = [
+        scored(scored_index, other_views, protocol, workers=workers, out=tmp_path / str(workers))
+        for workers in (1, 2)
+    ]
+
+    assert numbers(results[0]) == numbers(results[1])
+    assert results[0].distances == results[1].distances
+
+
+def test_a_callable_gets_its_tiers_inputs_in_batches_and_scores_as_if_written(
+    scored_index, other_views, protocol
+):
+    seen = []
+
+    def method(inputs):
+        seen.append({name: (tuple(each.shape), each.dtype) for name, each in inputs.items()})
+        found = np.abs(inputs["left"].numpy()[:, None].astype(int) - known_lefts).sum((2, 3, 4))
+        return torch.from_numpy(known_rights[found.argmin(1)])
+
+    places = [(scene, frame) for scene in keys(scored_index) for frame in range(FRAMES)]
+    known_lefts = np.stack([rendered(scored_index, s, 0, f) for s, f in places])[None].astype(int)
+    known_rights = np.stack([rendered(scored_index, s, 2, f) for s, f in places])
+    called = scored(scored_index, method, protocol)
+    written = scored(scored_index, other_views, protocol)
+
+    assert numbers(called) == numbers(written)
+    assert called.name == "method"
+    assert [each["left"] for each in seen] == [
+        ((size, 3, *SIZE), torch.uint8) for _ in range(3) for size in (3, 1)
+    ]
+    assert seen[0]["baseline_m"] == ((3,), torch.float64)
+    assert set(seen[0]) == {"left", "baseline_m", "intrinsics"}
+
+
+def test_floats_of_0_to_1_are_rounded_to_8_bits(scored_index, protocol):
+    def lefts(inputs):
+        return inputs["left"]
+
+    def float_lefts(inputs):
+        return inputs["left"].float() / 255
+
+    assert numbers(scored(scored_index, lefts, protocol)) == numbers(
+        scored(scored_index, float_lefts, protocol)
+    )
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        (lambda inputs: inputs["left"][:1], r"given 3 frames and returned uint8 \(1, 3, 48, 64\)"),
+        (
+            lambda inputs: inputs["left"][..., :32],
+            r"gave uint8 \(3, 48, 32\) for a frame; expected",
+        ),
+        (lambda inputs: inputs["left"].float(), r"returned floats of \d+ to \d+; expected 0 to 1"),
+        (lambda inputs: inputs["left"].float() * math.nan, r"returned floats of nan to nan"),
+        (lambda inputs: inputs["left"].int(), r"gave int32 \(3, 48, 64\) for a frame"),
+    ],
+)
+def test_what_a_callable_returns_is_checked(scored_index, protocol, method, message):
+    with pytest.raises(PredictionFault, match=message):
+        scored(scored_index, method, protocol)
+
+
+def test_a_video_as_released_is_a_prediction_of_the_stored_size(scored_index, tmp_path):
+    root = Path(scored_index.root)
+    for key in keys(scored_index):
+        target = tmp_path / key / "00-01.mp4"
+        target.parent.mkdir(parents=True)
+        shutil.copy(root / key / rgb_name(1), target)
+    protocol = EvaluationProtocol(metrics=("psnr",), size=SIZE)
+    scores = scored(scored_index, tmp_path, protocol)
+
+    assert [pair.tallies["psnr"].infinite for pair in scores.pairs] == [FRAMES] * 3
+
+
+def test_all_pairs_are_scored_with_one_prediction_each(scored_index, protocol, tmp_path):
+    scores = scored(
+        scored_index, lambda inputs: inputs["left"], protocol, pairs="all", frames=[0],
+        scenes=keys(scored_index)[0],
+    )  # fmt: skip
+
+    assert len(scores.pairs) == 15
+    assert [pair.pair for pair in scores.pairs if pair.is_primary] == [(0, 1)]
+    assert all(pair.tallies["psnr"].finite == 1 for pair in scores.pairs)
+
+
+def test_a_missing_prediction_is_an_error_before_anything_is_scored(scored_index, copied, protocol):
+    scene = keys(scored_index)[1]
+    shutil.rmtree(copied / item_name(scene, (0, 1)))
+    done = []
+
+    with pytest.raises(
+        EvaluationError, match=rf"1 predictions are missing or unusable and 0 are allowed.*{scene}"
+    ):
+        scored(scored_index, copied, protocol, progress=lambda *counts: done.append(counts))
+    assert done == []
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda path: path.unlink(), r"lacks 1 of 4 frames, the first is 003\.png"),
+        (lambda path: path.write_bytes(b"no picture"), r"003\.png is no picture that can be read"),
+        (
+            lambda path: Image.new("RGB", (10, 10)).save(path),
+            r"003\.png is 10x10; expected 64x48",
+        ),
+    ],
+)
+def test_a_prediction_that_is_not_right_is_an_error_or_a_counted_gap(
+    scored_index, copied, protocol, spoil, message
+):
+    scene = keys(scored_index)[2]
+    spoil(copied / item_name(scene, (0, 1)) / frame_name(3))
+
+    with pytest.raises(PredictionFault, match=message):
+        scored(scored_index, copied, protocol)
+    scores = scored(scored_index, copied, protocol, allow_missing=1)
+    assert [pair.scene for pair in scores.pairs if pair.fault] == [scene]
+    assert [bool(pair.tallies) for pair in scores.pairs] == [True, True, False]
+
+
+def test_more_gaps_than_allowed_are_an_error(scored_index, copied, protocol):
+    for scene in keys(scored_index)[:2]:
+        (copied / item_name(scene, (0, 1)) / frame_name(0)).write_bytes(b"")
+
+    with pytest.raises(EvaluationError, match=r"2 predictions are missing or unusable and 1 are"):
+        scored(scored_index, copied, protocol, allow_missing=1)
+
+
+def test_an_evaluation_that_was_killed_goes_on_with_what_it_has(scored_index, protocol, tmp_path):
+    out, scenes = tmp_path / "out", tmp_path / "out" / "scenes"
+    script = f"""
+import os, signal
+from stereogenbench_data import EvaluationProtocol, evaluate
+from stereogenbench_data.storage.index import SceneIndex
+
+batches = []
+
+def lefts(inputs):
+    batches.append(inputs)
+    if len(batches) == 4:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return inputs["left"]
+
+protocol = EvaluationProtocol(metrics=("psnr", "ssim", "p_psnr"), size={SIZE}, batch_frames=3)
+index = SceneIndex.open({scored_index.root!r})
+evaluate(index, lefts, tier="G1", protocol=protocol, out={str(out)!r})
+"""
+    killed = subprocess.run([sys.executable, "-c", script], check=False, timeout=120)
+    (kept,) = scenes.glob("*.json")
+    before = kept.stat().st_mtime_ns
+    calls = []
+
+    def lefts(inputs):
+        calls.append(len(inputs["left"]))
+        return inputs["left"]
+
+    resumed = scored(scored_index, lefts, protocol, out=out)
+
+    assert killed.returncode == -signal.SIGKILL
+    assert kept.stat().st_mtime_ns == before
+    assert sum(calls) == 2 * FRAMES
+    assert numbers(resumed) == numbers(scored(scored_index, lefts, protocol))
+
+
+def test_a_partial_result_that_was_cut_is_made_again(scored_index, right_views, protocol, tmp_path):
+    whole = scored(scored_index, right_views, protocol, out=tmp_path)
+    damaged = sorted((tmp_path / "scenes").glob("*.json"))[0]
+    damaged.write_bytes(damaged.read_bytes()[:100])
+
+    assert numbers(scored(scored_index, right_views, protocol, out=tmp_path)) == numbers(whole)
+    json.loads(damaged.read_text())
+
+
+@pytest.mark.parametrize(
+    ("change", "differs"),
+    [
+        ({"protocol": EvaluationProtocol(metrics=("psnr",), size=(32, 64))}, r"settings\.size"),
+        ({"protocol": EvaluationProtocol(metrics=("ssim",), size=SIZE)}, r"settings\.metrics"),
+        ({"tier": "G2"}, "tier was G1 there and is G2"),
+        ({"frames": [0, 1]}, "frames"),
+        ({"name": "another"}, "methods"),
+    ],
+)
+def test_results_of_another_evaluation_are_refused_by_what_differs(
+    scored_index, right_views, tmp_path, change, differs
+):
+    options = {"protocol": EvaluationProtocol(metrics=("psnr",), size=SIZE), "frames": [0]}
+    scored(scored_index, right_views, **options, out=tmp_path)
+
+    with pytest.raises(EvaluationError, match=rf"holds results of another evaluation: {differs}"):
+        scored(scored_index, right_views, **(options | change), out=tmp_path)
+
+
+def test_results_of_other_predictions_are_refused(
+    scored_index, right_views, copied, protocol, tmp_path
+):
+    out = tmp_path / "out"
+    scored(scored_index, copied, protocol, out=out)
+    with pytest.raises(EvaluationError, match="another evaluation: methods"):
+        scored(scored_index, right_views, protocol, out=out)
+    scene = keys(scored_index)[0]
+    changed = copied / item_name(scene, (0, 1)) / frame_name(0)
+    Image.new("RGB", SIZE[::-1]).save(changed)
+
+    with pytest.raises(
+        EvaluationError, match=rf"other right views of {scene}, cameras 00-01 .* changed since"
+    ):
+        scored(scored_index, copied, protocol, out=out)
+
+
+def test_a_gap_that_was_filled_since_is_scored(scored_index, copied, protocol, tmp_path):
+    scene = keys(scored_index)[0]
+    item = copied / item_name(scene, (0, 1))
+    item.rename(copied / "aside")
+    out = tmp_path / "out"
+    gaps = scored(scored_index, copied, protocol, out=out, allow_missing=1)
+    again = scored(scored_index, copied, protocol, out=out, allow_missing=1)
+    (copied / "aside").rename(item)
+    filled = scored(scored_index, copied, protocol, out=out)
+
+    assert [bool(pair.fault) for pair in gaps.pairs] == [True, False, False]
+    assert numbers(again) == numbers(gaps)
+    assert not any(pair.fault for pair in filled.pairs)
+
+
+def test_distances_between_sets_are_of_branches(scored_index, right_views, other_views, tmp_path):
+    protocol = EvaluationProtocol(metrics=("fd-colour", "fd-motion"), size=SIZE, batch_frames=3)
+    same = scored(scored_index, right_views, protocol).distances
+    other = scored(scored_index, other_views, protocol, out=tmp_path / "out").distances
+
+    assert set(same) == {("seen_map", "Uniform"), ("unseen_map", "IPD_Gaussian")}
+    for branch, found in same.items():
+        assert found["fd-colour"].value == pytest.approx(0, abs=1e-6)
+        assert other[branch]["fd-colour"].value > 1
+    uniform = other["seen_map", "Uniform"]
+    assert uniform["fd-colour"].samples == (2 * FRAMES, 2 * FRAMES)
+    assert uniform["fd-motion"].samples == (2, 2)
+    assert uniform["fd-colour"].underdetermined
+
+
+@pytest.mark.parametrize("frames", [("clips", 2), ("random", 2)])
+def test_frames_that_are_not_single_and_fixed_are_refused(
+    scored_index, right_views, protocol, frames
+):
+    with pytest.raises(EvaluationError, match="frames must be 'all', 'first', numbers of frames"):
+        scored(scored_index, right_views, protocol, frames=frames)
+
+
+@pytest.mark.parametrize("options", [{"pairs": "sweep"}, {"direction": "right_to_left"}])
+def test_pairs_that_are_no_left_and_right_are_refused(scored_index, right_views, protocol, options):
+    with pytest.raises(
+        EvaluationError, match="a right view is generated from the view to its left"
+    ):
+        scored(scored_index, right_views, protocol, **options)
+
+
+def test_a_folder_that_is_none_is_refused(scored_index, protocol, tmp_path):
+    with pytest.raises(EvaluationError, match="nowhere: is no folder of predictions"):
+        scored(scored_index, tmp_path / "nowhere", protocol)
+
+
+def test_an_unknown_metric_is_refused_with_those_there_are():
+    with pytest.raises(EvaluationError, match="there is no metric 'mse': choose among psnr, ssim"):
+        EvaluationProtocol(metrics=("psnr", "mse"))
+
+
+def test_each_view_is_decoded_once_for_all_pairs(scored_index, protocol, monkeypatch):
+    from stereogenbench_data.media.decoder import Decoder
+
+    decoded = []
+    reach = Decoder.reach
+
+    def counted(self, index):
+        decoded.append((id(self), index))
+        return reach(self, index)
+
+    monkeypatch.setattr(Decoder, "reach", counted)
+    scored(
+        scored_index, lambda inputs: inputs["left"], protocol, tier="G2", pairs="all",
+        scenes=keys(scored_index)[0],
+    )  # fmt: skip
+
+    # Six colour videos, and the depth of the five cameras that are left of another.
+    assert len(decoded) == 11 * FRAMES
+
+
+def test_what_metrics_are_computed_with_is_loaded_once_for_all_scenes(
+    scored_index, right_views, monkeypatch
+):
+    from stereogenbench_data.evaluation import protocol
+
+    loaded = []
+    load = protocol.load_keypoint_matcher
+
+    def counted(*arguments):
+        loaded.append(arguments)
+        return load(*arguments)
+
+    monkeypatch.setattr(protocol, "load_keypoint_matcher", counted)
+    matches = EvaluationProtocol(metrics=("e_match",), size=SIZE)
+    scored(scored_index, right_views, matches, frames=[0])
+
+    assert len(loaded) == 1
+    assert protocol.tools_of.cache_info().currsize == 0
+
+
+def test_progress_counts_frames_of_pairs_up_to_all(scored_index, right_views, protocol):
+    told = []
+    scored(scored_index, right_views, protocol, progress=lambda *counts: told.append(counts))
+
+    assert told[0] == (0, 3 * FRAMES)
+    assert told[-1] == (3 * FRAMES, 3 * FRAMES)
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+
+
+def test_the_number_of_threads_is_left_as_it_was(scored_index, right_views, protocol):
+    before = torch.get_num_threads()
+    scored(scored_index, right_views, protocol, frames=[0])
+
+    assert torch.get_num_threads() == before
+
+
+def test_predictions_of_some_frames_suffice_where_these_are_scored(
+    scored_index, protocol, tmp_path
+):
+    folder = write_pngs(tmp_path / "some", scored_index, frames=[0, 2])
+    scores = scored(scored_index, folder, protocol, frames=("every", 2))
+
+    assert [pair.frames for pair in scores.pairs] == [2, 2, 2]

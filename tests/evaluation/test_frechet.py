@@ -1,0 +1,170 @@
+"""The Fréchet distance against roots of matrices, by scipy and to sixty digits by mpmath."""
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import sqrtm
+
+from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.frechet import Spread, frechet_distance
+
+
+def distance(one: np.ndarray, two: np.ndarray) -> float:
+    return frechet_distance(Spread.of(one), Spread.of(two)).value
+
+
+def by_matrix_root(one: np.ndarray, two: np.ndarray) -> float:
+    """Return the distance by the root of the product of covariances, in double precision."""
+    covariances = [np.cov(side.T) for side in (one, two)]
+    between = one.mean(axis=0) - two.mean(axis=0)
+    root = sqrtm(covariances[0] @ covariances[1])
+    return float(between @ between + sum(map(np.trace, covariances)) - 2 * np.trace(root).real)
+
+
+def by_sixty_digits(one: np.ndarray, two: np.ndarray) -> float:
+    """Return the distance by the eigenvalues of the product of covariances, to 60 digits."""
+    with mpmath.workdps(60):
+        (mean_one, first), (mean_two, second) = map(precise_moments, (one, two))
+        eigenvalues = mpmath.eig(first * second, right=False)
+        root = mpmath.fsum(mpmath.sqrt(max(mpmath.re(value), 0)) for value in eigenvalues)
+        apart = mpmath.fsum((a - b) ** 2 for a, b in zip(mean_one, mean_two, strict=True))
+        traces = mpmath.fsum(first[i, i] + second[i, i] for i in range(first.rows))
+        return float(apart + traces - 2 * root)
+
+
+def precise_moments(samples: np.ndarray) -> tuple[list, mpmath.matrix]:
+    table = mpmath.matrix(samples.tolist())
+    mean = [mpmath.fsum(table[:, column]) / table.rows for column in range(table.cols)]
+    for row in range(table.rows):
+        for column in range(table.cols):
+            table[row, column] -= mean[column]
+    return mean, table.T * table / (table.rows - 1)
+
+
+def mixed(rng, samples: int, dim: int, *, offset: float = 0.0) -> np.ndarray:
+    return rng.normal(size=(samples, dim)) @ rng.normal(size=(dim, dim)) + offset
+
+
+@pytest.mark.parametrize(
+    ("samples", "others", "dim"), [(50, 60, 1), (200, 150, 20), (400, 500, 64)]
+)
+def test_well_conditioned_sets_are_as_far_apart_as_a_matrix_root_says(samples, others, dim):
+    rng = np.random.default_rng(dim)
+    one, two = mixed(rng, samples, dim), mixed(rng, others, dim, offset=1)
+    truth = (
+        by_matrix_root(one, two)
+        if dim > 1
+        else (one.mean() - two.mean()) ** 2 + (one.std(ddof=1) - two.std(ddof=1)) ** 2
+    )
+
+    assert distance(one, two) == pytest.approx(truth, rel=1e-9)
+
+
+@pytest.mark.parametrize("decades", [4, 8])
+def test_ill_conditioned_sets_far_from_zero_are_as_far_apart_as_sixty_digits_say(decades):
+    rng = np.random.default_rng(decades)
+    scales = np.logspace(0, -decades, 8)
+    turn = np.linalg.qr(rng.normal(size=(8, 8)))[0]
+    one = rng.normal(size=(30, 8)) * scales + 100
+    two = (rng.normal(size=(25, 8)) * scales) @ turn + 100.5
+
+    assert distance(one, two) == pytest.approx(by_sixty_digits(one, two), rel=1e-9)
+
+
+@pytest.mark.parametrize(("samples", "others"), [(4, 5), (4, 30), (2, 2)])
+def test_fewer_samples_than_features_are_no_difficulty(samples, others):
+    rng = np.random.default_rng(samples)
+    one, two = rng.normal(size=(samples, 8)), rng.normal(size=(others, 8)) + 0.3
+
+    found = frechet_distance(Spread.of(one), Spread.of(two))
+
+    assert found.value == pytest.approx(by_sixty_digits(one, two), rel=1e-9)
+    assert found.underdetermined
+    assert (found.samples, found.dim) == ((samples, others), 8)
+
+
+def test_gaussians_along_the_axes_are_as_far_apart_as_their_formula_says():
+    def corners(x: float, y: float, *, at: float) -> np.ndarray:
+        """Return four points of variances 4/3 x^2 and 4/3 y^2."""
+        return np.array([(x, y), (x, -y), (-x, y), (-x, -y)]) + at
+
+    found = frechet_distance(Spread.of(corners(3, 1, at=0)), Spread.of(corners(1, 2, at=5)))
+
+    assert found.value == pytest.approx(2 * 5**2 + 4 / 3 * ((3 - 1) ** 2 + (1 - 2) ** 2), rel=1e-12)
+    assert not found.underdetermined
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 999), cuts=st.lists(st.integers(0, 300), max_size=6))
+def test_gathered_in_parts_a_set_spreads_as_it_does_at_once(seed, cuts):
+    rng = np.random.default_rng(seed)
+    samples = mixed(rng, 300, 5, offset=1e3)
+    parts = [Spread.of(part) for part in np.split(samples, sorted(cuts))]
+
+    gathered = Spread.empty(5)
+    for part in parts:
+        gathered = gathered.merged(part)
+    backwards = Spread.empty(5)
+    for part in parts[::-1]:
+        backwards = part.merged(backwards)
+
+    scatter = np.cov(samples.T) * 299
+    for spread in (gathered, backwards):
+        assert spread.count == 300
+        assert len(spread.root) <= 10
+        np.testing.assert_allclose(spread.mean, samples.mean(axis=0), rtol=1e-13)
+        np.testing.assert_allclose(spread.root.T @ spread.root, scatter, rtol=1e-9, atol=1e-8)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 999), samples=st.integers(2, 40), dim=st.integers(1, 12))
+def test_the_distance_is_symmetric_never_negative_and_zero_from_itself(seed, samples, dim):
+    rng = np.random.default_rng(seed)
+    one, two = rng.normal(size=(samples, dim)), rng.normal(size=(samples + 3, dim)) * 2
+
+    assert distance(one, two) == pytest.approx(distance(two, one), rel=1e-12)
+    assert distance(one, two) >= 0
+    assert distance(one, one) == pytest.approx(0, abs=1e-12 * np.sum(one**2))
+
+
+def test_moving_both_sets_changes_nothing_and_moving_one_adds_the_square():
+    rng = np.random.default_rng(0)
+    one, two = rng.normal(size=(30, 4)), rng.normal(size=(20, 4))
+    centred = distance(one - one.mean(axis=0), two - two.mean(axis=0))
+
+    assert distance(one + 7, two + 7) == pytest.approx(distance(one, two), rel=1e-10)
+    assert distance(one - one.mean(axis=0) + 3, two - two.mean(axis=0)) == pytest.approx(
+        centred + 4 * 9, rel=1e-12
+    )
+
+
+def test_the_spread_of_stored_arrays_is_the_spread():
+    spread = Spread.of(np.random.default_rng(0).normal(size=(9, 3)))
+    back = Spread(spread.count, spread.mean, spread.root)
+
+    assert frechet_distance(back, spread).value == frechet_distance(spread, spread).value
+
+
+@pytest.mark.parametrize("few", [0, 1])
+def test_below_two_samples_there_is_no_distance(few):
+    many = Spread.of(np.random.default_rng(0).normal(size=(9, 3)))
+
+    found = frechet_distance(Spread.of(np.zeros((few, 3))), many)
+
+    assert math.isnan(found.value)
+    assert found.underdetermined
+
+
+def test_features_that_cannot_be_gathered_are_named():
+    with pytest.raises(EvaluationError, match=r"shape \(n, dim\), got \(4,\)"):
+        Spread.of(np.zeros(4))
+    with pytest.raises(EvaluationError, match=r"1 of 3 samples .* not finite, sample 2 first"):
+        Spread.of(np.array([[0.0], [1.0], [np.nan]]))
+    with pytest.raises(EvaluationError, match="sets of 2 and of 3 features cannot be compared"):
+        Spread.empty(2).merged(Spread.empty(3))
+    with pytest.raises(EvaluationError, match="sets of 2 and of 3 features cannot be compared"):
+        frechet_distance(Spread.empty(2), Spread.empty(3))

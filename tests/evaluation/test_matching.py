@@ -1,0 +1,252 @@
+"""E_match: by hand with keypoints that are given, and with SIFT on photographs."""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.matching import (
+    match_error,
+    match_settings,
+    mutual_matches,
+    target_matches,
+)
+from stereogenbench_data.evaluation.protocols import KeypointMatcher, Keypoints
+from stereogenbench_data.evaluation.sift import Sift
+
+
+def view(number: int, *, height: int = 8, width: int = 9) -> np.ndarray:
+    """Return a picture that stands for the view of this number."""
+    return np.full((3, height, width), number, dtype=np.uint8)
+
+
+def keypoints(rows: list[float]) -> Keypoints:
+    """Return keypoints in these rows, described by their order."""
+    xy = np.array([(5.0, row) for row in rows], dtype=np.float32).reshape(-1, 2)
+    descriptors = np.arange(len(rows), dtype=np.float32)[:, None]
+    return Keypoints(xy_px=xy, descriptors=descriptors)
+
+
+@dataclass
+class Listed:
+    """A matcher whose keypoints and matches are listed by view; the left view is 0."""
+
+    rows: dict[int, list[float]]
+    pairs: dict[int, list[tuple[int, int]]]
+    name: str = "listed"
+    settings: dict = field(default_factory=lambda: {"keypoints": 5})
+    detected: list[int] = field(default_factory=list)
+    view_of: dict[int, int] = field(default_factory=dict)
+
+    def detect(self, picture):
+        number = int(picture[0, 0, 0])
+        self.detected.append(number)
+        found = keypoints(self.rows[number])
+        self.view_of[id(found.xy_px)] = number
+        self.kept = [*getattr(self, "kept", []), found]
+        return found
+
+    def match(self, left, right):
+        pairs = self.pairs[self.view_of[id(right.xy_px)]]
+        return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+LEFT, TARGET, PREDICTED, NOTHING = range(4)
+
+
+@pytest.fixture
+def listed():
+    return Listed(
+        rows={
+            LEFT: [1, 2, 3, 4, 5],
+            TARGET: [1, 2, 3, 9],
+            PREDICTED: [1, 4.0, 5.1, 6],
+            NOTHING: [],
+        },
+        pairs={
+            LEFT: [(n, n) for n in range(5)],
+            TARGET: [(0, 0), (1, 1), (2, 2), (3, 3)],
+            PREDICTED: [(0, 0), (1, 1), (2, 2), (4, 3)],
+            NOTHING: [],
+        },
+    )
+
+
+def error_of(listed, predicted, *, target=TARGET):
+    against = target_matches(view(LEFT), view(target), matcher=listed)
+    return match_error(view(predicted), against=against, matcher=listed)
+
+
+def test_matches_are_counted_as_worked_by_hand(listed):
+    """Of the target 4 is 5 rows off; of the prediction 2 is 2 rows off, 3 is 2.1."""
+    score = error_of(listed, PREDICTED)
+
+    assert (score.keypoints, score.target_matches, score.predicted_matches) == (5, 3, 3)
+    assert score.common == 2
+    assert score.error == pytest.approx(100 * (1 - 2 / 4))
+
+
+def test_the_target_itself_has_no_error(listed):
+    assert error_of(listed, TARGET).error == 0
+
+
+def test_the_copied_left_matches_every_keypoint_so_its_error_is_what_the_target_lacks(listed):
+    score = error_of(listed, LEFT)
+
+    assert score.predicted_matches == score.keypoints == 5
+    assert score.error == pytest.approx(100 * (1 - 3 / 5))
+
+
+def test_where_only_one_side_matches_the_error_is_whole_and_where_none_does_there_is_none(listed):
+    assert error_of(listed, NOTHING).error == 100
+    assert math.isnan(error_of(listed, NOTHING, target=NOTHING).error)
+
+
+def test_left_keypoints_are_detected_once_for_all_predictions(listed):
+    against = target_matches(view(LEFT), view(TARGET), matcher=listed)
+    for predicted in (TARGET, PREDICTED):
+        match_error(view(predicted), against=against, matcher=listed)
+
+    assert listed.detected == [LEFT, TARGET, TARGET, PREDICTED]
+
+
+def test_another_tolerance_accepts_other_matches(listed):
+    against = target_matches(view(LEFT), view(TARGET), matcher=listed, epipolar_px=2.2)
+
+    assert match_error(view(PREDICTED), against=against, matcher=listed).predicted_matches == 4
+
+
+def test_a_prediction_of_another_size_or_matcher_is_refused(listed):
+    against = target_matches(view(LEFT), view(TARGET), matcher=listed)
+    other = Listed(rows=listed.rows, pairs=listed.pairs, name="other")
+
+    with pytest.raises(EvaluationError, match=r"at 9x8 by listed, the prediction is .* 10x8"):
+        match_error(view(TARGET, width=10), against=against, matcher=listed)
+    with pytest.raises(EvaluationError, match="to be at 9x8 by other"):
+        match_error(view(TARGET), against=against, matcher=other)
+
+
+def test_the_settings_name_the_matcher_and_its_own_choices(listed):
+    settings = match_settings(listed, epipolar_px=3.0)
+
+    assert (settings["matcher"], settings["epipolar_px"], settings["keypoints"]) == ("listed", 3, 5)
+
+
+def described(*values: float) -> Keypoints:
+    return Keypoints(
+        xy_px=np.zeros((len(values), 2), dtype=np.float32),
+        descriptors=np.array(values, dtype=np.float32)[:, None],
+    )
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "pairs"),
+    [
+        pytest.param((0, 10), (10.1, 0.1), [(0, 1), (1, 0)], id="each has its own"),
+        pytest.param((0, 2), (1.0, 90), [], id="two want the same, as near"),
+        pytest.param((0, 100), (9, 10), [(0, 0)], id="9 to 10 is just 0.9, 90 to 91 is above"),
+        pytest.param((0, 100), (8.9, 10, 100), [(0, 0), (1, 2)], id="8.9 to 10 is below 0.9"),
+        pytest.param((0, 100), (9.1, 10, 100), [(1, 2)], id="9.1 to 10 is above 0.9"),
+        pytest.param((0, 100), (0, 0, 100), [(1, 2)], id="two equally perfect are ambiguous"),
+        pytest.param((0, 100), (5,), [], id="no second to compare with"),
+        pytest.param((), (5, 7), [], id="nothing"),
+    ],
+)
+def test_mutual_matches_are_those_worked_by_hand(left, right, pairs):
+    assert mutual_matches(described(*left), described(*right)).tolist() == [list(p) for p in pairs]
+
+
+def test_mutual_matches_are_those_of_a_search_by_loops():
+    rng = np.random.default_rng(0)
+    sides = [rng.normal(size=(40, 3)).astype(np.float32) for _ in range(2)]
+    one, two = (side.astype(np.float64) for side in sides)
+    distances = np.linalg.norm(one[:, None] - two, axis=2)
+
+    def clear(row: np.ndarray) -> bool:
+        nearest, second = np.sort(row)[:2]
+        return nearest <= 0.9 * second
+
+    expected = [
+        [i, j]
+        for i in range(40)
+        for j in range(40)
+        if distances[i].argmin() == j
+        and distances[:, j].argmin() == i
+        and clear(distances[i])
+        and clear(distances[:, j])
+    ]
+    made = [Keypoints(np.zeros((40, 2), dtype=np.float32), side) for side in sides]
+
+    assert expected
+    assert mutual_matches(*made).tolist() == expected
+
+
+@pytest.fixture(scope="module")
+def cones(ground_truth):
+    def read(name):
+        with Image.open(ground_truth / "cones" / name) as picture:
+            return np.asarray(picture.convert("RGB")).transpose(2, 0, 1)
+
+    return read("left.png"), read("right.png")
+
+
+@pytest.fixture(scope="module")
+def sift():
+    return Sift()
+
+
+def test_sift_on_photographs_orders_target_noise_copy_and_another_scene(cones, sift):
+    left, right = cones
+    against = target_matches(left, right, matcher=sift)
+    noise = np.random.default_rng(0).normal(0, 8, right.shape)
+
+    def score(picture):
+        return match_error(picture, against=against, matcher=sift)
+
+    target, copied, other = score(right), score(left), score(left[:, ::-1, ::-1])
+    noisy = score(np.clip(right + noise, 0, 255).astype(np.uint8))
+    assert target.error == 0
+    assert 20 < noisy.error < 45
+    assert copied.predicted_matches == copied.keypoints
+    assert copied.error == pytest.approx(100 * (1 - target.target_matches / target.keypoints))
+    assert other.error > 90
+
+
+def test_sift_keypoints_are_the_strongest_distinct_and_inside(cones):
+    left = cones[0]
+    few, all_points = Sift(keypoints=50).detect(left), Sift().detect(left)
+
+    assert len(few.xy_px) == 50
+    assert len(all_points.xy_px) <= 2048
+    np.testing.assert_array_equal(few.xy_px, all_points.xy_px[:50])
+    assert (all_points.xy_px > 0).all()
+    assert (all_points.xy_px < (left.shape[2], left.shape[1])).all()
+    np.testing.assert_array_equal(all_points.descriptors, np.rint(all_points.descriptors))
+
+
+def test_sift_points_to_the_middle_of_a_spot(sift):
+    """A bright spot whose centre is that of the pixel in column 40, row 30."""
+    rows, columns = np.mgrid[:64, :80]
+    spot = 255 * np.exp(-((rows - 30) ** 2 + (columns - 40) ** 2) / (2 * 4**2))
+    picture = np.repeat(spot.astype(np.uint8)[None], 3, axis=0)
+
+    found = sift.detect(picture)
+
+    np.testing.assert_allclose(found.xy_px[0], (40.5, 30.5), atol=0.02)
+
+
+def test_a_flat_picture_has_no_keypoint_and_no_match(sift):
+    flat = np.full((3, 40, 50), 128, dtype=np.uint8)
+    found = sift.detect(flat)
+
+    assert found.xy_px.shape == (0, 2)
+    assert sift.match(found, found).shape == (0, 2)
+
+
+def test_sift_is_a_keypoint_matcher_that_names_its_choices(sift):
+    assert isinstance(sift, KeypointMatcher)
+    assert sift.name.startswith("SIFT (OpenCV ")
+    assert (sift.settings["ratio"], sift.settings["keypoints"]) == (0.9, 2048)

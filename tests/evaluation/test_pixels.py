@@ -1,0 +1,126 @@
+"""PSNR and SSIM against scikit-image, on random, flat and photographed pictures."""
+
+import math
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis.extra.numpy import arrays
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from stereogenbench_data.errors import EvaluationError, ExtraError
+from stereogenbench_data.evaluation.pixels import PSNR_SETTINGS, SSIM_SETTINGS, psnr_db, ssim
+
+pictures = arrays(np.uint8, (3, 13, 17))
+
+
+def true_ssim(one: np.ndarray, two: np.ndarray) -> float:
+    return structural_similarity(
+        one,
+        two,
+        channel_axis=0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=255,
+    )
+
+
+def noisy(picture: np.ndarray, *, sigma: float) -> np.ndarray:
+    noise = np.random.default_rng(3).normal(0, sigma, picture.shape)
+    return np.clip(picture + noise, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(
+    scope="module", params=["cones/left.png", "cloth3/view1.png", "motorcycle/motorcycle_left.png"]
+)
+def photograph(request, ground_truth):
+    with Image.open(ground_truth / request.param) as picture:
+        return np.asarray(picture.convert("RGB")).transpose(2, 0, 1)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 5, 80])
+def test_photographs_score_as_in_scikit_image(photograph, sigma):
+    other = noisy(photograph, sigma=sigma)
+
+    assert psnr_db(other, photograph) == pytest.approx(
+        peak_signal_noise_ratio(photograph, other, data_range=255), abs=1e-9
+    )
+    assert ssim(other, photograph) == pytest.approx(true_ssim(photograph, other), abs=1e-9)
+
+
+@pytest.mark.parametrize("size", [(11, 11), (11, 200), (74, 75), (138, 31), (480, 832)])
+def test_random_pictures_of_any_size_score_as_in_scikit_image(size):
+    rng = np.random.default_rng(1)
+    one, two = (rng.integers(0, 256, (3, *size)).astype(np.uint8) for _ in range(2))
+
+    assert psnr_db(one, two) == pytest.approx(
+        peak_signal_noise_ratio(one, two, data_range=255), abs=1e-9
+    )
+    assert ssim(one, two) == pytest.approx(true_ssim(one, two), abs=1e-9)
+
+
+@pytest.mark.parametrize("other", [254, 128, 1, 0])
+def test_flat_pictures_score_as_in_scikit_image(other):
+    white = np.full((3, 20, 30), 255, dtype=np.uint8)
+    flat = np.full_like(white, other)
+
+    assert psnr_db(white, flat) == pytest.approx(20 * math.log10(255 / (255 - other)), abs=1e-12)
+    assert ssim(white, flat) == pytest.approx(true_ssim(white, flat), abs=1e-9)
+
+
+def test_one_level_off_everywhere_is_48_db():
+    picture = np.full((3, 2, 2), 7, dtype=np.uint8)
+
+    assert psnr_db(picture, picture + np.uint8(1)) == pytest.approx(48.1308036086791, abs=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(one=pictures, two=pictures)
+def test_scores_do_not_depend_on_which_is_the_target_nor_on_a_mirror(one, two):
+    assert psnr_db(one, two) == psnr_db(two, one) == psnr_db(one[..., ::-1], two[..., ::-1])
+    assert ssim(one, two) == ssim(two, one)
+    assert ssim(one, two) == pytest.approx(ssim(one[:, ::-1], two[:, ::-1]), abs=1e-12)
+    assert -1 <= ssim(one, two) <= 1
+
+
+@settings(max_examples=25, deadline=None)
+@given(picture=pictures)
+def test_a_picture_is_infinitely_and_wholly_like_itself(picture):
+    assert psnr_db(picture, picture) == math.inf
+    assert ssim(picture, picture) == 1
+
+
+@pytest.mark.parametrize("score", [psnr_db, ssim])
+def test_what_is_no_pair_of_pictures_is_named(score):
+    picture = np.zeros((3, 20, 24), dtype=np.uint8)
+
+    with pytest.raises(EvaluationError, match=r"\(3, h, w\), got float32 of shape \(3, 20, 24\)"):
+        score(picture.astype(np.float32), picture)
+    with pytest.raises(EvaluationError, match=r"got uint8 of shape \(20, 24, 3\)"):
+        score(picture.transpose(1, 2, 0), picture)
+    with pytest.raises(EvaluationError, match="of one size, got 24x20 and 23x20"):
+        score(picture, picture[..., 1:])
+
+
+def test_a_picture_below_the_window_has_no_ssim():
+    small = np.zeros((3, 10, 30), dtype=np.uint8)
+
+    with pytest.raises(EvaluationError, match="at least 11x11 pixels, got 30x10"):
+        ssim(small, small)
+
+
+def test_without_opencv_ssim_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    picture = np.zeros((3, 20, 30), dtype=np.uint8)
+
+    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[evaluation\]'"):
+        ssim(picture, picture)
+
+
+def test_every_choice_is_named():
+    assert PSNR_SETTINGS["data_range"] == SSIM_SETTINGS["data_range"] == 255
+    assert (SSIM_SETTINGS["window_px"], SSIM_SETTINGS["sigma_px"]) == (11, 1.5)
+    assert (SSIM_SETTINGS["k1"], SSIM_SETTINGS["k2"]) == (0.01, 0.03)

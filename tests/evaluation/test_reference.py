@@ -1,0 +1,101 @@
+"""The paper's tables as data: cells read off the paper, sums that it states, its discrepancies."""
+
+import math
+import re
+
+import pytest
+
+from stereogenbench_data import EvaluationError
+from stereogenbench_data.evaluation.reference import (
+    DISCREPANCIES,
+    SOURCES,
+    reference_rows,
+    reference_table,
+)
+from stereogenbench_data.schema.release import BASELINE_BINS
+from tests.conftest import SHARED
+
+
+@pytest.mark.parametrize(
+    ("table", "where", "column", "printed"),
+    [
+        ("main", {"method": "GenStereo", "family": "Uniform"}, "psnr", "27.35"),
+        ("main", {"method": "StereoPilot", "family": "IPD_Gaussian"}, "fvd", "332.50"),
+        ("main", {"tier": "G1", "family": "IPD_Gaussian"}, "sd", "0.5346"),
+        ("unseen", {"method": "Mono2Stereo", "family": "Uniform"}, "sd", "28.2631"),
+        ("unseen", {"method": "StereoCrafter-Zero", "family": "Uniform"}, "fid", ""),
+        ("bins", {"method": "SVG", "baseline_bin_cm": "[60,100)"}, "sd_ci95", "0.0942"),
+        ("bins", {"method": "ZeroStereo", "baseline_bin_cm": "[1,10)"}, "psnr", "35.50"),
+        ("controls", {"control": "copied left"}, "sd", "97.7503"),
+        ("controls", {"control": "rendered target"}, "psnr", "inf"),
+    ],
+)
+def test_a_cell_is_as_printed(table, where, column, printed):
+    (row,) = reference_rows(table, **where)
+
+    assert row[column] == printed
+
+
+def test_every_table_has_all_its_rows_and_names_its_source():
+    counts = {name: len(reference_table(name).rows) for name in SOURCES}
+
+    assert counts == {"main": 22, "unseen": 22, "bins": 55, "controls": 4}
+    assert all(source.startswith("tab:") for source in SOURCES.values())
+
+
+def test_the_bins_of_every_method_cover_the_281_scenes():
+    for method in {row["method"] for row in reference_table("bins").rows}:
+        rows = reference_rows("bins", method=method)
+
+        assert [int(row["n_scenes"]) for row in rows] == [52, 65, 70, 55, 39]
+        assert [row["baseline_bin_cm"] for row in rows] == list(BASELINE_BINS)[1:6]
+
+
+def test_every_number_is_one():
+    for name in SOURCES:
+        for row in reference_table(name).rows:
+            numbers = [
+                value for key, value in row.items() if key in ("psnr", "ssim", "sd") and value
+            ]
+
+            assert all(not math.isnan(float(number)) for number in numbers)
+
+
+def test_bins_and_branches_differ_by_what_the_note_says():
+    off = {}
+    for row in reference_rows("main", family="Uniform"):
+        bins = reference_rows("bins", method=row["method"])
+        for column in ("psnr", "ssim", "lpips", "e_match", "p_psnr", "sd"):
+            weighted = sum(int(each["n_scenes"]) * float(each[column]) for each in bins) / 281
+            off[row["method"], row["tier"], column] = abs(weighted / float(row[column]) - 1)
+
+    assert 0.002 < max(value for key, value in off.items() if key[2] != "sd") < 0.003
+    assert 0.01 < max(value for key, value in off.items() if key[1:] == ("G0", "sd")) < 0.0125
+    assert "1.2 %" in DISCREPANCIES["bins and branches"]
+
+
+def test_an_unknown_table_or_column_is_refused_by_name():
+    with pytest.raises(EvaluationError, match=r"there is no table 'best': there are main, unseen"):
+        reference_table("best")
+    with pytest.raises(EvaluationError, match=r"'controls' has no column 'method': it has control"):
+        reference_rows("controls", method="GenStereo")
+
+
+def test_every_number_stands_in_the_paper():
+    paper = SHARED / "paper" / "stereogenbench.tex"
+    if not paper.is_file():
+        pytest.skip("needs the paper's source, which stands beside the project")
+    text = paper.read_text()
+    for name, source in SOURCES.items():
+        label = source.partition(",")[0]
+        start = text.index(f"\\label{{{label}}}")
+        body = text[start : text.index(r"\end{tabular}", start)]
+        there = re.findall(r"\d+\.\d+", body)
+        ours = [
+            value
+            for row in reference_table(name).rows
+            for value in row.values()
+            if re.fullmatch(r"\d+\.\d+", value)
+        ]
+
+        assert sorted(there) == sorted(ours)

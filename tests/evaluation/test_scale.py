@@ -1,0 +1,230 @@
+"""SD: hand-worked lines, and SGBM on photographs with measured disparity."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.protocols import StereoMatcher
+from stereogenbench_data.evaluation.scale import fit_scale, scale_settings
+from stereogenbench_data.evaluation.sgbm import Sgbm
+
+METHODS = ("filtered", "least_squares", "theil_sen")
+SIZE = (20, 30)
+EVERYWHERE = np.ones(SIZE, dtype=bool)
+
+
+@pytest.fixture
+def truth():
+    return np.random.default_rng(0).uniform(3, 40, SIZE).astype(np.float32)
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(
+    ("factor", "slope", "drift"), [(1, 1, 0), (2, 0.5, 0.5), (0.5, 2, 1), (-1, -1, 2)]
+)
+def test_a_disparity_that_is_scaled_drifts_by_its_inverse(truth, method, factor, slope, drift):
+    fit = fit_scale(factor * truth, truth, scored=EVERYWHERE, method=method)
+
+    assert fit.slope == pytest.approx(slope, abs=1e-6)
+    assert fit.drift == pytest.approx(drift, abs=1e-6)
+    assert fit.offset_px == pytest.approx(0, abs=1e-5)
+    assert (fit.pixels, fit.outliers, fit.reason) == (600, 0, "")
+    assert fit.valid_ratio == fit.answered_ratio == 1
+    assert fit.r_squared == pytest.approx(1)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_offset_is_told_from_a_scale(truth, method):
+    fit = fit_scale(truth / 2 + 1000, truth, scored=EVERYWHERE, method=method)
+
+    assert fit.slope == pytest.approx(2, abs=1e-4)
+    assert fit.offset_px == pytest.approx(-2000, abs=0.1)
+
+
+def test_least_squares_are_those_of_numpy(truth):
+    noisy = truth + np.random.default_rng(1).normal(0, 3, SIZE).astype(np.float32)
+    slope, offset = np.polyfit(noisy.ravel().astype(float), truth.ravel().astype(float), 1)
+    residual = truth - slope * noisy - offset
+
+    fit = fit_scale(noisy, truth, scored=EVERYWHERE, method="least_squares")
+
+    assert fit.slope == pytest.approx(slope, abs=1e-6)
+    assert fit.offset_px == pytest.approx(offset, abs=1e-5)
+    assert fit.residual_std_px == pytest.approx(residual.std(), abs=1e-5)
+    assert fit.residual_mad_px == pytest.approx(np.median(np.abs(residual)), abs=1e-5)
+    assert fit.r_squared == pytest.approx(
+        np.corrcoef(noisy.ravel(), truth.ravel())[0, 1] ** 2, abs=1e-5
+    )
+
+
+def test_few_gross_outliers_ruin_least_squares_and_are_left_out_by_the_filter(truth):
+    estimated = 2 * truth
+    estimated.reshape(-1)[::50] += 200
+
+    plain = fit_scale(estimated, truth, scored=EVERYWHERE, method="least_squares")
+    filtered = fit_scale(estimated, truth, scored=EVERYWHERE)
+    median = fit_scale(estimated, truth, scored=EVERYWHERE, method="theil_sen")
+
+    assert plain.drift > 0.7
+    assert filtered.drift == pytest.approx(0.5, abs=1e-3)
+    assert median.drift == pytest.approx(0.5, abs=0.01)
+    assert (filtered.pixels, filtered.outliers) == (588, 12)
+    assert filtered.valid_ratio == pytest.approx(588 / 600)
+    assert filtered.answered_ratio == 1
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_unrelated_disparity_drifts_by_about_1(method):
+    rng = np.random.default_rng(2)
+    estimated, truth = (rng.uniform(0, 60, (200, 200)) for _ in range(2))
+
+    fit = fit_scale(estimated, truth, scored=np.ones((200, 200), dtype=bool), method=method)
+
+    assert fit.drift == pytest.approx(1, abs=0.05)
+    assert abs(fit.r_squared) < 0.01
+
+
+def test_noise_of_the_matcher_alone_makes_the_slope_smaller_as_the_variances_say():
+    rng = np.random.default_rng(3)
+    truth = rng.normal(20, 2, (300, 300))
+    estimated = truth + rng.normal(0, 1, (300, 300))
+
+    fit = fit_scale(
+        estimated, truth, scored=np.ones((300, 300), dtype=bool), method="least_squares"
+    )
+
+    assert fit.slope == pytest.approx(2**2 / (2**2 + 1**2), abs=0.01)
+
+
+@given(factor=st.floats(0.1, 10), offset=st.floats(-50, 50))
+def test_any_line_is_found(factor, offset):
+    estimated = np.random.default_rng(4).uniform(0, 50, SIZE)
+
+    fit = fit_scale(estimated, factor * estimated + offset, scored=EVERYWHERE)
+
+    assert fit.slope == pytest.approx(factor, rel=1e-9)
+    assert fit.offset_px == pytest.approx(offset, abs=1e-7)
+
+
+def test_only_what_is_scored_and_answered_counts(truth):
+    estimated = 2 * truth
+    estimated[:5] = np.nan
+    scored = EVERYWHERE.copy()
+    scored[:, :10] = False
+    estimated[:, :10] = 999
+
+    fit = fit_scale(estimated, truth, scored=scored)
+
+    assert fit.drift == pytest.approx(0.5, abs=1e-6)
+    assert fit.pixels == 15 * 20
+    assert fit.valid_ratio == pytest.approx(300 / 600)
+    assert fit.answered_ratio == pytest.approx(300 / 400)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_without_a_line_there_is_a_reason(truth, method):
+    constant = fit_scale(np.full(SIZE, 3.5), truth, scored=EVERYWHERE, method=method)
+    silent = fit_scale(np.full(SIZE, np.nan), truth, scored=EVERYWHERE, method=method)
+    unseen = fit_scale(truth, truth, scored=~EVERYWHERE, method=method)
+
+    assert constant.reason == "the estimated disparity is 3.5 px everywhere"
+    assert silent.reason.startswith("0 of 600 scored pixels to fit, fewer than 100 or 1%")
+    assert unseen.reason.startswith("0 of 0 scored pixels to fit")
+    for fit in (constant, silent, unseen):
+        assert math.isnan(fit.drift)
+        assert fit.pixels == 0
+
+
+def test_a_few_answers_of_a_large_picture_are_no_scale():
+    truth = np.random.default_rng(5).uniform(1, 50, (200, 200))
+    estimated = np.full((200, 200), np.nan)
+    estimated[0, :200] = truth[0, :200]
+
+    fit = fit_scale(estimated, truth, scored=np.ones((200, 200), dtype=bool))
+
+    assert fit.reason.startswith("200 of 40000 scored pixels to fit")
+    assert fit.answered_ratio == pytest.approx(0.005)
+
+
+def test_wrong_questions_are_refused(truth):
+    with pytest.raises(EvaluationError, match="least_squares, theil_sen, filtered, got 'ransac'"):
+        fit_scale(truth, truth, scored=EVERYWHERE, method="ransac")
+    with pytest.raises(EvaluationError, match=r"\(20, 30\), \(20, 29\) and \(20, 30\)"):
+        fit_scale(truth, truth[:, 1:], scored=EVERYWHERE)
+
+
+@pytest.fixture(scope="module")
+def cloth(ground_truth):
+    def read(name):
+        with Image.open(ground_truth / "cloth3" / name) as picture:
+            return np.asarray(picture)
+
+    left, right = (read(f"view{number}.png").transpose(2, 0, 1) for number in (1, 5))
+    disparity = read("disp1.png").astype(np.float32) / 2
+    return left, right, disparity
+
+
+@pytest.fixture(scope="module")
+def sgbm():
+    return Sgbm(disparities=128)
+
+
+def test_sgbm_on_a_photographed_pair_has_the_true_scale(cloth, sgbm):
+    left, right, disparity = cloth
+
+    fit = fit_scale(sgbm(left, right), disparity, scored=disparity > 0)
+
+    assert fit.drift < 0.005
+    assert fit.residual_mad_px < 0.25
+    assert fit.answered_ratio > 0.7
+
+
+def test_sgbm_tells_a_view_that_is_not_shifted_by_a_huge_scale(cloth, sgbm):
+    left, _, disparity = cloth
+
+    fit = fit_scale(sgbm(left, left), disparity, scored=disparity > 0)
+
+    assert fit.drift > 10
+    assert fit.r_squared < 0.05
+
+
+def test_sgbm_gives_a_known_shift_and_nothing_where_its_search_leaves_the_picture(sgbm):
+    wide = np.random.default_rng(0).integers(0, 256, (3, 60, 300)).astype(np.uint8)
+
+    disparity = sgbm(wide[..., :280], wide[..., 20:])
+
+    assert disparity.dtype == np.float32
+    assert disparity.shape == (60, 280)
+    assert np.isnan(disparity[:, :112]).all()
+    assert np.isnan(disparity[:, -16:]).all()
+    assert np.median(disparity[10:-10, 140:250]) == 20
+    assert np.isfinite(disparity[10:-10, 140:250]).all()
+
+
+def test_sgbm_also_gives_a_small_negative_shift(sgbm):
+    wide = np.random.default_rng(1).integers(0, 256, (3, 60, 300)).astype(np.uint8)
+
+    disparity = sgbm(wide[..., 8:], wide[..., :-8])
+
+    assert np.nanmedian(disparity) == -8
+
+
+def test_sgbm_is_a_stereo_matcher_and_the_settings_name_the_choices(sgbm):
+    settings = scale_settings(sgbm, method="theil_sen")
+
+    assert isinstance(sgbm, StereoMatcher)
+    assert settings["matcher"].startswith("SGBM (OpenCV ")
+    assert (settings["fit"], settings["disparities"]) == ("theil_sen", 128)
+    assert "median slope" in settings["fit_meaning"]
+
+
+def test_pictures_narrower_than_the_search_are_refused():
+    view = np.zeros((3, 96, 128), dtype=np.uint8)
+
+    with pytest.raises(EvaluationError, match="searches 192 disparities, and the pictures are 128"):
+        Sgbm()(view, view)

@@ -1,0 +1,145 @@
+"""All that works offline, on a synthesised pair whose geometry is known."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.evaluation.matching import match_error, target_matches
+from stereogenbench_data.evaluation.patches import outside_window, patch_psnr
+from stereogenbench_data.evaluation.pixels import psnr_db, ssim
+from stereogenbench_data.evaluation.scale import fit_scale
+from stereogenbench_data.evaluation.sgbm import Sgbm
+from stereogenbench_data.evaluation.sift import Sift
+
+
+@pytest.fixture(scope="module")
+def pairs(detailed_release):
+    """Return samples of the pairs of cameras (0, 1), the target, and (0, 2), too wide a one."""
+    fields = ["left", "right", "disparity", "visible", "baseline_m"]
+    return [
+        {
+            name: np.asarray(value)
+            for name, value in StereoPairs(detailed_release, pairs=[pair], fields=fields)[0].items()
+        }
+        for pair in ((0, 1), (0, 2))
+    ]
+
+
+@pytest.fixture(scope="module")
+def scores(pairs):
+    """Return what each control scores by each metric."""
+    target, wide = pairs
+    left, right = target["left"], target["right"]
+    matcher, stereo = Sift(), Sgbm(disparities=48)
+    against = target_matches(left, right, matcher=matcher)
+    controls = {
+        "target": right,
+        "copied left": left,
+        "wrong baseline": wide["right"],
+        "random": right[:, ::-1, ::-1].copy(),
+    }
+    return {
+        name: {
+            "psnr": psnr_db(picture, right),
+            "ssim": ssim(picture, right),
+            "p_psnr": patch_psnr(left, picture).mean_db,
+            "match": match_error(picture, against=against, matcher=matcher),
+            "scale": fit_scale(
+                stereo(left, picture), target["disparity"][0], scored=target["visible"][0]
+            ),
+        }
+        for name, picture in controls.items()
+    }
+
+
+@pytest.mark.parametrize("metric", ["psnr", "ssim"])
+def test_the_target_scores_best_and_a_random_view_worst(scores, metric):
+    values = {name: score[metric] for name, score in scores.items()}
+
+    assert max(values, key=values.get) == "target"
+    assert min(values, key=values.get) == "random"
+
+
+def test_patches_of_a_random_view_match_worst_and_need_not_match_best_in_the_target(scores, pairs):
+    """Half of the target's disparities are below the 2 px that P-PSNR searches from."""
+    values = {name: score["p_psnr"] for name, score in scores.items()}
+
+    assert outside_window(pairs[0]["disparity"][0], pairs[0]["visible"][0]) > 0.4
+    assert min(values, key=values.get) == "random"
+    assert values["target"] > values["copied left"]
+
+
+def test_match_errors_are_ordered_and_the_copied_left_has_what_the_formula_says(scores):
+    errors = {name: score["match"].error for name, score in scores.items()}
+    target = scores["target"]["match"]
+
+    assert errors["target"] == 0 < errors["wrong baseline"] < errors["random"]
+    assert errors["random"] > 90
+    assert errors["copied left"] == pytest.approx(
+        100 * (1 - target.target_matches / target.keypoints)
+    )
+
+
+def test_the_scale_of_the_target_is_right_and_of_a_wrong_baseline_the_ratio_of_the_two(
+    scores, pairs
+):
+    ratio = pairs[0]["baseline_m"] / pairs[1]["baseline_m"]
+
+    assert scores["target"]["scale"].drift < 0.1
+    assert scores["wrong baseline"]["scale"].slope == pytest.approx(ratio, abs=0.1)
+    assert scores["copied left"]["scale"].r_squared < 0.05
+    assert scores["random"]["scale"].drift == pytest.approx(1, abs=0.2)
+
+
+MEASURE = """
+import json, sys
+import cv2, numpy, torch
+from stereogenbench_data.evaluation.matching import match_error, target_matches
+from stereogenbench_data.evaluation.patches import patch_psnr
+from stereogenbench_data.evaluation.picture_statistics import ColourStatistics
+from stereogenbench_data.evaluation.pixels import psnr_db, ssim
+from stereogenbench_data.evaluation.scale import fit_scale
+from stereogenbench_data.evaluation.sgbm import Sgbm
+from stereogenbench_data.evaluation.sift import Sift
+from stereogenbench_data.evaluation.threads import use_one_thread
+
+threads = int(sys.argv[1])
+use_one_thread()
+if threads > 1:
+    cv2.setNumThreads(threads)
+    torch.set_num_threads(threads)
+with numpy.load(sys.argv[2]) as views:
+    left, right = views["left"], views["right"]
+noisy = right // 2 + 30
+against = target_matches(left, right, matcher=Sift())
+disparity = Sgbm(disparities=48)(left, noisy)
+fit = fit_scale(disparity, disparity * 2 + left[0] / 100, scored=numpy.isfinite(disparity))
+print(json.dumps([
+    cv2.getNumThreads(), torch.get_num_threads(), psnr_db(noisy, right), ssim(noisy, right),
+    patch_psnr(left, noisy).mean_db, match_error(noisy, against=against, matcher=Sift()).error,
+    fit.slope, fit.residual_std_px, *ColourStatistics()(noisy[None])[0],
+]))
+"""
+
+
+def test_scores_are_the_same_to_the_last_digit_on_one_thread_and_on_three(pairs, tmp_path):
+    np.savez(tmp_path / "views.npz", left=pairs[0]["left"], right=pairs[0]["right"])
+
+    one, three = (
+        json.loads(
+            subprocess.run(
+                [sys.executable, "-c", MEASURE, threads, str(tmp_path / "views.npz")],
+                check=True,
+                capture_output=True,
+                text=True,
+            ).stdout
+        )
+        for threads in ("1", "3")
+    )
+
+    assert (one[:2], three[:2]) == ([1, 1], [3, 3])
+    assert one[2:] == three[2:]

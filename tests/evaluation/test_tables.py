@@ -1,0 +1,211 @@
+"""Tables: groups in order, the paper's rows of the same tier beside, no nan, nothing mixed."""
+
+import csv
+import io
+import json
+
+import pytest
+
+from stereogenbench_data import EvaluationError, EvaluationProtocol, tables_of, write_report
+from stereogenbench_data.evaluation.aggregate import PairMeans, tally
+from stereogenbench_data.evaluation.frechet import FrechetDistance
+from stereogenbench_data.evaluation.render import latex, markdown
+from stereogenbench_data.evaluation.report import document
+from stereogenbench_data.evaluation.results import Scores
+from stereogenbench_data.evaluation.tables import bin_table, branch_table, stratum_table
+
+PAPERS = EvaluationProtocol()
+INF, NAN = float("inf"), float("nan")
+BASELINES_CM = (5.0, 20.0, 150.0, 12.0)
+
+
+@pytest.fixture
+def scores(scored_index):
+    """Made-up scores of the three scenes' primary pairs, and of one wide pair."""
+
+    def made(name="ours", *, tier="G0", protocol=PAPERS, psnr=((30, 32), (20, 24), (10, 12))):
+        pairs = []
+        for row, frames in enumerate((*psnr, (8, 8))):
+            scene = scored_index.scene(min(row, 2))
+            columns = {"psnr": frames, "ssim": (0.5, 0.75), "sd": (0.25, 0.75), "e_match": (1, NAN)}
+            pairs.append(
+                PairMeans(
+                    row=min(row, 2), scene=scene.id.key, pair=(0, 1) if row < 3 else (0, 5),
+                    is_primary=row < 3, baseline_cm=BASELINES_CM[row], frames=2,
+                    tallies={key: tally(values) for key, values in columns.items()},
+                )
+            )  # fmt: skip
+        return Scores(name, tier, protocol, {"size": "832x480"}, scored_index, tuple(pairs))
+
+    return made
+
+
+def rows(table):
+    return [(row.method, *row.labels) for row in table.rows]
+
+
+def test_branches_stand_beside_the_papers_rows_of_the_same_tier(scores):
+    table = branch_table([scores(tier="G1")])
+
+    assert rows(table) == [
+        ("ours", "seen_map", "Uniform"),
+        ("StereoSpace (paper)", "seen_map", "Uniform"),
+        ("ours", "unseen_map", "IPD_Gaussian"),
+        ("StereoSpace (paper)", "unseen_map", "IPD_Gaussian"),
+    ]
+    assert table.rows[0].cells["psnr"].mean == (31 + 22) / 2
+    assert table.rows[1].printed["psnr"] == "19.71"
+    assert (table.rows[0].scenes, table.rows[0].frames) == (2, 4)
+
+
+def test_bins_are_in_order_with_the_papers_beside(scores):
+    table = bin_table([scores(tier="G1")], "primary")
+
+    assert rows(table) == [
+        ("ours", "seen_map", "Uniform", "[1,10)"),
+        ("StereoSpace (paper)", "seen_map", "Uniform", "[1,10)"),
+        ("ours", "seen_map", "Uniform", "[10,30)"),
+        ("StereoSpace (paper)", "seen_map", "Uniform", "[10,30)"),
+        ("ours", "unseen_map", "IPD_Gaussian", "[100,150]"),
+    ]
+    assert table.rows[1].printed["psnr"] == "21.69 ± 1.04"
+
+
+def test_all_pairs_have_a_table_of_their_own(scores):
+    names = [table.name for table in tables_of([scores()])]
+    table = bin_table([scores()], "all")
+
+    assert names == ["branches", "bins_primary", "bins_all", "explanations"]
+    assert ("ours", "unseen_map", "IPD_Gaussian", "[10,30)") in rows(table)
+
+
+def test_a_column_of_the_index_makes_strata(scores, scored_index):
+    by_map = stratum_table([scores()], "map_name")
+    by_focal = stratum_table([scores()], "focal_mm", edges=(0, 1000))
+
+    assert [row.labels[2] for row in by_map.rows] == ["SynthStage", "SynthYard"]
+    assert [row.labels[2] for row in by_focal.rows] == ["[0,1000]", "[0,1000]"]
+    with pytest.raises(EvaluationError, match="baselines_cm has 15 values a scene"):
+        stratum_table([scores()], "baselines_cm")
+
+
+def test_methods_of_one_tier_share_a_table_and_those_of_two_do_not(scores):
+    both = branch_table([scores("one"), scores("two")])
+
+    assert [row.method for row in both.rows if not row.is_papers] == ["one", "two"] * 2
+    with pytest.raises(EvaluationError, match=r"their tier differs \(G0 and G2\)"):
+        tables_of([scores("one"), scores("two", tier="G2")])
+    other = EvaluationProtocol(size=(240, 416))
+    with pytest.raises(EvaluationError, match="their protocol differs"):
+        tables_of([scores("one"), scores("two", protocol=other)])
+
+
+def test_what_is_not_comparable_with_the_paper_is_said(scores):
+    table = branch_table([scores(protocol=EvaluationProtocol(size=(240, 416)))])
+    text = markdown(table)
+
+    assert "E_match (sift)↓" in text
+    assert "SD (sgbm)↓" in text
+    assert "43.85 †" in text
+    assert "The paper scores at 832x480, this at 416x240: not comparable" in text
+    assert "The paper scores 81 frames a scene, this [2]" in text
+
+
+def test_the_papers_own_backends_are_not_marked(scores):
+    papers = EvaluationProtocol(keypoint_matcher="dedode", stereo_matcher="foundation-stereo")
+    text = markdown(branch_table([scores(protocol=papers)]))
+
+    assert "| E_match↓ |" in text
+    assert "†" not in text
+
+
+def test_identical_and_undefined_frames_are_counted_in_the_cell(scores):
+    text = markdown(branch_table([scores(psnr=((INF, INF), (INF, INF), (10, INF)))]))
+
+    assert "∞ (4 identical)" in text
+    assert "10.00 (1 identical)" in text
+    assert "(2 undefined)" in text
+
+
+def test_the_median_of_sd_stands_beside_its_mean(scores):
+    text = markdown(branch_table([scores()]))
+
+    assert "0.5000 ± 0.0000 [0.5000]" in text
+
+
+def test_a_gap_is_a_column_of_the_table(scores):
+    whole = scores()
+    gap = PairMeans(
+        row=1, scene=whole.pairs[1].scene, pair=(0, 1), is_primary=True, baseline_cm=20.0,
+        frames=2, tallies={}, fault="has no prediction",
+    )  # fmt: skip
+    holed = Scores("ours", "G0", PAPERS, {}, whole.index, (whole.pairs[0], gap, *whole.pairs[2:]))
+    table = branch_table([holed])
+
+    assert "| missing |" in markdown(table)
+    assert (table.rows[0].missing, table.rows[0].scenes) == (1, 1)
+    assert "missing" not in markdown(branch_table([whole])).partition("\n\n")[2]
+
+
+def test_a_distance_says_its_sample_and_its_dimension(scores):
+    distance = FrechetDistance(value=12.5, samples=(6, 6), dim=66, underdetermined=True)
+    protocol = EvaluationProtocol(metrics=("psnr", "fd-colour"))
+    one = scores(protocol=protocol)
+    told = Scores(
+        "ours", "G0", protocol, {}, one.index, one.pairs,
+        {("seen_map", "Uniform"): {"fd-colour": distance}},
+    )  # fmt: skip
+    text = markdown(branch_table([told]))
+
+    assert "FD-colour↓" in text
+    assert "12.50 (N 6 ≤ D 66) !" in text
+    assert "biased upwards" in text
+
+
+def test_no_output_holds_nan_and_json_reads_back(scores, tmp_path):
+    results = [scores(psnr=((INF, INF), (20, 24), (NAN, NAN)))]
+    tables = tables_of(results, by={"focal_mm": ()})
+    files = write_report(tmp_path, results, tables, plots="skip")
+    told = json.loads(
+        (tmp_path / "results.json").read_text(), parse_constant=lambda text: pytest.fail(text)
+    )
+
+    assert {path.name for path in files} == {
+        "results.json", "report.md", "tables.tex", "tables.csv", "pairs.csv",
+    }  # fmt: skip
+    assert told == document(results, tables)
+    for path in files:
+        assert "nan" not in path.read_text().replace("nan (", "").lower().split(), path
+    assert told["tables"][0]["rows"][0]["cells"]["psnr"]["infinite"] == 2
+
+
+def test_the_csv_has_a_line_for_each_row_and_column(scores, tmp_path):
+    results = [scores()]
+    write_report(tmp_path, results, tables_of(results), plots="skip")
+    lines = list(csv.DictReader(io.StringIO((tmp_path / "tables.csv").read_text())))
+    ours = [
+        line
+        for line in lines
+        if line["table"] == "branches" and line["source"] == "scored" and line["column"] == "PSNR↑"
+    ]
+
+    assert [float(line["mean"]) for line in ours] == [26.5, 11]
+    assert ours[0]["group"] == "subset=seen_map; family=Uniform"
+    pairs = list(csv.DictReader(io.StringIO((tmp_path / "pairs.csv").read_text())))
+    assert [float(line["psnr"]) for line in pairs] == [31, 22, 11, 8]
+
+
+def test_latex_has_its_signs_escaped_and_its_columns_counted(scores):
+    text = latex(branch_table([scores("50 % & more_{x}")]))
+    rows_of_text = [line for line in text.splitlines() if line.endswith(r"\\")]
+
+    assert r"50 \% \& more\_\{x\}" in text
+    assert r"31.00" not in text
+    assert r"$\pm$" in text
+    assert len({line.replace(r"\&", "").count("&") for line in rows_of_text}) == 1
+    assert text.count(r"\begin{") == text.count(r"\end{") == 2
+
+
+def test_a_table_needs_a_method():
+    with pytest.raises(EvaluationError, match="scores of one method at least, got none"):
+        tables_of([])
