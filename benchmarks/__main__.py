@@ -1,0 +1,147 @@
+"""`python -m benchmarks`: prepares the data, measures, and writes docs/performance."""
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from benchmarks.accuracy import CASES, measure_accuracy
+from benchmarks.equality import differences
+from benchmarks.ffmpeg_links import link_libraries
+from benchmarks.machine import machine
+from benchmarks.material import Material, facts, prepared
+from benchmarks.plots import plot_all
+from benchmarks.profile import measure_profile
+from benchmarks.race import Plan, run_races
+from benchmarks.results import Results
+from benchmarks.start import measure_memory, measure_start
+from benchmarks.tables import tables
+from benchmarks.workloads import WORKLOADS, Workload
+
+ROOT: Final = Path(__file__).parents[1]
+OTHERS: Final = ("accuracy", "profile", "start", "memory")
+"""What is measured beside the races; `--only` takes these names too."""
+
+QUICK: Final = ("first", "all-frames", "random", "accuracy", "profile")
+
+
+def parse(words: Sequence[str]) -> argparse.Namespace:
+    """Return the options of a command line."""
+    known = [workload.name for workload in WORKLOADS] + list(OTHERS)
+    parser = argparse.ArgumentParser(prog="stereogenbench bench", description=__doc__)
+    parser.add_argument(
+        "--only", action="append", choices=known, help="measure this; may be given again"
+    )
+    parser.add_argument("--quick", action="store_true", help="one round of " + ", ".join(QUICK))
+    parser.add_argument("--rounds", type=int, default=5, help="rounds of every race [5]")
+    parser.add_argument("--workers", help="worker processes of every race, such as 2,0,1,4")
+    parser.add_argument("--whole", action="store_true", help="all frames, not a window of them")
+    parser.add_argument("--batches", type=int, default=400, help="batches of the memory run [400]")
+    parser.add_argument("--resume", action="store_true", help="keep the rounds that are there")
+    parser.add_argument("--draw", action="store_true", help="only draw and pack the data")
+    parser.add_argument(
+        "--check", action="store_true", help="only compare every contestant's samples with ours"
+    )
+    parser.add_argument("--tables", action="store_true", help="only tables and plots, anew")
+    parser.add_argument("--data", type=Path, default=ROOT / "build" / "bench")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "performance")
+    parser.add_argument("--size", type=int, default=1280, help=argparse.SUPPRESS)
+    parser.add_argument("--frames", type=int, default=81, help=argparse.SUPPRESS)
+    parser.add_argument("--scale", type=float, default=1.0, help=argparse.SUPPRESS)
+    return parser.parse_args(words)
+
+
+def chosen(options: argparse.Namespace) -> tuple[list[Workload], list[str]]:
+    """Return the workloads to race over, and the names of what else is to be measured."""
+    names = options.only or (QUICK if options.quick else [w.name for w in WORKLOADS] + [*OTHERS])
+    workloads = [workload for workload in WORKLOADS if workload.name in names]
+    if options.whole:
+        workloads = [replace(workload, window=workload.frames) for workload in workloads]
+    if options.workers:
+        workers = tuple(int(word) for word in options.workers.split(","))
+        workloads = [replace(workload, workers=workers) for workload in workloads]
+    if options.quick:
+        workloads = [replace(workload, workers=workload.workers[:1]) for workload in workloads]
+    return workloads, [name for name in OTHERS if name in names]
+
+
+def measure(options: argparse.Namespace, *, say: Callable[[str], None]) -> None:
+    """Measure what is asked for, and write results, tables and plots."""
+    material = Material(
+        options.data, size_px=options.size, frames=options.frames, scale=options.scale
+    )
+    results = Results(options.out / "results.json")
+    if not options.tables:
+        prepared(material, say=say)
+        if options.draw:
+            return
+        if options.check:
+            print(json.dumps(differences(material), indent=1))  # noqa: T201
+            return
+        results.put("machine", machine())
+        results.put("data", facts(material))
+        rounds = 1 if options.quick else options.rounds
+        workloads, others = chosen(options)
+        if others:
+            _measure_others(others, material, results, options=options, say=say)
+        plan = Plan(rounds=rounds, resume=options.resume)
+        run_races(workloads, material, results, plan=plan, say=say)
+    write_pages(results, options.out)
+    say(f"results are in {options.out}")
+
+
+def _measure_others(
+    names: list[str],
+    material: Material,
+    results: Results,
+    *,
+    options: argparse.Namespace,
+    say: Callable[[str], None],
+) -> None:
+    rounds = 1 if options.quick else options.rounds
+    work = {
+        "accuracy": lambda: measure_accuracy(material, rounds=rounds, cases=CASES, say=say),
+        "profile": lambda: measure_profile(material, rounds=min(rounds, 3), say=say),
+        "start": lambda: measure_start(material, rounds=rounds, say=say),
+        "memory": lambda: measure_memory(material, batches=options.batches, say=say),
+    }
+    for name in names:
+        if options.resume and name in results.sections:
+            continue
+        results.put(name, work[name]())
+
+
+def write_pages(results: Results, out: Path) -> None:
+    """Write tables and plots of the results at hand."""
+    (out / "tables.md").write_text(tables(results.sections))
+    plot_all(results.sections, out)
+
+
+def require_libraries(data: Path) -> None:
+    """Start this process anew if torchcodec's FFmpeg, or one thread a process, is not yet set."""
+    links = link_libraries((data / "ffmpeg").resolve())
+    paths = os.environ.get("LD_LIBRARY_PATH", "")
+    if links is None or str(links) in paths.split(":"):
+        return
+    own = {"LD_LIBRARY_PATH": f"{links}:{paths}".rstrip(":"), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "benchmarks", *sys.argv[1:]]
+    os.execve(sys.executable, command, os.environ | own)
+
+
+def main() -> None:
+    """Run the command line."""
+    options = parse(sys.argv[1:])
+    require_libraries(options.data)
+    try:
+        measure(options, say=lambda text: print(text, file=sys.stderr, flush=True))  # noqa: T201
+    except KeyboardInterrupt:
+        print("stopped; run the same command with --resume to go on", file=sys.stderr)  # noqa: T201
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

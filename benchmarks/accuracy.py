@@ -1,0 +1,310 @@
+"""Speed against error: nanoseconds a pixel of every way, and how far it is from the truth."""
+
+import math
+import mmap
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import av
+import numpy as np
+
+from benchmarks.material import Material
+from benchmarks.results import Spread
+from benchmarks.ways import (
+    WAYS,
+    Pair,
+    Sight,
+    in_blocks,
+    interpolated,
+    visible_by_both,
+    visible_by_left,
+)
+from stereogenbench_data.geometry.disparity import disparity_error_px, disparity_from_units
+from stereogenbench_data.samples.load import resized_nearest
+from stereogenbench_data.storage.index import SceneIndex
+
+CASES: Final = 240
+PIXELS: Final = (8, 256)
+SCREEN_PX: Final = 1280.0
+"""Beyond this disparity a point is outside any picture of the release."""
+CONVERSION: Final = "uint16 to float32"
+CONVERSION_HERE: Final = "uint16 to float32, into the same array"
+DEFAULT_HERE: Final = "the default, into the same array"
+
+CONVERSION_FRESH: Final = "uint16 to float32, into memory fresh from the system"
+DEFAULT_FRESH: Final = "the default, into memory fresh from the system"
+_LIKE: Final = {DEFAULT_HERE: CONVERSION_HERE, DEFAULT_FRESH: CONVERSION_FRESH}
+"""With which conversion a call is compared, if not with the plain one."""
+
+INVENTED_PX: Final = 1.0
+"""A disparity so far from every surface at its pixel is of no surface: it was averaged."""
+
+Say = Callable[[str], None]
+
+
+def hard_pairs(count: int = CASES) -> Iterator[tuple[Pair, np.ndarray]]:
+    """Yield pairs and maps of stored depth: the cases that the geometry tests call hard.
+
+    Baselines of 1 cm to 7.5 m either way, depth of 0.1 to 6,553 m, 1e6 cm from the world's origin,
+    looking straight up and down, focal lengths of the release and units of 0.1 mm to 0.1 m.
+    """
+    rng = np.random.default_rng(0)
+    for number in range(count):
+        unit_m = float(rng.choice([0.1, 0.01, 0.001, 1 / 256, 0.05]))
+        nearest, farthest = max(0.1 / unit_m, 1), min(65534.0, 6553.0 / unit_m)
+        depth = np.exp(rng.uniform(np.log(nearest), np.log(farthest), PIXELS))
+        units = np.clip(np.rint(depth), 1, 65534).astype(np.uint16)
+        pair = Pair(
+            focal_px=float(rng.uniform(970, 4580)),
+            baseline_m=float(np.exp(rng.uniform(np.log(0.01), np.log(7.5)))) * (-1) ** number,
+            unit_m=unit_m,
+            rotator_deg=(
+                float(rng.choice([-90.0, 90.0, 89.9999, 0.0, rng.uniform(-90, 90)])),
+                float(rng.uniform(-180, 180)),
+                float(rng.uniform(-180, 180)),
+            ),
+            offset_cm=tuple(rng.choice([-1e6, 1e6, 1e5, 0.0], 3).tolist()),  # type: ignore[arg-type]
+        )
+        yield pair, units
+
+
+def measure_accuracy(material: Material, *, rounds: int, cases: int, say: Say) -> dict[str, Any]:
+    """Return the section of the results: every way's error and speed."""
+    say("speed against error")
+    pair, left, right = rendered_pair(material)
+    ways = [
+        {"name": way.name, "offered": way.offered, "kind": "disparity"} | _errors(way.run, cases)
+        for way in WAYS
+    ]
+    calls: dict[str, Callable[[], Any]] = {
+        way.name: (lambda run=way.run: run(left, pair)) for way in WAYS
+    }
+    room = np.empty(left.shape, dtype=np.float32)
+    calls |= {
+        CONVERSION: lambda: left.astype(np.float32),
+        CONVERSION_HERE: lambda: np.copyto(room, left),
+        DEFAULT_HERE: lambda: in_blocks(left, pair, room),
+        CONVERSION_FRESH: lambda: np.copyto(_fresh(left.shape), left),
+        DEFAULT_FRESH: lambda: in_blocks(left, pair, _fresh(left.shape)),
+    }
+    resized, resizing = _resized(material.size_px)
+    sights, seeing = _visibility(pair, left, right)
+    calls |= resizing | seeing
+    spent = time_calls(calls, pixels=left.size, rounds=rounds)
+    for way in (*ways, *resized, *sights):
+        way["ns_a_pixel"] = spent[way["name"]]
+    return {
+        "pixels": left.size,
+        "cases": cases * PIXELS[0] * PIXELS[1],
+        "conversion_ns": spent[CONVERSION],
+        "conversion_here_ns": spent[CONVERSION_HERE],
+        "default_here_ns": spent[DEFAULT_HERE],
+        "conversion_fresh_ns": spent[CONVERSION_FRESH],
+        "default_fresh_ns": spent[DEFAULT_FRESH],
+        "ways": ways,
+        "resized": resized,
+        "visibility": sights,
+        "justified": justified(ways),
+        "rounds": rounds,
+    }
+
+
+def _fresh(shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array whose memory the system has yet to give, as that of a worker's batch."""
+    return np.frombuffer(mmap.mmap(-1, 4 * math.prod(shape)), np.float32).reshape(shape)
+
+
+def time_calls(
+    calls: dict[str, Callable[[], Any]], *, pixels: int, rounds: int
+) -> dict[str, dict[str, float]]:
+    """Return nanoseconds a pixel of each call by processor time, alternating them round by round.
+
+    Beside the spread of the times stands that of the ratio to the conversion in the same round:
+    into a new array, the same one or fresh memory, as the call does it.
+    """
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for number in range(rounds + 1):
+        for name in list(calls)[:: 1 if number % 2 else -1]:
+            begin, done = time.process_time(), 0
+            while done < 2 or time.process_time() - begin < 0.02:
+                calls[name]()
+                done += 1
+            if number:
+                times[name].append((time.process_time() - begin) / done / pixels * 1e9)
+    found = {}
+    for name, values in times.items():
+        plain = times[_LIKE.get(name, CONVERSION)]
+        spread = Spread.of(values)
+        ratio = Spread.of(value / base for value, base in zip(values, plain, strict=True))
+        found[name] = {
+            "median": spread.median, "low": spread.low, "high": spread.high,
+            "conversions": ratio.median, "conversions_low": ratio.low,
+            "conversions_high": ratio.high,
+        }  # fmt: skip
+    return found
+
+
+def _errors(run: Callable[[np.ndarray, Pair], np.ndarray], cases: int) -> dict[str, Any]:
+    """Return how far a way is from the truth, over the hard cases."""
+    all_px, screen_px, ulps, of_bound, lost = [], [], 0.0, 0.0, 0
+    for pair, units in hard_pairs(cases):
+        true_px = pair.true_px(units)
+        found = run(units, pair)
+        kept = np.isfinite(found)
+        lost += int((~kept).sum())
+        error_px = np.abs(found[kept].astype(np.longdouble) - true_px[kept]).astype(np.float64)
+        size_px = np.abs(true_px[kept]).astype(np.float64)
+        bound_px = disparity_error_px(
+            (units * pair.unit_m)[kept][None],
+            focal_px=pair.focal_px, baseline_m=pair.baseline_m, quantum_m=pair.unit_m,
+        )[0]  # fmt: skip
+        all_px.append(error_px)
+        screen_px.append(error_px[size_px <= SCREEN_PX])
+        ulps = max(ulps, float((error_px / np.spacing(size_px.astype(np.float32))).max()))
+        of_bound = max(of_bound, float((error_px / bound_px).max()))
+    everywhere, within = np.concatenate(all_px), np.concatenate(screen_px)
+    return {
+        "worst_px": float(everywhere.max()),
+        "p999_px": float(np.quantile(everywhere, 0.999)),
+        "worst_on_screen_px": float(within.max()),
+        "p999_on_screen_px": float(np.quantile(within, 0.999)),
+        "worst_ulps": ulps,
+        "worst_of_bound": of_bound,
+        "overflowed": lost,
+    }
+
+
+def justified(ways: list[dict[str, Any]]) -> str:
+    """Return the cheapest way within the depth quantum's bound and 1 ulp of float32."""
+    fit = [
+        way
+        for way in ways
+        if way["worst_ulps"] <= 1 and way["worst_of_bound"] <= 1 and not way["overflowed"]
+    ]
+    return str(min(fit, key=lambda way: way["ns_a_pixel"]["median"])["name"])
+
+
+def rendered_pair(material: Material) -> tuple[Pair, np.ndarray, np.ndarray]:
+    """Return the primary pair of a drawn scene: its numbers, and a frame of both stored depths."""
+    index = SceneIndex.open(material.eight)
+    scene = index.scene(0)
+    left, right = scene.rig.primary_pair
+    maps = [
+        _stored(Path(index.root) / scene.members[f"cam_{camera:02d}_depth.mkv"].path)
+        for camera in (left, right)
+    ]
+    pair = Pair(
+        focal_px=scene.rig.focal_mm / scene.rig.sensor_width_mm * scene.rig.image_width_px,
+        baseline_m=scene.rig.baseline_cm(left, right) / 100,
+        unit_m=scene.depth_unit_m[left],
+    )
+    return pair, *maps
+
+
+def _stored(path: Path) -> np.ndarray:
+    with av.open(str(path)) as container:
+        frame = next(container.decode(video=0))
+        return np.ascontiguousarray(frame.to_ndarray())
+
+
+def two_planes(
+    u_px: np.ndarray, v_px: np.ndarray, *, size: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the disparity of a slanted disc before a slanted wall: seen, of the disc, of the wall.
+
+    The disparity of a plane is linear in the pixel, so the truth at any point is known.
+    """
+    u, v = u_px / size, v_px / size
+    wall = 8 + 6 * u + 2 * v
+    disc = 90 + 25 * u - 15 * v
+    return np.where((u - 0.45) ** 2 + (v - 0.5) ** 2 < 0.09, disc, wall), disc, wall
+
+
+def _resized(size: int) -> tuple[list[dict[str, Any]], dict[str, Callable[[], Any]]]:
+    """Return every resizing policy's error on two planes, at the paper's 832x480, and its call."""
+    centres = np.arange(size) + 0.5
+    here_px, _, _ = two_planes(centres[None, :], centres[:, None], size=size)
+    height, width = max(2, size * 480 // 1280), max(2, size * 832 // 1280)
+    across = width / size
+    depth = (1000 / here_px).astype(np.float32)
+    disparity = here_px.astype(np.float32)
+    u_px = (np.arange(width) + 0.5)[None, :] / across
+    v_px = (np.arange(height) + 0.5)[:, None] * size / height
+    truth, disc, wall = (surface * across for surface in two_planes(u_px, v_px, size=size))
+    out = (height, width)
+    policies: dict[str, tuple[str, Callable[[], np.ndarray]]] = {
+        "nearest-exact, depth": ("default", lambda: 1000 / resized_nearest(depth, size=out)),
+        "nearest (corner), depth": (
+            "not taken", lambda: 1000 / interpolated(depth, size=out, mode="nearest"),
+        ),
+        "bilinear, depth": (
+            "not taken", lambda: 1000 / interpolated(depth, size=out, mode="bilinear"),
+        ),
+        "area, depth": ("not taken", lambda: 1000 / interpolated(depth, size=out, mode="area")),
+        "bilinear, disparity": (
+            "not taken", lambda: interpolated(disparity, size=out, mode="bilinear"),
+        ),
+        "area, disparity": ("not taken", lambda: interpolated(disparity, size=out, mode="area")),
+    }  # fmt: skip
+    found = []
+    for name, (offered, run) in policies.items():
+        found_px = run() * across
+        error_px = np.abs(found_px - truth)
+        nowhere_px = np.minimum(np.abs(found_px - disc), np.abs(found_px - wall))
+        found.append(
+            {
+                "name": name,
+                "kind": "resized",
+                "offered": offered,
+                "worst_px": float(error_px.max()),
+                "p999_px": float(np.quantile(error_px, 0.999)),
+                "p99_px": float(np.quantile(error_px, 0.99)),
+                "mean_px": float(error_px.mean()),
+                "invented_share": float((nowhere_px > INVENTED_PX).mean()),
+            }
+        )
+    return found, {name: run for name, (_, run) in policies.items()}
+
+
+def _visibility(
+    pair: Pair, left: np.ndarray, right: np.ndarray
+) -> tuple[list[dict[str, Any]], dict[str, Callable[[], Any]]]:
+    """Return how often each way decides otherwise than float64 by both depths, and its call."""
+    single, double = (_sight(pair, left, right, dtype=dtype) for dtype in (np.float32, np.float64))
+    truth = visible_by_both(double)
+    ways: dict[str, tuple[str, Callable[[], Any]]] = {
+        "visible, float64": ("not taken", lambda: visible_by_both(double)),
+        "visible, float32": ("default", lambda: visible_by_both(single)),
+        "visible, float32, from stored units on": (
+            "default", lambda: visible_by_both(_sight(pair, left, right, dtype=np.float32)),
+        ),
+        "visible_from_left, float32": ("offered", lambda: visible_by_left(single)),
+    }  # fmt: skip
+    found = [
+        {
+            "name": name,
+            "kind": "visibility",
+            "offered": offered,
+            "other_share": float(np.mean(run() != truth)),
+        }
+        for name, (offered, run) in ways.items()
+    ]
+    return found, {name: run for name, (_, run) in ways.items()}
+
+
+def _sight(pair: Pair, left: np.ndarray, right: np.ndarray, *, dtype: Any) -> Sight:
+    measured = [(units != 0) & (units != 65535) for units in (left, right)]
+    left_m, right_m = (
+        np.multiply(units, pair.unit_m, dtype=np.float64).astype(dtype) * there
+        for units, there in zip((left, right), measured, strict=True)
+    )
+    if dtype == np.float32:
+        disparity_px = measured[0] * disparity_from_units(
+            left, focal_px=pair.focal_px, baseline_m=pair.baseline_m, unit_m=pair.unit_m
+        )
+    else:
+        with np.errstate(divide="ignore"):
+            disparity_px = np.where(measured[0], pair.focal_px * pair.baseline_m / left_m, 0.0)
+    return Sight(left_m, right_m, *measured, disparity_px, pair.unit_m)

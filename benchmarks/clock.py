@@ -1,0 +1,143 @@
+"""How a contestant is timed: in a process of its own, from workers at the ready to the last batch.
+
+Each measurement forks from this process, which has imported everything and opened nothing, so that
+none inherits another's memory, files or threads. Time runs from the moment at which worker
+processes have started (their mean, where there are several) until the last batch has arrived; so
+opening files, filling queues and the unevenness of the end all count.
+"""
+
+import multiprocessing
+import resource
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, Final
+
+import torch
+
+from benchmarks.contestants import limit
+from benchmarks.field import CONTESTANTS, LIMIT
+from benchmarks.workloads import Job
+
+LONGEST_S: Final = 900.0
+"""After this long a contestant is taken to hang."""
+
+_FORK = multiprocessing.get_context("fork")
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What came out: samples, seconds of wall time, and seconds of processor time in all."""
+
+    samples: int
+    seconds: float
+    cpu_s: float
+
+
+class MeasurementError(Exception):
+    """A contestant failed; the message is its own."""
+
+
+def measured(name: str, job: Job, *, workers: int) -> Measured:
+    """Return how fast a contestant loads a job's slice with so many worker processes.
+
+    Raises:
+        MeasurementError: If it fails, saying why.
+    """
+    return in_a_fork(lambda: _run(name, job, workers=workers), longest_s=LONGEST_S)
+
+
+def in_a_fork(work: Callable[[], Any], *, longest_s: float | None = None) -> Any:
+    """Return what a function returns in a process forked from this one.
+
+    Raises:
+        MeasurementError: If it raises, the process dies, or it takes longer than it may.
+    """
+    here, there = _FORK.Pipe(duplex=False)
+    process = _FORK.Process(target=_report, args=(work, there))
+    process.start()
+    there.close()
+    done, result = False, f"took longer than {longest_s} s"
+    if here.poll(longest_s):
+        try:
+            done, result = here.recv()
+        except EOFError:
+            result = "the process died"
+    else:
+        process.kill()
+    process.join()
+    if not done:
+        raise MeasurementError(result)
+    return result
+
+
+def _report(work: Callable[[], Any], to: Connection) -> None:
+    try:
+        to.send((True, work()))
+    except Exception as error:  # noqa: BLE001 - whatever a contestant raises is a result
+        to.send((False, f"{type(error).__name__}: {error}"))
+
+
+def _run(name: str, job: Job, *, workers: int) -> Measured:
+    torch.set_num_threads(1)
+    list(job.of_scene)  # worked out before the clock starts
+    before = _cpu_s()
+    if name == LIMIT:
+        samples, seconds = _bare(job, processes=max(1, workers))
+    else:
+        samples, seconds = _batched(name, job, workers=workers)
+    return Measured(samples, seconds, _cpu_s() - before)
+
+
+def _cpu_s() -> float:
+    """Return the processor time of this process and of its ended children."""
+    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in spent)
+
+
+def _batched(name: str, job: Job, *, workers: int) -> tuple[int, float]:
+    started = torch.zeros(max(1, workers), dtype=torch.float64).share_memory_()
+
+    def note_start(worker: int) -> None:
+        torch.set_num_threads(1)
+        started[worker] = time.perf_counter()
+
+    warnings.filterwarnings("ignore", message="This DataLoader will create")
+    loader = CONTESTANTS[name].batches(job, num_workers=workers, worker_init_fn=note_start)
+    samples = 0
+    note_start(0)
+    for batch in loader:
+        samples += len(batch["scene"])
+    return samples, time.perf_counter() - float(started.mean())
+
+
+def _bare(job: Job, *, processes: int) -> tuple[int, float]:
+    """Run the limit: N loops over scenes of their own, whose rates are added up."""
+    scenes = list(job.of_scene)
+    if processes == 1:
+        return _timed_loop(job, scenes)
+    barrier = _FORK.Barrier(processes)
+    here, there = _FORK.Pipe(duplex=False)
+
+    def loop(own: list[str]) -> None:
+        barrier.wait()
+        there.send(_timed_loop(job, own))
+
+    running = [
+        _FORK.Process(target=loop, args=(scenes[place::processes],)) for place in range(processes)
+    ]
+    for process in running:
+        process.start()
+    found = [here.recv() for _ in running]
+    for process in running:
+        process.join()
+    samples = sum(samples for samples, _ in found)
+    return samples, samples / sum(count / seconds for count, seconds in found)
+
+
+def _timed_loop(job: Job, scenes: list[str]) -> tuple[int, float]:
+    begin = time.perf_counter()
+    samples = sum(1 for _ in limit.samples(job, scenes))
+    return samples, time.perf_counter() - begin

@@ -1,0 +1,124 @@
+"""The limit: each needed stream decoded once by a bare PyAV loop, every array written once.
+
+Nothing else is done: no checks, no masks, no batches, no queues. Arrays are written into buffers
+that are used again and again, so that not even memory is asked for. With N processes, N of these
+loops run over scenes of their own.
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import av
+import numpy as np
+from av.video.reformatter import Interpolation, VideoReformatter
+
+from benchmarks.contestants.rig import camera_files, nearest_places, pair_numbers, unit_m_of
+from benchmarks.workloads import Job, Wanted
+
+_RED_GREEN_BLUE: Final = (2, 0, 1)
+
+
+class Stream:
+    """The frames of one video, forwards; what the last one was converted to is kept."""
+
+    def __init__(self, path: Path, size: tuple[int, int]) -> None:
+        """Open a video whose pictures are wanted at (height, width); one thread decodes."""
+        self.container = av.open(str(path))
+        video = self.container.streams.video[0]
+        video.codec_context.thread_count = 1
+        self._decoded = self.container.decode(video)
+        self._at = -1
+        self._size = size
+        self._scaler = VideoReformatter()
+        self._kept: Any = None
+
+    def colours(self, index: int) -> list[np.ndarray]:
+        """Return the red, green and blue planes of a frame."""
+        if index != self._at:
+            frame, (height, width) = self._frame(index), self._size
+            shrinks = self._size != (frame.height, frame.width)
+            picture = self._scaler.reformat(
+                frame, width=width, height=height, format="gbrp", threads=1,
+                interpolation=Interpolation.AREA if shrinks else Interpolation.BICUBIC,
+            )  # fmt: skip
+            self._kept = [_plane(picture, number, "u1") for number in _RED_GREEN_BLUE]
+        return self._kept
+
+    def units(self, index: int) -> np.ndarray:
+        """Return the stored depth of a frame."""
+        if index != self._at:
+            stored = _plane(self._frame(index), 0, "<u2")
+            if stored.shape != self._size:
+                rows, columns = nearest_places(stored.shape, self._size)
+                stored = stored[rows].take(columns, axis=1)
+            self._kept = stored
+        return self._kept
+
+    def _frame(self, index: int) -> Any:
+        if index < self._at:
+            raise ValueError(f"frame {index} is asked for after frame {self._at}")
+        for _ in range(self._at, index):
+            frame = next(self._decoded)
+        self._at = index
+        return frame
+
+
+def _plane(frame: Any, number: int, dtype: str) -> np.ndarray:
+    """Return a plane of a frame as an array, without copying."""
+    held = frame.planes[number]
+    return np.frombuffer(held, dtype).reshape(held.height, -1)[:, : held.width]
+
+
+def samples(job: Job, scenes: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the samples of some scenes; the arrays are overwritten by the next one."""
+    workload = job.workload
+    height, width = size = workload.size or (job.material.size_px, job.material.size_px)
+    frames = len(job.wanted[0].frames)
+    arrays = {
+        name: np.empty((frames, 3, height, width), np.uint8)
+        if name in ("left", "right")
+        else np.empty((frames, 1, height, width), np.float32)
+        for name in ("left", "right", "disparity", "disparity_right")
+        if name in workload.fields
+    }
+    cut = slice(None) if workload.is_clip else 0
+    shown = {name: array[cut] for name, array in arrays.items()}
+    for key in scenes:
+        wanted = job.of_scene[key]
+        folder = job.tree / key
+        document = json.loads((folder / "baseline.json").read_text())
+        streams = {
+            name: Stream(folder / name, size)
+            for name in camera_files(wanted, both_ways=workload.both_ways)
+        }
+        depth = streams[f"cam_{wanted[0].left:02d}_depth.mkv"]
+        unit_m = unit_m_of(depth.container)
+        for sample in wanted:
+            pair = pair_numbers(document, left=sample.left, right=sample.right, width_px=width)
+            _fill(arrays, sample, streams, np.float32(pair.fx_px * pair.baseline_m / unit_m))
+            yield shown | {"wanted": sample}
+        for stream in streams.values():
+            stream.container.close()
+
+
+def _fill(
+    arrays: dict[str, np.ndarray], sample: Wanted, streams: dict[str, Stream], scale: np.float32
+) -> None:
+    views = {"left": sample.left, "right": sample.right}
+    maps = {"disparity": sample.left, "disparity_right": sample.right}
+    for place, index in enumerate(sample.frames):
+        for name, camera in views.items():
+            out = arrays[name][place]
+            colours = streams[f"cam_{camera:02d}_rgb.mp4"].colours(index)
+            for channel, plane in zip(out, colours, strict=True):
+                channel[...] = plane
+        for name, camera in maps.items():
+            if name in arrays:
+                units = streams[f"cam_{camera:02d}_depth.mkv"].units(index)
+                with np.errstate(divide="ignore"):
+                    np.divide(
+                        scale, units, out=arrays[name][place, 0], dtype=np.float32,
+                        casting="same_kind",
+                    )  # fmt: skip

@@ -1,0 +1,21 @@
+"""This package: the map-style dataset's loader, and the stream in torch's own `DataLoader`."""
+
+from pathlib import Path
+from typing import Any
+
+from torch.utils.data import DataLoader
+
+from benchmarks.workloads import SEED, Job
+from stereogenbench_data import StereoPairs, StereoPairStream
+
+
+def mapped(job: Job, data: str | Path, **options: Any) -> DataLoader[Any]:
+    """Return the loader of `StereoPairs`, its options the defaults."""
+    pairs = StereoPairs(data, **job.selection)
+    return pairs.loader(job.workload.batch, tail="uneven", seed=SEED, **options)
+
+
+def streamed(job: Job, data: str | Path, **options: Any) -> DataLoader[Any]:
+    """Return torch's `DataLoader` of a `StereoPairStream`, its options the defaults."""
+    stream = StereoPairStream(data, job.workload.batch, tail="uneven", **job.selection)
+    return DataLoader(stream, batch_size=job.workload.batch, **options)

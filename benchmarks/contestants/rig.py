@@ -1,0 +1,100 @@
+"""What a careful user of any library needs beside its decoder: a pair's numbers, and disparity."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+
+from benchmarks.workloads import Wanted
+
+NO_DEPTH: Final = (0, 65535)
+"""Stored numbers that mean "not measured"."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairNumbers:
+    """What turns stored depth into disparity: focal length and baseline of a pair."""
+
+    fx_px: float
+    baseline_m: float
+
+
+def camera_number(name: str | int) -> int:
+    """Return a camera's number from its name (or, in the older form, itself)."""
+    if isinstance(name, int):
+        return name
+    found = re.search(r"[Cc]am_?(\d+)$", name)
+    if found is None:
+        raise ValueError(f"cannot parse camera index from {name!r}")
+    return int(found[1])
+
+
+def pair_numbers(document: dict[str, Any], *, left: int, right: int, width_px: int) -> PairNumbers:
+    """Return a pair's numbers out of ``baseline.json``, for pictures of this width."""
+    intrinsics = document["camera_intrinsics"]
+    fx_px = intrinsics["focal_length_mm"] / intrinsics["sensor_width_mm"] * width_px
+    for entry in document["pairwise_pairs"]:
+        if sorted((entry["camera_index_a"], entry["camera_index_b"])) == [left, right]:
+            return PairNumbers(fx_px, entry["baseline_cm"] / 100)
+    raise KeyError((left, right))
+
+
+def unit_m_of(container: Any) -> float:
+    """Return the metres in a stored unit, as a depth video's tags tell."""
+    tags = container.metadata | container.streams.video[0].metadata
+    return float(next((tags[key] for key in tags if "scale" in key.lower()), 0.1))
+
+
+def camera_files(wanted: Iterable[Wanted], *, both_ways: bool) -> list[str]:
+    """Return the names of the videos that samples are made from."""
+    names = set()
+    for sample in wanted:
+        names |= {f"cam_{camera:02d}_rgb.mp4" for camera in (sample.left, sample.right)}
+        names |= {f"cam_{sample.left:02d}_depth.mkv"}
+        names |= {f"cam_{sample.right:02d}_depth.mkv"} if both_ways else set()
+    return sorted(names)
+
+
+@cache
+def nearest_places(found: tuple[int, ...], size: tuple[int, int]) -> list[np.ndarray]:
+    """Return the rows and columns that a map at (height, width) takes: nearest pixel centres."""
+    return [
+        ((np.arange(wanted) + 0.5) * there / wanted).astype(np.intp)
+        for wanted, there in zip(size, found, strict=True)
+    ]
+
+
+def disparity_px(
+    units: np.ndarray, pair: PairNumbers, *, unit_m: float, size: tuple[int, int] | None
+) -> np.ndarray:
+    """Return B fx / z as float32 (1, h, w), 0 where depth was not measured."""
+    if size is not None:
+        rows, columns = nearest_places(units.shape, size)
+        units = units[rows].take(columns, axis=1)
+    measured = (units != NO_DEPTH[0]) & (units != NO_DEPTH[1])
+    scale = np.float32(pair.fx_px * pair.baseline_m / unit_m)
+    return np.where(measured, scale / np.maximum(units, 1).astype(np.float32), np.float32(0))[None]
+
+
+def sample_of(
+    wanted: Wanted, pair: PairNumbers, pictures: dict[str, list[np.ndarray]], *, clip: bool
+) -> dict[str, Any]:
+    """Return a sample as a dict that torch's own collate takes.
+
+    Args:
+        wanted: Which sample.
+        pair: Its numbers.
+        pictures: left, right, disparity (and disparity_right), one array a frame.
+        clip: Whether a sample has a time axis.
+    """
+    arrays = {name: np.stack(found) if clip else found[0] for name, found in pictures.items()}
+    frames = np.array(wanted.frames, dtype=np.int64)
+    return arrays | {
+        "baseline_m": np.float64(pair.baseline_m),
+        "frame_index": frames if clip else frames[0],
+        "pair": np.array([wanted.left, wanted.right], dtype=np.int64),
+        "scene": wanted.scene,
+    }

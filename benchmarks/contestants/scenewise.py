@@ -1,0 +1,157 @@
+"""Plain webdataset and Hugging Face datasets: whole scenes from shards, with a decode step.
+
+A scene is one sample of a shard. The decode step decodes each needed video of it once, from
+memory, and gives the scene's pairs one after another. So frames of one scene follow each other:
+shuffling them over scenes would take a buffer of many scenes' samples.
+"""
+
+import io
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import av
+import numpy as np
+from torch.utils.data import IterableDataset
+
+from benchmarks.contestants.rig import (
+    camera_files,
+    disparity_px,
+    pair_numbers,
+    sample_of,
+    unit_m_of,
+)
+from benchmarks.workloads import Job, Wanted
+from stereogenbench_data.storage.index import SceneIndex
+
+
+def urls(job: Job) -> list[str]:
+    """Return where the shards of the workload's scenes are, as far as they are packed.
+
+    A workload of more scenes than are packed is read in part: each scene costs the same here.
+    """
+    index = SceneIndex.open(job.material.shards)
+    shards = {
+        str(index.column("key")[row]): index.scene(row).members["baseline.json"].path
+        for row in range(len(index))
+    }
+    names = list(dict.fromkeys(shards[key] for key in job.keys if key in shards))
+    folder = job.url or str(job.material.shards)
+    return [f"{folder}/{name}" for name in names]
+
+
+def decoded(job: Job, key: str, files: dict[str, bytes]) -> Iterator[dict[str, Any]]:
+    """Yield a scene's samples: the decode step."""
+    workload = job.workload
+    wanted = job.of_scene.get(key)
+    if not wanted:  # another scene of a shard that holds several
+        return
+    text: Any = files["baseline.json"]
+    document = text if isinstance(text, dict) else json.loads(text)  # datasets parses by itself
+    names = camera_files(wanted, both_ways=workload.both_ways)
+    moments: dict[tuple[int, ...], list[Wanted]] = {}
+    for sample in wanted:
+        moments.setdefault(sample.frames, []).append(sample)
+    last = max(frames[-1] for frames in moments)
+    containers = {name: av.open(io.BytesIO(files[name])) for name in names}
+    for container in containers.values():
+        container.streams.video[0].codec_context.thread_count = 1
+    videos = {name: container.decode(video=0) for name, container in containers.items()}
+    recent: dict[int, dict[str, Any]] = {}
+    for index in range(last + 1):
+        recent[index] = {name: next(video) for name, video in videos.items()}
+        for frames in [frames for frames in moments if frames[-1] == index]:
+            arrays = {number: _arrays(recent[number], workload.size) for number in frames}
+            for sample in moments[frames]:
+                yield _sample(job, sample, arrays, document, containers)
+        earliest = min((frames[0] for frames in moments if frames[-1] > index), default=index)
+        for number in [number for number in recent if number < earliest]:
+            del recent[number]
+    for container in containers.values():
+        container.close()
+
+
+def _arrays(frames: dict[str, Any], size: tuple[int, int] | None) -> dict[str, np.ndarray]:
+    """Return pictures (3, h, w) and stored depth (h, w) of one moment."""
+    scaled = {} if size is None else {"height": size[0], "width": size[1], "interpolation": "AREA"}
+    return {
+        name: frame.to_ndarray()
+        if name.endswith(".mkv")
+        else frame.to_ndarray(format="rgb24", **scaled).transpose(2, 0, 1)
+        for name, frame in frames.items()
+    }
+
+
+def _sample(
+    job: Job,
+    wanted: Wanted,
+    arrays: dict[int, dict[str, np.ndarray]],
+    document: dict[str, Any],
+    containers: dict[str, Any],
+) -> dict[str, Any]:
+    workload = job.workload
+    width_px = (workload.size or (0, document["image_width"]))[1]
+    pair = pair_numbers(document, left=wanted.left, right=wanted.right, width_px=width_px)
+    pictures: dict[str, list[np.ndarray]] = {}
+    for index in wanted.frames:
+        for name, camera in (("left", wanted.left), ("right", wanted.right)):
+            pictures.setdefault(name, []).append(arrays[index][f"cam_{camera:02d}_rgb.mp4"])
+        for name, camera in (("disparity", wanted.left), ("disparity_right", wanted.right)):
+            if name in workload.fields:
+                depth = f"cam_{camera:02d}_depth.mkv"
+                found = disparity_px(
+                    arrays[index][depth], pair, unit_m=unit_m_of(containers[depth]),
+                    size=workload.size,
+                )  # fmt: skip
+                pictures.setdefault(name, []).append(found)
+    return sample_of(wanted, pair, pictures, clip=workload.is_clip)
+
+
+class DecodedScenes(IterableDataset[dict[str, Any]]):
+    """A stream of scenes' files, decoded."""
+
+    def __init__(self, job: Job, scenes: Callable[[], Any]) -> None:
+        """Take what makes an iterable of scenes; torch's workers share its shards out."""
+        self._job = job
+        self._scenes = scenes()
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """Yield samples."""
+        for scene in self._scenes:
+            yield from decoded(self._job, scene["__key__"], scene)
+
+
+def webdataset_samples(job: Job) -> IterableDataset[dict[str, Any]]:
+    """Return samples through plain webdataset."""
+    import webdataset
+
+    names = {"baseline.json", *camera_files(job.wanted, both_ways=job.workload.both_ways)}
+
+    def is_needed(member: str) -> bool:
+        return member.rsplit("/", 1)[-1].partition(".")[2] in names
+
+    return DecodedScenes(
+        job,
+        lambda: webdataset.WebDataset(
+            urls(job), shardshuffle=False, select_files=is_needed, empty_check=False
+        ),
+    )
+
+
+def hugging_face_samples(job: Job) -> IterableDataset[dict[str, Any]]:
+    """Return samples through Hugging Face datasets, streaming."""
+    from datasets import Features, Value, load_dataset
+
+    needed = camera_files(job.wanted, both_ways=job.workload.both_ways)
+    columns = {name: Value("binary") for name in ("baseline.json", *needed)}
+    features = Features({**columns, "__key__": Value("string"), "__url__": Value("string")})
+    return DecodedScenes(
+        job,
+        lambda: load_dataset(
+            "webdataset",
+            data_files={"train": urls(job)},
+            split="train",
+            streaming=True,
+            features=features,
+        ),
+    )

@@ -1,0 +1,177 @@
+"""How long scoring one scene takes, against decoding and resizing alone plus the matchers' time.
+
+Run by itself: ``python -m benchmarks.evaluation [--frames 81] [--size 1280] [--out FILE]``. It
+draws one scene, writes its right views as PNG predictions, scores them by the offline metrics at
+832x480 in one process, and prints JSON. Times are of the processor, so other work on the machine
+hardly shows.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import closing
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from stereogenbench_data.evaluation import scoring
+from stereogenbench_data.evaluation.candidates import PredictionFolder
+from stereogenbench_data.evaluation.evaluate import selected
+from stereogenbench_data.evaluation.one_thread import one_thread
+from stereogenbench_data.evaluation.predictions import frame_name, item_name
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
+from stereogenbench_data.evaluation.running import Extent
+from stereogenbench_data.samples.load import resized_nearest
+from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.schema.release import depth_name, rgb_name
+from stereogenbench_data.storage.source import MemberSource
+from stereogenbench_data.synthesis import SynthRequest, synthesise
+
+LIMIT = 3.0
+"""Scoring may take so many times the decoding, beside what the matchers take."""
+
+
+class Stopwatch:
+    """Adds up the processor's time that calls take."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def timed(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the call with its time added up."""
+
+        def timed_call(*arguments: Any, **options: Any) -> Any:
+            start = time.process_time()
+            try:
+                return call(*arguments, **options)
+            finally:
+                self.seconds += time.process_time() - start
+
+        return timed_call
+
+
+class TimedMatcher:
+    """A matcher whose calls are timed."""
+
+    def __init__(self, matcher: Any, watch: Stopwatch) -> None:
+        self.name, self.settings = matcher.name, matcher.settings
+        for name in ("detect", "match"):
+            if hasattr(matcher, name):
+                setattr(self, name, watch.timed(getattr(matcher, name)))
+        self._call = watch.timed(matcher) if callable(matcher) else None
+
+    def __call__(self, *views: Any) -> Any:
+        """Return what the stereo matcher answers."""
+        return self._call(*views) if self._call else None
+
+
+def measure(*, frames: int, size_px: int) -> dict[str, Any]:
+    """Return the times of one scene in seconds of the processor, and their ratio."""
+    with tempfile.TemporaryDirectory(prefix="stereogenbench-bench-") as temporary:
+        root, predictions = Path(temporary) / "scenes", Path(temporary) / "predictions"
+        request = SynthRequest(
+            family="Uniform", scenes=1, size_px=size_px, frames=frames, seed=5, split="eval"
+        )
+        synthesise(root, request, workers=os.cpu_count() or 1)
+        protocol = EvaluationProtocol()
+        extent = selected(root, protocol, inputs=(), options={})
+        _write_right_views(extent, predictions)
+        with one_thread():
+            _decode(extent, predictions)  # once unmeasured: files in memory, libraries loaded
+            decoding_s = _seconds(lambda: _decode(extent, predictions))
+            scoring_s, matchers_s = _score(extent, predictions, protocol)
+    return {
+        "what": "one scene scored by the offline metrics",
+        "frames": frames,
+        "stored_px": size_px,
+        "scored_at": "832x480",
+        "decoding_and_resizing_s": round(decoding_s, 3),
+        "matchers_s": round(matchers_s, 3),
+        "scoring_s": round(scoring_s, 3),
+        "beside_matchers_over_decoding": round((scoring_s - matchers_s) / decoding_s, 3),
+        "limit": LIMIT,
+        "versions": {
+            "python": sys.version.split()[0],
+            **{name: version(name) for name in ("stereogenbench-data", "numpy", "av", "torch")},
+        },
+    }
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    start = time.process_time()
+    work()
+    return time.process_time() - start
+
+
+def _write_right_views(extent: Extent, folder: Path) -> None:
+    ((wanted,),) = extent.wanted
+    scene = extent.index.scene(extent.rows[0])
+    target = folder / item_name(wanted.scene, wanted.pair)
+    target.mkdir(parents=True)
+    with closing(_streams(extent)) as streams:
+        for frame in wanted.frames:
+            view = streams.rgb(scene, rgb_name(wanted.pair[1]), frame, size=wanted.size)
+            picture = Image.fromarray(np.ascontiguousarray(view.transpose(1, 2, 0)))
+            picture.save(target / frame_name(frame), compress_level=1)
+
+
+def _streams(extent: Extent) -> Streams:
+    index = extent.index
+    return Streams(MemberSource(index.root, shards=index.shards, revision=index.digest))
+
+
+def _decode(extent: Extent, predictions: Path) -> None:
+    """Decode and resize all that scoring reads, and nothing else."""
+    ((wanted,),) = extent.wanted
+    scene = extent.index.scene(extent.rows[0])
+    encoding = DepthEncoding(unit_m=scene.depth_unit_m[0])
+    folder = predictions / item_name(wanted.scene, wanted.pair)
+    with closing(_streams(extent)) as streams:
+        for frame in wanted.frames:
+            for camera in wanted.pair:
+                streams.rgb(scene, rgb_name(camera), frame, size=wanted.size)
+                units = streams.depth_units(scene, depth_name(camera), frame, encoding=encoding)
+                resized_nearest(units, size=wanted.size)
+            with Image.open(folder / frame_name(frame)) as picture:
+                np.ascontiguousarray(np.asarray(picture).transpose(2, 0, 1))
+
+
+def _score(extent: Extent, predictions: Path, protocol: EvaluationProtocol) -> tuple[float, float]:
+    """Return how long scoring took, and its matchers."""
+    watch = Stopwatch()
+    tools = Tools(protocol)
+    tools.keypoint_matcher = TimedMatcher(tools.keypoint_matcher, watch)
+    tools.stereo_matcher = TimedMatcher(tools.stereo_matcher, watch)
+    work = scoring.SceneWork(
+        index=extent.index,
+        wanted=extent.wanted[0],
+        protocol=protocol,
+        candidates=(PredictionFolder("right views", predictions),),
+    )
+    seconds = _seconds(lambda: scoring.score_scene(work, lambda done: None, tools=tools))
+    return seconds, watch.seconds
+
+
+def main() -> None:
+    """Measure, print and, where asked to, write JSON."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=81)
+    parser.add_argument("--size", type=int, default=1280)
+    parser.add_argument("--out", type=Path)
+    arguments = parser.parse_args()
+    text = json.dumps(measure(frames=arguments.frames, size_px=arguments.size), indent=1)
+    sys.stdout.write(text + "\n")
+    if arguments.out is not None:
+        arguments.out.write_text(text + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

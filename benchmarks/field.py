@@ -1,0 +1,157 @@
+"""Who races: by name, what makes the batches, and which slice of a workload it loads."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, Final
+
+from torch.utils.data import DataLoader
+
+from benchmarks.contestants import naive, ours, random_access, scenewise
+from benchmarks.material import can_pack_blosc2
+from benchmarks.workloads import Job, Reading, Workload
+
+LIMIT: Final = "limit"
+NAIVE: Final = "naive"
+OURS: Final = "ours"
+
+
+@dataclass(frozen=True, slots=True)
+class Contestant:
+    """One contestant.
+
+    Attributes:
+        name: Its name in results.
+        title: What tables call it.
+        reading: Which slice it loads.
+        batches: Returns the `DataLoader` for a job, with the options given to it.
+        module: What must be importable, if anything beside the package is.
+    """
+
+    name: str
+    title: str
+    reading: Reading
+    batches: Callable[..., DataLoader[Any]]
+    module: str | None = None
+
+
+def _anywhere(dataset: Callable[[Job], Any]) -> Callable[..., DataLoader[Any]]:
+    """Return what loads single samples: each is independent of the others."""
+    return lambda job, **options: DataLoader(dataset(job), batch_size=1, **options)
+
+
+def _forwards(dataset: Callable[[Job], Any]) -> Callable[..., DataLoader[Any]]:
+    return lambda job, **options: DataLoader(dataset(job), batch_size=job.workload.batch, **options)
+
+
+_TITLES: Final = {
+    LIMIT: "limit: bare PyAV loop",
+    NAIVE: "naive: the paper's snippet",
+    "webdataset": "webdataset + decode step",
+    "datasets": "HF datasets streaming + decode step",
+    "torchcodec": "torchcodec RGB, PyAV depth",
+    "decord": "decord RGB, PyAV depth",
+    OURS: "ours, StereoPairs.loader",
+    "ours-stream": "ours, StereoPairStream",
+    "ours-shards": "ours, from shards",
+    "ours-blosc2": "ours, from blosc2 shards",
+    "ours-web": "ours, shards by HTTP",
+    "ours-web-blosc2": "ours, blosc2 shards by HTTP",
+    "webdataset-web": "webdataset by HTTP",
+    "datasets-web": "HF datasets by HTTP",
+}
+
+_CONTESTANTS: Final = (
+    Contestant(NAIVE, _TITLES[NAIVE], "anywhere", _anywhere(naive.NaivePairs)),
+    Contestant(
+        "webdataset", _TITLES["webdataset"], "forwards",
+        _forwards(scenewise.webdataset_samples), "webdataset",
+    ),
+    Contestant(
+        "datasets", _TITLES["datasets"], "forwards",
+        _forwards(scenewise.hugging_face_samples), "datasets",
+    ),
+    Contestant(
+        "torchcodec", _TITLES["torchcodec"], "anywhere",
+        _anywhere(lambda job: random_access.KeptOpenPairs(job, random_access.TorchcodecVideo)),
+        "torchcodec",
+    ),
+    Contestant(
+        "decord", _TITLES["decord"], "anywhere",
+        _anywhere(lambda job: random_access.KeptOpenPairs(job, random_access.DecordVideo)),
+        "decord",
+    ),
+    Contestant(
+        OURS, _TITLES[OURS], "forwards", lambda job, **o: ours.mapped(job, job.tree, **o)
+    ),
+    Contestant(
+        "ours-stream", _TITLES["ours-stream"], "forwards",
+        lambda job, **o: ours.streamed(job, job.tree, **o),
+    ),
+    Contestant(
+        "ours-shards", _TITLES["ours-shards"], "forwards",
+        lambda job, **o: ours.mapped(job, job.material.shards, **o),
+    ),
+    Contestant(
+        "ours-blosc2", _TITLES["ours-blosc2"], "forwards",
+        lambda job, **o: ours.mapped(job, job.material.blosc2, **o), "blosc2",
+    ),
+    Contestant(
+        "ours-web", _TITLES["ours-web"], "forwards",
+        lambda job, **o: ours.mapped(job, f"{job.url}/shards", **o),
+    ),
+    Contestant(
+        "ours-web-blosc2", _TITLES["ours-web-blosc2"], "forwards",
+        lambda job, **o: ours.mapped(job, f"{job.url}/blosc2", **o), "blosc2",
+    ),
+    Contestant(
+        "webdataset-web", _TITLES["webdataset-web"], "forwards",
+        _forwards(scenewise.webdataset_samples), "webdataset",
+    ),
+    Contestant(
+        "datasets-web", _TITLES["datasets-web"], "forwards",
+        _forwards(scenewise.hugging_face_samples), "datasets",
+    ),
+)  # fmt: skip
+CONTESTANTS: Final = {contestant.name: contestant for contestant in _CONTESTANTS}
+
+
+def title(name: str) -> str:
+    """Return what tables call a contestant."""
+    return _TITLES[name]
+
+
+def why_not(name: str) -> str | None:
+    """Return why a contestant cannot race here, None where it can."""
+    if "blosc2" in name and not can_pack_blosc2():
+        return "this version does not pack depth as blosc2 frames"
+    contestant = CONTESTANTS.get(name)
+    if contestant is None or contestant.module is None:
+        return None
+    try:
+        import_module(contestant.module)
+    except (ImportError, RuntimeError, OSError) as error:
+        return f"{contestant.module} cannot be imported: {str(error).splitlines()[0]}"
+    return None
+
+
+def entrants(workload: Workload) -> list[tuple[str, int]]:
+    """Return who races over a workload: names, each with a number of worker processes.
+
+    The first number of workers is the headline: everybody races under it. Under the others the
+    limit and ours race; on the main workload the naive loader too.
+    """
+    headline = workload.workers[0]
+    if workload.source == "web":
+        names = ["limit", "ours", "ours-web", "ours-web-blosc2", "webdataset-web", "datasets-web"]
+        return [(name, headline) for name in names]
+    names = [
+        LIMIT, OURS, "ours-stream", NAIVE, "webdataset", "datasets", "torchcodec", "decord",
+        *workload.more,
+    ]  # fmt: skip
+    found = [(name, headline) for name in names]
+    for workers in workload.workers[1:]:
+        found += [(name, workers) for name in (LIMIT, OURS)]
+        if workload.name == "all-frames":
+            found.append((NAIVE, workers))
+    return found

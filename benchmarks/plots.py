@@ -1,0 +1,260 @@
+"""The pictures of the results, from the JSON file."""
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, OURS, title
+from benchmarks.results import Spread, entry, rates, ratios
+from benchmarks.workloads import WORKLOADS, Workload
+
+_INK: Final = "#222222"
+_OURS: Final = "#0b6e99"
+_OTHERS: Final = "#b8b8b8"
+_TARGET: Final = "#c0392b"
+
+
+def plot_all(sections: dict[str, Any], folder: Path) -> list[Path]:
+    """Write a picture of every section at hand; return their paths.
+
+    Raises:
+        ImportError: If matplotlib is not installed.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    mpl.rcParams.update(
+        {
+            "font.size": 10, "axes.spines.top": False, "axes.spines.right": False,
+            "axes.edgecolor": _INK, "axes.titlesize": 11, "axes.titleweight": "bold",
+            "axes.titlelocation": "left", "figure.dpi": 130, "savefig.bbox": "tight",
+        }
+    )  # fmt: skip
+    races = sections.get("races", {})
+    local = [w for w in WORKLOADS if w.name in races and w.source == "local"]
+    web = [w for w in WORKLOADS if w.name in races and w.source == "web"]
+    made = []
+    for name, wanted, make in (
+        ("contestants", local, lambda: _contestants(races, local)),
+        ("workers", "all-frames" in races, lambda: _workers(races["all-frames"])),
+        ("web", web, lambda: _web(races, web)),
+        ("accuracy", "accuracy" in sections, lambda: _accuracy(sections["accuracy"])),
+        ("profile", "profile" in sections, lambda: _profile(sections["profile"])),
+        ("memory", "memory" in sections, lambda: _memory(sections["memory"])),
+    ):
+        if wanted:
+            path = folder / f"{name}.png"
+            _save(make(), path)
+            made.append(path)
+    return made
+
+
+def _save(figure: Any, path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    figure.savefig(path, metadata={"Software": None})
+    plt.close(figure)
+
+
+def _colour(name: str) -> str:
+    return _OURS if name.startswith(OURS) else _OTHERS
+
+
+def _bars(axes: Any, names: list[str], spreads: list[Spread], *, form: str) -> None:
+    """Draw horizontal bars of medians with quartiles, each with its number."""
+    places = np.arange(len(names))[::-1]
+    middle = np.array([spread.median for spread in spreads])
+    low = middle - [spread.low for spread in spreads]
+    high = np.array([spread.high for spread in spreads]) - middle
+    axes.barh(places, middle, color=[_colour(name) for name in names], height=0.7)
+    axes.errorbar(middle, places, xerr=[low, high], fmt="none", ecolor=_INK, elinewidth=1)
+    for place, spread in zip(places, spreads, strict=True):
+        axes.annotate(
+            f" {spread.median:{form}}", (spread.high, place), va="center", fontsize=8, color=_INK
+        )
+    axes.set_yticks(places, [title(name) for name in names], fontsize=8)
+    axes.margins(x=0.15)
+
+
+def _contestants(races: dict[str, Any], workloads: list[Workload]) -> Any:
+    import matplotlib.pyplot as plt
+
+    rows = -(-len(workloads) // 2)
+    figure, grid = plt.subplots(rows, 2, figsize=(12.5, 3.3 * rows), squeeze=False)
+    for axes in grid.flat[len(workloads) :]:
+        axes.set_visible(False)
+    for axes, workload in zip(grid.flat, workloads, strict=False):
+        rounds, workers = races[workload.name]["rounds"], workload.workers[0]
+        found = {
+            name: ratios(rounds, entry(name, workers), to=entry(LIMIT, workers))
+            for name in (*CONTESTANTS,)
+        }
+        shown = {name: spread for name, spread in found.items() if spread is not None}
+        names = sorted(shown, key=lambda name: -shown[name].median)
+        _bars(axes, names, [shown[name] for name in names], form=".2f")
+        axes.axvline(1, color=_INK, linewidth=1)
+        if workload.target is not None:
+            axes.axvline(workload.target.limit, color=_TARGET, linewidth=1, linestyle="--")
+        axes.set_title(workload.title)
+        axes.set_xlabel("samples a second, as a share of the bare loop's", fontsize=8)
+    figure.suptitle(
+        "Speed against a bare decoding loop, as many processes each "
+        "(line: the loop; dashed: target for ours; bars: median, quartiles)",
+        x=0.01, ha="left", fontsize=10,
+    )  # fmt: skip
+    figure.tight_layout(rect=(0, 0, 1, 0.98))
+    return figure
+
+
+def _workers(race: dict[str, Any]) -> Any:
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6.5, 4))
+    workers = sorted({int(name.split("/")[1]) for found in race["rounds"] for name in found})
+    for name, colour, marker in ((LIMIT, _INK, "s"), (OURS, _OURS, "o"), (NAIVE, "#888888", "v")):
+        spreads = {count: rates(race["rounds"], entry(name, count)) for count in workers}
+        shown = {count: spread for count, spread in spreads.items() if spread is not None}
+        if not shown:
+            continue
+        middle = np.array([spread.median for spread in shown.values()])
+        low = middle - [spread.low for spread in shown.values()]
+        high = np.array([spread.high for spread in shown.values()]) - middle
+        places = [workers.index(count) for count in shown]
+        axes.errorbar(
+            places, middle, yerr=[low, high], color=colour, marker=marker, capsize=3,
+            label=title(name),
+        )  # fmt: skip
+    axes.set_xticks(range(len(workers)), [str(count) for count in workers])
+    axes.set_xlabel("worker processes (0: in the training process)")
+    axes.set_ylabel("samples a second")
+    axes.set_ylim(bottom=0)
+    axes.set_title(race["settings"]["title"])
+    axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _web(races: dict[str, Any], workloads: list[Workload]) -> Any:
+    import matplotlib.pyplot as plt
+
+    figure, grid = plt.subplots(
+        len(workloads), 2, figsize=(12.5, 2.3 * len(workloads)), squeeze=False
+    )
+    for (speed, traffic), workload in zip(grid, workloads, strict=True):
+        rounds, workers = races[workload.name]["rounds"], workload.workers[0]
+        names = [
+            name
+            for name in ("ours-web", "ours-web-blosc2", "webdataset-web", "datasets-web")
+            if rates(rounds, entry(name, workers)) is not None
+        ]
+        _bars(speed, names, [rates(rounds, entry(name, workers)) for name in names], form=".1f")
+        sent = [
+            Spread.of(
+                found[entry(name, workers)]["bytes"] / found[entry(name, workers)]["samples"] / 1e6
+                for found in rounds
+                if entry(name, workers) in found
+            )
+            for name in names
+        ]
+        _bars(traffic, names, sent, form=".2f")
+        traffic.set_yticks([])
+        speed.set_title(workload.title)
+        speed.set_xlabel("samples a second", fontsize=8)
+        traffic.set_xlabel("MB fetched a sample", fontsize=8)
+    figure.tight_layout()
+    return figure
+
+
+_MARKS: Final = {"default": ("o", _OURS), "offered": ("o", "#7fb8d1"), "not taken": ("X", _OTHERS)}
+_FLOOR_PX: Final = 1e-13
+
+
+def _accuracy(found: dict[str, Any]) -> Any:
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(11, 6))
+    ways = sorted(found["ways"], key=lambda way: way["worst_on_screen_px"])
+    for number, way in enumerate(ways):
+        ns = way["ns_a_pixel"]["median"]
+        marker, colour = _MARKS[way["offered"]]
+        worst, most = (
+            max(way[key], _FLOOR_PX) for key in ("worst_on_screen_px", "p999_on_screen_px")
+        )
+        axes.plot([ns, ns], [most, worst], color=colour, linewidth=1.5, zorder=2)
+        axes.scatter([ns], [worst], marker=marker, color=colour, s=55, zorder=3)
+        axes.scatter([ns], [most], marker="_", color=colour, s=80, zorder=3)
+        axes.annotate(
+            way["name"], (ns, worst), xytext=(1.03, (number + 0.5) / len(ways)),
+            textcoords="axes fraction", fontsize=8.5, va="center", annotation_clip=False,
+            arrowprops={
+                "arrowstyle": "-", "color": "#d0d0d0", "linewidth": 0.8, "relpos": (0, 0.5),
+            },
+        )  # fmt: skip
+    conversion = found["conversion_ns"]["median"]
+    axes.axvline(conversion, color=_INK, linestyle=":", linewidth=1, zorder=1)
+    axes.annotate(
+        "one conversion\nuint16 to float32", (conversion, 3e-12), xytext=(4, 0),
+        textcoords="offset points", fontsize=8,
+    )  # fmt: skip
+    ulp = float(np.spacing(np.float32(1279)))
+    axes.axhline(ulp, color=_TARGET, linestyle="--", linewidth=1, zorder=1)
+    axes.annotate(
+        "1 ulp of float32 below 1280 px", (0.02, ulp), xycoords=("axes fraction", "data"),
+        xytext=(0, 4), textcoords="offset points", fontsize=8, color=_TARGET,
+    )  # fmt: skip
+    for label, (marker, colour) in _MARKS.items():
+        axes.scatter([], [], marker=marker, color=colour, label=f"{label} in the package")
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.margins(x=0.12, y=0.08)
+    axes.set_xlabel("nanoseconds a pixel")
+    axes.set_ylabel("error in px, of disparities up to 1280 px\n(mark: worst; dash: 99.9 %)")
+    axes.set_title("Ways from stored depth to disparity: speed against error")
+    axes.legend(frameon=False, fontsize=8, loc="upper left")
+    return figure
+
+
+def _profile(profile: dict[str, Any]) -> Any:
+    import matplotlib.pyplot as plt
+
+    names = list(profile)
+    labels = list(profile[names[0]]["ms_a_sample"])
+    colours = plt.get_cmap("tab20")(np.linspace(0, 1, len(labels)))
+    figure, axes = plt.subplots(figsize=(11, 0.75 * len(names) + 2))
+    places = np.arange(len(names))[::-1]
+    left = np.zeros(len(names))
+    totals = np.array([sum(profile[name]["ms_a_sample"].values()) for name in names])
+    for label, colour in zip(labels, colours, strict=True):
+        shares = np.array([profile[name]["ms_a_sample"][label] for name in names]) / totals * 100
+        axes.barh(places, shares, left=left, color=colour, label=label, height=0.65)
+        for place, share, start in zip(places, shares, left, strict=True):
+            if share >= 4:
+                axes.text(start + share / 2, place, f"{share:.0f}", ha="center", va="center",
+                          fontsize=8)  # fmt: skip
+        left += shares
+    axes.set_yticks(
+        places,
+        [f"{name}\n{total:.1f} ms a sample" for name, total in zip(names, totals, strict=True)],
+        fontsize=8,
+    )
+    axes.set_xlabel("% of one worker's time")
+    axes.set_title("Where an epoch's time goes")
+    axes.legend(
+        frameon=False, fontsize=8, ncol=6, loc="upper left", bbox_to_anchor=(0, -0.9 / len(names))
+    )
+    return figure
+
+
+def _memory(memory: dict[str, Any]) -> Any:
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(8, 3.6))
+    axes.plot(memory["resident_mb"], color=_OURS, label="resident")
+    axes.plot(memory["private_mb"], color=_OTHERS, label="without shared memory")
+    axes.axhline(1500, color=_TARGET, linestyle="--", linewidth=1, label="target")
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel(f"batches of {memory['batch']}")
+    axes.set_ylabel("MB of the larger worker")
+    axes.set_title("A worker's memory: all pairs, all frames, default settings")
+    axes.legend(frameon=False, fontsize=8, loc="lower right")
+    return figure

@@ -1,0 +1,143 @@
+"""Races: rounds in which every entrant of a workload runs once, in turn, on the same samples."""
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import Any
+
+from benchmarks.clock import Measured, MeasurementError, measured
+from benchmarks.field import CONTESTANTS, entrants, why_not
+from benchmarks.material import Material
+from benchmarks.results import Results, entry
+from benchmarks.server import WebServer, serving
+from benchmarks.workloads import Job, Workload
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How a race is run.
+
+    Attributes:
+        rounds: How many rounds.
+        resume: Whether rounds that the results hold already, of the same settings, count.
+    """
+
+    rounds: int = 5
+    resume: bool = False
+
+
+class Clock:
+    """An estimate of the time left, from what each measurement took before."""
+
+    def __init__(self, results: Results, workloads: list[Workload], *, rounds: int) -> None:
+        """Take the durations that the results remember."""
+        self._took: dict[str, float] = dict(results.sections.get("took_s", {}))
+        self._results = results
+        self._left = {
+            f"{workload.name} {entry(*entrant)}": rounds
+            for workload in workloads
+            for entrant in entrants(workload)
+        }
+
+    def spent(self, what: str, seconds: float) -> None:
+        """Note what one measurement took."""
+        self._took[what] = seconds
+        self._results.sections["took_s"] = {k: round(v, 2) for k, v in self._took.items()}
+        self.skip(what)
+
+    def skip(self, what: str) -> None:
+        """Note that one measurement is not to come."""
+        self._left[what] = max(0, self._left.get(what, 0) - 1)
+
+    def left(self) -> str:
+        """Return the time left as m:ss, about."""
+        mean = sum(self._took.values()) / len(self._took) if self._took else 5.0
+        seconds = sum(count * self._took.get(what, mean) for what, count in self._left.items())
+        return f"{int(seconds // 60)}:{int(seconds % 60):02d}"
+
+
+def run_races(
+    workloads: list[Workload], material: Material, results: Results, *, plan: Plan, say: Say
+) -> None:
+    """Run the races of some workloads; results are written after every round."""
+    clock = Clock(results, workloads, rounds=plan.rounds)
+    with ExitStack() as stack:
+        server = None
+        if any(workload.source == "web" for workload in workloads):
+            home = material.root / "server"
+            server = stack.enter_context(serving(material.root, home=home))
+        for workload in workloads:
+            _race(workload, material, results, plan=plan, say=say, clock=clock, server=server)
+
+
+def _race(  # noqa: PLR0913 - one race's surroundings
+    workload: Workload,
+    material: Material,
+    results: Results,
+    *,
+    plan: Plan,
+    say: Say,
+    clock: Clock,
+    server: WebServer | None,
+) -> None:
+    job = Job(workload, material, url=server.url if server else None)
+    settings = {
+        "title": workload.title, "scenes": workload.scenes, "batch": workload.batch,
+        "few": workload.few, "workers": list(workload.workers), "samples": len(job.wanted),
+        "server": server.kind if server and workload.source == "web" else None,
+    }  # fmt: skip
+    section: dict[str, Any] = results.race(workload.name)
+    if not plan.resume or section["settings"] != settings:
+        section = {"settings": settings, "rounds": [], "failed": {}}
+    jobs = {"forwards": job, "anywhere": replace(job, reading="anywhere")}
+    field = []
+    for name, workers in entrants(workload):
+        reason = why_not(name)
+        if reason is None:
+            field.append((name, workers))
+        else:
+            section["failed"][name] = reason
+    for number in range(plan.rounds):
+        turn = number % max(1, len(field))
+        in_turn = field[turn:] + field[:turn]
+        if number < len(section["rounds"]):
+            for entrant in field:
+                clock.skip(f"{workload.name} {entry(*entrant)}")
+            continue
+        say(f"{workload.name}: round {number + 1} of {plan.rounds}, about {clock.left()} left")
+        found = {}
+        for name, workers in in_turn if number % 2 == 0 else in_turn[::-1]:
+            reading = CONTESTANTS[name].reading if name in CONTESTANTS else "forwards"
+            began = time.perf_counter()
+            sent = server.sent_bytes() if server else 0
+            try:
+                took = measured(name, addressed(jobs[reading], name), workers=workers)
+            except MeasurementError as error:
+                section["failed"][entry(name, workers)] = str(error)[-500:]
+                say(f"{workload.name}: {name} failed: {str(error)[-300:]}")
+                continue
+            finally:
+                clock.spent(f"{workload.name} {entry(name, workers)}", time.perf_counter() - began)
+            found[entry(name, workers)] = _noted(took)
+            if server and name.endswith(("-web", "-web-blosc2")):
+                found[entry(name, workers)]["bytes"] = server.sent_bytes() - sent
+        section["rounds"].append(found)
+        results.put_race(workload.name, section)
+
+
+def addressed(job: Job, name: str) -> Job:
+    """Return the job with the address under which this contestant finds its shards."""
+    if name.startswith("ours"):
+        return job
+    return replace(job, url=f"{job.url}/shards" if name.endswith("-web") else None)
+
+
+def _noted(took: Measured) -> dict[str, float]:
+    return {
+        "samples": took.samples,
+        "seconds": round(took.seconds, 4),
+        "cpu_s": round(took.cpu_s, 3),
+    }

@@ -1,0 +1,249 @@
+"""Starting and memory: imports, the command, a large index, the first batch, resuming, a worker."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from benchmarks.clock import in_a_fork
+from benchmarks.material import Material
+from benchmarks.results import Spread
+from benchmarks.workloads import WORKLOADS, Job
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.storage.index import SceneIndex
+
+Say = Callable[[str], None]
+
+IMPORTS: Final = {
+    "python alone": "pass",
+    "import numpy": "import numpy",
+    "import stereogenbench_data": "import stereogenbench_data",
+    "from stereogenbench_data import SceneIndex": "from stereogenbench_data import SceneIndex",
+    "import torch": "import torch",
+    "from stereogenbench_data import StereoPairs": "from stereogenbench_data import StereoPairs",
+}
+
+_FIRST_BATCH: Final = """
+import sys, time
+began = time.time()
+from pathlib import Path
+from benchmarks.material import Material
+from benchmarks.workloads import WORKLOADS, Job
+material = Material(Path(sys.argv[1]), size_px=int(sys.argv[2]), frames=int(sys.argv[3]))
+workload = next(workload for workload in WORKLOADS if workload.name == "first")
+job = Job(workload, material, reading="forwards")
+{choose}
+batch = next(iter(loader))
+print(time.time() - began)
+"""
+_CHOOSE: Final = {
+    "ours": "from benchmarks.contestants import ours\nloader = ours.mapped(job, job.tree)",
+    "naive": (
+        "from torch.utils.data import DataLoader\n"
+        "from benchmarks.contestants.naive import NaivePairs\n"
+        "job.wanted\n"
+        "began = time.time() - {torch_s}\n"
+        "loader = DataLoader(NaivePairs(job), batch_size=workload.batch)"
+    ),
+}
+
+
+def measure_start(material: Material, *, rounds: int, say: Say) -> dict[str, Any]:
+    """Return the section of the results on starting."""
+    say("start: imports and commands")
+    imports = {name: _python("-c", code, rounds=rounds) for name, code in IMPORTS.items()}
+    helps = {
+        " ".join(["stereogenbench", *words]): _python(
+            "-m", "stereogenbench_data.cli.main", *words, rounds=rounds
+        )
+        for words in (["--help"], ["index", "--help"], ["pack", "--help"])
+    }
+    torch_free = subprocess.run(
+        [sys.executable, "-c", "import sys, stereogenbench_data; sys.exit('torch' in sys.modules)"],
+        check=False,
+    )
+    say("start: index of 8,493 scenes")
+    index = [in_a_fork(lambda: _open_and_select(material)) for _ in range(rounds)]
+    say("start: first batch, cold")
+    first = _first_batches(material, rounds=rounds)
+    say("start: resuming at half an epoch")
+    resumed = [in_a_fork(lambda: _resume(material)) for _ in range(rounds)]
+    return {
+        "imports_s": imports,
+        "commands_s": helps,
+        "imports_torch": bool(torch_free.returncode),
+        "index_scenes": index[0]["scenes"],
+        "index_pairs": index[0]["pairs"],
+        "index_open_s": _spread(found["open_s"] for found in index),
+        "index_select_s": _spread(found["select_s"] for found in index),
+        "index_both_s": _spread(found["open_s"] + found["select_s"] for found in index),
+        "first_batch_s": {name: _spread(times) for name, times in first.items()},
+        "first_batch_ratio": _spread(
+            theirs / own for own, theirs in zip(first["ours"], first["naive"], strict=True)
+        ),
+        "start_s": _spread(found["start_s"] for found in resumed),
+        "resume_s": _spread(found["resume_s"] for found in resumed),
+        "seek_s": _spread(found["seek_s"] for found in resumed),
+        "epoch_from_start_s": _spread(found["rest_from_start_s"] for found in resumed),
+        "epoch_from_half_s": _spread(found["rest_from_half_s"] for found in resumed),
+        "rounds": rounds,
+    }
+
+
+def _spread(values: Any) -> dict[str, float]:
+    spread = Spread.of(values)
+    return {"median": spread.median, "low": spread.low, "high": spread.high}
+
+
+def _python(*words: str, rounds: int) -> dict[str, float]:
+    """Return how long a fresh interpreter takes, in seconds of wall time."""
+    times = []
+    for _ in range(rounds):
+        began = time.perf_counter()
+        subprocess.run([sys.executable, *words], check=True, capture_output=True)
+        times.append(time.perf_counter() - began)
+    return _spread(times)
+
+
+def _open_and_select(material: Material) -> dict[str, float]:
+    began = time.perf_counter()
+    index = SceneIndex.open(material.full_index)
+    opened = time.perf_counter()
+    pairs = StereoPairs(index, split="train", family="Uniform", pairs="all")
+    selected = time.perf_counter()
+    return {
+        "scenes": len(index), "pairs": len(pairs),
+        "open_s": opened - began, "select_s": selected - opened,
+    }  # fmt: skip
+
+
+def _first_batches(material: Material, *, rounds: int) -> dict[str, list[float]]:
+    """Return seconds from a fresh interpreter to its first batch, no file in the page cache.
+
+    Ours opens its index; the naive loader is given its list of scenes, and is charged for
+    importing torch and its own modules, not for making the list.
+    """
+    torch_s = min(
+        float(
+            _printed(
+                "import time; b = time.time(); import torch, av, numpy; print(time.time() - b)"
+            )
+        )
+        for _ in range(2)
+    )
+    times: dict[str, list[float]] = {name: [] for name in _CHOOSE}
+    for _ in range(rounds):
+        for name, choose in _CHOOSE.items():
+            forget_files(material.release)
+            code = _FIRST_BATCH.format(choose=choose.format(torch_s=torch_s))
+            words = (str(material.root), str(material.size_px), str(material.frames))
+            times[name].append(float(_printed(code, *words)))
+    return times
+
+
+def _printed(code: str, *words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], check=True, capture_output=True, text=True
+    )
+    return done.stdout
+
+
+def forget_files(folder: Path) -> None:
+    """Ask the system to drop a folder's files from its page cache."""
+    for path in folder.rglob("*"):
+        if path.is_file() and hasattr(os, "posix_fadvise"):
+            with path.open("rb") as file:
+                os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def _resume(material: Material) -> dict[str, float]:
+    """Return seconds to a first batch, at the start and resumed at half an epoch.
+
+    Of an epoch of eight scenes' primary pairs. ``seek_s`` is what loading the state took by itself.
+    ``rest_from_start_s`` and ``rest_from_half_s`` are the time that a batch takes on average over
+    the 16 batches from there on: resuming costs what it adds to these.
+    """
+    workload = next(workload for workload in WORKLOADS if workload.name == "all-frames")
+    job = Job(workload, material)
+    chosen = job.selection | {"frames": "all"}
+
+    def timed(state: dict[str, Any] | None) -> tuple[float, float, float]:
+        pairs = StereoPairs(job.tree, **chosen)
+        loader = pairs.loader(workload.batch, seed=0)
+        began = time.perf_counter()
+        if state is not None:
+            loader.load_state_dict(state)
+        loaded = time.perf_counter()
+        batches = iter(loader)
+        next(batches)
+        first = time.perf_counter()
+        count = sum(1 for _, _ in zip(range(16), batches, strict=False))
+        ended = time.perf_counter()
+        pairs.close()
+        return loaded - began, first - began, (ended - began) / (count + 1)
+
+    pairs = StereoPairs(job.tree, **chosen)
+    loader = pairs.loader(workload.batch, seed=0)
+    half = loader.batches.state_at(0, len(loader) // 2)
+    timed(None)  # whatever is done once a process
+    _, start_s, rest_from_start_s = timed(None)
+    seek_s, resume_s, rest_from_half_s = timed(half)
+    return {
+        "start_s": start_s, "resume_s": resume_s, "seek_s": seek_s,
+        "rest_from_start_s": rest_from_start_s, "rest_from_half_s": rest_from_half_s,
+    }  # fmt: skip
+
+
+def measure_memory(material: Material, *, batches: int, say: Say) -> dict[str, Any]:
+    """Return the section of the results on a worker's memory: all pairs, default settings."""
+    say(f"memory: {batches} batches")
+    return in_a_fork(lambda: _watch(material, batches=batches, say=say))
+
+
+def _watch(material: Material, *, batches: int, say: Say) -> dict[str, Any]:
+    workers, size = 2, 4
+    pairs = StereoPairs(material.many, pairs="all", frames="all")
+    loader = pairs.loader(size, num_workers=workers, seed=0)
+    megabytes: list[float] = []
+    private: list[float] = []
+    began = time.perf_counter()
+    iterator = iter(loader)
+    for number, _ in zip(range(batches), iterator, strict=False):
+        found = [_resident(pid) for pid in children(os.getpid())]
+        megabytes.append(max(total for total, _ in found))
+        private.append(max(own for _, own in found))
+        if number % 100 == 99:
+            seconds = (time.perf_counter() - began) / (number + 1) * (batches - number - 1)
+            say(f"memory: batch {number + 1}, {megabytes[-1]:.0f} MB, {seconds:.0f} s left")
+    quarter = max(1, len(megabytes) // 4)
+    third, last = megabytes[-2 * quarter : -quarter] or megabytes, megabytes[-quarter:]
+    growth_mb = float(np.mean(last) - np.mean(third)) / quarter * 1000
+    return {
+        "workers": workers, "batch": size, "batches": len(megabytes),
+        "open_scenes": loader.batches.rule.open_scenes, "lanes": loader.batches.rule.lanes,
+        "scenes": len(pairs.plan.scene_rows), "epoch_batches": len(loader),
+        "peak_mb": max(megabytes), "peak_private_mb": max(private),
+        "growth_mb_per_1000": growth_mb,
+        "resident_mb": [round(value, 1) for value in megabytes],
+        "private_mb": [round(value, 1) for value in private],
+    }  # fmt: skip
+
+
+def _resident(pid: int) -> tuple[float, float]:
+    """Return megabytes of a process: all that is resident, and without what is shared memory."""
+    found = {}
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        name, _, value = line.partition(":")
+        if name in ("VmRSS", "RssShmem"):
+            found[name] = int(value.split()[0]) / 1000
+    return found["VmRSS"], found["VmRSS"] - found["RssShmem"]
+
+
+def children(pid: int) -> list[int]:
+    """Return the processes that a process started."""
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]

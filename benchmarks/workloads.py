@@ -1,0 +1,217 @@
+"""What is raced over: which samples a workload has, and how large a slice each contestant loads.
+
+Whoever reads videos forwards (ours, the limit, scene-wise decoders) costs the same for every
+frame, so a slice is the first ``window`` frames of each scene. Whoever starts anew for every sample
+costs more the later a frame comes, so a slice is a random choice among *all* samples of the
+workload. Both are samples of the same workload.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from benchmarks.material import Material
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.storage.index import SceneIndex
+
+Reading = Literal["forwards", "anywhere"]
+
+SEED: Final = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """One sample: the scene's key, the two cameras, and its frames."""
+
+    scene: str
+    left: int
+    right: int
+    frames: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """What the ratios to the limit and to the naive loader are to reach."""
+
+    limit: float
+    naive: float
+
+
+@dataclass(frozen=True)
+class Workload:
+    """One workload.
+
+    Attributes:
+        name: Its short name, for ``--only``.
+        title: What tables call it.
+        scenes: How many scenes are open to it.
+        frames: `StereoPairs`'s ``frames``, for all of the workload.
+        window: The same for the slice of those that read forwards.
+        pairs: "primary" or "all".
+        size: (height, width) that pictures are scaled to; None for the stored size.
+        both_ways: Whether the right view's disparity is wanted too.
+        batch: Samples in a batch.
+        few: Samples in the slice of those that start anew for every sample.
+        workers: Worker processes, the first being the headline.
+        target: The ratios to reach, if any are stated.
+        blosc2: The ratio to reach from blosc2 shards, if one is stated.
+        more: Contestants that race over this workload beside the usual ones.
+        source: "local" files, or shards through the "web".
+    """
+
+    name: str
+    title: str
+    scenes: int
+    frames: Any
+    window: Any
+    pairs: Literal["primary", "all"] = "primary"
+    size: tuple[int, int] | None = None
+    both_ways: bool = False
+    batch: int = 2
+    few: int = 8
+    workers: tuple[int, ...] = (2, 0)
+    target: Target | None = None
+    blosc2: float | None = None
+    more: tuple[str, ...] = ()
+    source: Literal["local", "web"] = "local"
+
+    @property
+    def is_clip(self) -> bool:
+        """Whether samples have a time axis."""
+        return isinstance(self.frames, tuple) and self.frames[0] == "clips"
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields of a sample, in every contestant's."""
+        maps = ("disparity", "disparity_right") if self.both_ways else ("disparity",)
+        return ("left", "right", *maps, "baseline_m", "frame_index", "pair", "scene")
+
+
+WORKLOADS: Final = (
+    Workload(
+        "first", "primary pair, first frame, 1280", 48, "first", "first", few=16,
+        target=Target(0.85, 1.2),
+    ),
+    Workload(
+        "all-frames", "primary pair, all frames shuffled, 1280", 8, "all", range(24), few=8,
+        workers=(2, 0, 1, 4), target=Target(0.85, 15), blosc2=2.5,
+        more=("ours-shards", "ours-blosc2"),
+    ),
+    Workload(
+        "all-pairs", "all 15 pairs, all frames, both disparities, 1280", 4, "all", range(6),
+        pairs="all", both_ways=True, few=6, target=Target(0.75, 60),
+    ),
+    Workload(
+        "all-pairs-832", "all 15 pairs, all frames, both disparities, 832x480", 4, "all", range(8),
+        pairs="all", both_ways=True, size=(480, 832), few=6, target=Target(0.85, 60), blosc2=2.5,
+        more=("ours-blosc2",),
+    ),
+    Workload(
+        "clips", "16-frame clips, primary pair, 1280", 2, ("clips", 16, 1, 16),
+        ("clips", 16, 1, 16), batch=1, few=4, target=Target(0.85, 3),
+    ),
+    Workload(
+        "random", "random single frames, 8 a scene, 1280", 4, ("random", 8), ("random", 8), few=8,
+        workers=(2,), target=Target(0.7, 3), blosc2=3.0, more=("ours-blosc2",),
+    ),
+    Workload(
+        "web-first", "by HTTP: primary pair, first frame, 1280", 8, "first", "first",
+        workers=(2,), source="web",
+    ),
+    Workload(
+        "web-all-frames", "by HTTP: primary pair, all frames shuffled, 1280", 2, "all", "all",
+        batch=1, workers=(2,), source="web",
+    ),
+    Workload(
+        "web-random", "by HTTP: random single frames, 8 a scene, 1280", 4, ("random", 8),
+        ("random", 8), workers=(2,), source="web",
+    ),
+)  # fmt: skip
+
+
+def tiny(workload: Workload) -> Workload:
+    """Return a workload for tests: a few frames of a few scenes."""
+    short: dict[Any, Any] = {"clips": ("clips", 2, 1, 2), "random": ("random", 2)}
+    kind = workload.frames[0] if isinstance(workload.frames, tuple) else workload.frames
+    frames = short.get(kind, workload.frames)
+    return replace(
+        workload, scenes=min(workload.scenes, 2), few=2, frames=frames, workers=(0,), batch=1,
+        window=range(2) if isinstance(workload.window, range) else frames,
+        size=None if workload.size is None else (24, 40),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Job:
+    """A workload on the data at hand: what a contestant is given.
+
+    Attributes:
+        workload: What is raced over.
+        material: Where the data lie.
+        reading: Whether the slice is that of forward readers, or a random choice of all samples.
+        url: The shards' address, where they are to be read through the web.
+    """
+
+    workload: Workload
+    material: Material
+    reading: Reading = "forwards"
+    url: str | None = None
+
+    @cached_property
+    def tree(self) -> Path:
+        """The released folder that this workload reads."""
+        return self.material.many if self.workload.scenes > 8 else self.material.eight
+
+    @cached_property
+    def keys(self) -> list[str]:
+        """The keys of the workload's scenes, both families alike."""
+        keys = SceneIndex.open(self.tree).column("key").tolist()
+        half = len(keys) // 2
+        mixed = [key for both in zip(keys[:half], keys[half:], strict=True) for key in both]
+        return mixed[: self.workload.scenes]
+
+    @property
+    def selection(self) -> dict[str, Any]:
+        """What `StereoPairs` is asked for."""
+        workload = self.workload
+        frames = workload.window if self.reading == "forwards" else workload.frames
+        return {
+            "scenes": self.keys,
+            "pairs": workload.pairs,
+            "frames": list(frames) if isinstance(frames, range) else frames,
+            "size": workload.size,
+            "fields": workload.fields,
+            "seed": SEED,
+        }
+
+    @cached_property
+    def numbers(self) -> list[int]:
+        """The numbers of the slice's samples: in order for forward readers, else drawn from all."""
+        count = len(StereoPairs(self.tree, **self.selection))
+        if self.reading == "forwards":
+            return list(range(count))
+        drawn = np.random.default_rng(SEED).permutation(count)[: self.workload.few]
+        return [int(number) for number in drawn]
+
+    @cached_property
+    def wanted(self) -> list[Wanted]:
+        """The samples of the slice."""
+        pairs = StereoPairs(self.tree, **self.selection)
+        keys = pairs.index.column("key")
+        found = []
+        for number in self.numbers:
+            address = pairs.plan.locate(number, epoch=0)
+            (right,) = address.targets
+            found.append(Wanted(str(keys[address.row]), address.source, right, address.frames))
+        return found
+
+    @cached_property
+    def of_scene(self) -> dict[str, list[Wanted]]:
+        """The samples of each scene."""
+        scenes: dict[str, list[Wanted]] = {}
+        for wanted in self.wanted:
+            scenes.setdefault(wanted.scene, []).append(wanted)
+        return scenes

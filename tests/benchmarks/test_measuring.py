@@ -1,0 +1,169 @@
+"""What measures, run once on tiny data; what came out is written, tabled and drawn."""
+
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from benchmarks import accuracy, clock, profile, race, start, tables
+from benchmarks.__main__ import chosen, parse
+from benchmarks.plots import plot_all
+from benchmarks.results import Results, Spread, ratios
+from benchmarks.ways import WAYS
+from benchmarks.workloads import WORKLOADS, Job, tiny
+
+TINY = {workload.name: tiny(workload) for workload in WORKLOADS}
+
+
+@pytest.fixture(scope="module")
+def results(material, tmp_path_factory):
+    """Return results of one round of a race, and of all else that is measured in this process."""
+    found = Results(tmp_path_factory.mktemp("out") / "results.json")
+    found.put("machine", {"cores": 2, "cpu": "a processor", "versions": {"av": "18.1"}})
+    found.put("accuracy", accuracy.measure_accuracy(material, rounds=1, cases=6, say=str))
+    plan = race.Plan(rounds=1)
+    workloads = [TINY["all-frames"]]
+    race.run_races(workloads, material, found, plan=plan, say=str)
+    return found
+
+
+def test_a_round_holds_every_entrant_that_can_race(results):
+    section = results.race("all-frames")
+    (found,) = section["rounds"]
+
+    assert {"limit/0", "naive/0", "ours/0", "ours-stream/0", "webdataset/0"} <= found.keys()
+    assert all(run["samples"] > 0 and run["seconds"] > 0 for run in found.values())
+    assert not {"limit/0", "ours/0", "naive/0"} & section["failed"].keys()
+
+
+def test_rounds_that_are_there_are_not_run_again_when_resumed(results, material):
+    before = results.race("all-frames")["rounds"]
+    told = []
+
+    plan = race.Plan(rounds=1, resume=True)
+    race.run_races([TINY["all-frames"]], material, results, plan=plan, say=told.append)
+
+    assert told == []
+    assert results.race("all-frames")["rounds"] == before
+
+
+def test_the_limit_of_two_processes_counts_the_samples_of_both(material):
+    job = Job(TINY["all-frames"], material)
+
+    measured = clock.measured("limit", job, workers=2)
+
+    assert measured.samples == len(job.wanted) == 4
+
+
+def test_a_contestant_that_fails_says_so(material):
+    def fail():
+        raise ValueError("no such thing")
+
+    with pytest.raises(clock.MeasurementError, match="ValueError: no such thing"):
+        clock.in_a_fork(fail)
+
+
+def test_a_contestant_that_hangs_is_stopped():
+    with pytest.raises(clock.MeasurementError, match=r"took longer than 0\.05 s"):
+        clock.in_a_fork(lambda: time.sleep(60), longest_s=0.05)
+
+
+def test_every_way_has_an_error_and_a_speed(results):
+    ways = results.sections["accuracy"]["ways"]
+
+    assert [way["name"] for way in ways] == [way.name for way in WAYS]
+    assert all(way["ns_a_pixel"]["median"] > 0 for way in ways)
+
+
+def test_the_default_is_within_an_ulp_and_the_quantum_and_float16_is_not(results):
+    ways = {way["name"]: way for way in results.sections["accuracy"]["ways"]}
+    (default,) = [way for way in ways.values() if way["offered"] == "default"]
+
+    assert default["worst_ulps"] <= 1
+    assert default["worst_of_bound"] <= 1
+    assert ways["closed form stored as float16"]["worst_ulps"] > 100
+    assert ways["pose chain, all float32 (textbook)"]["worst_on_screen_px"] > 0.01
+
+
+def test_depth_that_is_averaged_belongs_to_no_surface(results):
+    shares = {way["name"]: way["invented_share"] for way in results.sections["accuracy"]["resized"]}
+
+    assert shares["nearest-exact, depth"] == 0
+    assert shares["bilinear, depth"] > 0
+
+
+def test_the_functions_that_the_profile_times_are_there():
+    assert clock.in_a_fork(lambda: profile.Spans().install()) == []
+
+
+def test_the_parts_of_a_profile_add_up_to_the_whole(material):
+    job = Job(TINY["all-frames"], material)
+
+    found = clock.in_a_fork(lambda: profile._profiled(job, job.tree))
+
+    assert found["ms"]["decoding depth"] > 0
+    assert found["ms"]["decoding colour"] > 0
+    assert found["ms"]["queueing"] > 0
+
+
+def test_starting_and_memory_are_measured(material):
+    index = start._open_and_select(material)
+    watched = clock.in_a_fork(lambda: start._watch(material, batches=2, say=str))
+
+    assert index["pairs"] == 15 * round(774 * material.scale)
+    assert watched["batches"] == 2
+    assert watched["peak_mb"] > 50
+
+
+def test_the_tables_and_the_plots_are_made_of_the_results(results, tmp_path):
+    text = tables.tables(results.sections)
+    made = plot_all(results.sections, tmp_path)
+
+    assert "primary pair, all frames shuffled" in text
+    assert "float32 closed form" in text
+    assert {path.name for path in made} == {"contestants.png", "workers.png", "accuracy.png"}
+    assert all(path.stat().st_size > 10_000 for path in made)
+
+
+def test_results_outlive_the_process(results):
+    again = Results(results.path)
+
+    assert again.sections == json.loads(json.dumps(results.sections))
+
+
+def test_a_ratio_is_taken_within_each_round():
+    rounds = [
+        {"a/2": {"samples": 10, "seconds": 1}, "b/2": {"samples": 10, "seconds": 2}},
+        {"a/2": {"samples": 10, "seconds": 4}, "b/2": {"samples": 10, "seconds": 16}},
+        {"a/2": {"samples": 10, "seconds": 1}},
+    ]
+
+    assert ratios(rounds, "a/2", to="b/2") == Spread(3.0, 2.5, 3.5, 2)
+
+
+def test_options_choose_workloads_and_workers():
+    workloads, others = chosen(parse(["--only", "clips", "--only", "memory", "--workers", "4,1"]))
+
+    assert [(workload.name, workload.workers) for workload in workloads] == [("clips", (4, 1))]
+    assert others == ["memory"]
+
+
+def test_the_command_is_said_to_need_a_checkout(tmp_path):
+    code = (
+        "import sys, pathlib, stereogenbench_data.cli.bench as bench; "
+        "bench.__file__ = '/nowhere/at/all/bench.py'; bench._checkout()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+
+    assert done.returncode == 1
+    assert "StorageError: benchmarks/: is neither in /nowhere" in done.stderr
+
+
+def test_the_spread_of_nothing_is_none():
+    assert Spread.of([]) is None
+    assert np.isclose(Spread.of([1, 2, 3, 4]).median, 2.5)
