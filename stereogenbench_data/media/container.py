@@ -154,11 +154,12 @@ def stream_facts(
         height_px=context.height,
         frames=frames,
         frame_rate_hz=float(stream.average_rate or 0),
-        tags=_merged_tags(container.metadata, stream.metadata),
+        tags=merged_tags(container.metadata, stream.metadata),
     )
 
 
-def _merged_tags(container: Mapping[str, str], stream: Mapping[str, str]) -> dict[str, str]:
+def merged_tags(container: Mapping[str, str], stream: Mapping[str, str]) -> dict[str, str]:
+    """Return the tags of a container and of its stream as `StreamFacts` has them."""
     tags = {key.lower(): value for key, value in container.items()}
     for key, value in stream.items():
         known = tags.setdefault(key.lower(), value)

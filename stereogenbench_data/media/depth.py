@@ -15,13 +15,17 @@ from jaxtyping import Bool, Float32, UInt16
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import planar_from_ray
-from stereogenbench_data.media.container import StreamFacts
+from stereogenbench_data.media.container import StreamFacts, VideoFile
+from stereogenbench_data.media.depth_frame_file import CODEC_NAME, PACKED_SUFFIX
+from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.planes import plane_numbers
 from stereogenbench_data.media.video import VideoReader
 from stereogenbench_data.schema.records import DepthEncoding, DepthRisk
 from stereogenbench_data.schema.release import DEFAULT_DEPTH_UNIT_M
 
-_LOSSLESS_CODECS: Final = frozenset({"ffv1", "ffvhuff", "huffyuv", "png", "rawvideo", "utvideo"})
+_LOSSLESS_CODECS: Final = frozenset(
+    {CODEC_NAME, "ffv1", "ffvhuff", "huffyuv", "png", "rawvideo", "utvideo"}
+)
 """Codecs that return what they were given, whatever their settings."""
 
 _NUMBER_FORMAT: Final = re.compile(
@@ -130,25 +134,43 @@ def _accepted_layout(
     return layout
 
 
+def open_depth(file: VideoFile, *, name: str, frames: int) -> VideoReader | DepthFrames:
+    """Open depth that must have so many frames: a video or, by its name, blosc2's frames of one.
+
+    Raises:
+        StorageError: If the file cannot be read.
+        MediaError: If it is not what its name says, or has another number of frames.
+        ExtraError: If blosc2 is needed and not installed.
+    """
+    reader = DepthFrames if name.endswith(PACKED_SUFFIX) else VideoReader
+    return reader(file, name=name, frames=frames)
+
+
 def read_depth_units(
-    reader: VideoReader, index: int, *, encoding: DepthEncoding
+    reader: VideoReader | DepthFrames, index: int, *, encoding: DepthEncoding
 ) -> UInt16[np.ndarray, "h w"]:
     """Return the numbers of a depth frame as they are stored, bit for bit.
 
     Args:
-        reader: An open depth video.
+        reader: An open depth video, or depth packed by blosc2.
         index: Which frame of the file, from 0; `depth_frame_index` tells which an RGB frame needs.
         encoding: The depth contract, which decides what streams are let in.
 
     Returns:
-        uint16 (h, w), in stored units.
+        uint16 (h, w), in stored units; read-only, of the decoded picture's own memory where that
+        holds them so.
 
     Raises:
         MediaError: If the stream is refused (see `require_depth_stream`) or does not decode.
     """
     facts = reader.facts
     layout = _accepted_layout(facts.codec, facts.pixel_format, encoding, name=reader.name)
-    return plane_numbers(reader.frame(index), 0, dtype=layout.dtype).astype(np.uint16)
+    if isinstance(reader, DepthFrames):
+        return reader.units(index)
+    numbers = plane_numbers(reader.frame(index), 0, dtype=layout.dtype)
+    units: UInt16[np.ndarray, "h w"] = numbers.astype(np.uint16, copy=False)
+    units.flags.writeable = False
+    return units
 
 
 def measured(

@@ -73,3 +73,12 @@ class Problems:
             lines.append(f"and {sum(map(len, list(self._paths.values())[_SHOWN:]))} more")
         head = "1 problem" if self._count == 1 else f"{self._count} problems"
         raise SchemaError(f"{self._where}: {head}:\n  " + "\n  ".join(lines))
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun.
+
+    >>> counted(1, "shard"), counted(0, "shard")
+    ('1 shard', '0 shards')
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

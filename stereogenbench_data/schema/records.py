@@ -14,7 +14,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.release import CAMERA_PAIRS, Split, Subset
+from stereogenbench_data.schema.release import (
+    CAMERA_PAIRS,
+    PACKED_DEPTH_NAMES,
+    VIDEO_FILES,
+    Split,
+    Subset,
+)
 
 RotationKind = Literal["rotator_deg", "quaternion_xyzw", "matrix"]
 DepthKind = Literal["planar", "ray"]
@@ -228,10 +234,12 @@ class Scene:
         depth_unit_m: Metres in a stored unit for each camera's depth, as tagged or by default.
         depth_unit_source: "tag", "default", or "unreadable" (contradictory tags, unit nan), for
             each camera.
-        depth_codec: FFmpeg's name of the codec of each camera's depth.
+        depth_codec: FFmpeg's name of the codec of each camera's depth, or "blosc2" for depth that
+            was packed so.
         depth_pixel_format: FFmpeg's name of the pixel format of each camera's depth.
         frames: Frames that every video and the trajectory have.
-        members: File name to the place of its bytes.
+        members: File name to the place of its bytes; depth that was packed by blosc2 stands under
+            its own name, which `held_name` tells.
     """
 
     id: SceneId
@@ -248,3 +256,12 @@ class Scene:
     depth_pixel_format: tuple[str, ...]
     valid_depth_ratio: float | None
     members: Mapping[str, Member] = field(hash=False)
+
+    def held_name(self, name: str) -> str:
+        """Return by what name ``members`` has one of the release's files: depth may be packed."""
+        return name if name in self.members else PACKED_DEPTH_NAMES.get(name, name)
+
+    @property
+    def held_videos(self) -> tuple[str, ...]:
+        """The names in ``members`` of the files of colour and depth that there are."""
+        return tuple(name for name in map(self.held_name, VIDEO_FILES) if name in self.members)

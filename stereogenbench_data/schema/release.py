@@ -99,6 +99,10 @@ def depth_name(camera: int) -> str:
 VIDEO_FILES: Final = tuple(
     name(camera) for name in (rgb_name, depth_name) for camera in range(CAMERA_COUNT)
 )
+PACKED_DEPTH_NAMES: Final = {
+    depth_name(camera): f"cam_{camera:02d}_depth.b2frame" for camera in range(CAMERA_COUNT)
+}
+"""What a camera's depth is called in shards where blosc2 packed it, by its released name."""
 
 
 def baseline_bin(baseline_cm: float) -> str:

@@ -5,6 +5,10 @@ and the member's place, size and checksum. It is written beside its place and mo
 no reader meets half of one; a lock lets one process fetch it while others wait. When the limit is
 reached, items that were not used for longest go. A reader keeps what it has opened even then: its
 open file stays whole until it is closed.
+
+A stored item bears a time of change that follows from its name. Whatever is written into it later
+changes that time: then its checksum decides whether it is still what was fetched. When it was used
+last is its time of access.
 """
 
 import errno
@@ -12,11 +16,12 @@ import hashlib
 import json
 import os
 import re
+import time
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.records import Member
@@ -34,7 +39,7 @@ _OWN_FILE: Final = re.compile(r"([0-9a-f]{64})\.(member|part)")
 _FULL: Final = 0.9
 """The share of the limit to which a full cache is emptied, so that not every item empties it."""
 
-_CHUNK: Final = 1024 * 1024
+_FIRST_STAMP_S: Final = 1_000_000_000
 
 
 class ShardCache:
@@ -53,11 +58,12 @@ class ShardCache:
             limit_bytes: The bytes that all members together may take.
 
         Raises:
-            StorageError: If the folder cannot be written, or what has the cache's name in it was
-                not made by one.
+            StorageError: If there is no folder or no limit, the folder holds shards or cannot be
+                written, or what has the cache's name in it was not made by one.
         """
-        if limit_bytes < 1:
-            raise StorageError(f"{folder}: a cache needs a limit above 0 bytes, got {limit_bytes}.")
+        if not str(folder):
+            raise StorageError("a cache needs a folder, got '': name one, such as 'cache/'.")
+        require_limit(limit_bytes, folder=folder)
         self.folder = Path(folder, FOLDER_NAME)
         self.limit_bytes = limit_bytes
         self._items = self.folder / "items"
@@ -95,12 +101,9 @@ class ShardCache:
             place = self._place(key)
             if member.crc32 is None or not place.is_file():
                 return False
-            with place.open("rb") as file:
-                crc32 = 0
-                while data := file.read(_CHUNK):
-                    crc32 = zlib.crc32(data, crc32)
-            if crc32 == member.crc32:
-                return False
+            with FileSlice(place, Member(key, 0, place.stat().st_size)) as file:
+                if file.crc32() == member.crc32:
+                    return False
             self._drop(place)
             return True
 
@@ -109,6 +112,12 @@ class ShardCache:
         return sum(size for _, size, _ in self._own_files())
 
     def _make(self) -> None:
+        shard = next(self.folder.parent.glob("*.tar"), None)
+        if shard is not None:
+            raise StorageError(
+                f"{self.folder.parent}: holds shards ({shard.name}), which are read where they "
+                f"are. A cache keeps what comes from a URL: give it a folder of its own."
+            )
         self.folder.mkdir(parents=True, exist_ok=True)
         tag = self.folder / _TAG
         names = sorted(each.name for each in self.folder.iterdir())
@@ -129,16 +138,23 @@ class ShardCache:
         self._locks.mkdir(exist_ok=True)
 
     def _find(self, key: str, member: Member) -> FileSlice | None:
-        """Return an item that is stored and has its size; it counts as used now."""
+        """Return an item that is stored and is what was fetched; it counts as used now."""
         place = self._place(key)
         try:
             found = FileSlice(place, Member(key, 0, member.size))
-            if found.file_size() == member.size:
-                os.utime(place)
-                return found
-            found.close()
         except FileNotFoundError:
-            pass
+            return None
+        except IsADirectoryError:
+            with suppress(FileNotFoundError):  # another process may have met it too
+                place.rename(place.with_suffix(f".not-a-member.{os.getpid()}"))
+            return None
+        status = found.status()
+        if status.st_size == member.size and (
+            status.st_mtime_ns == _stamp_ns(key) or found.crc32() == member.crc32
+        ):
+            _mark_used(place, key)
+            return found
+        found.close()
         return None
 
     def _fill(self, key: str, member: Member, *, remote: RemoteObject) -> FileSlice:
@@ -156,6 +172,7 @@ class ShardCache:
                     f"{crc32:08x}, and the index says {member.crc32:08x}, twice. The shard was "
                     f"damaged or replaced: use the index that was made with it."
                 )
+            _mark_used(part, key)
             # Opened before others may see it, for they may evict it at once.
             found = FileSlice(part, Member(key, 0, member.size))
             with self._locked("size"):
@@ -220,7 +237,7 @@ class ShardCache:
                         status = entry.stat(follow_symlinks=False)
                     except FileNotFoundError:
                         continue
-                    yield status.st_mtime_ns, status.st_size, Path(entry.path)
+                    yield status.st_atime_ns, status.st_size, Path(entry.path)
 
     def _place(self, key: str) -> Path:
         return self._items / f"{key}.member"
@@ -230,6 +247,32 @@ class ShardCache:
         path = self._locks / name
         with locked(path):
             yield path
+
+
+def require_limit(limit_bytes: Any, *, folder: str | Path) -> None:
+    """Refuse what is no number of bytes.
+
+    Raises:
+        StorageError: If it is not a whole number above 0.
+    """
+    whole = isinstance(limit_bytes, int) and not isinstance(limit_bytes, bool)
+    if not whole or limit_bytes < 1:
+        raise StorageError(
+            f"{folder}: a cache needs a limit in whole bytes above 0, got {limit_bytes!r}: give a "
+            f"number, such as limit_bytes=50_000_000_000."
+        )
+
+
+def _stamp_ns(key: str) -> int:
+    """Return an item's time of change: even seconds, which every file system can keep."""
+    return (_FIRST_STAMP_S + 2 * int(key[:6], 16)) * 1_000_000_000
+
+
+def _mark_used(path: Path, key: str) -> None:
+    """Set when an item was used last, and its own time of change."""
+    # Of another user's item neither can be set: it goes as if it had not been used.
+    with suppress(PermissionError):
+        os.utime(path, ns=(time.time_ns(), _stamp_ns(key)))
 
 
 def _key(member: Member, *, where: str, revision: str) -> str:

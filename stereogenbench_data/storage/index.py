@@ -12,12 +12,14 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.storage.digest import table_digest
+from stereogenbench_data.storage.filesystems import MissingObject
 from stereogenbench_data.storage.index_file import (
-    AGAIN,
+    made_again,
     read_index_file,
     require_sound,
     root_of,
@@ -32,12 +34,16 @@ from stereogenbench_data.storage.location import (
     split_name,
 )
 from stereogenbench_data.storage.remote import RemoteObject
+from stereogenbench_data.storage.remote_tree import find_remote_scenes
 from stereogenbench_data.storage.rows import SCHEMA, row_of, scene_of
 from stereogenbench_data.storage.walk import TreeReport, walk
 
 INDEX_NAME: Final = "index.parquet"
 MAX_INDEX_BYTES: Final = 256 * 2**20
 """The largest index that is fetched. One of 8,493 scenes has a few megabytes."""
+
+MOST_REMOTE_SCENES: Final = 64
+"""The most scenes behind a URL that are described when a tree without an index is opened."""
 
 _SHOWN: Final = 10
 
@@ -139,7 +145,7 @@ class SceneIndex:
         return index
 
     @classmethod
-    def _from_tree(cls, root: Path) -> "SceneIndex":
+    def _from_tree(cls, root: str | Path) -> "SceneIndex":
         # In this process: a script without `if __name__ == "__main__"` could start no others.
         report = walk(root, workers=1)
         if report.broken:
@@ -161,10 +167,16 @@ class SceneIndex:
     def _from_url(cls, url: str) -> "SceneIndex":
         """Fetch an index; its data lie beside it."""
         root, name = split_name(url)
-        if not name.endswith(".parquet"):
+        is_folder = not name.endswith(".parquet")
+        if is_folder:
             root, url = url.rstrip("/"), joined(url.rstrip("/"), INDEX_NAME)
         remote = RemoteObject(url)
-        size = remote.size()
+        try:
+            size = remote.size()
+        except MissingObject:
+            if not is_folder:
+                raise
+            return cls._from_remote_tree(root)
         if size > MAX_INDEX_BYTES:
             raise StorageError(
                 f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
@@ -175,13 +187,28 @@ class SceneIndex:
         return cls._checked(table, head, root=root, where=remote.where)
 
     @classmethod
+    def _from_remote_tree(cls, root: str) -> "SceneIndex":
+        """Walk a tree behind a URL, if it is small enough to be walked each time it is opened."""
+        found = find_remote_scenes(root)
+        if len(found.keys) > MOST_REMOTE_SCENES:
+            raise StorageError(
+                f"{shown(root)}: has no {INDEX_NAME}, and the headers of {len(found.keys)} scenes "
+                "are too many to be fetched each time. Index it once, or the part you need: "
+                f"`stereogenbench index {shown(root)} -o index.parquet --split eval`, and open "
+                "that file."
+            )
+        return cls._from_tree(root)
+
+    @classmethod
     def _checked(
         cls, table: pa.Table, head: Mapping[str, Any], *, root: str | Path, where: str
     ) -> "SceneIndex":
         """Return the index that a file's rows and its description of itself are."""
         index = cls(table, root=root, head=head)
         if index.digest != head.get("digest"):
-            raise StorageError(f"{where}: its rows are not those that were written. {AGAIN}")
+            raise StorageError(
+                f"{where}: its rows are not those that were written. {made_again(where)}"
+            )
         return index
 
     def write(self, path: str | Path) -> None:
@@ -237,12 +264,33 @@ class SceneIndex:
             self._columns[name] = _array(self._table.column(name).combine_chunks())
         return self._columns[name]
 
+    def video_counts(self) -> np.ndarray:
+        """Return how many videos each scene has, (n,) int64: fewer than 12 in a part of a release."""
+        lists = self._table.column("members").combine_chunks()
+        lists = lists.chunk(0) if isinstance(lists, pa.ChunkedArray) else lists
+        names = pc.struct_field(lists.flatten(), "name")
+        is_video = pc.starts_with(names, "cam_").to_numpy(zero_copy_only=False)
+        rows = pc.list_parent_indices(lists).to_numpy(zero_copy_only=False)
+        return np.bincount(rows[is_video], minlength=len(self))
+
     @property
     def digest(self) -> str:
         """A sha256 of the rows, the same wherever and by whatever version they were written."""
         if not self._digest:
             self._digest = table_digest(self._table)
         return self._digest
+
+    def parted(self) -> tuple[pa.Table, dict[str, Any]]:
+        """Return the rows, and all else that `of_parts` needs: for who shares the rows."""
+        rest = self.__getstate__()
+        return rest.pop("_table"), rest
+
+    @classmethod
+    def of_parts(cls, table: pa.Table, rest: Mapping[str, Any]) -> "SceneIndex":
+        """Return the index that was `parted`, over the same rows wherever they lie."""
+        index = cls.__new__(cls)
+        index.__dict__.update(rest, _table=table)
+        return index
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""

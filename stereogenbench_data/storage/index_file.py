@@ -20,11 +20,22 @@ from stereogenbench_data.storage.location import is_remote, local_path, shown
 from stereogenbench_data.storage.rows import SCHEMA
 from stereogenbench_data.storage.source import UNSAFE_PATH
 
-AGAIN: Final = "Run `stereogenbench index ROOT` again."
-"""What to do about an index that cannot be used."""
+_OF_RELEASE: Final = "Run `stereogenbench index ROOT` again."
+_OF_SHARDS: Final = (
+    "It is the index of shards: fetch it again or, where they were packed, run the same "
+    "`stereogenbench pack` again, which keeps finished shards."
+)
 
 _FORMAT: Final = 1
 _METADATA_KEY: Final = b"stereogenbench_data.index"
+
+
+def made_again(where: str) -> str:
+    """Return what to do about an index, found there, that cannot be used."""
+    if is_remote(where):
+        return "Fetch it again; if it is damaged there, too, tell who published it."
+    shards = local_path(where).parent.glob("*.tar")
+    return _OF_RELEASE if next(shards, None) is None else _OF_SHARDS
 
 
 def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Table, dict[str, Any]]:
@@ -44,7 +55,7 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise StorageError(
             f"{where}: is no Parquet file that can be read ({error}). It was cut short or is "
-            f"something else. {AGAIN}"
+            f"something else. {made_again(where)}"
         ) from error
     require_sound(table, where=where)
     return table, head
@@ -122,7 +133,7 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
     if head.get("format") != _FORMAT:
         raise StorageError(
             f"{where}: is an index of format {head.get('format')!r}, and this version of the "
-            f"package reads format {_FORMAT}. {AGAIN}"
+            f"package reads format {_FORMAT}. {made_again(where)}"
         )
     tables = [head.get("incomplete"), head.get("broken"), head.get("shards")]
     if (
@@ -130,7 +141,7 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
         or not isinstance(head.get("root"), str)
         or not all(map(_are_shard_facts, head["shards"].values()))
     ):
-        raise StorageError(f"{where}: its description of itself was altered. {AGAIN}")
+        raise StorageError(f"{where}: its description of itself was altered. {made_again(where)}")
     return head
 
 
@@ -150,19 +161,21 @@ def require_sound(table: pa.Table, *, where: str) -> None:
         ]
         raise StorageError(
             f"{where}: its columns are not those of an index (see {', '.join(odd) or 'order'}). "
-            f"{AGAIN}"
+            f"{made_again(where)}"
         )
     keys = table.column("key").to_pylist()
     for key, following in itertools.pairwise(keys):
         if key >= following:
-            raise StorageError(f"{where}: scene {following!r} is there twice or out of order.")
+            raise StorageError(
+                f"{where}: scene {following!r} is there twice or out of order. {made_again(where)}"
+            )
     members = pc.list_flatten(table.column("members"))
     for paths in (table.column("key"), pc.struct_field(members, "path")):
         unsafe = paths.filter(pc.match_substring_regex(paths, UNSAFE_PATH))
         if len(unsafe):
             raise StorageError(
                 f"{where}: {unsafe[0].as_py()!r} is no path inside the data's root. The index "
-                f"was altered. {AGAIN}"
+                f"was altered. {made_again(where)}"
             )
     for name, numbers, least in (
         ("frames", table.column("frames"), 1),
@@ -171,4 +184,4 @@ def require_sound(table: pa.Table, *, where: str) -> None:
     ):
         lowest = pc.min(numbers).as_py()
         if lowest is not None and lowest < least:
-            raise StorageError(f"{where}: {name} is {lowest}, below {least}. {AGAIN}")
+            raise StorageError(f"{where}: {name} is {lowest}, below {least}. {made_again(where)}")

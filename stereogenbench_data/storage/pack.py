@@ -4,35 +4,41 @@ Any number of processes on any number of machines may pack parts of one plan int
 need to agree on nothing but the plan, and that is a function of the release and the target size.
 """
 
-import json
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
 
 from stereogenbench_data.errors import ShardError
+from stereogenbench_data.media.depth_frame_file import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
+from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES
 from stereogenbench_data.storage.foreign_index import write_foreign_indexes
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
+from stereogenbench_data.storage.pack_folder import take_folder
 from stereogenbench_data.storage.pool import run_tasks
+from stereogenbench_data.storage.repack_check import require_same_rows, require_same_sources
+from stereogenbench_data.storage.shard_note import (
+    PackedShard,
+    ShardNote,
+    ShardTask,
+    find_packed,
+    read_note,
+)
 from stereogenbench_data.storage.shard_plan import (
     DEFAULT_SHARD_BYTES,
+    DepthCodec,
     PlannedShard,
     ShardPlan,
     plan_shards,
 )
-from stereogenbench_data.storage.shard_writer import (
-    UNFINISHED,
-    PackedShard,
-    ShardTask,
-    find_packed,
-    pack_task,
-)
-from stereogenbench_data.storage.unfinished import PARTS, write_whole
+from stereogenbench_data.storage.shard_writer import found_whole, pack_task
 
 Progress = Callable[[int, int], None]
 
-_PLAN_NOTE: Final = "plan.json"
+
+class OversizedSceneWarning(UserWarning):
+    """Some scenes alone exceed the size that shards were to have: the message says which."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +47,7 @@ class PackReport:
 
     Attributes:
         part: Names of the shards of this part, all of which are finished.
-        packed: Names of those that were not finished when this run began.
+        packed: Names of those that this run packed, and not another before it or beside it.
         missing: Names of the plan's shards that other parts have not finished yet.
         index: The index file; None while shards are missing.
     """
@@ -77,11 +83,12 @@ class PackJob:
         return [task for task in tasks if find_packed(task) is None]
 
 
-def pack(
+def pack(  # noqa: PLR0913 - each is an option of the command
     data: SceneIndex | str | Path,
     out: str | Path,
     *,
     target_bytes: int = DEFAULT_SHARD_BYTES,
+    depth_codec: DepthCodec = "released",
     part: tuple[int, int] = (1, 1),
     workers: int | None = None,
     progress: Progress | None = None,
@@ -94,7 +101,10 @@ def pack(
     Args:
         data: The release: its folder or index.
         out: Folder for the shards; made if need be.
-        target_bytes: The size that a shard does not exceed, unless one scene alone does.
+        target_bytes: The size that a shard does not exceed, unless one scene alone does; depth
+            that is packed anew counts with its released size.
+        depth_codec: "released" keeps depth as it is; "blosc2" packs it so that each frame stands
+            alone and decodes faster, bit for bit (extra ``blosc2``).
         part: (I, N): pack every N-th shard, from the I-th on; I is 1 to N.
         workers: Processes that pack at the same time; None is one a core.
         progress: Called now and then with the bytes packed of this part, and all there are.
@@ -104,32 +114,47 @@ def pack(
 
     Raises:
         StorageError: If the release cannot be read or scenes of it are broken, or a worker died.
-        ShardError: If a shard cannot be packed, or the folder holds anything else than this plan.
+        ShardError: If a shard cannot be packed, or the folder lies in the release, or it holds
+            anything else than this plan or shards that were packed from other files.
     """
-    job = prepare(data, out, target_bytes=target_bytes, part=part)
+    job = prepare(data, out, target_bytes=target_bytes, depth_codec=depth_codec, part=part)
     tasks = job.unfinished()
     after_bytes = packed_counter(job, tasks, progress)
-    for _ in run_tasks(pack_task, tasks, workers=workers, after_bytes=after_bytes):
-        pass
-    return finish(job, packed=[task.shard.name for task in tasks])
+    outcomes = run_tasks(pack_task, tasks, workers=workers, after_bytes=after_bytes)
+    return finish(job, packed=[each.shard.name for each in outcomes if each.work == "packed"])
 
 
 def prepare(
-    data: SceneIndex | str | Path, out: str | Path, *, target_bytes: int, part: tuple[int, int]
+    data: SceneIndex | str | Path,
+    out: str | Path,
+    *,
+    target_bytes: int,
+    part: tuple[int, int],
+    depth_codec: DepthCodec = "released",
 ) -> PackJob:
     """Make the plan and take the folder for it.
 
     Raises:
         StorageError: If the release cannot be read or scenes of it are broken.
-        ShardError: If the folder holds anything else than this plan, or there is no such part.
+        ShardError: If the folder lies in the release, holds anything else than this plan or
+            shards that were packed from other files; if no scene fits into a shard, or there is
+            no such part.
+        ExtraError: If the codec needs something that is not installed.
     """
     number, count = part
     if not 1 <= number <= count:
         raise ShardError(f"part {number}/{count}: a part is I/N with I from 1 to N, such as 1/4.")
     index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
-    job = PackJob(index, plan_shards(index, target_bytes), Path(out), part)
+    if depth_codec == "blosc2":
+        blosc2_module()
+    plan = plan_shards(index, target_bytes, depth_codec=depth_codec)
+    job = PackJob(index, plan, Path(out), part)
+    _require_fitting(job.plan)
     try:
-        _take_folder(job)
+        take_folder(job.plan, job.out)
+        for task, note in _noted(job):
+            require_same_sources(task, note)
+            require_same_rows(task, note)
     except OSError as error:
         if isinstance(error, ShardError):
             raise
@@ -140,26 +165,52 @@ def prepare(
     return job
 
 
+def _require_fitting(plan: ShardPlan) -> None:
+    """Warn of scenes that exceed the size of a shard; refuse a size that none fits into."""
+    above = plan.oversized
+    if not above:
+        return
+    sizes = {shard.size: shard.keys[0] for shard in above}
+    least, most = min(sizes), max(sizes)
+    if len(above) == len(plan.shards):
+        raise ShardError(
+            f"no scene fits into a shard of {plan.target_bytes} bytes: the smallest, "
+            f"{sizes[least]}, needs {least}. Choose a larger size of shards."
+        )
+    warnings.warn(
+        f"{len(above)} of {len(plan.shards)} shards exceed {plan.target_bytes} bytes, each by the "
+        f"one scene it holds: the largest, {sizes[most]}, needs {most}",
+        OversizedSceneWarning,
+        stacklevel=3,
+    )
+
+
 def finish(job: PackJob, *, packed: list[str]) -> PackReport:
     """Write the index, if all shards of the plan are there by now.
 
     Raises:
         StorageError: If the index cannot be written.
+        ShardError: If it would tell scenes otherwise than their shards do.
     """
-    done = {shard.name: find_packed(job.task(shard)) for shard in job.plan.shards}
+    done = {
+        task.shard.name: find_packed(task) or found_whole(task, lambda count: None)
+        for task in map(job.task, job.plan.shards)
+    }
     missing = tuple(name for name, found in done.items() if found is None)
     target = None if missing else job.out / INDEX_NAME
     if target is not None:
+        for task, note in _noted(job):
+            require_same_rows(task, note)
         shards = {name: found for name, found in done.items() if found is not None}
-        packed_index(job, shards).write(target)
-        write_foreign_indexes(job.plan, shards, out=job.out)
+        index = packed_index(job, shards)
+        index.write(target)
+        write_foreign_indexes(index, out=job.out)
     part = tuple(shard.name for shard in job.shards)
-    return PackReport(part, tuple(packed), missing, target)
+    return PackReport(part, tuple(name for name in part if name in packed), missing, target)
 
 
 def packed_index(job: PackJob, shards: dict[str, PackedShard]) -> SceneIndex:
     """Return the index of finished shards: the scenes of the release, at their new places."""
-    scenes = {scene.id.key: scene for scene in map(job.index.scene, range(len(job.index)))}
     facts = {
         shard.name: ShardFacts(
             size=shards[shard.name].size,
@@ -168,72 +219,29 @@ def packed_index(job: PackJob, shards: dict[str, PackedShard]) -> SceneIndex:
         )
         for shard in job.plan.shards
     }
-    moved = [
-        scene
-        for shard in job.plan.shards
-        for scene in _moved(shard, shards[shard.name], scenes=scenes)
-    ]
+    moved = [scene for shard in job.plan.shards for scene in _moved(shard, shards[shard.name])]
     return SceneIndex.from_scenes(moved, job.out, shards=facts)
 
 
-def _moved(
-    shard: PlannedShard, packed: PackedShard, *, scenes: dict[str, Scene]
-) -> Iterator[Scene]:
+def _moved(shard: PlannedShard, packed: PackedShard) -> Iterator[Scene]:
     places: dict[str, dict[str, Member]] = {key: {} for key in shard.keys}
-    for member, offset, crc32 in zip(shard.members, packed.offsets, packed.crc32s, strict=True):
+    placed = zip(packed.offsets, packed.sizes, packed.crc32s, strict=True)
+    for member, (offset, size, crc32) in zip(shard.members, placed, strict=True):
         key, _, name = member.name.partition(".")
-        places[key][name] = Member(shard.name, offset, member.size, crc32)
-    for key, members in places.items():
-        yield replace(scenes[key], members=members)
+        places[key][name] = Member(shard.name, offset, size, crc32)
+    for scene in shard.scenes:
+        members = places[scene.id.key]
+        is_packed = not members.keys().isdisjoint(PACKED_DEPTH_NAMES.values())
+        codec = (CODEC_NAME,) * CAMERA_COUNT if is_packed else scene.depth_codec
+        yield replace(scene, members=members, depth_codec=codec)
 
 
-def _take_folder(job: PackJob) -> None:
-    """Note the plan in the folder, or find it noted there; refuse what other plans left."""
-    note = job.out / PARTS / _PLAN_NOTE
-    told = {
-        "plan": job.plan.digest,
-        "target_bytes": job.plan.target_bytes,
-        "shards": len(job.plan.shards),
-    }
-    if job.out.resolve() == Path(job.plan.root).resolve():
-        raise ShardError(f"{job.out}: is the release itself. Pack into another folder.")
-    note.parent.mkdir(parents=True, exist_ok=True)
-    if not note.exists():
-        _require_no_shards(job)
-        write_whole(note, json.dumps(told).encode())
-    try:
-        found = json.loads(note.read_bytes())
-    except ValueError:
-        found = None
-    if found != told:
-        raise ShardError(
-            f"{note}: this folder was begun with another plan ({_brief(found)}, and this one is "
-            f"{_brief(told)}): the release or the size of the shards was another. Pack into an "
-            f"empty folder, or remove what is in {job.out}."
-        )
-    _require_no_shards(job, but=frozenset(shard.name for shard in job.plan.shards))
-
-
-def _brief(told: object) -> str:
-    if not isinstance(told, dict):
-        return "unreadable"
-    plan, size = str(told.get("plan"))[:12], told.get("target_bytes")
-    return f"{told.get('shards')} shards of {size} bytes, {plan}"
-
-
-def _require_no_shards(job: PackJob, *, but: frozenset[str] = frozenset()) -> None:
-    if not but and (job.out / INDEX_NAME).exists():
-        raise ShardError(
-            f"{job.out / INDEX_NAME}: is there, and was not packed here by this plan. Pack into "
-            f"an empty folder."
-        )
-    for path in sorted(job.out.iterdir()):
-        name = path.name.removesuffix(UNFINISHED)
-        if name.endswith(".tar") and name not in but:
-            raise ShardError(
-                f"{path}: is there, and is no shard of this plan. Move it away, or pack into an "
-                f"empty folder."
-            )
+def _noted(job: PackJob) -> Iterator[tuple[ShardTask, ShardNote]]:
+    """Yield every shard of the plan that is finished, of whatever part."""
+    for task in map(job.task, job.plan.shards):
+        note = read_note(task)
+        if note is not None and task.target.is_file():
+            yield task, note
 
 
 def packed_counter(

@@ -4,11 +4,13 @@ import errno
 import io
 import os
 import stat
+import zlib
+from abc import abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.records import Member
 
 FIRST_BLOCK: Final = 64 * 1024
@@ -60,15 +62,16 @@ class MemberFile(io.RawIOBase):
         self._position = stop
         return data
 
-    def readinto(self, buffer: bytearray | memoryview, /) -> int:  # type: ignore[override]
-        """Fill a buffer as far as there are bytes; return how many."""
-        data = self.read(len(buffer))
-        buffer[: len(data)] = data
+    def readinto(self, buffer: Any, /) -> int:
+        """Fill whatever has a buffer's interface as far as there are bytes; return how many."""
+        room = memoryview(buffer).cast("B")
+        data = self.read(len(room))
+        room[: len(data)] = data
         return len(data)
 
+    @abstractmethod
     def _bytes(self, start: int, stop: int) -> bytes:
         """Return the bytes from start to stop, which lie within the member."""
-        raise NotImplementedError
 
 
 class FileSlice(MemberFile):
@@ -85,9 +88,17 @@ class FileSlice(MemberFile):
         self._offset = member.offset
         self._file = io.FileIO(_regular_file(path), "rb")
 
-    def file_size(self) -> int:
-        """Return the bytes of the whole file that holds the member."""
-        return os.fstat(self._file.fileno()).st_size
+    def status(self) -> os.stat_result:
+        """Return what the operating system knows of the whole file that holds the member."""
+        return os.fstat(self._file.fileno())
+
+    def crc32(self) -> int:
+        """Return the crc32 of the member's bytes, having read them all."""
+        crc32 = 0
+        for start in range(0, self.size, LARGEST_BLOCK):
+            stop = min(start + LARGEST_BLOCK, self.size)
+            crc32 = zlib.crc32(self._bytes(start, stop), crc32)
+        return crc32
 
     def close(self) -> None:
         """Close the file."""
@@ -113,8 +124,10 @@ class FileSlice(MemberFile):
 
 def _regular_file(path: Path) -> Path:
     """Return a path that is a file; a pipe would be waited for when it is opened."""
-    if not stat.S_ISREG(path.stat().st_mode):
-        raise OSError(errno.EINVAL, "it is no regular file")
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode):
+        code = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
+        raise OSError(code, "it is no regular file")
     return path
 
 
@@ -123,14 +136,30 @@ class RangedFile(MemberFile):
 
     Blocks start small and double while reading goes on where one ended, so that a first frame
     costs little and a whole pass few requests. No byte is fetched twice in a pass forwards, and
-    none beyond the member.
+    none beyond the member. When the last of all its bytes comes, they are compared with their
+    checksum.
     """
 
-    def __init__(self, fetch: Callable[[int, int], bytes], *, size: int) -> None:
-        """Read through ``fetch(start, stop)``, which returns these bytes of the member."""
+    def __init__(
+        self,
+        fetch: Callable[[int, int], bytes],
+        *,
+        size: int,
+        name: str = "",
+        crc32: int | None = None,
+    ) -> None:
+        """Read through ``fetch(start, stop)``, which returns these bytes of the member.
+
+        Args:
+            fetch: What returns bytes of the member.
+            size: How many it has.
+            name: What messages call it.
+            crc32: Their checksum; None compares nothing.
+        """
         super().__init__(size)
         self._fetch = fetch
         self._blocks: list[tuple[int, bytes]] = []
+        self._checksum = None if crc32 is None else _Checksum(crc32, size=size, name=name)
         self.failure: StorageError | None = None
 
     def close(self) -> None:
@@ -160,6 +189,8 @@ class RangedFile(MemberFile):
             raise self.failure
         try:
             block = (start, self._fetch(start, end))
+            if self._checksum is not None:
+                self._checksum.add(*block)
         except StorageError as error:
             # Whoever reads may take an error for the end of the file and try again: tell it anew.
             self.failure = error
@@ -168,3 +199,52 @@ class RangedFile(MemberFile):
         while sum(len(data) for _, data in self._blocks) > KEPT_BYTES and len(self._blocks) > 1:
             self._blocks.pop(0)
         return block
+
+
+class _Checksum:
+    """The crc32 of a member whose parts come in nearly ascending order.
+
+    A part that lies ahead, such as an MP4 file's table at its end, waits for those before it. Where
+    too much would have to wait, as when single frames are read, nothing is compared.
+    """
+
+    def __init__(self, expected: int, *, size: int, name: str) -> None:
+        self._expected = expected
+        self._size = size
+        self._name = name
+        self._crc32 = 0
+        self._end = 0
+        self._ahead: dict[int, bytes] = {}
+
+    def add(self, start: int, data: bytes) -> None:
+        """Take note of a part; with the last one all are compared.
+
+        Raises:
+            ShardError: If they are not what was expected.
+        """
+        if self._end >= min(self._size, start + len(data)):
+            return
+        seen = max(0, self._end - start)
+        self._ahead[start + seen] = data[seen:]
+        while self._end in self._ahead:
+            following = self._ahead.pop(self._end)
+            self._crc32 = zlib.crc32(following, self._crc32)
+            self._end += len(following)
+        if sum(map(len, self._ahead.values())) > LARGEST_BLOCK:
+            self._end = self._size + 1
+            self._ahead.clear()
+        if self._end == self._size:
+            require_crc32(self._crc32, expected=self._expected, name=self._name)
+
+
+def require_crc32(found: int, *, expected: int | None, name: str) -> None:
+    """Refuse a member whose bytes are not those that were indexed.
+
+    Raises:
+        ShardError: If the checksum is another than the one expected; None expects any.
+    """
+    if expected not in (None, found):
+        raise ShardError(
+            f"{name}: has crc32 {found:08x}, and the index says {expected:08x}. It was damaged or "
+            f"replaced: fetch it again."
+        )

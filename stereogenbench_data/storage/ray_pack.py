@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from stereogenbench_data.errors import ShardError
+from stereogenbench_data.errors import ExtraError, ShardError
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.pack import (
     PackJob,
@@ -16,8 +16,9 @@ from stereogenbench_data.storage.pack import (
     packed_counter,
     prepare,
 )
-from stereogenbench_data.storage.shard_plan import DEFAULT_SHARD_BYTES
-from stereogenbench_data.storage.shard_writer import PackedShard, ShardTask, pack_task
+from stereogenbench_data.storage.shard_note import ShardTask
+from stereogenbench_data.storage.shard_plan import DEFAULT_SHARD_BYTES, DepthCodec
+from stereogenbench_data.storage.shard_writer import ShardOutcome, pack_task
 
 _CANCEL_S: Final = 30.0
 """How long to wait for tasks that are called off to remove what they began."""
@@ -28,6 +29,7 @@ def pack_on_ray(
     out: str | Path,
     *,
     target_bytes: int = DEFAULT_SHARD_BYTES,
+    depth_codec: DepthCodec = "released",
     part: tuple[int, int] = (1, 1),
     progress: Progress | None = None,
 ) -> PackReport:
@@ -39,7 +41,9 @@ def pack_on_ray(
     Args:
         data: The release: its folder or index.
         out: Folder for the shards, on storage that all nodes share.
-        target_bytes: The size that a shard does not exceed, unless one scene alone does.
+        target_bytes: The size that a shard does not exceed, unless one scene alone does; depth
+            that is packed anew counts with its released size.
+        depth_codec: "released" keeps depth as it is; "blosc2" packs it, on nodes that have it.
         part: (I, N): pack every N-th shard, from the I-th on.
         progress: Called after each shard with the bytes packed of this part, and all there are.
 
@@ -49,8 +53,8 @@ def pack_on_ray(
             or the folder holds anything else than this plan.
     """
     ray = _ray()
-    job = prepare(data, out, target_bytes=target_bytes, part=part)
     with _connected(ray):
+        job = prepare(data, out, target_bytes=target_bytes, depth_codec=depth_codec, part=part)
         packed = _packed(ray, job, progress)
     return finish(job, packed=packed)
 
@@ -88,36 +92,39 @@ def _packed(ray: Any, job: PackJob, progress: Progress | None) -> list[str]:
     after_bytes = packed_counter(job, tasks, progress)
     remote = ray.remote(max_retries=0)(_pack_quietly)
     running = {remote.remote(task): task for task in tasks}
+    packed = []
     try:
         while running:
             done, _ = ray.wait(list(running), num_returns=1)
             for reference in done:
                 task = running.pop(reference)
-                _result(ray, reference, task)
+                if _result(ray, reference, task).work == "packed":
+                    packed.append(task.shard.name)
                 after_bytes(sum(member.size for member in task.shard.members))
     finally:
         for reference in running:
             ray.cancel(reference)
         if running:
             ray.wait(list(running), num_returns=len(running), timeout=_CANCEL_S)
-    return [task.shard.name for task in tasks]
+    return packed
 
 
-def _pack_quietly(task: ShardTask) -> PackedShard | str:
+def _pack_quietly(task: ShardTask) -> ShardOutcome | str:
     """Pack one shard; an error of ours comes back as its text, without Ray's wrapping."""
     try:
         return pack_task(task, lambda count: None)
-    except ShardError as error:
+    except (ShardError, ExtraError) as error:
         return str(error)
 
 
-def _result(ray: Any, reference: Any, task: ShardTask) -> None:
+def _result(ray: Any, reference: Any, task: ShardTask) -> ShardOutcome:
     try:
-        packed = ray.get(reference)
+        outcome: ShardOutcome | str = ray.get(reference)
     except ray.exceptions.RayError as error:
         raise ShardError(
             f"{task.target}: Ray lost its task ({str(error).strip().splitlines()[0]}). Run the "
             f"same command again: finished shards are kept."
         ) from error
-    if isinstance(packed, str):
-        raise ShardError(packed)
+    if isinstance(outcome, str):
+        raise ShardError(outcome)
+    return outcome

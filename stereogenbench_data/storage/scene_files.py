@@ -6,13 +6,13 @@ from typing import Protocol, runtime_checkable
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.schema.document import require_text_size
-from stereogenbench_data.schema.release import METADATA_FILES, VIDEO_FILES
+from stereogenbench_data.schema.release import METADATA_FILES, PACKED_DEPTH_NAMES, VIDEO_FILES
 from stereogenbench_data.storage.location import is_remote, joined
 from stereogenbench_data.storage.ranged_file import MemberFile, RangedFile
 from stereogenbench_data.storage.remote import RemoteObject
 from stereogenbench_data.storage.source import read_text_file
 
-_WANTED = frozenset({*METADATA_FILES, *VIDEO_FILES})
+_WANTED = frozenset({*METADATA_FILES, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
 
 
 @runtime_checkable

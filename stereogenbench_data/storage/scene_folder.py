@@ -26,10 +26,11 @@ from stereogenbench_data.geometry.rig import (
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import (
     measured,
+    open_depth,
     read_depth_units,
     resolve_encoding,
 )
-from stereogenbench_data.media.video import VideoReader, probe
+from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.document import parse_text
 from stereogenbench_data.schema.parse import (
     parse_complete,
@@ -54,6 +55,7 @@ from stereogenbench_data.schema.release import (
     COMPLETE_JSON,
     DESCRIPTION_JSON,
     DESCRIPTION_TXT,
+    PACKED_DEPTH_NAMES,
     TRAJECTORY_JSON,
     VIDEO_FILES,
     depth_name,
@@ -107,7 +109,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     }
     caption = caption_of(described, key=key)
     depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
-    facts = {name: _probed(folder, key, name) for name in VIDEO_FILES}
+    facts = {name: _probed(folder, key, _held(files, name)) for name in VIDEO_FILES}
     frames = _common_frames(key, facts, trajectory)
     rig = _sized_as_videos(key, rig, facts)
     poses = CameraPoses.from_trajectory(trajectory)
@@ -135,6 +137,11 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     )
 
 
+def _held(files: Mapping[str, object], name: str) -> str:
+    """Return by what name a folder has one of the release's files: depth may be packed."""
+    return name if name in files else PACKED_DEPTH_NAMES.get(name, name)
+
+
 def _probed(folder: SceneFiles, key: str, name: str) -> StreamFacts:
     video = folder.video(name)
     try:
@@ -155,7 +162,7 @@ def _require_finished(key: str, files: Mapping[str, object]) -> None:
         raise IncompleteScene(f"{key}: has no {COMPLETE_JSON}, so it was never finished")
     if not any(name in files for name in VIDEO_FILES):
         raise IncompleteScene(f"{key}: has metadata only, and none of its 12 videos")
-    missing = [name for name in _NEEDED if name not in files]
+    missing = [name for name in _NEEDED if _held(files, name) not in files]
     if missing:
         raise StorageError(
             f"{key}: is marked as complete and has no {', '.join(missing)} "
@@ -276,9 +283,9 @@ def _depth_unit(facts: StreamFacts, *, name: str) -> tuple[float, DepthUnitSourc
 def _valid_ratio(folder: SceneFiles, key: str, frames: int) -> float:
     shares = []
     encoding = DepthEncoding()
-    for name in map(depth_name, range(CAMERA_COUNT)):
-        video = folder.video(name)
-        with VideoReader(video, name=f"{key}/{name}", frames=frames) as reader:
+    files = folder.stamps()
+    for name in (_held(files, depth_name(camera)) for camera in range(CAMERA_COUNT)):
+        with open_depth(folder.video(name), name=f"{key}/{name}", frames=frames) as reader:
             for frame in sorted({0, frames // 2, frames - 1}):
                 units = read_depth_units(reader, frame, encoding=encoding)
                 known = measured(units, encoding=encoding, pixel_format=reader.facts.pixel_format)

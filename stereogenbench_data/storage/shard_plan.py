@@ -9,13 +9,22 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Final
+from typing import Final, Literal
 
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.schema.records import Scene
-from stereogenbench_data.schema.release import CAMERA_COUNT, METADATA_FILES, depth_name, rgb_name
+from stereogenbench_data.schema.release import (
+    CAMERA_COUNT,
+    METADATA_FILES,
+    PACKED_DEPTH_NAMES,
+    depth_name,
+    rgb_name,
+)
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.tar import BLOCK_BYTES, END_OF_ARCHIVE, member_header, padded
+
+DepthCodec = Literal["released", "blosc2"]
+"""How depth lies in shards: in the released videos, or in blosc2's frames, which decode faster."""
 
 DEFAULT_SHARD_BYTES: Final = 2_000_000_000
 
@@ -32,11 +41,15 @@ _SIZE: Final = re.compile(r"(\d+(?:\.\d+)?) ?([kmgt]?i?)b?", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class PlannedMember:
-    """A file of a scene: its name in the shard, and where it lies below the root."""
+    """A file of a scene: its name in the shard, and the file below the root that it is made from.
+
+    ``size`` is that of the source; so is the member's, if it is the released file unchanged.
+    """
 
     name: str
     source: str
     size: int
+    form: DepthCodec = "released"
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +58,13 @@ class PlannedShard:
 
     name: str
     size: int
-    keys: tuple[str, ...]
+    scenes: tuple[Scene, ...]
     members: tuple[PlannedMember, ...]
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The keys of its scenes, in order."""
+        return tuple(scene.id.key for scene in self.scenes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,18 +73,31 @@ class ShardPlan:
 
     Attributes:
         root: The folder below which the files lie.
-        target_bytes: The size that a shard does not exceed, unless one scene alone does.
+        target_bytes: The size that a shard does not exceed, unless one scene alone does; depth
+            that is packed anew counts with its released size.
         digest: sha256 of what goes where: of the target, and of all names and sizes. It does not
             depend on where the files lie.
+        depth_codec: How depth lies in the shards.
     """
 
     root: str
     target_bytes: int
     shards: tuple[PlannedShard, ...]
     digest: str
+    depth_codec: DepthCodec = "released"
+
+    @property
+    def oversized(self) -> tuple[PlannedShard, ...]:
+        """The shards that exceed the target because their one scene does."""
+        return tuple(shard for shard in self.shards if shard.size > self.target_bytes)
 
 
-def plan_shards(index: SceneIndex, target_bytes: int = DEFAULT_SHARD_BYTES) -> ShardPlan:
+def plan_shards(
+    index: SceneIndex,
+    target_bytes: int = DEFAULT_SHARD_BYTES,
+    *,
+    depth_codec: DepthCodec = "released",
+) -> ShardPlan:
     """Return the plan that packs the scenes of an index.
 
     Raises:
@@ -80,7 +111,7 @@ def plan_shards(index: SceneIndex, target_bytes: int = DEFAULT_SHARD_BYTES) -> S
     shards = tuple(
         shard
         for group, members in groupby(scenes, key=_group_of)
-        for shard in _filled(group, members, target_bytes=target_bytes)
+        for shard in _filled(group, members, target_bytes=target_bytes, depth_codec=depth_codec)
     )
     _require_distinct(shard.name for shard in shards)
     content = [
@@ -88,7 +119,8 @@ def plan_shards(index: SceneIndex, target_bytes: int = DEFAULT_SHARD_BYTES) -> S
         for shard in shards
     ]
     told = json.dumps([target_bytes, content], separators=(",", ":"))
-    return ShardPlan(index.root, target_bytes, shards, hashlib.sha256(told.encode()).hexdigest())
+    digest = hashlib.sha256(told.encode()).hexdigest()
+    return ShardPlan(index.root, target_bytes, shards, digest, depth_codec)
 
 
 def parse_size(text: str) -> int:
@@ -111,8 +143,8 @@ def parse_size(text: str) -> int:
 def _require_released(index: SceneIndex) -> None:
     if index.shards:
         raise ShardError(
-            f"{index.root}: holds shards already. To pack again, unpack them with `tar -xf` into "
-            f"a folder, and pass that folder."
+            f"{index.root}: holds shards already. To pack again, run `stereogenbench unpack`, and "
+            f"pass the folder that it made."
         )
     if "://" in index.root:
         raise ShardError(f"{index.root}: is far away. Fetch the release, and pass its folder.")
@@ -136,33 +168,46 @@ def _group_and_key(scene: Scene) -> tuple[str, str]:
     return _group_of(scene), scene.id.key
 
 
-def _filled(group: str, scenes: Iterable[Scene], *, target_bytes: int) -> Iterator[PlannedShard]:
+def _filled(
+    group: str, scenes: Iterable[Scene], *, target_bytes: int, depth_codec: DepthCodec
+) -> Iterator[PlannedShard]:
     """Yield shards of one group, each as full as the order allows."""
     number = 0
-    keys: list[str] = []
+    held: list[Scene] = []
     members: list[PlannedMember] = []
     size = len(END_OF_ARCHIVE)
     for scene in scenes:
-        added = _members_of(scene)
+        added = _members_of(scene, depth_codec)
         added_bytes = sum(BLOCK_BYTES + padded(member.size) for member in added)
-        if keys and size + added_bytes > target_bytes:
-            yield PlannedShard(f"{group}-{number:06d}.tar", size, tuple(keys), tuple(members))
-            keys, members, size, number = [], [], len(END_OF_ARCHIVE), number + 1
-        keys.append(scene.id.key)
+        if held and size + added_bytes > target_bytes:
+            yield PlannedShard(f"{group}-{number:06d}.tar", size, tuple(held), tuple(members))
+            held, members, size, number = [], [], len(END_OF_ARCHIVE), number + 1
+        held.append(scene)
         members += added
         size += added_bytes
-    yield PlannedShard(f"{group}-{number:06d}.tar", size, tuple(keys), tuple(members))
+    yield PlannedShard(f"{group}-{number:06d}.tar", size, tuple(held), tuple(members))
 
 
-def _members_of(scene: Scene) -> list[PlannedMember]:
+def _members_of(scene: Scene, depth_codec: DepthCodec) -> list[PlannedMember]:
     unknown = sorted(set(scene.members) - set(MEMBER_ORDER))
+    if not scene.members.keys().isdisjoint(PACKED_DEPTH_NAMES.values()):
+        raise ShardError(
+            f"{scene.id.key}: its depth is packed by blosc2, and shards are packed from released "
+            f"videos. Run `stereogenbench unpack` on its shards, and pass the folder that it made."
+        )
     if unknown:
         raise ShardError(
             f"{scene.id.key}: its index names {', '.join(unknown)}, which is no file of a scene. "
             f"Run `stereogenbench index` again."
         )
+    packed = {} if depth_codec == "released" else PACKED_DEPTH_NAMES
     planned = [
-        PlannedMember(f"{scene.id.key}.{name}", scene.members[name].path, scene.members[name].size)
+        PlannedMember(
+            f"{scene.id.key}.{packed.get(name, name)}",
+            scene.members[name].path,
+            scene.members[name].size,
+            depth_codec if name in packed else "released",
+        )
         for name in MEMBER_ORDER
         if name in scene.members
     ]

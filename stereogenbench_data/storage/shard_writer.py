@@ -1,24 +1,34 @@
-"""One shard on disk, whole or not there: written beside its place, read back, then renamed.
-
-What was written is noted in ``OUT/.parts/<shard>.json`` just before the shard gets its name. A
-shard that has both is finished; one without its note was not made here and is left alone.
-"""
+"""One shard on disk, whole or not there: written beside its place, read back, then renamed."""
 
 import errno
 import hashlib
-import json
 import os
-import stat
 import zlib
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from io import FileIO
+from itertools import groupby
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 from stereogenbench_data.errors import ShardError
+from stereogenbench_data.schema.records import Scene
+from stereogenbench_data.schema.release import METADATA_FILES
 from stereogenbench_data.storage.pool import AfterBytes
-from stereogenbench_data.storage.shard_plan import PlannedMember, PlannedShard, ShardPlan
+from stereogenbench_data.storage.released_file import read_packed_depth, read_released
+from stereogenbench_data.storage.repack_check import require_indexed_metadata
+from stereogenbench_data.storage.shard_note import (
+    PackedShard,
+    SeenFile,
+    ShardNote,
+    ShardTask,
+    find_packed,
+    read_note,
+    row_digest,
+    write_note,
+)
+from stereogenbench_data.storage.shard_plan import PlannedMember, ShardPlan
 from stereogenbench_data.storage.tar import (
     END_OF_ARCHIVE,
     Checksums,
@@ -28,88 +38,71 @@ from stereogenbench_data.storage.tar import (
     read_checksums,
     read_members,
 )
-from stereogenbench_data.storage.unfinished import PARTS, alone, write_whole
+from stereogenbench_data.storage.unfinished import alone
 
 UNFINISHED: Final = ".tmp"
 
-_CHUNK_BYTES: Final = 4 * 1024 * 1024
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 @dataclass(frozen=True, slots=True)
-class ShardTask:
-    """A shard to be packed, with all that another process needs for it."""
+class ShardOutcome:
+    """What became of a shard: packed just now, or found finished and kept."""
 
-    shard: PlannedShard
-    root: str
-    out: str
-    plan_digest: str
-
-    @property
-    def target(self) -> Path:
-        """Where the shard is to lie."""
-        return Path(self.out, self.shard.name)
-
-
-@dataclass(frozen=True, slots=True)
-class PackedShard:
-    """A finished shard; ``offsets`` and ``crc32s`` are of its planned members, in their order."""
-
-    name: str
-    size: int
-    sha256: str
-    offsets: tuple[int, ...]
-    crc32s: tuple[int, ...]
+    shard: PackedShard
+    work: Literal["packed", "kept"]
 
 
 def pack_shard(plan: ShardPlan, number: int, out: str | Path) -> PackedShard:
     """Pack one shard of a plan into a folder, unless it is there already.
 
     Raises:
-        ShardError: If a source is missing, unreadable or changes meanwhile; the disk is full; the
-            shard does not read back as written; a file that was not packed here has its name; or
-            another process is packing it.
+        ShardError: If a source is missing, unreadable, changes meanwhile or tells otherwise than
+            the index; the disk is full; the shard does not read back as written; a file that was
+            not packed here has its name; or another process is packing it.
     """
     task = ShardTask(plan.shards[number], plan.root, str(out), plan.digest)
-    return pack_task(task, lambda count: None)
+    return pack_task(task, lambda count: None).shard
 
 
-def pack_task(task: ShardTask, after_bytes: AfterBytes) -> PackedShard:
+def pack_task(task: ShardTask, after_bytes: AfterBytes) -> ShardOutcome:
     """Pack one shard, as `pack_shard` does; a worker process calls this."""
     done = find_packed(task)
     if done is not None:
-        return done
-    if task.target.exists() and not _note_of(task).is_file():
-        raise ShardError(
-            f"{task.target}: is there and was not packed here by this plan. Move it away, or pack "
-            f"into an empty folder."
-        )
+        return ShardOutcome(done, "kept")
     try:
         with alone(_unfinished_of(task)) as file:
-            return find_packed(task) or _pack(task, file, after_bytes)
+            done = find_packed(task) or found_whole(task, after_bytes)
+            if done is not None:
+                return ShardOutcome(done, "kept")
+            return _pack(task, file, after_bytes)
     except OSError as error:
         if isinstance(error, ShardError):
             raise
         raise ShardError(_why_not_written(task, error)) from error
 
 
-def find_packed(task: ShardTask) -> PackedShard | None:
-    """Return a shard that this plan has packed before, None if it is to be packed."""
-    try:
-        noted = json.loads(_note_of(task).read_bytes())
-        packed = PackedShard(
-            noted["name"], noted["size"], noted["sha256"], tuple(noted["offsets"]),
-            tuple(noted["crc32s"]),
-        )  # fmt: skip
-        size = task.target.stat().st_size
-    except (OSError, ValueError, KeyError, TypeError):
+def found_whole(task: ShardTask, after_bytes: AfterBytes) -> PackedShard | None:
+    """Return a finished shard that was touched and holds the bytes that were noted all the same.
+
+    Raises:
+        OSError: If it cannot be read.
+    """
+    note = read_note(task)
+    if note is None or not task.target.is_file():
         return None
-    is_same = noted.get("plan") == task.plan_digest and packed.name == task.shard.name
-    return packed if is_same and packed.size == size else None
-
-
-def _note_of(task: ShardTask) -> Path:
-    return task.target.parent / PARTS / f"{task.target.stem}.json"
+    with task.target.open("rb", buffering=0) as file:
+        status = os.fstat(file.fileno())
+        if status.st_size != note.packed.size:
+            return None
+        found = read_checksums(
+            file, status.st_size, parts=[], after_bytes=lambda count: after_bytes(0)
+        )
+    if found.sha256 != note.packed.sha256:
+        return None
+    write_note(task, replace(note, modified_ns=status.st_mtime_ns))
+    after_bytes(sum(member.size for member in task.shard.members))
+    return note.packed
 
 
 def _unfinished_of(task: ShardTask) -> Path:
@@ -129,12 +122,16 @@ def _why_not_written(task: ShardTask, error: OSError) -> str:
 
 
 class _Output:
-    """What is written, with its size and sha256 so far."""
+    """What is written, with its size, its sha256 so far and the places of its members."""
 
     def __init__(self, file: FileIO) -> None:
         self._file = file
         self._sha256 = hashlib.sha256()
         self.size = 0
+        self.offsets: list[int] = []
+        self.sizes: list[int] = []
+        self.crc32s: list[int] = []
+        self.sources: list[SeenFile] = []
 
     @property
     def sha256(self) -> str:
@@ -147,20 +144,47 @@ class _Output:
         while left:
             left = left[self._file.write(left) :]
 
+    def begin_member(self, name: str, size: int) -> None:
+        self.write(member_header(name, size))
+        self.offsets.append(self.size)
+        self.sizes.append(size)
+        self.crc32s.append(0)
 
-def _pack(task: ShardTask, file: FileIO, after_bytes: AfterBytes) -> PackedShard:
-    packed = _written(task, file, after_bytes)
-    _require_read_back(task, file, packed)
-    write_whole(_note_of(task), _note(task, packed))
+    def write_member(self, content: bytes) -> None:
+        self.write(content)
+        self.crc32s[-1] = zlib.crc32(content, self.crc32s[-1])
+
+    def end_member(self, source: SeenFile) -> None:
+        self.write(bytes(padded(self.sizes[-1]) - self.sizes[-1]))
+        self.sources.append(source)
+
+
+def _pack(task: ShardTask, file: FileIO, after_bytes: AfterBytes) -> ShardOutcome:
+    # A shard without a note is kept if it is what packing gives: its notes were removed.
+    is_unknown = read_note(task) is None and task.target.exists()
+    note = _written(task, file, after_bytes)
+    _require_read_back(task, file, note.packed)
+    if is_unknown:
+        note = _require_same_shard(task, note)
+    write_note(task, note)
+    if is_unknown:
+        return ShardOutcome(note.packed, "kept")
     _unfinished_of(task).replace(task.target)
     _sync_folder(task.target.parent)
-    return packed
+    return ShardOutcome(note.packed, "packed")
 
 
-def _note(task: ShardTask, packed: PackedShard) -> bytes:
-    members = [member.name for member in task.shard.members]
-    noted = asdict(packed) | {"plan": task.plan_digest, "members": members}
-    return json.dumps(noted).encode()
+def _require_same_shard(task: ShardTask, note: ShardNote) -> ShardNote:
+    """Return the note for a shard that lies there, which must hold the bytes just written."""
+    with task.target.open("rb", buffering=0) as file:
+        status = os.fstat(file.fileno())
+        found = read_checksums(file, status.st_size, parts=[], after_bytes=lambda count: None)
+    if found.sha256 != note.packed.sha256:
+        raise ShardError(
+            f"{task.target}: is there and was not packed here by this plan. Move it away, or pack "
+            f"into an empty folder."
+        )
+    return replace(note, modified_ns=status.st_mtime_ns)
 
 
 def _sync_folder(folder: Path) -> None:
@@ -173,81 +197,64 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def _written(task: ShardTask, file: FileIO, after_bytes: AfterBytes) -> PackedShard:
+def _written(task: ShardTask, file: FileIO, after_bytes: AfterBytes) -> ShardNote:
+    """Write a shard's bytes; return what is to be noted of it."""
     output = _Output(file)
-    offsets, crc32s = [], []
-    for member in task.shard.members:
-        output.write(member_header(member.name, member.size))
-        offsets.append(output.size)
-        crc32s.append(_copied(Path(task.root, member.source), member, output, after_bytes))
-        output.write(bytes(padded(member.size) - member.size))
+    scenes = {scene.id.key: scene for scene in task.shard.scenes}
+    for key, members in groupby(task.shard.members, key=lambda each: each.name.partition(".")[0]):
+        _write_scene(task, list(members), output, scene=scenes.get(key), after_bytes=after_bytes)
     output.write(END_OF_ARCHIVE)
     os.fsync(file.fileno())
-    return PackedShard(task.shard.name, output.size, output.sha256, tuple(offsets), tuple(crc32s))
+    packed = PackedShard(
+        task.shard.name, output.size, output.sha256, tuple(output.offsets), tuple(output.sizes),
+        tuple(output.crc32s),
+    )  # fmt: skip
+    modified_ns = os.fstat(file.fileno()).st_mtime_ns
+    rows = {key: row_digest(scene) for key, scene in scenes.items()}
+    return ShardNote(packed, modified_ns, tuple(output.sources), rows)
 
 
-def _copied(source: Path, member: PlannedMember, output: _Output, after_bytes: AfterBytes) -> int:
-    """Copy a file's bytes, which must be the same file all the while; return their crc32."""
-    with _opened(source) as file:
-        before = os.fstat(file.fileno())
-        _require_planned_size(source, member, before.st_size)
-        crc32, left = 0, member.size
-        while left:
-            chunk = _read(source, file, min(left, _CHUNK_BYTES))
-            if not chunk:
-                _require_planned_size(source, member, member.size - left)
-            output.write(chunk)
-            crc32 = zlib.crc32(chunk, crc32)
-            left -= len(chunk)
-            after_bytes(len(chunk))
-        if _identity(_status(source)) != _identity(before):
-            raise ShardError(
-                f"{source}: was changed while it was packed. Let nothing write to the release, "
-                f"then run the same command again."
+def _write_scene(
+    task: ShardTask,
+    members: Sequence[PlannedMember],
+    output: _Output,
+    *,
+    scene: Scene | None,
+    after_bytes: AfterBytes,
+) -> None:
+    """Write a scene's files, its metadata first; these must be what the index was made from."""
+    texts: dict[str, bytes] = {}
+    for member in members:
+        name = member.name.partition(".")[2]
+        source = Path(task.root, member.source)
+        if name in METADATA_FILES:
+            parts: list[bytes] = []
+            seen = read_released(source, member.size, take=parts.append, after_bytes=after_bytes)
+            texts[name] = b"".join(parts)
+            output.begin_member(member.name, member.size)
+            output.write_member(texts[name])
+            output.end_member(seen)
+            continue
+        _require_indexed(scene, texts, task=task)
+        if member.form == "released" or scene is None:
+            output.begin_member(member.name, member.size)
+            take = output.write_member
+            seen = read_released(source, member.size, take=take, after_bytes=after_bytes)
+        else:
+            content, seen = read_packed_depth(
+                source, member.size, frames=scene.frames, after_bytes=after_bytes
             )
-    return crc32
+            output.begin_member(member.name, len(content))
+            output.write_member(content)
+        output.end_member(seen)
+    _require_indexed(scene, texts, task=task)
 
 
-def _opened(source: Path) -> FileIO:
-    if not stat.S_ISREG(_status(source).st_mode):
-        raise ShardError(f"{source}: is no file. Put the release's own file in its place.")
-    try:
-        return FileIO(source)
-    except OSError as error:
-        raise _unreadable(source, error) from error
-
-
-def _status(source: Path) -> os.stat_result:
-    try:
-        return source.stat()
-    except OSError as error:
-        raise _unreadable(source, error) from error
-
-
-def _read(source: Path, file: FileIO, size: int) -> bytes:
-    try:
-        return file.read(size)
-    except OSError as error:
-        raise _unreadable(source, error) from error
-
-
-def _unreadable(source: Path, error: OSError) -> ShardError:
-    return ShardError(
-        f"{source}: cannot be read ({error.strerror}). Fetch it again or give read permission, "
-        f"then run the same command again."
-    )
-
-
-def _identity(status: os.stat_result) -> tuple[int, int, int]:
-    return status.st_ino, status.st_size, status.st_mtime_ns
-
-
-def _require_planned_size(source: Path, member: PlannedMember, size: int) -> None:
-    if size != member.size:
-        raise ShardError(
-            f"{source}: has {size} bytes, and had {member.size} when the plan was made. Let "
-            f"nothing write to the release; run `stereogenbench index` again if it has an index."
-        )
+def _require_indexed(scene: Scene | None, texts: dict[str, bytes], *, task: ShardTask) -> None:
+    """Compare once, when all of a scene's metadata have been read."""
+    if scene is not None and texts:
+        require_indexed_metadata(scene, texts, root=task.root)
+        texts.clear()
 
 
 def _require_read_back(task: ShardTask, file: FileIO, packed: PackedShard) -> None:
@@ -255,8 +262,10 @@ def _require_read_back(task: ShardTask, file: FileIO, packed: PackedShard) -> No
     if hasattr(os, "posix_fadvise"):
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
     planned = [
-        TarMember(member.name, offset, member.size)
-        for member, offset in zip(task.shard.members, packed.offsets, strict=True)
+        TarMember(member.name, offset, size)
+        for member, offset, size in zip(
+            task.shard.members, packed.offsets, packed.sizes, strict=True
+        )
     ]
     found = read_members(file, packed.size, where=str(task.target))
     checksums = read_checksums(

@@ -5,14 +5,19 @@ import stat
 import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.storage.cache import ShardCache
 from stereogenbench_data.storage.location import is_remote, joined, local_path, shown
-from stereogenbench_data.storage.ranged_file import FileSlice, MemberFile, RangedFile
+from stereogenbench_data.storage.ranged_file import (
+    FileSlice,
+    MemberFile,
+    RangedFile,
+    require_crc32,
+)
 from stereogenbench_data.storage.remote import RemoteObject
 
 UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
@@ -69,6 +74,7 @@ class MemberSource:
         shards: Mapping[str, ShardFacts],
         revision: str = "",
         cache: ShardCache | None = None,
+        check: Literal["opened", "metadata"] = "metadata",
     ) -> None:
         """Prepare to read; nothing is opened yet.
 
@@ -77,11 +83,16 @@ class MemberSource:
             shards: What the index knows of each shard, by path.
             revision: The index's digest, by which a cache tells data apart.
             cache: Where to keep members that come from a URL, or None.
+            check: What is compared with its checksum. "opened": each member of a shard or of the
+                cache when this process first opens it, and one from a URL when its last byte
+                comes. "metadata": metadata files alone.
         """
         self._root = str(root)
         self._shards = shards
         self._revision = revision
         self._cache = cache
+        self._check = check
+        self._sound: set[tuple[str, int]] = set()
         self._objects: dict[str, RemoteObject] = {}
 
     def open(self, scene: Scene, name: str) -> Path | MemberFile:
@@ -90,17 +101,36 @@ class MemberSource:
         Raises:
             StorageError: If it is missing, unreadable or not the one that was indexed.
         """
+        name = scene.held_name(name)
         member = scene.members[name]
         if not is_remote(self._root):
-            return open_local(self._root, member, shard=self._shards.get(member.path))
+            found = open_local(self._root, member, shard=self._shards.get(member.path))
+            return found if isinstance(found, Path) else self._checked(found, scene, name)
         _require_safe(member)
         remote = self._object(member)
         if self._cache is not None:
-            return self._cache.open(member, remote=remote, revision=self._revision)
+            stored = self._cache.open(member, remote=remote, revision=self._revision)
+            return self._checked(stored, scene, name)
         offset = member.offset
         return RangedFile(
-            lambda start, stop: remote.read(offset + start, offset + stop), size=member.size
+            lambda start, stop: remote.read(offset + start, offset + stop),
+            size=member.size,
+            name=self.label(scene, name),
+            crc32=member.crc32 if self._check == "opened" else None,
         )
+
+    def _checked(self, file: FileSlice, scene: Scene, name: str) -> FileSlice:
+        """Return an open file whose bytes were compared with their checksum once, if asked for."""
+        member = scene.members[name]
+        place = (member.path, member.offset)
+        if self._check == "opened" and member.crc32 is not None and place not in self._sound:
+            try:
+                require_crc32(file.crc32(), expected=member.crc32, name=self.label(scene, name))
+            except StorageError:
+                file.close()
+                raise
+            self._sound.add(place)
+        return file
 
     def read(self, scene: Scene, name: str) -> bytes:
         """Return one of a scene's metadata files, whole and as its checksum says.
@@ -116,16 +146,12 @@ class MemberSource:
             return read_text_file(opened, where=where)
         with opened:
             text = opened.read()
-        found = zlib.crc32(text)
-        if member.crc32 not in (None, found):
-            raise ShardError(
-                f"{where}: has crc32 {found:08x}, and the index says {member.crc32:08x}. The file "
-                f"was damaged or replaced: fetch it again."
-            )
+        require_crc32(zlib.crc32(text), expected=member.crc32, name=where)
         return text
 
     def label(self, scene: Scene, name: str) -> str:
         """Return what messages call one of a scene's files: where it lies, and its name."""
+        name = scene.held_name(name)
         place = self._shown(scene.members[name].path)
         return place if place.endswith(name) else f"{place}: {name}"
 
@@ -172,7 +198,7 @@ class MemberSource:
 
 def open_local(
     root: str | Path, member: Member, *, shard: ShardFacts | None = None
-) -> Path | MemberFile:
+) -> Path | FileSlice:
     """Return a member's path where it is a whole file, else an open file over its part.
 
     Args:
@@ -192,7 +218,7 @@ def open_local(
         file = FileSlice(path, member)
     except OSError as error:
         raise ShardError(f"{path}: cannot be read ({error.strerror}). {again}") from error
-    found, end = file.file_size(), member.offset + member.size
+    found, end = file.status().st_size, member.offset + member.size
     if found < end or (shard is not None and found != shard.size):
         file.close()
         says = f"at least {end}" if shard is None else shard.size

@@ -32,6 +32,22 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 @contextmanager
+def held_alone(lock: Path) -> Iterator[bool]:
+    """Hold a lock file if no other process does, and yield whether it is held.
+
+    Where the file system knows no locks it counts as held.
+    """
+    with ExitStack() as stack:
+        try:
+            is_ours = stack.enter_context(locked(lock, when_taken="skip"))
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            is_ours = True
+        yield is_ours
+
+
+@contextmanager
 def alone(path: Path) -> Iterator[FileIO]:
     """Open an unfinished file, empty, for this process alone; unless renamed, it is removed.
 
@@ -43,13 +59,7 @@ def alone(path: Path) -> Iterator[FileIO]:
     """
     lock = path.parent / PARTS / f"{path.name}.lock"
     lock.parent.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as stack:
-        try:
-            is_ours = stack.enter_context(locked(lock, when_taken="skip"))
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                raise
-            is_ours = True
+    with held_alone(lock) as is_ours:
         if not is_ours:
             raise ShardError(
                 f"{path}: another process is packing this shard. Give each process a part of its "

@@ -3,19 +3,17 @@
 A shard that is wrong does not stop the rest: all that is wrong is gathered, each with its cure.
 """
 
-import io
-from collections import defaultdict
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
 from stereogenbench_data.errors import ShardError
-from stereogenbench_data.schema.records import Member, ShardFacts
+from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.storage.foreign_index import foreign_indexes
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
-from stereogenbench_data.storage.pool import AfterBytes, run_tasks
+from stereogenbench_data.storage.pool import run_tasks
 from stereogenbench_data.storage.shard_writer import UNFINISHED
-from stereogenbench_data.storage.tar import TarMember, read_checksums, read_members
 from stereogenbench_data.storage.unfinished import PARTS
 from stereogenbench_data.storage.verify_decode import (
     Problem,
@@ -23,12 +21,16 @@ from stereogenbench_data.storage.verify_decode import (
     decode_tasks,
     video_bytes,
 )
+from stereogenbench_data.storage.verify_shard import (
+    FETCH,
+    WRONG_INDEX,
+    ExpectedShard,
+    check_shard,
+)
 
 Progress = Callable[[int, int], None]
 
-_FETCH: Final = "Fetch the shard again, or pack it again."
-_WRONG_INDEX: Final = "Put the index beside the shards that it was packed with."
-_SHOWN: Final = 3
+_WRITE_AGAIN: Final = "Fetch it again, or write it anew: run `stereogenbench pack` again."
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,21 +46,6 @@ class VerifyReport:
     problems: tuple[Problem, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class _Expected:
-    """What the index says of one shard: facts, and members by their whole name."""
-
-    root: str
-    shard: str
-    facts: ShardFacts
-    members: dict[str, Member] = field(default_factory=dict)
-
-    def problem(self, name: str, found: str, cure: str = _FETCH) -> Problem:
-        """Return a problem of the member of that name, or of the shard for an empty one."""
-        scene, _, member = name.partition(".")
-        return Problem(self.shard, scene, member, found, cure)
-
-
 def verify(
     data: str | Path,
     *,
@@ -66,7 +53,9 @@ def verify(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> VerifyReport:
-    """Compare shards with their index.
+    """Compare shards, and what was packed beside them, with their index.
+
+    The index itself is held against the metadata that the shards hold.
 
     Args:
         data: The folder of the shards, or its index file.
@@ -93,7 +82,7 @@ def verify(
             progress(min(done, total), total)
 
     sound: set[str] = set()
-    for checked in run_tasks(_check_shard, checks, workers=workers, after_bytes=after_bytes):
+    for checked in run_tasks(check_shard, checks, workers=workers, after_bytes=after_bytes):
         problems += checked.problems
         sound |= checked.sound
     tasks = decode_tasks(scenes, index.root, sound)
@@ -130,9 +119,9 @@ def _opened(data: str | Path) -> SceneIndex:
     return index
 
 
-def _expected_of(index: SceneIndex) -> dict[str, _Expected]:
+def _expected_of(index: SceneIndex) -> dict[str, ExpectedShard]:
     expected = {
-        name: _Expected(index.root, name, facts) for name, facts in sorted(index.shards.items())
+        name: ExpectedShard(index.root, name, facts) for name, facts in sorted(index.shards.items())
     }
     for scene in map(index.scene, range(len(index))):
         for name, member in scene.members.items():
@@ -142,133 +131,36 @@ def _expected_of(index: SceneIndex) -> dict[str, _Expected]:
                     f"knows no such shard. The index was altered: fetch it again."
                 )
             expected[member.path].members[f"{scene.id.key}.{name}"] = member
+        for path in {member.path for member in scene.members.values()}:
+            expected[path].scenes.append(scene)
     return expected
 
 
-def _folder_problems(index: SceneIndex, expected: dict[str, _Expected]) -> Iterator[Problem]:
+def _folder_problems(index: SceneIndex, expected: dict[str, ExpectedShard]) -> Iterator[Problem]:
     there = {path.name for path in Path(index.root).iterdir()}
     for each in expected.values():
         if not Path(each.root, each.shard).is_file():
             scenes = len({name.partition(".")[0] for name in each.members})
             what = "is no file" if each.shard in there else "is missing"
-            yield each.problem("", f"{what}, with {scenes} scenes", _FETCH)
+            yield each.problem("", f"{what}, with {counted(scenes, 'scene')}", FETCH)
     for name in sorted(there - expected.keys()):
         if name.endswith(".tar"):
-            yield Problem(name, "", "", "is there, and the index does not know it", _WRONG_INDEX)
+            yield Problem(name, "", "", "is there, and the index does not know it", WRONG_INDEX)
         elif name.endswith(f".tar{UNFINISHED}"):
             cure = "Run `stereogenbench pack` again, or remove it."
             yield Problem(name, "", "", "is an unfinished shard", cure)
+    yield from _companion_problems(index)
 
 
-@dataclass(slots=True)
-class _Checked:
-    """What was found out about a shard; ``sound`` names the members that are as they were."""
-
-    problems: list[Problem] = field(default_factory=list)
-    sound: set[str] = field(default_factory=set)
-
-
-def _check_shard(expected: _Expected, after_bytes: AfterBytes) -> _Checked:
-    path = Path(expected.root, expected.shard)
-    try:
-        with path.open("rb", buffering=0) as file:
-            return _checked(expected, file, path.stat().st_size, after_bytes)
-    except OSError as error:
-        return _Checked([expected.problem("", f"cannot be read ({error.strerror or error})")])
-
-
-def _checked(expected: _Expected, file: io.FileIO, size: int, after_bytes: AfterBytes) -> _Checked:
-    checked = _Checked()
-    try:
-        found = {each.name: each for each in read_members(file, size, where=expected.shard)}
-    except ShardError as error:
-        told = str(error).removeprefix(f"{expected.shard}: ").removesuffix(f" {_FETCH}")
-        checked.problems.append(expected.problem("", told.rstrip(".")))
-        checked.problems += _cut_off(expected, size)
-        placed = {
-            name: each for name, each in expected.members.items() if each.offset + each.size <= size
-        }
-    else:
-        checked.problems += _differing(expected, found)
-        placed = {
-            name: each
-            for name, each in expected.members.items()
-            if found.get(name) == TarMember(name, each.offset, each.size)
-        }
-    parts = _apart(placed)
-    checksums = read_checksums(
-        file,
-        size,
-        parts=[(each.offset, each.size) for each in parts.values()],
-        after_bytes=after_bytes,
-    )
-    for (name, member), crc32 in zip(parts.items(), checksums.crc32s, strict=True):
-        if crc32 == member.crc32:
-            checked.sound.add(name)
-            continue
-        told = "none is" if member.crc32 is None else f"{member.crc32:08x} is"
-        found_crc = f"its bytes have crc32 {crc32:08x}, and by the index {told} right"
-        checked.problems.append(expected.problem(name, found_crc))
-    facts = expected.facts
-    if not checked.problems and (size, checksums.sha256) != (facts.size, facts.sha256):
-        told = (
-            f"all members are whole, and yet the file has {size} bytes with sha256 "
-            f"{checksums.sha256[:16]}..., and by the index {facts.size} with {facts.sha256[:16]}..."
-        )
-        checked.problems.append(expected.problem("", told))
-    return checked
-
-
-def _cut_off(expected: _Expected, size: int) -> Iterator[Problem]:
-    """Yield a problem for each scene of which members lie beyond the end of the file."""
-    of_scene = defaultdict(list)
-    for name, member in expected.members.items():
-        if member.offset + member.size > size:
-            of_scene[name.partition(".")[0]].append(name.partition(".")[2])
-    for scene, names in of_scene.items():
-        yield expected.problem(scene, f"{len(names)} of its files are cut off ({_few(names)})")
-
-
-def _few(names: list[str]) -> str:
-    return ", ".join([*names[:_SHOWN], "..."] if len(names) > _SHOWN else names)
-
-
-def _differing(expected: _Expected, found: dict[str, TarMember]) -> Iterator[Problem]:
-    """Yield what differs between the members that are there and those of the index."""
-    scenes, told = (
-        {name.partition(".")[0] for name in names} for names in (found, expected.members)
-    )
-    if scenes != told:
-        text = (
-            f"holds other scenes than the index says: {len(scenes - told)} unknown, "
-            f"{len(told - scenes)} not there ({_few(sorted(scenes ^ told))}); shard and index are "
-            f"of different packs"
-        )
-        yield expected.problem("", text, _WRONG_INDEX)
-        return
-    for name in sorted(found.keys() | expected.members.keys()):
-        here, member = found.get(name), expected.members.get(name)
-        if here is None:
-            yield expected.problem(name, "is missing")
-        elif member is None:
-            yield expected.problem(name, "is there, and the index does not know it")
-        elif (here.offset, here.size) != (member.offset, member.size):
-            yield expected.problem(
-                name,
-                f"has {here.size} bytes from byte {here.offset} on, and by the index "
-                f"{member.size} from {member.offset} on",
-            )
-
-
-def _apart(members: dict[str, Member]) -> dict[str, Member]:
-    """Return members in the order of their bytes, without any that begins inside another.
-
-    Only an altered index has such, and only beside a tar that cannot be read: that is told.
-    """
-    apart: dict[str, Member] = {}
-    end = 0
-    for name, member in sorted(members.items(), key=lambda item: item[1].offset):
-        if member.offset >= end:
-            apart[name] = member
-            end = member.offset + member.size
-    return apart
+def _companion_problems(index: SceneIndex) -> Iterator[Problem]:
+    """Yield what is wrong with the files that pack writes for other readers."""
+    for name, content in foreign_indexes(index).items():
+        try:
+            found = Path(index.root, name).read_bytes()
+        except FileNotFoundError:
+            yield Problem(name, "", "", "is missing, and pack wrote it", _WRITE_AGAIN)
+        except OSError as error:
+            yield Problem(name, "", "", f"cannot be read ({error.strerror})", _WRITE_AGAIN)
+        else:
+            if found != content:
+                yield Problem(name, "", "", "contradicts the index", _WRITE_AGAIN)

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import require_depth_stream, resolve_encoding
+from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.video import VideoReader, probe
 from stereogenbench_data.schema.records import Scene
-from stereogenbench_data.schema.release import CAMERA_COUNT, VIDEO_FILES, depth_name
+from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES, depth_name
 from stereogenbench_data.storage.pool import AfterBytes
 
 
@@ -39,14 +41,14 @@ class DecodeTask:
 
 def video_bytes(scene: Scene) -> int:
     """Return how many bytes a scene's videos have."""
-    return sum(scene.members[name].size for name in VIDEO_FILES)
+    return sum(scene.members[name].size for name in scene.held_videos)
 
 
 def decode_tasks(scenes: list[Scene], root: str, sound: set[str]) -> list[DecodeTask]:
     """Return what to decode: all videos whose bytes are those that were packed."""
     tasks = []
     for scene in scenes:
-        names = tuple(name for name in VIDEO_FILES if f"{scene.id.key}.{name}" in sound)
+        names = tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound)
         if names:
             tasks.append(DecodeTask(root, scene, names))
     return tasks
@@ -73,25 +75,30 @@ def _decode(task: DecodeTask, name: str) -> None:
     with Path(task.root, member.path).open("rb") as shard:
         shard.seek(member.offset)
         file = io.BytesIO(shard.read(member.size))
-    facts = probe(file, name=name)
-    size = (scene.rig.image_width_px, scene.rig.image_height_px)
-    found = (facts.frames, (facts.width_px, facts.height_px))
-    if found != (scene.frames, size):
-        raise MediaError(
-            f"{name}: has {facts.frames} frames of {facts.width_px}x{facts.height_px} pixels, and "
-            f"by the index {scene.frames} of {size[0]}x{size[1]}."
-        )
-    depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
-    if name in depth_names:
-        _require_indexed_depth(scene, depth_names.index(name), file)
+    if name in PACKED_DEPTH_NAMES.values():
+        with DepthFrames(file, name=name, frames=scene.frames) as depth:
+            _require_indexed(scene, name, depth.facts)
+            for index in range(scene.frames):
+                depth.units(index)
+        return
+    _require_indexed(scene, name, probe(file, name=name))
     with VideoReader(file, name=name, frames=scene.frames) as reader:
         for index in range(scene.frames):
             reader.frame(index)
 
 
-def _require_indexed_depth(scene: Scene, camera: int, file: io.BytesIO) -> None:
-    name = depth_name(camera)
-    facts = probe(file, name=name)
+def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
+    """Hold a video's header against the index."""
+    size = (scene.rig.image_width_px, scene.rig.image_height_px)
+    if (facts.frames, (facts.width_px, facts.height_px)) != (scene.frames, size):
+        raise MediaError(
+            f"{name}: has {facts.frames} frames of {facts.width_px}x{facts.height_px} pixels, and "
+            f"by the index {scene.frames} of {size[0]}x{size[1]}."
+        )
+    depth_names = [scene.held_name(depth_name(camera)) for camera in range(CAMERA_COUNT)]
+    if name not in depth_names:
+        return
+    camera = depth_names.index(name)
     encoding = resolve_encoding(facts, name=name)
     found = (facts.codec, facts.pixel_format, encoding.known_unit_m)
     told = (

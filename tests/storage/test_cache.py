@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.storage import cache as cache_module
-from stereogenbench_data.storage.cache import FOLDER_NAME, ShardCache
+from stereogenbench_data.storage.cache import FOLDER_NAME, ShardCache, require_limit
 from stereogenbench_data.storage.remote import RemoteObject
 from tests.servers.fault import Answer
 
@@ -135,13 +135,50 @@ def test_an_item_of_another_size_is_fetched_again(cache, shelf, tmp_path):
     assert len(shelf.fetched) == 3
 
 
+def test_an_item_that_was_written_into_is_fetched_again(cache, shelf, tmp_path):
+    read(cache, member(1000, 2000), shelf)
+    items(tmp_path)[0].write_bytes(bytes(2000))
+
+    assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
+    assert len(shelf.fetched) == 2
+
+
+@pytest.mark.parametrize(("crc32", "fetched"), [(zlib.crc32(DATA[1000:3000]), 1), (None, 2)])
+def test_an_item_of_another_time_is_kept_if_its_checksum_is_right(
+    cache, shelf, tmp_path, crc32, fetched
+):
+    wanted = member(1000, 2000, crc32=crc32)
+    read(cache, wanted, shelf)
+    os.utime(items(tmp_path)[0])
+    read(cache, wanted, shelf)
+
+    assert len(shelf.fetched) == fetched
+    assert read(cache, wanted, shelf) == DATA[1000:3000]
+    assert len(shelf.fetched) == fetched
+
+
+def test_a_folder_in_an_items_place_makes_way_for_it_and_is_kept(cache, shelf, tmp_path):
+    read(cache, member(1000, 2000), shelf)
+    item = items(tmp_path)[0]
+    item.unlink()
+    item.mkdir()
+    (item / "mine.txt").touch()
+
+    assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
+    assert item.is_file()
+    assert len(list(tmp_path.rglob("mine.txt"))) == 1
+
+
 def test_a_damaged_item_is_found_and_dropped_when_it_is_looked_for(cache, shelf, tmp_path):
     wanted = member(1000, 2000)
     how = {"where": shelf.where, "revision": "1"}
     assert not cache.drop_damaged(wanted, **how)
     read(cache, wanted, shelf)
     assert not cache.drop_damaged(wanted, **how)
-    items(tmp_path)[0].write_bytes(bytes(2000))
+    item = items(tmp_path)[0]
+    times = item.stat()
+    item.write_bytes(bytes(2000))
+    os.utime(item, ns=(times.st_atime_ns, times.st_mtime_ns))
 
     assert cache.drop_damaged(wanted, **how)
     assert read(cache, wanted, shelf) == DATA[1000:3000]
@@ -150,9 +187,10 @@ def test_a_damaged_item_is_found_and_dropped_when_it_is_looked_for(cache, shelf,
 def test_what_was_not_used_for_longest_goes_first(cache, shelf, tmp_path):
     first, second, third = (member(3000 * each, 3000) for each in range(3))
     for age, wanted in enumerate((first, second, third)):
+        known = set(items(tmp_path))
         read(cache, wanted, shelf)
-        newest = max(items(tmp_path), key=lambda path: path.stat().st_mtime_ns)
-        os.utime(newest, (1000 + age, 1000 + age))
+        newest = (set(items(tmp_path)) - known).pop()
+        os.utime(newest, (1000 + age, newest.stat().st_mtime))
     read(cache, first, shelf)
     shelf.fetched.clear()
 
@@ -213,9 +251,28 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path):
         ShardCache(tmp_path / "file", limit_bytes=1)
 
 
-def test_a_limit_of_nothing_is_refused(tmp_path):
-    with pytest.raises(StorageError, match="a cache needs a limit above 0 bytes, got 0"):
-        ShardCache(tmp_path, limit_bytes=0)
+@pytest.mark.parametrize("limit", [0, -1, "1GB", None, 1.5, True], ids=repr)
+def test_a_limit_that_is_no_number_of_bytes_is_refused(tmp_path, limit):
+    with pytest.raises(
+        StorageError, match=rf"limit in whole bytes above 0, got {limit!r}: give a number, such as"
+    ):
+        require_limit(limit, folder=tmp_path)
+    if type(limit) is int:
+        with pytest.raises(StorageError, match="above 0"):
+            ShardCache(tmp_path, limit_bytes=limit)
+
+
+def test_a_folder_without_a_name_is_refused():
+    with pytest.raises(StorageError, match="a cache needs a folder, got ''"):
+        ShardCache("", limit_bytes=1)
+
+
+def test_a_folder_of_shards_is_refused_and_left_as_it_is(tmp_path):
+    (tmp_path / "train-Uniform-000000.tar").touch()
+
+    with pytest.raises(StorageError, match=r"holds shards \(train-Uniform-000000.tar\), which"):
+        ShardCache(tmp_path, limit_bytes=1)
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_full_disk_is_told_and_leaves_nothing(cache, shelf, tmp_path, monkeypatch):

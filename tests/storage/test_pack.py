@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -10,6 +11,7 @@ import sys
 import tarfile
 import warnings
 import zlib
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -21,10 +23,12 @@ from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.storage import shard_writer
 from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.storage.locks import locked
-from stereogenbench_data.storage.pack import pack, prepare
+from stereogenbench_data.storage.pack import OversizedSceneWarning, pack, prepare
 from stereogenbench_data.storage.pool import run_tasks
+from stereogenbench_data.storage.shard_note import ShardTask
 from stereogenbench_data.storage.shard_plan import PlannedMember, PlannedShard, plan_shards
-from stereogenbench_data.storage.shard_writer import ShardTask, pack_shard, pack_task
+from stereogenbench_data.storage.shard_writer import pack_shard, pack_task
+from stereogenbench_data.storage.verify import verify
 
 ONE_EACH = 250_000
 """A target that holds one of the small release's scenes, not two."""
@@ -198,6 +202,161 @@ def test_a_shard_without_its_note_or_of_another_size_is_not_taken_for_finished(
     assert bytes_of(out) == bytes_of(packed)
 
 
+def changed_bytes(path):
+    """Change a byte without changing the size, and the time of change for certain."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    os.utime(path, ns=(0, path.stat().st_mtime_ns + 10**9))
+
+
+def test_a_finished_shard_that_was_changed_at_the_same_size_is_packed_again(
+    packed, release, tmp_path
+):
+    out = shutil.copytree(packed, tmp_path / "out")
+    changed_bytes(out / NAMES[1])
+
+    report = pack(release, out, target_bytes=ONE_EACH, workers=1)
+
+    assert report.packed == (NAMES[1],)
+    assert bytes_of(out) == bytes_of(packed)
+
+
+def test_a_finished_shard_that_was_only_touched_is_read_and_kept(packed, release, tmp_path):
+    out = shutil.copytree(packed, tmp_path / "out")
+    for name in NAMES:
+        os.utime(out / name, (1, 1))
+
+    report = pack(release, out, target_bytes=ONE_EACH, workers=1)
+
+    assert report.packed == ()
+    assert {(out / name).stat().st_mtime for name in NAMES} == {1}
+    assert prepare(release, out, target_bytes=ONE_EACH, part=(1, 1)).unfinished() == []
+
+
+def focal_changed(folder):
+    """Edit a scene's focal length: the file keeps its size and its time of change."""
+    path = folder / "baseline.json"
+    text, before = path.read_text(), path.stat()
+    found = re.search(r'"focal_length_mm": *(\d)', text)
+    digit = str(9 - int(found[1]))
+    path.write_text(text[: found.start(1)] + digit + text[found.end(1) :])
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert path.stat().st_size == before.st_size
+
+
+@pytest.mark.parametrize("index_is", ["walked", "stale", "rebuilt"])
+def test_a_source_that_was_edited_after_its_shard_is_named(tree, tmp_path, index_is):
+    key = "eval/MapSeenInTrain/Uniform/SynthStage/scene_000000"
+    if index_is != "walked":
+        SceneIndex.open(tree).write(tree / "index.parquet")
+    pack(tree, tmp_path / "out", target_bytes=ONE_EACH, part=(1, 2), workers=1)
+    focal_changed(tree / key)
+    if index_is == "rebuilt":
+        (tree / "index.parquet").unlink()
+        SceneIndex.open(tree).write(tree / "index.parquet")
+
+    with pytest.raises(ShardError) as told:
+        pack(tree, tmp_path / "out", target_bytes=ONE_EACH, part=(2, 2), workers=1)
+
+    assert f"{key}: its baseline.json is not the one that {tmp_path / 'out' / NAMES[0]}" in str(
+        told.value
+    )
+    assert "Remove that shard to have it packed anew and run the same command again" in str(
+        told.value
+    )
+    assert not (tmp_path / "out" / "index.parquet").exists()
+
+
+def test_an_edited_scene_is_packed_anew_once_its_shard_is_removed(tree, tmp_path):
+    out = tmp_path / "out"
+    pack(tree, out, target_bytes=ONE_EACH, workers=1)
+    focal_changed(next(tree.glob("eval/*/*/*/scene_000000")))
+    (out / NAMES[0]).unlink()
+
+    report = pack(tree, out, target_bytes=ONE_EACH, workers=1)
+
+    assert report.packed == (NAMES[0],)
+    assert verify(out, workers=1).problems == ()
+
+
+def test_an_edited_video_is_named_whatever_its_size(tree, tmp_path):
+    pack(tree, tmp_path / "out", target_bytes=ONE_EACH, part=(1, 2), workers=1)
+    source = next(tree.glob("eval/*/*/*/scene_000000/cam_02_depth.mkv"))
+    touched = next(tree.glob("eval/*/*/*/scene_000000/cam_01_depth.mkv"))
+    os.utime(touched, (1, 1))
+    changed_bytes(source)
+
+    with pytest.raises(ShardError, match=r"scene_000000: its cam_02_depth\.mkv is not the one"):
+        pack(tree, tmp_path / "out", target_bytes=ONE_EACH, workers=1)
+
+
+def test_sources_that_were_removed_after_packing_contradict_nothing(tree, packed, tmp_path):
+    out = tmp_path / "out"
+    index = SceneIndex.open(tree)
+    pack(index, out, target_bytes=ONE_EACH, part=(1, 2), workers=1)
+    shutil.rmtree(next(tree.glob("eval/*/*/*/scene_000000")))
+
+    pack(index, out, target_bytes=ONE_EACH, part=(2, 2), workers=1)
+
+    assert bytes_of(out) == bytes_of(packed)
+
+
+def test_metadata_that_the_index_does_not_know_are_not_packed(tree, tmp_path):
+    SceneIndex.open(tree).write(tree / "index.parquet")
+    focal_changed(next(tree.glob("train/Uniform/*/scene_000001")))
+
+    with pytest.raises(ShardError) as told:
+        pack(tree, tmp_path / "out", target_bytes=ONE_EACH, workers=1)
+
+    assert re.search(
+        r"scene_000001/baseline\.json: tells focal_mm .* by the index it is", str(told.value)
+    )
+    assert "run `stereogenbench index` on the release again" in str(told.value)
+    assert NAMES[3] not in tars(tmp_path / "out")
+
+
+def test_an_index_that_was_changed_after_a_shard_is_not_written_beside_it(tree, tmp_path):
+    out, index = tmp_path / "out", SceneIndex.open(tree)
+    pack(index, out, target_bytes=ONE_EACH, part=(1, 2), workers=1)
+    scenes = [replace(index.scene(row), caption="Rain.") for row in range(len(index))]
+
+    with pytest.raises(ShardError, match=r"level\.json: tells the caption .* it is 'Rain\.'"):
+        pack(SceneIndex.from_scenes(scenes, tree), out, target_bytes=ONE_EACH, workers=1)
+
+    assert not (out / "index.parquet").exists()
+
+
+def test_packing_goes_on_without_the_notes_of_finished_shards(packed, release, tmp_path):
+    out = shutil.copytree(packed, tmp_path / "out")
+    shutil.rmtree(out / ".parts")
+    (out / NAMES[2]).unlink()
+
+    report = pack(release, out, target_bytes=ONE_EACH, workers=1)
+
+    assert report.packed == (NAMES[2],)
+    assert bytes_of(out) == bytes_of(packed)
+    assert pack(release, out, target_bytes=ONE_EACH, workers=1).packed == ()
+
+
+def test_without_its_note_a_shard_of_other_bytes_is_refused(packed, release, tmp_path):
+    out = shutil.copytree(packed, tmp_path / "out")
+    shutil.rmtree(out / ".parts")
+    changed_bytes(out / NAMES[2])
+
+    with pytest.raises(ShardError, match=f"{NAMES[2]}: is there and was not packed here by this"):
+        pack(release, out, target_bytes=ONE_EACH, workers=1)
+
+
+def test_of_two_packers_each_reports_what_it_packed(packed, release, tmp_path):
+    job = prepare(release, tmp_path, target_bytes=ONE_EACH, part=(1, 1))
+    shutil.copytree(packed, tmp_path, dirs_exist_ok=True)
+
+    outcomes = [pack_task(job.task(shard), lambda count: None) for shard in job.shards]
+
+    assert {outcome.work for outcome in outcomes} == {"kept"}
+
+
 KILLED_WHILE_PACKING = """
 import sys, time
 from stereogenbench_data.storage.pack import pack
@@ -277,7 +436,7 @@ def large_tasks(tmp_path):
     out.mkdir()
     return [
         ShardTask(
-            PlannedShard(name, 0, ("a",), (PlannedMember("a.mp4", "film", 400_000_000),)),
+            PlannedShard(name, 0, (), (PlannedMember("a.mp4", "film", 400_000_000),)),
             str(tmp_path), str(out), "plan",
         )
         for name in ("x.tar", "y.tar")
@@ -375,9 +534,7 @@ def test_a_source_that_is_changed_while_it_is_read_is_an_error(tmp_path, change)
     source = tmp_path / "film"
     source.write_bytes(bytes(9 * 1024 * 1024))
     member = PlannedMember("a.mp4", "film", 9 * 1024 * 1024)
-    task = ShardTask(
-        PlannedShard("x.tar", 0, ("a",), (member,)), str(tmp_path), str(tmp_path), "plan"
-    )
+    task = ShardTask(PlannedShard("x.tar", 0, (), (member,)), str(tmp_path), str(tmp_path), "plan")
     calls = []
 
     def after_bytes(count):
@@ -493,6 +650,48 @@ def test_a_release_is_not_packed_into_itself(tree):
     with pytest.raises(ShardError, match="is the release itself"):
         pack(tree, tree)
 
+    assert not (tree / ".parts").exists()
+
+
+@pytest.mark.parametrize("place", ["train/out", "eval", "train/Uniform/SynthStage/scene_000000"])
+def test_a_release_is_not_packed_among_its_scenes(tree, place):
+    before = sorted(tree.rglob("*"))
+
+    with pytest.raises(ShardError, match=r"among the scenes of the release\. Pack into a folder"):
+        pack(tree, tree / place)
+
+    assert sorted(tree.rglob("*")) == before
+
+
+def test_shards_may_lie_beside_the_splits_of_their_release(tree, packed):
+    pack(tree, tree / "shards", target_bytes=ONE_EACH, workers=1)
+
+    assert bytes_of(tree / "shards") == bytes_of(packed)
+    assert len(SceneIndex.open(tree)) == 4
+
+
+def test_a_refused_folder_is_left_as_it_was(release, tmp_path):
+    (tmp_path / "other.tar").write_text("mine")
+
+    with pytest.raises(ShardError, match="no shard of this plan"):
+        pack(release, tmp_path)
+
+    assert [path.name for path in tmp_path.iterdir()] == ["other.tar"]
+
+
+def test_a_size_that_no_scene_fits_into_is_refused_before_anything_is_written(release, tmp_path):
+    with pytest.raises(ShardError, match=r"no scene fits into a shard of 1000 bytes: the smallest"):
+        pack(release, tmp_path / "out", target_bytes=1000)
+
+    assert not (tmp_path / "out").exists()
+
+
+def test_scenes_larger_than_a_shard_are_warned_of_once(release, tmp_path):
+    sizes = sorted(shard.size for shard in plan_shards(release, ONE_EACH).shards)
+
+    with pytest.warns(OversizedSceneWarning, match=f"1 of 4 shards exceed .* needs {sizes[-1]}$"):
+        pack(release, tmp_path, target_bytes=sizes[-1] - 1, part=(4, 4), workers=1)
+
 
 def test_shards_are_not_packed_again(packed, tmp_path):
     with pytest.raises(ShardError, match="holds shards already"):
@@ -582,8 +781,8 @@ def test_the_command_packs_and_tells_what_there_is(small_release, tmp_path, pack
     assert (first.exit_code, second.exit_code) == (0, 0)
     assert first.stdout == (
         f"{tmp_path}: 2 shards packed, 0 were finished before\n"
-        f"2 shards of the plan are missing, the first is {NAMES[1]}: the part that packs the "
-        f"last one writes the index\n"
+        f"2 shards of the plan yet to be packed, the first is {NAMES[1]}: the part that packs "
+        f"the last one writes the index\n"
     )
     assert second.stdout == (
         f"{tmp_path}: 2 shards packed, 2 were finished before\n"
@@ -609,8 +808,8 @@ def test_the_command_refuses_a_release_with_broken_scenes(tree, tmp_path):
 
     result = command(tree, tmp_path / "out")
 
-    assert isinstance(result.exception, StorageError)
-    assert "scene_000001: is marked as complete and has no trajectory.json" in str(result.exception)
+    assert result.exit_code == 2
+    assert "scene_000001: is marked as complete and has no trajectory.json" in result.stderr
     assert not (tmp_path / "out").exists()
 
 

@@ -1,12 +1,13 @@
 """A member as a file: its own bytes and no others, each fetched once, ahead of the reader."""
 
 import io
+import zlib
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.storage.ranged_file import (
     FIRST_BLOCK,
@@ -147,6 +148,57 @@ def test_a_failure_is_told_again_without_being_fetched_again():
 
     assert len(tries) == 1
     assert str(file.failure) == "the server is gone"
+
+
+def passed_over(file):
+    """Read a file as FFmpeg reads MP4: the start, the table at the end, then all between."""
+    file.read(100)
+    file.seek(-500, io.SEEK_END)
+    file.read()
+    file.seek(100)
+    read_on(file)
+
+
+def read_on(file):
+    while file.read(32768):
+        pass
+
+
+@pytest.mark.parametrize("size", [700, MIB, 5 * MIB + 3])
+def test_a_pass_over_all_bytes_compares_them_with_their_checksum(size):
+    store = Store(size)
+    right = zlib.crc32(store.data)
+    passed_over(RangedFile(store.fetch, size=size, name="a.mp4", crc32=right))
+    passed_over(RangedFile(store.fetch, size=size, name="a.mp4"))
+    wrong = RangedFile(store.fetch, size=size, name="a.mp4", crc32=right ^ 1)
+
+    with pytest.raises(
+        ShardError, match=f"a.mp4: has crc32 {right:08x}, and the index says {right ^ 1:08x}. It"
+    ):
+        passed_over(wrong)
+    assert isinstance(wrong.failure, ShardError)
+
+
+def test_a_jump_back_over_what_is_no_longer_kept_changes_no_checksum():
+    store = Store(4 * MIB)
+    file = RangedFile(store.fetch, size=4 * MIB, name="a.mp4", crc32=zlib.crc32(store.data) ^ 1)
+    while file.tell() < 3 * MIB + 5:
+        file.read(32768)
+    file.seek(MIB // 2)
+    with pytest.raises(ShardError, match="has crc32"):
+        read_on(file)
+
+    assert store.fetched > 4 * MIB
+
+
+def test_parts_of_a_member_are_not_compared():
+    store = Store(9 * MIB)
+    file = RangedFile(store.fetch, size=9 * MIB, name="a.mp4", crc32=1)
+    for place in (8 * MIB, 5 * MIB, 2 * MIB):
+        file.seek(place)
+        file.read(MIB)
+
+    assert file.failure is None
 
 
 def test_bytes_can_be_read_into_a_buffer():

@@ -14,8 +14,10 @@ import pytest
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.main import app
-from stereogenbench_data.errors import ShardError
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Member, ShardFacts
+from stereogenbench_data.storage.foreign_index import write_foreign_indexes
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.pack import pack
 from stereogenbench_data.storage.tar import END_OF_ARCHIVE, member_header, padded, read_members
@@ -176,7 +178,7 @@ def tar_of(files):
 
 KEY = "train/Uniform/Town/scene_000001"
 FILES = [
-    (f"{KEY}.baseline.json", b"{}"),
+    (f"{KEY}.cam_00_depth.mkv", b"{}"),
     (f"{KEY}.cam_00_rgb.mp4", b"left" * 128),
     (f"{KEY}.cam_01_rgb.mp4", b"four" * 128),
 ]
@@ -196,9 +198,11 @@ def toy(small_shards, tmp_path):
         )
         for each in read_members(io.BytesIO(content), len(content), where="x.tar")
     }
-    scene = replace(pattern, id=replace(pattern.id, key=KEY), members=members)
+    scene = replace(pattern, id=parse_scene_key(KEY), members=members)
     facts = ShardFacts(len(content), sha256(content).hexdigest(), len(FILES))
-    SceneIndex.from_scenes([scene], root, shards={"x.tar": facts}).write(root / "index.parquet")
+    index = SceneIndex.from_scenes([scene], root, shards={"x.tar": facts})
+    index.write(root / "index.parquet")
+    write_foreign_indexes(index, out=root)
 
     def verified(other):
         (root / "x.tar").write_bytes(other)
@@ -271,7 +275,7 @@ def test_a_renamed_scene_is_of_another_pack(toy):
         ("a/x.mp4", tarfile.GNUTYPE_SPARSE, "'a/x.mp4' is a GNU sparse file"),
         ("a/x.mp4", tarfile.XHDTYPE, "'a/x.mp4' is a PAX header"),
         ("././@LongLink", tarfile.GNUTYPE_LONGNAME, "is a GNU long name"),
-        (FILES[0][0], tarfile.REGTYPE, "_000001.baseline.json' is there a second time"),
+        (FILES[0][0], tarfile.REGTYPE, "_000001.cam_00_depth.mkv' is there a second time"),
     ],
 )  # fmt: skip
 def test_a_member_that_no_shard_may_hold_is_refused_by_name(toy, name, kind, found):
@@ -322,12 +326,18 @@ def test_an_index_of_another_pack_is_told_for_every_shard_that_differs(
 
     told = lines(shards, mode="decode")
 
-    assert len(told) == 2
-    assert told[0].startswith(
-        f"{PAIR}: holds other scenes than the index says: 1 unknown, 0 not there ({SCENES[1]}); "
-        f"shard and index are of different packs"
+    assert [line.partition(":")[0] for line in told] == [
+        "dali/train-Uniform-000000.idx", "dali/train-Uniform-000001.idx", "shards.json", PAIR,
+        "train-Uniform-000001.tar",
+    ]  # fmt: skip
+    assert told[3].startswith(
+        f"{PAIR}: holds 17 members that the index does not place in it ({SCENES[1]}._scene"
     )
-    assert told[1].startswith("train-Uniform-000001.tar: is missing, with 1 scenes.")
+    assert told[3].endswith(
+        ": something was appended, or the index is of another pack. Fetch the shard and its index "
+        "again, or pack them again."
+    )
+    assert told[4].startswith("train-Uniform-000001.tar: is missing, with 1 scene.")
 
 
 def test_all_problems_are_listed_whatever_the_workers(shards, edit, place):
@@ -427,6 +437,77 @@ def test_far_shards_are_to_be_fetched(tmp_path):
         verify("https://example.org/shards")
 
 
+@pytest.mark.parametrize(
+    ("member", "change", "found"),
+    [
+        ("baseline.json", lambda scene: {"rig": replace(scene.rig, focal_mm=99.0)},
+         "tells focal_mm "),
+        ("baseline.json",
+         lambda scene: {"rig": replace(scene.rig, baselines_cm=(7.0,) * 15)},
+         "tells baselines_cm ("),
+        ("baseline.json", lambda scene: {"rig": replace(scene.rig, primary_pair=(2, 4))},
+         "tells primary_pair (0, 1), and by the index it is (2, 4)"),
+        ("trajectory.json", lambda scene: {"frames": 6},
+         "tells frames 7, and by the index it is 6"),
+        ("trajectory.json", lambda scene: {"lateral_m": (0.0,) * 6}, "tells lateral_m (0.0, "),
+        ("trajectory.json", lambda scene: {"rig_residual_px": 5.0}, "tells rig_residual_px "),
+        ("scene_description_qwen_dataset_level.json", lambda scene: {"caption": "Snow."},
+         "and by the index it is 'Snow.'"),
+        ("baseline.json", lambda scene: {"labels": replace(scene.labels, character="Nobody")},
+         "and by the index it is 'Nobody'"),
+        ("", lambda scene: {"id": replace(scene.id, family="IPD_Gaussian")},
+         "its path tells family 'Uniform', and by the index it is 'IPD_Gaussian'"),
+    ],
+)  # fmt: skip
+def test_an_index_that_contradicts_a_shards_metadata_is_told(shards, member, change, found):
+    index = SceneIndex.open(shards)
+    scenes = [index.scene(row) for row in range(len(index))]
+    row = [scene.id.key for scene in scenes].index(SCENES[1])
+    scenes[row] = replace(scenes[row], **change(scenes[row]))
+    altered = SceneIndex.from_scenes(scenes, shards, shards=index.shards)
+    altered.write(shards / "index.parquet")
+
+    (told,) = lines(shards)
+
+    assert told.startswith(": ".join(part for part in (PAIR, SCENES[1], member) if part) + ": ")
+    assert found in told
+    assert told.endswith(". Fetch the shard and its index again, or pack them again.")
+
+
+@pytest.mark.parametrize("name", ["shards.json", f"dali/{PAIR[:-4]}.idx"])
+def test_files_for_other_readers_that_are_missing_or_altered_are_told(shards, name):
+    write = "Fetch it again, or write it anew: run `stereogenbench pack` again."
+    content = (shards / name).read_bytes()
+    (shards / name).write_bytes(content.replace(b"1", b"2", 1))
+    altered = lines(shards)
+    (shards / name).unlink()
+
+    missing = lines(shards)
+
+    assert altered == [f"{name}: contradicts the index. {write}"]
+    assert missing == [f"{name}: is missing, and pack wrote it. {write}"]
+
+
+def test_a_file_that_was_appended_to_a_shard_is_told_as_such(shards, edit):
+    added = tar_of([("train/Uniform/SynthStage/scene_000009.notes.txt", b"mine")])
+    edit(PAIR, lambda content: content[: -len(END_OF_ARCHIVE)] + added)
+
+    assert lines(shards) == [
+        f"{PAIR}: holds 1 member that the index does not place in it (train/Uniform/SynthStage/"
+        f"scene_000009.notes.txt): something was appended, or the index is of another pack. Fetch "
+        f"the shard and its index again, or pack them again."
+    ]
+
+
+def test_a_damaged_index_of_shards_is_to_be_fetched_or_packed_again(shards):
+    content = bytearray((shards / "index.parquet").read_bytes())
+    content[len(content) // 2 :] = b""
+    (shards / "index.parquet").write_bytes(content)
+
+    with pytest.raises(StorageError, match="the index of shards: fetch it again or, where"):
+        verify(shards)
+
+
 def test_an_index_that_contradicts_itself_is_refused(shards):
     index = SceneIndex.open(shards)
     index.shards.pop(PAIR)
@@ -467,6 +548,12 @@ def test_the_command_ends_with_1_and_a_line_for_each_problem(shards):
         str(shards),
     ]
     assert result.stdout.splitlines()[-1].endswith("; 2 problems")
+
+
+def test_one_problem_is_told_in_the_singular(shards):
+    (shards / "shards.json").unlink()
+
+    assert command(shards).stdout.endswith("; 1 problem\n")
 
 
 def test_the_command_reports_as_json(shards):

@@ -1,0 +1,195 @@
+"""Depth videos to blosc2's frames and back, bit for bit: each is read again and compared.
+
+Only FFV1 of one grey plane is packed: of such a video the stored numbers are all there is.
+"""
+
+import io
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Final, cast
+
+import av
+import numpy as np
+from av.video.stream import VideoStream
+from jaxtyping import UInt16
+
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.container import VideoFile, open_container
+from stereogenbench_data.media.depth import read_depth_units, require_depth_stream
+from stereogenbench_data.media.depth_frame_file import (
+    StoredClip,
+    blosc2_module,
+    compressed_chunk,
+    frame_file,
+    is_zeros,
+)
+from stereogenbench_data.media.depth_frames import DepthFrames
+from stereogenbench_data.media.video import VideoReader
+from stereogenbench_data.schema.records import DepthEncoding
+
+_ANY_DEPTH: Final = DepthEncoding(accept=frozenset({"8-bit"}))
+_FFV1_OPTIONS: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
+_WRITERS_TAGS: Final = frozenset({"encoder", "duration"})
+"""Tags that whoever writes a Matroska file sets itself."""
+
+AfterFrame = Callable[[], None]
+
+
+def packed_depth(
+    video: VideoFile, *, name: str, frames: int, after_frame: AfterFrame = lambda: None
+) -> bytes:
+    """Return a depth video as a file of blosc2's frames.
+
+    Args:
+        video: A path, or a seekable binary file; the latter stays the caller's to close.
+        name: What messages call it.
+        frames: How many frames it must have.
+        after_frame: Called after each frame.
+
+    Raises:
+        ExtraError: If blosc2 is not installed.
+        MediaError: If the video cannot be decoded or is no FFV1 of one grey plane, or what was
+            packed does not read back as it was.
+    """
+    chunks, pts = [], []
+    with VideoReader(video, name=name, frames=frames) as reader:
+        facts = reader.facts
+        if facts.codec != "ffv1":
+            raise MediaError(
+                f"{name}: its depth is stored by codec {facts.codec}, and blosc2 packs FFV1 alone. "
+                f"Pack with --depth-codec released."
+            )
+        require_depth_stream(
+            codec=facts.codec, pixel_format=facts.pixel_format, encoding=_ANY_DEPTH, name=name
+        )
+        time_base = Fraction(1)
+        for index in range(frames):
+            units = read_depth_units(reader, index, encoding=_ANY_DEPTH)
+            chunk = compressed_chunk(units.tobytes())
+            frame = reader.frame(index)
+            pts.append(_ticks(frame, name=name))
+            time_base = frame.time_base or time_base
+            chunks.append(chunk)
+            _require_same(units, chunk, index=index, name=name)
+            after_frame()
+    with open_container(video, name=name) as container:
+        stream = container.streams.video[0]
+        rate = stream.average_rate or 1 / (time_base * max(pts[-1], 1))
+        clip = StoredClip(
+            width_px=facts.width_px,
+            height_px=facts.height_px,
+            codec=facts.codec,
+            pixel_format=facts.pixel_format,
+            rate=(rate.numerator, rate.denominator),
+            time_base=(time_base.numerator, time_base.denominator),
+            pts=tuple(pts),
+            tags=dict(container.metadata),
+            stream_tags=dict(stream.metadata),
+        )
+    content = frame_file(clip, chunks)
+    with DepthFrames(io.BytesIO(content), name=name, frames=frames) as packed:
+        for index, chunk in enumerate(chunks):
+            if packed.chunk(index) != (b"" if is_zeros(chunk) else chunk):
+                raise _not_whole(name, index)
+    return content
+
+
+def _ticks(frame: av.VideoFrame, *, name: str) -> int:
+    if frame.pts is None:
+        raise MediaError(
+            f"{name}: a frame has no time, so that the video could not be written anew. Pack with "
+            f"--depth-codec released."
+        )
+    return frame.pts
+
+
+def _require_same(units: UInt16[np.ndarray, "h w"], chunk: bytes, *, index: int, name: str) -> None:
+    """Decompress a frame right after it was compressed, and compare."""
+    found = np.empty_like(units)
+    blosc2_module().decompress2(chunk, dst=found, nthreads=1)
+    if not np.array_equal(found, units):
+        raise _not_whole(name, index)
+
+
+def _not_whole(name: str, index: int) -> MediaError:
+    return MediaError(
+        f"{name}: frame {index} does not come back from blosc2 as it was. Check the memory of this "
+        f"machine and the version of blosc2, then pack again."
+    )
+
+
+def write_depth_video(
+    packed: DepthFrames, target: Path, *, after_frame: AfterFrame = lambda: None
+) -> None:
+    """Write packed depth as a Matroska video by FFV1, with the tags and the times that it had.
+
+    The video is read again and compared. Its bytes are not those of the first: another encoder's
+    name and settings stand in it.
+
+    Raises:
+        MediaError: If a frame cannot be read, or the video does not hold what was packed.
+        OSError: If it cannot be written.
+    """
+    clip = packed.clip
+    time_base = Fraction(*clip.time_base)
+    options = {"fflags": "+bitexact"}
+    with av.open(target, "w", format="matroska", container_options=options) as container:
+        container.metadata.update(clip.tags)
+        stream = cast(
+            VideoStream,
+            container.add_stream(clip.codec, rate=Fraction(*clip.rate), options=_FFV1_OPTIONS),
+        )
+        stream.metadata.update(clip.stream_tags)
+        stream.width, stream.height = clip.width_px, clip.height_px
+        stream.pix_fmt = clip.pixel_format
+        stream.codec_context.thread_count = 1
+        stream.codec_context.time_base = time_base
+        stream.time_base = time_base
+        for index, pts in enumerate(clip.pts):
+            frame = _grey_frame(packed.units(index), pixel_format=clip.pixel_format)
+            frame.pts, frame.time_base = pts, time_base
+            container.mux(stream.encode(frame))
+            after_frame()
+        container.mux(stream.encode(None))
+    _require_same_video(packed, target)
+
+
+def _grey_frame(units: UInt16[np.ndarray, "h w"], *, pixel_format: str) -> av.VideoFrame:
+    height, width = units.shape
+    frame = av.VideoFrame(width, height, pixel_format)
+    plane = frame.planes[0]
+    numbers = units.astype("u1" if pixel_format == "gray" else "<u2")
+    rows = np.zeros((height, plane.line_size // numbers.itemsize), numbers.dtype)
+    rows[:, :width] = numbers
+    plane.update(rows.tobytes())
+    return frame
+
+
+def _require_same_video(packed: DepthFrames, target: Path) -> None:
+    clip, name = packed.clip, packed.name
+    with VideoReader(target, name=str(target), frames=packed.frames) as reader:
+        for index, pts in enumerate(clip.pts):
+            frame = reader.frame(index)
+            units = read_depth_units(reader, index, encoding=_ANY_DEPTH)
+            shown_s = None if frame.time_base is None else (frame.pts or 0) * frame.time_base
+            if not np.array_equal(units, packed.units(index)):
+                raise _not_unpacked(name, f"frame {index} has other numbers")
+            if shown_s != pts * Fraction(*clip.time_base):
+                raise _not_unpacked(name, f"frame {index} is shown at {shown_s} s")
+    with open_container(target, name=str(target)) as container:
+        for found, told in (
+            (container.metadata, clip.tags),
+            (container.streams.video[0].metadata, clip.stream_tags),
+        ):
+            lost = {key for key in told if found.get(key) != told[key]}
+            lost -= {key for key in lost if key.lower() in _WRITERS_TAGS}
+            if lost:
+                raise _not_unpacked(name, f"the tags {sorted(lost)} are lost")
+
+
+def _not_unpacked(name: str, why: str) -> MediaError:
+    return MediaError(
+        f"{name}: was not written as a video as it is: {why}. Check the version of PyAV; the "
+        f"packed file is unharmed."
+    )

@@ -1,0 +1,367 @@
+"""Depth packed by blosc2: bit for bit, frame by frame, and nothing that the bytes say believed."""
+
+import io
+import json
+import sys
+import zlib
+from dataclasses import replace
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+
+from stereogenbench_data.errors import ExtraError, MediaError
+from stereogenbench_data.media import depth_frames
+from stereogenbench_data.media.depth import open_depth, read_depth_units, resolve_encoding
+from stereogenbench_data.media.depth_frame_file import (
+    LAYER,
+    compressed_chunk,
+    frame_file,
+    parse_header,
+    require_chunk,
+)
+from stereogenbench_data.media.depth_frames import DepthFrames
+from stereogenbench_data.media.depth_packing import packed_depth, write_depth_video
+from stereogenbench_data.media.video import VideoReader, probe
+from stereogenbench_data.schema.records import DepthEncoding
+from tests.servers.tools import require_module
+
+SHAPE = (40, 56)
+TAGS = {"DEPTH_SCALE": "0.001", "TITLE": "Nowhere"}
+
+
+def pictures(largest=65535):
+    """Noise, nothing, one number everywhere, the largest number, a slope, noise of few levels."""
+    noise = np.random.default_rng(3)
+    slope = np.arange(SHAPE[0] * SHAPE[1]).reshape(SHAPE) % (largest + 1)
+    maps = [
+        noise.integers(0, largest + 1, SHAPE),
+        np.zeros(SHAPE),
+        np.full(SHAPE, 7),
+        np.full(SHAPE, largest),
+        slope,
+        noise.integers(0, 3, SHAPE),
+    ]
+    return [each.astype(np.uint16) for each in maps]
+
+
+def write_depth(path, maps, *, pixel_format="gray16le", codec="ffv1", step=1):
+    with av.open(str(path), "w") as container:
+        container.metadata.update(TAGS)
+        stream = container.add_stream(codec, rate=15)
+        stream.height, stream.width = SHAPE
+        stream.pix_fmt = pixel_format
+        for number, units in enumerate(maps):
+            frame = av.VideoFrame(SHAPE[1], SHAPE[0], pixel_format)
+            for plane in frame.planes:
+                numbers = units.astype("u1") if pixel_format in ("gray", "yuv420p") else units
+                rows = np.zeros((plane.height, plane.line_size // numbers.itemsize), numbers.dtype)
+                rows[:, : plane.width] = numbers[: plane.height, : plane.width]
+                plane.update(rows.tobytes())
+            frame.pts, frame.time_base = number * step, Fraction(1, 15)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+@pytest.fixture(scope="module")
+def blosc2():
+    return require_module("blosc2")
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    return write_depth(tmp_path_factory.mktemp("depth") / "cam_00_depth.mkv", pictures())
+
+
+@pytest.fixture(scope="module")
+def packed(blosc2, video):
+    assert blosc2.__version__
+    return packed_depth(video, name="cam_00_depth.mkv", frames=6)
+
+
+def opened(content, frames=6):
+    return DepthFrames(io.BytesIO(content), name="cam_00_depth.b2frame", frames=frames)
+
+
+def test_every_frame_comes_back_bit_for_bit_in_any_order(packed):
+    with opened(packed) as depth:
+        for index in (5, 0, 3, 3, 1, 2, 4):
+            found = depth.units(index)
+
+            assert found.dtype == np.uint16
+            np.testing.assert_array_equal(found, pictures()[index])
+
+
+def test_blosc2_itself_reads_the_file_and_its_description(blosc2, packed):
+    schunk = blosc2.schunk_from_cframe(packed)
+
+    assert schunk.nchunks == 6
+    for index, units in enumerate(pictures()):
+        found = np.frombuffer(schunk.decompress_chunk(index), np.uint16).reshape(SHAPE)
+        np.testing.assert_array_equal(found, units)
+    clip = json.loads(schunk.meta[LAYER][4:])["clip"]
+    assert (clip["width_px"], clip["height_px"]) == (56, 40)
+    assert (clip["codec"], clip["pixel_format"]) == ("ffv1", "gray16le")
+    assert clip["tags"]["DEPTH_SCALE"] == "0.001"
+
+
+def test_a_video_packs_to_the_same_bytes_each_time(packed, video):
+    assert packed_depth(video, name="again", frames=6) == packed
+
+
+def test_its_facts_are_those_of_the_video(packed, video):
+    found, told = opened(packed).facts, probe(video, name="cam_00_depth.mkv")
+
+    assert found == replace(told, codec="blosc2")
+    assert probe(io.BytesIO(packed), name="cam_00_depth.b2frame") == found
+    assert resolve_encoding(found, name="it").unit_m == 0.001
+
+
+def test_depth_is_opened_by_its_name(packed, video):
+    encoding = DepthEncoding(unit_m=0.001)
+    with (
+        open_depth(io.BytesIO(packed), name="cam_00_depth.b2frame", frames=6) as one,
+        open_depth(video, name="cam_00_depth.mkv", frames=6) as other,
+    ):
+        for index in range(6):
+            np.testing.assert_array_equal(
+                read_depth_units(one, index, encoding=encoding),
+                read_depth_units(other, index, encoding=encoding),
+            )
+
+
+class Counting(io.BytesIO):
+    """A file that notes what is read of it."""
+
+    def __init__(self, content):
+        super().__init__(content)
+        self.ranges = []
+
+    def read(self, size=-1, /):
+        start = self.tell()
+        data = super().read(size)
+        self.ranges.append((start, len(data)))
+        return data
+
+
+@pytest.mark.usefixtures("blosc2")
+def test_one_frame_costs_the_header_and_its_own_chunk():
+    noise = np.random.default_rng(1)
+    clip = opened_clip()
+    maps = [noise.integers(0, 65536, (200, 200)).astype(np.uint16) for _ in range(4)]
+    clip = replace(clip, width_px=200, height_px=200, pts=(0, 1, 2, 3))
+    file = Counting(frame_file(clip, [compressed_chunk(units.tobytes()) for units in maps]))
+
+    with DepthFrames(file, name="x.b2frame", frames=4) as depth:
+        np.testing.assert_array_equal(depth.units(2), maps[2])
+        chunk = depth.chunk(2)
+
+    assert file.ranges[0] == (0, 4096)
+    assert file.ranges[1] == file.ranges[2]
+    assert file.ranges[1][1] == len(chunk) <= 200 * 200 * 2 + 32
+
+
+def opened_clip():
+    return depth_frames.StoredClip(
+        width_px=56, height_px=40, codec="ffv1", pixel_format="gray16le", rate=(15, 1),
+        time_base=(1, 1000), pts=(0,), tags={}, stream_tags={},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("index", [0, 2, 5])
+def test_a_flipped_byte_of_a_frame_is_told_with_its_number_and_others_are_read(packed, index):
+    with opened(packed) as depth:
+        place = packed.index(depth.chunk(index))
+    content = bytearray(packed)
+    content[place + 40] ^= 1
+
+    with opened(bytes(content)) as depth:
+        with pytest.raises(MediaError, match=f"b2frame: frame {index}: has crc32 .* is damaged"):
+            depth.units(index)
+
+        np.testing.assert_array_equal(depth.units(4), pictures()[4])
+
+
+def test_a_flipped_byte_of_the_header_is_refused_or_changes_nothing(packed):
+    facts, told = opened(packed).facts, []
+
+    for at in range(2, 500, 3):
+        content = bytearray(packed)
+        content[at] ^= 0x11
+        try:
+            depth = opened(bytes(content))
+        except MediaError as error:
+            told.append(str(error))
+            continue
+        assert depth.facts == facts
+        for index, units in enumerate(pictures()):
+            np.testing.assert_array_equal(depth.units(index), units)
+
+    assert len(told) > 130
+    assert {line[:22] for line in told} == {"cam_00_depth.b2frame: "}
+
+
+@pytest.mark.parametrize("left", [0, 5, 100, 400, 3000])
+def test_a_file_that_was_cut_short_is_refused(packed, left):
+    with pytest.raises(MediaError, match=r"cam_00_depth\.b2frame: is (no depth|cut short)"):
+        opened(packed[:left])
+
+
+def test_a_video_under_its_name_is_refused(video):
+    with pytest.raises(MediaError, match=r"its first bytes are .* not those of a blosc2 frame"):
+        opened(video.read_bytes())
+
+
+def test_another_number_of_frames_is_refused(packed):
+    with pytest.raises(MediaError, match="holds 6 frames where 7 are expected"):
+        opened(packed, frames=7)
+
+
+@pytest.mark.parametrize("index", [-1, 6])
+def test_a_frame_that_does_not_exist_is_refused(packed, index):
+    with pytest.raises(MediaError, match=f"has no frame {index}: ask for one of 0 to 5"):
+        opened(packed).units(index)
+
+
+def test_frames_too_large_are_refused_before_anything_is_allocated(packed, monkeypatch):
+    monkeypatch.setattr(depth_frames, "LARGEST_FRAME_BYTES", 56 * 40 * 2 - 1)
+
+    with pytest.raises(MediaError, match="claims frames of 56x40 pixels, 4,480 bytes each"):
+        opened(packed)
+
+
+def changed(chunk, at, value):
+    content = bytearray(chunk)
+    content[at : at + len(value)] = value
+    return bytes(content)
+
+
+@pytest.mark.usefixtures("blosc2")
+@pytest.mark.parametrize(
+    ("at", "value", "found"),
+    [
+        (4, (2**31 - 16).to_bytes(4, "little"), "claims 2147483632 bytes of units"),
+        (12, (10**6).to_bytes(4, "little"), "in 1000000, in blocks"),
+        (8, bytes(4), "in blocks of 0"),
+        (2, b"\xc5", "asks for another codec"),
+        (16, b"\xa0", "asks for another codec"),
+        (22, b"\x25", "asks for another codec"),
+        (31, b"\x08", "asks for another codec"),
+        (3, b"\x04", "asks for another codec"),
+    ],
+    ids=["a bomb", "a size", "no blocks", "a codec", "a filter of the user's", "a plugin's codec",
+         "a lazy chunk", "wide units"],
+)  # fmt: skip
+def test_a_chunk_that_blosc2_would_take_otherwise_is_refused_before_it_does(at, value, found):
+    clip = opened_clip()
+    chunk = changed(compressed_chunk(pictures()[0].tobytes()), at, value)
+
+    with pytest.raises(MediaError, match=found):
+        require_chunk(chunk, clip=clip, crc32=zlib.crc32(chunk), name="frame 3")
+
+
+def test_a_chunk_shorter_than_its_header_is_refused():
+    with pytest.raises(MediaError, match="it has 3 bytes, which is less than a chunk's header"):
+        require_chunk(b"abc", clip=opened_clip(), crc32=zlib.crc32(b"abc"), name="frame 3")
+
+
+def test_a_chunk_that_does_not_decompress_is_told(packed, monkeypatch):
+    with opened(packed) as depth:
+        whole = depth.chunk(4)
+    monkeypatch.setattr(depth_frames, "require_chunk", lambda chunk, **how: None)
+    content = packed.replace(whole, changed(whole, 32, b"\xff" * (len(whole) - 32)))
+
+    with pytest.raises(MediaError, match="frame 4 does not decompress"):
+        opened(content).units(4)
+
+
+def parse_text(content):
+    start = content.index(b'{"format":1')
+    end = content.index(b"]}", content.index(b'"crc32s"', start)) + 2
+    return content[start:end]
+
+
+@pytest.mark.usefixtures("blosc2")
+@pytest.mark.parametrize(
+    ("pixel_format", "largest"), [("gray16le", 65535), ("gray12le", 4095), ("gray", 255)]
+)
+def test_packed_depth_becomes_the_same_video_again(tmp_path, pixel_format, largest):
+    first = write_depth(
+        tmp_path / "first.mkv", pictures(largest), pixel_format=pixel_format, step=2
+    )
+    content = packed_depth(first, name="first.mkv", frames=6)
+
+    write_depth_video(opened(content), tmp_path / "second.mkv")
+
+    one, other = (probe(tmp_path / name, name=name) for name in ("first.mkv", "second.mkv"))
+    assert other.tags.pop("encoder", "") != ""
+    one.tags.pop("encoder")
+    assert one == other
+    with (
+        VideoReader(first, name="first", frames=6) as before,
+        VideoReader(tmp_path / "second.mkv", name="second", frames=6) as after,
+    ):
+        for index in range(6):
+            assert before.frame(index).time == after.frame(index).time
+            np.testing.assert_array_equal(
+                before.frame(index).to_ndarray(), after.frame(index).to_ndarray()
+            )
+    again = packed_depth(tmp_path / "second.mkv", name="second.mkv", frames=6)
+    clips = [opened(each).clip for each in (content, again)]
+    for clip in clips:
+        del clip.tags[next(key for key in clip.tags if key.lower() == "encoder")]
+    assert clips[0] == clips[1]
+
+
+@pytest.mark.parametrize(
+    ("codec", "pixel_format", "found"),
+    [
+        ("libx264", "yuv420p", "stored by codec h264, and blosc2 packs FFV1 alone"),
+        ("ffv1", "yuv420p10le", "depth is stored by codec ffv1 as yuv420p10le"),
+    ],
+)
+def test_what_cannot_come_back_whole_is_not_packed(tmp_path, codec, pixel_format, found):
+    path = write_depth(
+        tmp_path / "x.mkv", pictures(1000)[:2], codec=codec, pixel_format=pixel_format
+    )
+
+    with pytest.raises(MediaError, match=found):
+        packed_depth(path, name="x.mkv", frames=2)
+
+
+def test_what_blosc2_does_not_give_back_is_an_error(blosc2, video, monkeypatch):
+    def forgetful(chunk, dst, **how):
+        dst[...] = 1
+
+    monkeypatch.setattr(blosc2, "decompress2", forgetful)
+
+    with pytest.raises(MediaError, match="frame 0 does not come back from blosc2 as it was"):
+        packed_depth(video, name="x.mkv", frames=6)
+
+
+def test_without_blosc2_the_extra_is_named(packed, monkeypatch):
+    monkeypatch.setitem(sys.modules, "blosc2", None)
+
+    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[blosc2\]'"):
+        opened(packed)
+
+
+def test_a_header_of_another_version_is_refused(packed):
+    content = packed.replace(b'{"format":1', b'{"format":2')
+    text = parse_text(packed).replace(b'{"format":1', b'{"format":2')
+    content = content.replace(
+        zlib.crc32(parse_text(packed)).to_bytes(4, "big") + text,
+        zlib.crc32(text).to_bytes(4, "big") + text,
+    )
+
+    with pytest.raises(MediaError, match="its description of itself is of another version"):
+        parse_header(content[:2000], file_bytes=len(content), name="x")
+
+
+def test_an_open_reader_stays_in_its_process(packed):
+    import pickle
+
+    with pytest.raises(TypeError, match="an open DepthFrames cannot be pickled"):
+        pickle.dumps(opened(packed))
