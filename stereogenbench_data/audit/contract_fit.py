@@ -1,0 +1,231 @@
+"""A contract's two lengths, scale and offset: found from matches, refined on the pictures.
+
+The scale is voted for by the ratios of found to predicted disparities, which no wrong start can
+mislead. It is then refined by Gauss-Newton steps on the difference of the pictures (Lucas and
+Kanade, 1981, with disparity a scale and an offset of what depth predicts), robustly weighted.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from stereogenbench_data.audit.contract_hypotheses import Structure
+from stereogenbench_data.audit.contract_scoring import Pair, Scored, differences, scored
+from stereogenbench_data.audit.contract_views import Points, SceneViews, Shot
+
+Free = Literal["nothing", "scale", "offset", "both"]
+
+_TOLERANCE_PX: Final = 1.0
+_BIN: Final = 0.02
+_LOG_RANGE: Final = 32.0
+_STEPS: Final = 10
+_LARGEST_STEP_PX: Final = 1.0
+_DRAWS: Final = 300
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Term:
+    """A shot with the disparity that a structure predicts for the pixels of which it tells.
+
+    ``large_px`` is the 90th percentile of the predicted sizes.
+    """
+
+    shot: Shot
+    known: np.ndarray
+    predicted_px: Points
+    matched_px: Points
+    large_px: float
+
+    @property
+    def pair(self) -> Pair:
+        return self.shot.left, self.shot.right
+
+
+def fitted(views: SceneViews, shots: Sequence[Shot], structure: Structure, *, free: Free) -> Scored:
+    """Return a structure with the scale and offsets that explain the pictures best."""
+    terms = _terms(views, shots, structure)
+    if free == "nothing" or not terms:
+        return scored(views, shots, structure)
+    scale, offsets_px = _start(terms, free=free)
+    scale, offsets_px, error = _refined(views, terms, scale, offsets_px, free=free)
+    return scored(views, shots, structure, scale=scale, offsets_px=offsets_px, scale_error=error)
+
+
+def _terms(views: SceneViews, shots: Sequence[Shot], structure: Structure) -> list[_Term]:
+    terms = []
+    for shot in shots:
+        predicted = views.predicted(shot, structure)
+        if predicted is not None and predicted[1].any():
+            disparity_px, known = predicted
+            told_px = disparity_px[known]
+            large_px = float(np.percentile(np.abs(told_px), 90))
+            terms.append(_Term(shot, known, told_px, shot.matched_px[known], large_px))
+    return terms
+
+
+def _start(terms: Sequence[_Term], *, free: Free) -> tuple[float, dict[Pair, float]]:
+    """Return a scale and offsets from the matches alone."""
+    found = np.concatenate([term.matched_px for term in terms])
+    predicted = np.concatenate([term.predicted_px for term in terms])
+    if free == "scale":
+        return _voted_scale(found, predicted), {}
+    scale = 1.0
+    if free == "both":
+        widest = max(terms, key=lambda term: len(term.matched_px)).pair
+        own = [term for term in terms if term.pair == widest]
+        scale = _drawn_scale(
+            np.concatenate([term.matched_px for term in own]),
+            np.concatenate([term.predicted_px for term in own]),
+        )
+    offsets_px = {}
+    for pair in dict.fromkeys(term.pair for term in terms):
+        rest = [term.matched_px - scale * term.predicted_px for term in terms if term.pair == pair]
+        offsets_px[pair] = _densest(np.concatenate(rest))
+    return scale, offsets_px
+
+
+def _agreement(found: Points, predicted: Points) -> float:
+    """Return how many matches a prediction explains, each counted by how near it is."""
+    away = (found - predicted) / _TOLERANCE_PX
+    return float((1 / (1 + away * away)).sum())
+
+
+def _voted_scale(found: Points, predicted: Points) -> float:
+    """Return the scale that most matches agree on, of those that their ratios propose."""
+    usable = (found * predicted > 0) & (np.abs(found) > 0.1)
+    if not usable.any():
+        return 1.0
+    ratios = np.log(found[usable] / predicted[usable])
+    weights = np.minimum(np.abs(found[usable]), 5.0)
+    bins = int(2 * _LOG_RANGE / _BIN)
+    votes, edges = np.histogram(ratios, bins=bins, range=(-_LOG_RANGE, _LOG_RANGE), weights=weights)
+    smooth = np.convolve(votes, [1, 2, 3, 2, 1], mode="same")
+    best = smooth.argsort()[-12:]
+    scales = [1.0, *np.exp((edges[best] + edges[best + 1]) / 2), math.exp(np.median(ratios))]
+    return float(max(scales, key=lambda scale: _agreement(found, scale * predicted)))
+
+
+def _drawn_scale(found: Points, predicted: Points) -> float:
+    """Return the scale of the line, offset and all, on which most matches are."""
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(len(found), size=(2, _DRAWS))
+    apart = predicted[first] - predicted[second]
+    wide = np.abs(apart) > 0
+    first, second, apart = first[wide], second[wide], apart[wide]
+    scales = (found[first] - found[second]) / apart
+    best, most = 1.0, -1.0
+    few = rng.integers(len(found), size=min(len(found), 1500))
+    for scale, anchor in zip(scales, first, strict=True):
+        if scale > 0:
+            shift = found[anchor] - scale * predicted[anchor]
+            agree = _agreement(found[few], scale * predicted[few] + shift)
+            best, most = (float(scale), agree) if agree > most else (best, most)
+    return best
+
+
+def _densest(values: Points) -> float:
+    """Return where most values are, to half a pixel or better."""
+    places = np.round(values * 4)
+    numbers, counts = np.unique(places, return_counts=True)
+    tallest = numbers[counts.argsort()[-8:]] / 4
+    best = max(tallest, key=lambda place: _agreement(values, np.full_like(values, place)))
+    near = values[np.abs(values - best) < _TOLERANCE_PX]
+    return float(np.median(near))
+
+
+def _refined(
+    views: SceneViews,
+    terms: Sequence[_Term],
+    scale: float,
+    offsets_px: dict[Pair, float],
+    *,
+    free: Free,
+) -> tuple[float, dict[Pair, float], float]:
+    """Return scale and offsets after Gauss-Newton steps, and the error of log(scale)."""
+    pairs = list(dict.fromkeys(term.pair for term in terms))
+    fits_scale = free in ("scale", "both")
+    fits_offset = free in ("offset", "both")
+    unknowns = [*(["scale"] if fits_scale else []), *(pairs if fits_offset else [])]
+    error = math.inf
+    for _ in range(_STEPS):
+        normals, rights = _equations(views, terms, scale, offsets_px, unknowns=unknowns)
+        step, spread = _solved(normals, rights)
+        limit = max(np.abs(_moved(term, scale, step, unknowns)).max() for term in terms)
+        step *= min(1.0, _LARGEST_STEP_PX / max(limit, 1e-12))
+        for name, change in zip(unknowns, step, strict=True):
+            if isinstance(name, tuple):
+                offsets_px = offsets_px | {name: offsets_px.get(name, 0.0) + float(change)}
+            else:
+                scale *= math.exp(float(np.clip(change, -0.3, 0.3)))
+        if fits_scale:
+            error = float(spread[0])
+        if limit < 5e-3:
+            break
+    return scale, offsets_px, error
+
+
+def _moved(term: _Term, scale: float, step: Points, unknowns: Sequence[object]) -> Points:
+    """Return how far a step moves a term's matches, but for those that tell nothing."""
+    moved = np.zeros(1)
+    for name, change in zip(unknowns, step, strict=True):
+        if name == "scale":
+            moved = moved + np.array([scale * term.large_px * change])
+        elif name == term.pair:
+            moved = moved + change
+    return moved
+
+
+def _equations(
+    views: SceneViews,
+    terms: Sequence[_Term],
+    scale: float,
+    offsets_px: dict[Pair, float],
+    *,
+    unknowns: Sequence[object],
+) -> tuple[Float64[np.ndarray, "terms k k"], Float64[np.ndarray, "terms k"]]:
+    """Return each shot's normal equations for log(scale) and the pairs' offsets."""
+    normals = np.zeros((len(terms), len(unknowns), len(unknowns)))
+    rights = np.zeros((len(terms), len(unknowns)))
+    for number, term in enumerate(terms):
+        full = np.zeros(len(term.shot.rows))
+        full[term.known] = scale * term.predicted_px
+        shift_px = offsets_px.get(term.pair, 0.0)
+        difference, slope, inside = (
+            part[term.known] for part in differences(views, term.shot, full + shift_px)
+        )
+        near = np.abs(full[term.known] + shift_px - term.matched_px) < 3 * _TOLERANCE_PX
+        usable = inside & near
+        if usable.sum() < 10:
+            continue
+        spread = 1.4826 * np.median(np.abs(difference[usable])) + 1e-3
+        weight = usable / (1 + (difference / (2 * spread)) ** 2) ** 2 / spread**2
+        columns = np.zeros((len(difference), len(unknowns)))
+        for place, name in enumerate(unknowns):
+            if name == "scale":
+                columns[:, place] = slope * scale * term.predicted_px
+            elif name == term.pair:
+                columns[:, place] = slope
+        normals[number] = (columns * weight[:, None]).T @ columns
+        rights[number] = columns.T @ (weight * difference)
+    return normals, rights
+
+
+def _solved(
+    normals: Float64[np.ndarray, "terms k k"], rights: Float64[np.ndarray, "terms k"]
+) -> tuple[Points, Points]:
+    """Return the step and its standard errors, from how much single shots disagree with it."""
+    total = normals.sum(axis=0)
+    inverse = np.linalg.pinv(total, rcond=1e-12)
+    step = inverse @ rights.sum(axis=0)
+    left_over = rights - normals @ step
+    count = len(rights)
+    spread = np.full(len(step), np.inf)
+    if count > 1:
+        cover = inverse @ (left_over.T @ left_over) @ inverse * count / (count - 1)
+        known = np.diag(total) > 0
+        spread[known] = np.sqrt(np.maximum(np.diag(cover), 0))[known]
+    return step, spread

@@ -1,0 +1,229 @@
+"""The doctor's picture: a pair warped by two contracts, and the scores of all of them."""
+
+import math
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from stereogenbench_data.audit.contract import DoctorReport, scene_task
+from stereogenbench_data.audit.contract_hypotheses import Structure
+from stereogenbench_data.audit.contract_scoring import scored
+from stereogenbench_data.audit.contract_search import SceneDiagnosis
+from stereogenbench_data.audit.contract_views import SceneViews, Shot
+from stereogenbench_data.errors import ExtraError, SelectionError
+from stereogenbench_data.storage.index import SceneIndex
+
+_ENDINGS: Final = (".png", ".pdf", ".svg", ".jpg")
+_NOT_KNOWN: Final = 255
+_WIDE_M: Final = np.logspace(-6, 6, 121)
+_NEAR: Final = np.exp(np.linspace(-0.15, 0.15, 41))
+_FLOOR: Final = 1e-4
+_LONGEST_PX: Final = 640
+
+
+def require_picture_file(path: Path) -> None:
+    """Refuse, before anything is read, a file that no picture can be written to.
+
+    Raises:
+        SelectionError: If the name has no ending that matplotlib writes.
+        ExtraError: If matplotlib is not installed.
+    """
+    if path.suffix.lower() not in _ENDINGS:
+        raise SelectionError(f"{path}: name a picture: one of *{', *'.join(_ENDINGS)}.")
+    _figure_class()
+
+
+def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
+    """Write the picture of the scene that tells most.
+
+    Left, right, the right one warped to the left by the declared and by the best contract, what
+    differs; the score over metres a unit; and by how much every other answer is worse.
+
+    Raises:
+        SelectionError: If no scene was judged.
+        ExtraError: If matplotlib is not installed.
+    """
+    if not report.scenes:
+        raise SelectionError(f"{report.data}: no scene was judged, so there is nothing to draw.")
+    diagnosis = max(
+        report.scenes, key=lambda scene: (not scene.problem, scene.gain.mean_db, scene.matches)
+    )
+    task = scene_task(index, diagnosis.key, encoding=report.declared)
+    figure = _figure_class()(figsize=(14, 13.5), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(2, 1))
+    with closing(task.streams()) as streams:
+        views = SceneViews(task.scene, streams, encoding=report.declared)
+        shots = views.shots(frames=task.frames)
+        figure.suptitle(f"{diagnosis.key}: {_title(diagnosis)}", fontsize=12)
+        _draw_views(above.subplots(2, 3).ravel(), views, shots, diagnosis)
+        wide, near, others = below.subplots(1, 3)
+        found_m = diagnosis.unit_m / diagnosis.scale
+        _draw_curves(wide, views, shots, diagnosis, units_m=np.sort([*_WIDE_M, *found_m * _NEAR]))
+        _draw_curves(near, views, shots, diagnosis, units_m=found_m * _NEAR)
+        _draw_rivals(others, diagnosis)
+    figure.savefig(path, dpi=90)
+
+
+def _figure_class() -> Any:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ExtraError(
+            "a picture of scores needs matplotlib: pip install 'stereogenbench-data[plots]'."
+        ) from error
+    return Figure
+
+
+def _title(diagnosis: SceneDiagnosis) -> str:
+    if diagnosis.problem:
+        return f"cannot tell ({diagnosis.problem})"
+    changes = [
+        f"{question} {getattr(diagnosis.best, question)}"
+        for question in diagnosis.best.changes_from(diagnosis.declared)
+    ]
+    if diagnosis.changed in ("scale", "both") or diagnosis.best.form != diagnosis.declared.form:
+        changes.append(f"{diagnosis.unit_m / diagnosis.scale:.4g} m a unit")
+    if diagnosis.changed in ("offset", "both"):
+        changes.append("an offset")
+    if not changes:
+        return "the declared contract fits"
+    return f"{', '.join(changes)}: {diagnosis.gain.mean_db:.2f} dB better than declared"
+
+
+def _draw_views(
+    axes: Sequence[Any], views: SceneViews, shots: Sequence[Shot], diagnosis: SceneDiagnosis
+) -> None:
+    shot = max(shots, key=lambda shot: (shot.left, shot.right) == views.primary)
+    left, right = (
+        views.rgb(shot.frame, file).transpose(1, 2, 0) for file in (shot.left, shot.right)
+    )
+    best_scale = 1.0
+    if diagnosis.changed in ("scale", "both") or diagnosis.best.form != diagnosis.declared.form:
+        best_scale = diagnosis.scale
+    shift_px = 0.0
+    if diagnosis.changed in ("offset", "both"):
+        shift_px = diagnosis.offsets_px.get((shot.left, shot.right), 0.0)
+    by_declared = _warped(views, shot, diagnosis.declared, right, scale=1.0, shift_px=0.0)
+    by_best = _warped(views, shot, diagnosis.best, right, scale=best_scale, shift_px=shift_px)
+    pair = f"frame {shot.frame}, cam {shot.left} and {shot.right}"
+    pictures: list[tuple[str, Any]] = [
+        (f"left ({pair})", left),
+        ("right, warped by the declared contract", by_declared[0]),
+        ("|left - warped|, declared", _difference(left, *by_declared)),
+        ("right", right),
+        ("right, warped by the best contract", by_best[0]),
+        ("|left - warped|, best", _difference(left, *by_best)),
+    ]
+    for axis, (title, picture) in zip(axes, pictures, strict=True):
+        step = -(-max(picture.shape[:2]) // _LONGEST_PX)
+        axis.imshow(picture[::step, ::step], cmap="magma", vmin=0, vmax=80)
+        axis.set_title(title, fontsize=10)
+        axis.set_axis_off()
+
+
+def _warped(
+    views: SceneViews,
+    shot: Shot,
+    structure: Structure,
+    right: UInt8[np.ndarray, "h w 3"],
+    *,
+    scale: float,
+    shift_px: float,
+) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """Return the right picture seen from the left one, and where depth and picture tell of it."""
+    height, width = right.shape[:2]
+    rows, columns = np.divmod(np.arange(height * width), width)
+    everywhere = Shot(
+        frame=shot.frame, left=shot.left, right=shot.right, rows=rows, columns=columns,
+        matched_px=np.zeros(0), brightness=np.zeros(0, np.float32),
+        slope=np.zeros(0, np.float32), cells=np.zeros(0, np.int64), cap=1.0, textured=0,
+    )  # fmt: skip
+    white = np.full((height * width, 3), _NOT_KNOWN, dtype=np.uint8)
+    predicted = views.predicted(everywhere, structure)
+    if predicted is None:
+        return white.reshape(height, width, 3), np.zeros((height, width), dtype=bool)
+    disparity_px, known = predicted
+    place = columns - scale * disparity_px - shift_px
+    inside = known & (place >= 0) & (place <= width - 1)
+    place = np.clip(place, 0, width - 2)
+    low = place.astype(np.int64)
+    part = (place - low)[:, None]
+    flat = right[rows, low] * (1 - part) + right[rows, low + 1] * part
+    white[inside] = flat[inside].round()
+    return white.reshape(height, width, 3), inside.reshape(height, width)
+
+
+def _difference(
+    left: UInt8[np.ndarray, "h w 3"],
+    warped: UInt8[np.ndarray, "h w 3"],
+    told: Bool[np.ndarray, "h w"],
+) -> Float32[np.ndarray, "h w"]:
+    """Return the mean absolute difference, nan where nothing was warped."""
+    away: Float32[np.ndarray, "h w"] = np.abs(left.astype(np.float32) - warped).mean(axis=-1)
+    away[~told] = np.nan
+    return away
+
+
+def _draw_curves(
+    axis: Any,
+    views: SceneViews,
+    shots: Sequence[Shot],
+    diagnosis: SceneDiagnosis,
+    *,
+    units_m: Float64[np.ndarray, " k"],
+) -> None:
+    """Draw how well the pictures agree over metres a unit, for planar, ray and inverse depth."""
+    best = diagnosis.best
+    for name, structure in {
+        "along the axis": best.changed("kind", "planar").changed("form", "depth"),
+        "along the ray": best.changed("kind", "ray").changed("form", "depth"),
+        "inverse": best.changed("kind", "planar").changed("form", "inverse"),
+    }.items():
+        axis.plot(
+            units_m,
+            [
+                _score_db(views, shots, structure, scale=diagnosis.unit_m / unit_m)
+                for unit_m in units_m
+            ],
+            label=name,
+            linewidth=1.2,
+        )
+    if units_m[0] <= diagnosis.unit_m <= units_m[-1]:
+        axis.axvline(diagnosis.unit_m, color="grey", linestyle=":", label="declared unit")
+    axis.set(xscale="log", xlabel="metres a unit", ylabel="dB better than no agreement")
+    axis.set_xlim(units_m[0], units_m[-1])
+    axis.legend(fontsize=8)
+
+
+def _score_db(
+    views: SceneViews, shots: Sequence[Shot], structure: Structure, *, scale: float
+) -> float:
+    errors = scored(views, shots, structure, scale=scale).errors
+    shares = [
+        max(float(np.nanmean(part)) / shot.cap, _FLOOR)
+        for part, shot in zip(errors, shots, strict=True)
+        if np.isfinite(part).any()
+    ]
+    return -10 * float(np.mean(np.log10(shares))) if shares else math.nan
+
+
+def _draw_rivals(axis: Any, diagnosis: SceneDiagnosis) -> None:
+    """Draw by how much each other answer is worse than the best contract."""
+    told = [rival for rival in diagnosis.rivals if math.isfinite(rival.behind.mean_db)]
+    if not told:
+        axis.set_axis_off()
+        axis.text(0.5, 0.5, diagnosis.problem or "no other answers", ha="center", wrap=True)
+        return
+    names = [f"{rival.question}: {rival.answer}" for rival in told]
+    heights = [rival.behind.mean_db for rival in told]
+    errors = [min(1.96 * rival.behind.error_db, 50.0) for rival in told]
+    axis.set_title("other answers", fontsize=10)
+    axis.barh(names, heights, xerr=errors, color="tab:grey", error_kw={"linewidth": 0.8})
+    axis.axvline(0, color="black", linewidth=0.8)
+    axis.tick_params(axis="y", labelsize=7)
+    axis.set(xlabel="dB worse than the best contract")
+    axis.invert_yaxis()

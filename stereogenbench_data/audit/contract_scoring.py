@@ -1,0 +1,162 @@
+"""How well a contract explains pictures: squared differences after the warp, compared in dB."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from stereogenbench_data.audit.contract_hypotheses import Structure
+from stereogenbench_data.audit.contract_matching import Luma
+from stereogenbench_data.audit.contract_statistics import Evidence, t_975
+from stereogenbench_data.audit.contract_views import SIDE_CELLS, Points, SceneViews, Shot
+
+_FEWEST_POINTS = 40
+_FEWEST_CELLS = 3
+_FINE_CAP = 0.05
+_SMALLEST = 1e-6
+Pair = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scored:
+    """A contract and its score.
+
+    Attributes:
+        structure: Its answers.
+        scale: Measured disparity over that at the declared unit: the unit is declared / scale.
+        offsets_px: Constant disparity that is added, by pair; what is missing is 0.
+        scale_error: Standard error of log(scale), inf where it was not fitted.
+        errors: For each shot the squared difference at each pixel, capped; nan where the
+            contract does not tell.
+    """
+
+    structure: Structure
+    scale: float
+    offsets_px: dict[Pair, float]
+    scale_error: float
+    errors: list[Float32[np.ndarray, " n"]] = field(repr=False)
+
+
+def sampled(
+    band: Luma, rows: np.ndarray, columns: Points
+) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], np.ndarray]:
+    """Return a picture between its pixels along rows, its slope there, and what is inside it."""
+    width = band.shape[1]
+    inside = (columns >= 0) & (columns <= width - 1)
+    place = np.clip(np.where(inside, columns, 0.0), 0, width - 2)
+    low = place.astype(np.int64)
+    t = (place - low).astype(np.float32)
+    first = rows * width + low
+    flat = band.ravel()
+    here, there = flat[first], flat[first + 1]
+    before = flat[first - (low > 0)]
+    after = flat[first + 1 + (low < width - 2)]
+    # Catmull and Rom's cubic: between pixels a straight line is a blur, which favours some places.
+    linear = (there - before) / 2
+    square = before - 2.5 * here + 2 * there - after / 2
+    cube = (after - before) / 2 + 1.5 * (here - there)
+    value = here + t * (linear + t * (square + t * cube))
+    return value, linear + t * (2 * square + 3 * t * cube), inside
+
+
+def differences(
+    views: SceneViews, shot: Shot, disparity_px: Points
+) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], np.ndarray]:
+    """Return right less left at a disparity, the mean slope of both, and what lands inside."""
+    band = views.band(shot.frame, shot.right)
+    there, slope, inside = sampled(band, shot.rows, shot.columns - disparity_px)
+    return there - shot.brightness, (slope + shot.slope) / 2, inside
+
+
+def scored(
+    views: SceneViews,
+    shots: Sequence[Shot],
+    structure: Structure,
+    *,
+    scale: float = 1.0,
+    offsets_px: dict[Pair, float] | None = None,
+    scale_error: float = math.inf,
+) -> Scored:
+    """Return a contract's score on the shots of a scene.
+
+    A pixel counts as its capped squared difference, and as the cap where it leaves the picture.
+    """
+    offsets_px = offsets_px or {}
+    errors = []
+    for shot in shots:
+        predicted = views.predicted(shot, structure)
+        squares = np.full(len(shot.rows), np.nan, dtype=np.float32)
+        if predicted is not None:
+            disparity_px, known = predicted
+            shift_px = offsets_px.get((shot.left, shot.right), 0.0)
+            difference, _, inside = differences(views, shot, scale * disparity_px + shift_px)
+            capped = np.where(inside, np.minimum(difference**2, shot.cap), shot.cap)
+            squares[known] = capped[known]
+        errors.append(squares)
+    return Scored(structure, scale, offsets_px, scale_error, errors)
+
+
+def evidence(shots: Sequence[Shot], better: Scored, worse: Scored) -> Evidence:
+    """Return by how many dB one contract explains a scene better than another.
+
+    Both are judged by the pixels of which both tell. Contracts that take the same numbers from the
+    same places (another unit, ray, offset) differ by a little at many pixels: there a pixel counts
+    at most a small part of the cap, so that wrong matches do not outweigh it. Others (lag, order,
+    flips) differ by much at some pixels, which then count in full.
+
+    There are two errors, and the smaller holds: by how much views (a pair in a frame) differ, which
+    is large where something is wrong with some cameras; and a jackknife over parts of the picture,
+    each left out of all views at once, which is large where only a part tells (what moves, of a
+    lag).
+    """
+    same_places = better.structure.changed("kind", worse.structure.kind) == worse.structure
+    share = _FINE_CAP if same_places else 1.0
+    sums = np.zeros((2, 0, SIDE_CELLS**2))
+    for shot, low, high in zip(shots, better.errors, worse.errors, strict=True):
+        both = np.isfinite(low) & np.isfinite(high)
+        if both.sum() >= _FEWEST_POINTS:
+            cells = [
+                np.bincount(
+                    shot.cells[both],
+                    weights=np.minimum(part[both], share * shot.cap),
+                    minlength=SIDE_CELLS**2,
+                )
+                for part in (low, high)
+            ]
+            sums = np.concatenate([sums, np.array(cells)[:, None]], axis=1)
+    if sums.shape[1] == 0:
+        return Evidence(math.nan, math.inf)
+    ours, theirs = sums.sum(axis=-1, keepdims=True)
+    used = sums.sum(axis=(0, 1)) > 0
+    parts, views = int(used.sum()), sums.shape[1]
+    errors = [math.inf]
+    if parts >= _FEWEST_CELLS:
+        without = _mean_db(ours - sums[0][:, used], theirs - sums[1][:, used])
+        errors.append(math.sqrt((parts - 1) * float(without.var())))
+    if views >= 2:
+        each = _mean_db(ours[None, :, 0], theirs[None, :, 0])
+        errors.append(float(each.std(ddof=1)) / math.sqrt(views) * t_975(views - 1) / t_975(99))
+    return Evidence(float(_mean_db(ours, theirs)[0]), min(errors))
+
+
+def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:
+    """Return the mean over shots (the first axis) of the ratio of two sums in dB."""
+    ratios = np.maximum(theirs, _SMALLEST) / np.maximum(ours, _SMALLEST)
+    mean: Float64[np.ndarray, " k"] = 10 * np.log10(ratios).mean(axis=0)
+    return mean
+
+
+def agreement(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> float:
+    """Return the share of matches that a contract explains to a pixel; nan if it tells of none."""
+    near, told = 0, 0
+    for shot in shots:
+        predicted = views.predicted(shot, contract.structure)
+        if predicted is not None:
+            disparity_px, known = predicted
+            shift_px = contract.offsets_px.get((shot.left, shot.right), 0.0)
+            away = contract.scale * disparity_px + shift_px - shot.matched_px
+            near += int((np.abs(away[known]) < 1).sum())
+            told += int(known.sum())
+    return near / told if told else math.nan

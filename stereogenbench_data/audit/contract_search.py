@@ -1,0 +1,324 @@
+"""The contract that explains one scene: the declared one, changed as little as the pictures ask."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from stereogenbench_data.audit.contract_fit import Free, fitted
+from stereogenbench_data.audit.contract_hypotheses import QUESTIONS, Question, Structure
+from stereogenbench_data.audit.contract_scoring import Pair, Scored, agreement, evidence, scored
+from stereogenbench_data.audit.contract_statistics import LEAST_ERRORS, Evidence
+from stereogenbench_data.audit.contract_views import SceneViews, Shot
+from stereogenbench_data.schema.records import Rig, Scene
+
+LEAST_LOG_SCALE: Final = 0.01
+"""A unit that is off by less is not called wrong."""
+LEAST_OFFSET_PX: Final = 0.3
+_LEAST_SCALE_DB: Final = 0.02
+_SCALE_ERRORS: Final = 1.5
+"""Less is asked of the score of a scale, which has an error of its own to be judged by."""
+_MOST_CHANGES: Final = 4
+FEWEST_MATCHES: Final = 200
+
+_LENGTHS: Final[dict[Free, tuple[str, ...]]] = {
+    "nothing": (), "scale": ("scale",), "offset": ("offset",), "both": ("scale", "offset"),
+}  # fmt: skip
+_NOTHING: Final = Evidence(math.nan, math.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class Rival:
+    """Another answer to one question, all else as in the best contract but for the scale.
+
+    ``behind`` is by how much the best contract is better.
+    """
+
+    question: Question
+    answer: Any
+    behind: Evidence
+
+
+@dataclass(frozen=True, slots=True)
+class SceneDiagnosis:
+    """What one scene's pictures say about its depth contract.
+
+    Attributes:
+        key: The scene.
+        views: How many views (a pair in a frame) were compared.
+        pairs: The pairs.
+        matches: Pixels that were found in both pictures of a view.
+        textured: Pixels that were looked for.
+        unit_m: The declared unit of the primary pair's left depth, in metres.
+        unit_source: Where it comes from: "tag", "default", "user" or "unreadable".
+        focal_ratios: In words, other readings of focal length and sensor, and what disparity
+            each gives over that of the width; those that give the same are left out.
+        recorded_pair: The primary pair as it is recorded, if its left camera stands to the right
+            of the other by the poses; None if it does not.
+        declared: The declared answers.
+        best: The answers of the best contract.
+        changed: What else the best contract changes: the scale, the offset, or both.
+        scale: Found over declared disparity, fitted with the best contract's answers.
+        scale_error: Standard error of log(scale).
+        offsets_px: Constant disparity of each pair at the best contract.
+        gain: By how much the best contract beats the declared one.
+        parallax: By how much it beats no disparity at all.
+        agreement: Share of matches that the best contract explains to a pixel.
+        rivals: The other answers.
+        equals: Contracts with as few changes that are not clearly worse, in words.
+        problem: Why nothing could be told; empty where something could.
+    """
+
+    key: str
+    views: int
+    pairs: tuple[Pair, ...]
+    matches: int
+    textured: int
+    unit_m: float
+    unit_source: str
+    focal_ratios: dict[str, float]
+    recorded_pair: Pair | None
+    declared: Structure
+    best: Structure
+    changed: Free = "nothing"
+    scale: float = 1.0
+    scale_error: float = math.inf
+    offsets_px: dict[Pair, float] = field(default_factory=dict)
+    gain: Evidence = _NOTHING
+    parallax: Evidence = _NOTHING
+    agreement: float = math.nan
+    rivals: tuple[Rival, ...] = ()
+    equals: tuple[tuple[Structure, Free, float], ...] = ()
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """A contract in the search: how much of it is fitted, and its score."""
+
+    free: Free
+    score: Scored
+
+    @property
+    def structure(self) -> Structure:
+        return self.score.structure
+
+
+class Search:
+    """Contracts of one scene, each fitted once."""
+
+    def __init__(self, views: SceneViews, shots: Sequence[Shot]) -> None:
+        """Take what the contracts are judged by."""
+        self._views = views
+        self._shots = shots
+        self._fitted: dict[tuple[Structure, Free], _Candidate] = {}
+        self.declared = self.candidate(Structure.declared(views.encoding), free="nothing")
+
+    def candidate(self, structure: Structure, *, free: Free) -> _Candidate:
+        """Return a contract, fitted."""
+        if (structure, free) not in self._fitted:
+            score = fitted(self._views, self._shots, structure, free=free)
+            self._fitted[structure, free] = _Candidate(free, score)
+        return self._fitted[structure, free]
+
+    def best(self) -> _Candidate:
+        """Return the contract with the fewest changes that no further change clearly improves."""
+        current = self.declared
+        for _ in range(_MOST_CHANGES):
+            one = self._most_better(current, self._one_change(current))
+            two = self._most_better(current, self._two_changes(current))
+            if one is not None and (two is None or not self._is_better(two, one)):
+                current = one
+            elif two is not None:
+                current = two
+            else:
+                break
+        return self._pruned(current)
+
+    def _one_change(self, current: _Candidate) -> Iterator[_Candidate]:
+        """Yield contracts that change one answer, or let one length be fitted."""
+        for question in QUESTIONS:
+            for structure in current.structure.alternatives(question):
+                free = _freed(current.free, "scale") if question == "form" else current.free
+                yield self.candidate(structure, free=free)
+        for length in ("scale", "offset"):
+            free = _freed(current.free, length)
+            if free != current.free:
+                yield self.candidate(current.structure, free=free)
+
+    def _two_changes(self, current: _Candidate) -> Iterator[_Candidate]:
+        """Yield contracts that change one answer and the scale, or scale and offset."""
+        free = _freed(current.free, "scale")
+        if free != current.free:
+            for question in QUESTIONS:
+                for structure in current.structure.alternatives(question):
+                    yield self.candidate(structure, free=free)
+            yield self.candidate(current.structure, free="both")
+
+    def _most_better(self, current: _Candidate, others: Iterator[_Candidate]) -> _Candidate | None:
+        """Return the contract that is clearly better than the current one by most."""
+        better = [other for other in others if self._is_better(other, current)]
+        shifted = [other for other in better if "offset" in _new(other, current)]
+        scaled = [other for other in better if "scale" in _new(other, current)]
+        for other in shifted:
+            # One number for all pairs goes before one for each.
+            if any(not self.gain(other, plain).is_clear() for plain in scaled):
+                better.remove(other)
+        return max(better, key=lambda other: self.gain(other, current).mean_db, default=None)
+
+    def _pruned(self, current: _Candidate) -> _Candidate:
+        """Take back changes that another one has made needless."""
+        for simpler in list(self._simpler(current)):
+            if not self._is_better(current, simpler):
+                return self._pruned(simpler)
+        return current
+
+    def _simpler(self, current: _Candidate) -> Iterator[_Candidate]:
+        declared = self.declared.structure
+        fixed: dict[Free, tuple[Free, ...]] = {
+            "scale": ("nothing",), "offset": ("nothing",), "both": ("scale", "offset"),
+            "nothing": (),
+        }  # fmt: skip
+        for question in current.structure.changes_from(declared):
+            back = current.structure.changed(question, getattr(declared, question))
+            yield self.candidate(back, free=current.free)
+        for free in fixed[current.free]:
+            if current.structure.form == declared.form or free in ("scale", "both"):
+                yield self.candidate(current.structure, free=free)
+
+    def rivals(self, best: _Candidate) -> tuple[Rival, ...]:
+        """Return the other answers to every question, each with its own scale."""
+        free = _freed(best.free, "scale")
+        found = []
+        for question in QUESTIONS:
+            for structure in best.structure.alternatives(question):
+                other = self.candidate(structure, free=free)
+                answer = getattr(structure, question)
+                found.append(Rival(question, answer, self.gain(best, other)))
+        return tuple(found)
+
+    def equals(self, best: _Candidate) -> tuple[tuple[Structure, Free, float], ...]:
+        """Return the contracts with one change that are not clearly worse than the best one."""
+        if best is self.declared:
+            return ()
+        return tuple(
+            (other.structure, other.free, other.score.scale)
+            for other in self._one_change(self.declared)
+            if other is not best
+            and self._is_better(other, self.declared)
+            and not self.gain(best, other).is_clear()
+        )
+
+    def without_parallax(self, best: _Candidate) -> Evidence:
+        """Return by how much a contract is better than if all were infinitely far."""
+        flat = scored(self._views, self._shots, best.structure, scale=1e-12)
+        return evidence(self._shots, best.score, flat)
+
+    def gain(self, better: _Candidate, worse: _Candidate) -> Evidence:
+        """Return by how much one contract is better than another."""
+        return evidence(self._shots, better.score, worse.score)
+
+    def _is_better(self, other: _Candidate, current: _Candidate) -> bool:
+        """Tell whether a contract is clearly better, and what it fits worth mentioning."""
+        gain = self.gain(other, current)
+        freed = (current.free, other.free)
+        if other.structure == current.structure and freed in (
+            ("nothing", "scale"), ("offset", "both"),
+        ):  # fmt: skip
+            off = abs(math.log(other.score.scale))
+            sure = off > LEAST_LOG_SCALE + LEAST_ERRORS * min(other.score.scale_error, 1e3)
+            return sure and gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
+        if other.free in ("offset", "both") and current.free in ("nothing", "scale"):
+            largest_px = max(map(abs, other.score.offsets_px.values()), default=0.0)
+            return largest_px >= LEAST_OFFSET_PX and gain.is_clear()
+        return gain.is_clear()
+
+
+def _new(other: _Candidate, current: _Candidate) -> set[str]:
+    """Return which of "scale" and "offset" alone a contract fits beside another."""
+    if other.structure != current.structure:
+        return set()
+    return set(_LENGTHS[other.free]) - set(_LENGTHS[current.free])
+
+
+def _freed(free: Free, length: str) -> Free:
+    if free in ("nothing", length):
+        return "scale" if length == "scale" else "offset"
+    return "both"
+
+
+def focal_ratios(rig: Rig) -> dict[str, float]:
+    """Return other readings of a rig's focal length, each over f / sensor width * width."""
+    by_pixels = rig.image_height_px / rig.image_width_px
+    by_sensor = rig.sensor_width_mm / rig.sensor_height_mm
+    readings = {
+        "f / sensor height * picture height": by_pixels * by_sensor,
+        "f / sensor height * picture width": by_sensor,
+        "f / sensor width * picture height": by_pixels,
+    }
+    told: dict[str, float] = {}
+    for words, ratio in readings.items():
+        if all(abs(math.log(ratio / other)) > LEAST_LOG_SCALE for other in (1.0, *told.values())):
+            told[words] = ratio
+    return told
+
+
+def crossed_pair(scene: Scene) -> Pair | None:
+    """Return the recorded primary pair if its cameras stand in the other order by the poses."""
+    left, right = scene.rig.primary_pair
+    return (left, right) if scene.lateral_m[left] > scene.lateral_m[right] else None
+
+
+def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
+    """Return what a scene's pictures say about its declared contract.
+
+    Raises:
+        MediaError: If a video does not decode, or has another size than the scene's metadata say.
+    """
+    shots = views.shots(frames=frames)
+    file = views.primary[0]
+    declared = Structure.declared(views.encoding)
+    basics: dict[str, Any] = {
+        "key": views.scene.id.key,
+        "views": len(shots),
+        "pairs": tuple(views.chosen_pairs()),
+        "matches": sum(len(shot.rows) for shot in shots),
+        "textured": sum(shot.textured for shot in shots),
+        "unit_m": views.unit_m(file),
+        "unit_source": "user" if views.encoding.unit_m else views.scene.depth_unit_source[file],
+        "focal_ratios": focal_ratios(views.scene.rig),
+        "recorded_pair": crossed_pair(views.scene),
+        "declared": declared,
+    }
+    if basics["matches"] < FEWEST_MATCHES:
+        return SceneDiagnosis(
+            **basics, best=declared,
+            problem=f"no texture: {basics['textured']:,} pixels have any, and "
+            f"{basics['matches']:,} were found in both pictures",
+        )  # fmt: skip
+    search = Search(views, shots)
+    best = search.best()
+    share_told = agreement(views, shots, best.score)
+    parallax = search.without_parallax(best)
+    if math.isnan(share_told) or not parallax.is_clear():
+        problem = (
+            "no depth: none of the pixels that were found in both pictures has any"
+            if math.isnan(share_told)
+            else "too little parallax: no disparity at all explains the pictures as well"
+        )
+        return SceneDiagnosis(**basics, best=declared, parallax=parallax, problem=problem)
+    with_scale = search.candidate(best.structure, free=_freed(best.free, "scale")).score
+    shifted: Free = "offset" if best.free in ("nothing", "offset") else "both"
+    return SceneDiagnosis(
+        **basics,
+        best=best.structure,
+        changed=best.free,
+        scale=with_scale.scale,
+        scale_error=with_scale.scale_error,
+        offsets_px=search.candidate(best.structure, free=shifted).score.offsets_px,
+        gain=search.gain(best, search.declared),
+        parallax=parallax,
+        agreement=share_told,
+        rivals=search.rivals(best),
+        equals=search.equals(best),
+    )

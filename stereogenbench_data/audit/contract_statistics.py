@@ -1,0 +1,82 @@
+"""Differences in dB: how sure they are in one scene and over several, when they are believed."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+
+LEAST_DB: Final = 0.15
+"""A smaller mean difference is not believed, however sure: interpolation and codecs make such."""
+LEAST_ERRORS: Final = 3.0
+_NORMAL_975: Final = 1.96
+_T_975: Final = (
+    12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160,
+    2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064, 2.060, 2.056,
+    2.052, 2.048, 2.045,
+)  # fmt: skip
+"""The 97.5 % point of Student's t for 1 to 29 degrees of freedom; 1.96 + 2.5 / n beyond."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """By how many dB one contract is better than another in one scene, and its standard error."""
+
+    mean_db: float
+    error_db: float
+
+    def is_clear(self, *, least_db: float = LEAST_DB, errors: float = LEAST_ERRORS) -> bool:
+        """Tell whether the difference is large and sure enough to be believed."""
+        return self.mean_db >= max(least_db, errors * self.error_db)
+
+
+@dataclass(frozen=True, slots=True)
+class Gain:
+    """A mean difference in dB with its 95 % confidence interval.
+
+    Attributes:
+        mean_db: The mean; nan where there is nothing to compare.
+        low_db: Lower end.
+        high_db: Upper end.
+        over: What the interval is over: scenes or, where one alone tells, parts of its pictures.
+        count: How many scenes tell.
+        is_clear: Whether the difference may be believed.
+    """
+
+    mean_db: float
+    low_db: float
+    high_db: float
+    over: Literal["scenes", "parts of the pictures"]
+    count: int
+    is_clear: bool
+
+
+def t_975(freedom: int) -> float:
+    """Return the 97.5 % point of Student's t distribution."""
+    return _T_975[freedom - 1] if freedom <= len(_T_975) else _NORMAL_975 + 2.5 / freedom
+
+
+def interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Return the mean of two values or more, and the ends of its 95 % interval by Student's t."""
+    array = np.asarray(values, dtype=np.float64)
+    mean = float(array.mean())
+    half = t_975(len(array) - 1) * float(array.std(ddof=1)) / math.sqrt(len(array))
+    return mean, mean - half, mean + half
+
+
+def pooled(scenes: Sequence[Evidence]) -> Gain:
+    """Return the mean over scenes.
+
+    It is clear if the interval over scenes leaves no doubt or, because an interval over two or
+    three says little, if it is clear in each of them.
+    """
+    told = [scene for scene in scenes if math.isfinite(scene.mean_db)]
+    if len(told) <= 1:
+        scene = told[0] if told else Evidence(math.nan, math.inf)
+        half = _NORMAL_975 * scene.error_db
+        ends = (scene.mean_db - half, scene.mean_db + half)
+        return Gain(scene.mean_db, *ends, "parts of the pictures", len(told), scene.is_clear())
+    mean, low, high = interval([scene.mean_db for scene in told])
+    clear = mean >= LEAST_DB and (low > 0 or all(scene.is_clear() for scene in told))
+    return Gain(mean, low, high, "scenes", len(told), clear)

@@ -1,0 +1,254 @@
+"""The pictures and stored depth of one scene that its depth contract is judged by."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16
+
+from stereogenbench_data.audit.contract_hypotheses import LAGS, Flip, Structure
+from stereogenbench_data.audit.contract_matching import Luma, match_rows
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
+from stereogenbench_data.media.depth import measured
+from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.release import (
+    CAMERA_PAIRS,
+    DEFAULT_DEPTH_UNIT_M,
+    depth_name,
+    rgb_name,
+)
+
+Points = Float64[np.ndarray, " n"]
+_Numbers = tuple[UInt16[np.ndarray, " n"], Bool[np.ndarray, " n"]]
+
+_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+_BLUR: Final = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
+_MEAN_RADIUS_PX: Final = 6
+_MOST_POINTS: Final = 3000
+SIDE_CELLS: Final = 4
+"""Parts of a picture along each side, by which it is told how sure a comparison is."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """What one frame of two cameras has in common, found in the pictures alone.
+
+    Attributes:
+        frame: The RGB frame.
+        left: Number of the file whose pixels these are.
+        right: Number of the file in which they were found again.
+        rows: (n,) rows of the pixels.
+        columns: (n,) columns.
+        matched_px: (n,) how far to the left they were found.
+        brightness: (n,) band-passed grey levels there.
+        slope: (n,) their horizontal derivative.
+        cells: (n,) in which part of the picture each pixel lies.
+        cap: The square of a difference between pixels that have nothing to do with each other.
+        textured: How many pixels were looked for.
+    """
+
+    frame: int
+    left: int
+    right: int
+    rows: Int64[np.ndarray, " n"]
+    columns: Int64[np.ndarray, " n"]
+    matched_px: Points
+    brightness: Float32[np.ndarray, " n"]
+    slope: Float32[np.ndarray, " n"]
+    cells: Int64[np.ndarray, " n"]
+    cap: float
+    textured: int
+
+
+class SceneViews:
+    """One scene's pictures and depth, each decoded once."""
+
+    def __init__(self, scene: Scene, streams: Streams, *, encoding: DepthEncoding) -> None:
+        """Take a scene; ``encoding`` is the declared contract, whose unit may wait for the tags."""
+        self.scene = scene
+        self.encoding = encoding
+        self.intrinsics: Intrinsics = rig_intrinsics(scene.rig)
+        self._streams = streams
+        self._bands: dict[tuple[int, int], Luma] = {}
+        self._stored: dict[tuple[int, int, int], tuple[Shot, dict[Flip, _Numbers]]] = {}
+
+    @property
+    def primary(self) -> tuple[int, int]:
+        """The primary pair, the lower number first."""
+        left, right = sorted(self.scene.rig.primary_pair)
+        return left, right
+
+    def unit_m(self, file: int) -> float:
+        """Return the declared unit of a depth file; the release's default where none is told."""
+        unit_m = self.encoding.unit_m or self.scene.depth_unit_m[file]
+        return unit_m if np.isfinite(unit_m) else DEFAULT_DEPTH_UNIT_M
+
+    def rgb(self, frame: int, file: int) -> UInt8[np.ndarray, "3 h w"]:
+        """Return a picture."""
+        picture: UInt8[np.ndarray, "3 h w"] = self._streams.rgb(
+            self.scene, rgb_name(file), frame, size=None
+        )
+        expected = (self.intrinsics.height_px, self.intrinsics.width_px)
+        _require_size(picture.shape[1:], expected, where=f"{self.scene.id.key}/{rgb_name(file)}")
+        return picture
+
+    def band(self, frame: int, file: int) -> Luma:
+        """Return a picture's grey levels without noise and without slow changes of brightness."""
+        if (frame, file) not in self._bands:
+            luma = np.tensordot(_LUMA, self.rgb(frame, file).astype(np.float32), axes=1)
+            self._bands[frame, file] = band_passed(luma)
+        return self._bands[frame, file]
+
+    def depth(
+        self, frame: int, file: int
+    ) -> tuple[UInt16[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+        """Return stored depth and where it was measured."""
+        name = depth_name(file)
+        units = self._streams.depth_units(self.scene, name, frame, encoding=self.encoding)
+        expected = (self.intrinsics.height_px, self.intrinsics.width_px)
+        _require_size(units.shape, expected, where=f"{self.scene.id.key}/{name}")
+        pixel_format = self._streams.pixel_format(self.scene, name)
+        known = measured(units, encoding=self.encoding, pixel_format=pixel_format)
+        return units, known & (units > 0)
+
+    def _numbers(self, shot: Shot, *, frame: int, file: int) -> dict[Flip, _Numbers]:
+        """Return what a depth frame stores at a shot's pixels, as it is and turned over.
+
+        Only these numbers are kept: whole maps of all lags and cameras would fill the memory.
+        """
+        key = (id(shot), frame, file)
+        if key not in self._stored:
+            units, known = self.depth(frame, file)
+            height, width = units.shape
+            places: dict[Flip, tuple[np.ndarray, np.ndarray]] = {
+                "none": (shot.rows, shot.columns),
+                "vertical": (height - 1 - shot.rows, shot.columns),
+                "horizontal": (shot.rows, width - 1 - shot.columns),
+            }
+            numbers = {flip: (units[place], known[place]) for flip, place in places.items()}
+            # The shot is kept too, so that no other can get its identity.
+            self._stored[key] = (shot, numbers)
+        return self._stored[key][1]
+
+    @cached_property
+    def ray_per_planar(self) -> Float64[np.ndarray, "h w"]:
+        """The length of each pixel's ray to depth 1."""
+        camera = self.intrinsics
+        x = (np.arange(camera.width_px) + 0.5 - camera.cx_px) / camera.fx_px
+        y = (np.arange(camera.height_px) + 0.5 - camera.cy_px) / camera.fy_px
+        return np.sqrt(1 + x**2 + y[:, None] ** 2)
+
+    def shots(self, *, frames: int) -> list[Shot]:
+        """Return what pairs of several frames have in common."""
+        return [
+            self._shot(frame, left, right)
+            for frame in chosen_frames(self.scene.frames, count=frames)
+            for left, right in self.chosen_pairs()
+        ]
+
+    def chosen_pairs(self) -> list[tuple[int, int]]:
+        """Return the primary pair, the narrowest, one that touches the primary, two wider ones."""
+        lateral_m = np.array(self.scene.lateral_m)
+        by_width = sorted(
+            CAMERA_PAIRS, key=lambda pair: abs(float(lateral_m[pair[1]] - lateral_m[pair[0]]))
+        )
+        touching = next(pair for pair in by_width if len(set(pair) & set(self.primary)) == 1)
+        wanted = [self.primary, by_width[0], touching, by_width[7], by_width[-1]]
+        return list(dict.fromkeys(wanted))
+
+    def _shot(self, frame: int, left: int, right: int) -> Shot:
+        here, there = self.band(frame, left), self.band(frame, right)
+        matches = match_rows(here, there)
+        keep = np.arange(len(matches.rows))
+        if len(keep) > _MOST_POINTS:
+            chosen = np.random.default_rng(0).choice(keep, _MOST_POINTS, replace=False)
+            keep = np.sort(chosen)
+        rows, columns = matches.rows[keep], matches.columns[keep]
+        brightness = here[rows, columns]
+        width = here.shape[1]
+        after, before = np.minimum(columns + 1, width - 1), np.maximum(columns - 1, 0)
+        return Shot(
+            frame=frame,
+            left=left,
+            right=right,
+            rows=rows,
+            columns=columns,
+            matched_px=matches.disparity_px[keep].astype(np.float64),
+            brightness=brightness,
+            slope=(here[rows, after] - here[rows, before]) / 2,
+            cells=rows * SIDE_CELLS // here.shape[0] * SIDE_CELLS + columns * SIDE_CELLS // width,
+            cap=2 * float((brightness**2).mean()) if len(rows) else 1.0,
+            textured=matches.textured,
+        )
+
+    def predicted(
+        self, shot: Shot, structure: Structure
+    ) -> tuple[Points, Bool[np.ndarray, " n"]] | None:
+        """Return the disparity of a shot's pixels at the declared unit, and where it is known.
+
+        None where the frame of depth does not exist.
+        """
+        file = structure.depth_file(shot.left, primary=self.primary)
+        frame = shot.frame + structure.frame_lag
+        if not 0 <= frame < self.scene.frames:
+            return None
+        units, known = self._numbers(shot, frame=frame, file=file)[structure.flip]
+        number = np.where(known, units, 1).astype(np.float64)
+        unit_m = self.unit_m(file)
+        per_m = 1 / (unit_m * number) if structure.form == "depth" else number / unit_m
+        if structure.kind == "ray":
+            per_m *= self.ray_per_planar[shot.rows, shot.columns]
+        return self.intrinsics.fx_px * self.baseline_m(shot, structure) * per_m, known
+
+    def baseline_m(self, shot: Shot, structure: Structure) -> float:
+        """Return the signed baseline of a shot's two files."""
+        left, right = (
+            structure.camera_of(file, content="rgb", primary=self.primary)
+            for file in (shot.left, shot.right)
+        )
+        lateral_m = self.scene.lateral_m
+        baseline_m = lateral_m[right] - lateral_m[left]
+        return -baseline_m if structure.order == "mirrored" else baseline_m
+
+
+def chosen_frames(available: int, *, count: int) -> list[int]:
+    """Return frames spread over a scene, where it is long enough with room for every lag."""
+    margin = min(max(LAGS), max(0, (available - 1) // 2))
+    spread = np.linspace(margin, available - 1 - margin, min(count, available - 2 * margin))
+    return sorted({round(float(frame)) for frame in spread})
+
+
+def band_passed(luma: Luma) -> Luma:
+    """Return grey levels blurred a little, less their mean over 13 x 13 pixels."""
+    blurred, mean = luma, luma
+    box = np.full(2 * _MEAN_RADIUS_PX + 1, 1 / (2 * _MEAN_RADIUS_PX + 1), dtype=np.float32)
+    for axis in (0, 1):
+        blurred = _along(blurred, _BLUR, axis=axis)
+        mean = _along(mean, box, axis=axis)
+    band: Luma = blurred - mean
+    return band
+
+
+def _along(picture: Luma, taps: Float32[np.ndarray, " k"], *, axis: int) -> Luma:
+    """Return a picture convolved along one axis, its border repeated."""
+    radius = len(taps) // 2
+    margins = [(radius, radius) if each == axis else (0, 0) for each in (0, 1)]
+    padded = np.pad(picture, margins, mode="edge")
+    length = picture.shape[axis]
+    moved = (padded.take(range(start, start + length), axis=axis) for start in range(len(taps)))
+    total: Luma = np.zeros_like(picture)
+    for tap, shifted in zip(taps, moved, strict=True):
+        total += tap * shifted
+    return total
+
+
+def _require_size(found: Sequence[int], expected: tuple[int, int], *, where: str) -> None:
+    if tuple(found) != expected:
+        raise MediaError(
+            f"{where}: is {found[1]}x{found[0]} px where the scene's metadata says "
+            f"{expected[1]}x{expected[0]}: correct image_width and image_height, or the video."
+        )

@@ -1,0 +1,137 @@
+"""Scenes with one thing made wrong, by rewriting their files with PyAV and json alone."""
+
+import json
+import shutil
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+
+CAMERAS = range(6)
+
+
+def copied(source: Path, root: Path) -> Path:
+    """Copy a scene's folder below another root, under the same key; return the new folder."""
+    parts = source.parts
+    key = parts[max(i for i, part in enumerate(parts) if part in ("train", "eval")) :]
+    folder = root.joinpath(*key)
+    shutil.copytree(source, folder)
+    for path in folder.iterdir():
+        path.chmod(0o644)
+    return folder
+
+
+def read_depth(folder: Path, camera: int) -> tuple[np.ndarray, dict[str, str]]:
+    """Return (t, h, w) uint16 and the container's tags."""
+    with av.open(str(folder / f"cam_{camera:02d}_depth.mkv")) as container:
+        tags = dict(container.metadata)
+        frames = [_luma(frame) for frame in container.decode(video=0)]
+    return np.stack(frames), tags
+
+
+def write_depth(folder: Path, camera: int, units: np.ndarray, tags: dict[str, str]) -> None:
+    """Write (t, h, w) as FFV1 gray16le."""
+    path = folder / f"cam_{camera:02d}_depth.mkv"
+    _write(path, np.asarray(units, np.uint16), codec="ffv1", pixel_format="gray16le", tags=tags)
+
+
+def rewrite_depth(folder: Path, change, *, unit_factor: float = 1.0) -> None:
+    """Replace every camera's depth by change(units), and multiply what the tag says."""
+    for camera in CAMERAS:
+        units, tags = read_depth(folder, camera)
+        kept = {
+            key: repr(float(value) * unit_factor)
+            for key, value in tags.items()
+            if "scale" in key.lower()
+        }
+        write_depth(folder, camera, change(units), kept)
+
+
+def rewrite_rgb(folder: Path, camera: int, change) -> None:
+    """Replace a camera's pictures (t, h, w, 3) by change(pictures)."""
+    path = folder / f"cam_{camera:02d}_rgb.mp4"
+    with av.open(str(path)) as container:
+        pictures = np.stack([f.to_ndarray(format="rgb24") for f in container.decode(video=0)])
+    _write(path, change(pictures), codec="libx264", pixel_format="yuv420p", tags={})
+
+
+def edit_baseline(folder: Path, change) -> None:
+    """Let change(document) alter baseline.json."""
+    path = folder / "baseline.json"
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def ray_lengths(folder: Path, *, shape: tuple[int, int]) -> np.ndarray:
+    """Return |(x, y, 1)| of each pixel's ray, by the scene's baseline.json."""
+    camera = json.loads((folder / "baseline.json").read_text())["camera_intrinsics"]
+    height, width = shape
+    x = (np.arange(width) + 0.5 - width / 2) / width * camera["sensor_width_mm"]
+    y = (np.arange(height) + 0.5 - height / 2) / height * camera["sensor_height_mm"]
+    return np.sqrt(1 + (x**2 + y[:, None] ** 2) / camera["focal_length_mm"] ** 2)
+
+
+def as_ray(folder: Path):
+    """Return the change from depth along the axis to depth along the ray."""
+
+    def change(units):
+        known = (units > 0) & (units < 65535)
+        rays = np.rint(units * ray_lengths(folder, shape=units.shape[1:]))
+        return np.where(known, np.minimum(rays, 65534), units)
+
+    return change
+
+
+def as_inverse(folder: Path):
+    """Return the change to numbers in proportion to 1 / depth, half of them above 20,000."""
+    units, _ = read_depth(folder, 0)
+    middle = np.median(units[(units > 0) & (units < 65535)])
+
+    def change(units):
+        known = (units > 0) & (units < 65535)
+        return np.where(known, np.minimum(np.rint(20000 * middle / np.maximum(units, 1)), 65534), 0)
+
+    return change
+
+
+def lagged(lag: int):
+    """Return the change after which depth frame t + lag belongs to RGB frame t."""
+
+    def change(units):
+        return units[np.clip(np.arange(len(units)) - lag, 0, len(units) - 1)]
+
+    return change
+
+
+def exchange(folder: Path, cameras: dict[int, int], *, kinds=("rgb.mp4", "depth.mkv")) -> None:
+    """Give camera c the files of camera cameras[c]."""
+    for kind in kinds:
+        contents = {
+            camera: (folder / f"cam_{camera:02d}_{kind}").read_bytes() for camera in cameras
+        }
+        for camera, other in cameras.items():
+            (folder / f"cam_{camera:02d}_{kind}").write_bytes(contents[other])
+
+
+def _luma(frame) -> np.ndarray:
+    plane = frame.planes[0]
+    rows = np.frombuffer(plane, np.dtype("<u2")).reshape(plane.height, plane.line_size // 2)
+    return rows[:, : plane.width].copy()
+
+
+def _write(path: Path, frames: np.ndarray, *, codec, pixel_format, tags) -> None:
+    options = {"level": "3", "slicecrc": "1"} if codec == "ffv1" else {"crf": "18"}
+    with av.open(str(path), "w") as container:
+        container.metadata.update(tags)
+        stream = container.add_stream(codec, rate=15, options=options)
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = pixel_format
+        stream.codec_context.thread_count = 1
+        for number, picture in enumerate(frames):
+            source = "gray16le" if codec == "ffv1" else "rgb24"
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format=source)
+            frame.pts, frame.time_base = number, Fraction(1, 15)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))

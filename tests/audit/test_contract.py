@@ -1,0 +1,312 @@
+"""Scenes with one thing wrong each: what the pictures say of them, and what they cannot say."""
+
+import math
+
+import numpy as np
+import pytest
+
+from stereogenbench_data.audit.contract import diagnose
+from stereogenbench_data.audit.contract_answers import Unit, offset_words
+from stereogenbench_data.audit.contract_hypotheses import Structure
+from stereogenbench_data.audit.contract_matching import match_rows
+from stereogenbench_data.audit.contract_statistics import Evidence, interval, pooled
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.synthesis import SynthRequest, synthesise
+from tests.audit.corruption import (
+    as_inverse,
+    as_ray,
+    copied,
+    edit_baseline,
+    exchange,
+    lagged,
+    rewrite_depth,
+    rewrite_rgb,
+)
+
+UNIT_M = 0.001
+
+
+@pytest.fixture(scope="module")
+def right_scene(tmp_path_factory):
+    """The folder of a scene with nothing wrong: wide-angle, oblong, 9 frames."""
+    root = tmp_path_factory.mktemp("right")
+    (key,) = synthesise(
+        root,
+        SynthRequest(family="Uniform", size_px=176, height_px=112, frames=9, seed=21, focal_mm=20),
+    )
+    return root / key
+
+
+@pytest.fixture
+def verdict_on(right_scene, tmp_path):
+    """Make one thing wrong, and return the verdict."""
+
+    def verdict_on(corrupt, **options):
+        corrupt(copied(right_scene, tmp_path))
+        (verdict,) = diagnose(tmp_path, workers=1, **({"frames": 1} | options)).verdicts
+        return verdict
+
+    return verdict_on
+
+
+def answer(verdict, topic):
+    (found,) = [answer for answer in verdict.answers if answer.topic == topic]
+    return found
+
+
+def wrong_topics(verdict):
+    return {answer.topic for answer in verdict.answers if answer.status == "wrong"}
+
+
+def test_a_right_contract_is_confirmed_question_by_question(verdict_on):
+    verdict = verdict_on(lambda folder: None, frames=4)
+
+    assert not verdict.is_wrong
+    assert {answer.topic: answer.status for answer in verdict.answers} == {
+        "metres a unit": "confirmed",
+        "depth along": "confirmed",
+        "stored is": "confirmed",
+        "frame lag": "confirmed",
+        "left and right": "confirmed",
+        "flip of depth": "confirmed",
+        "focal length": "confirmed",
+        "disparity offset": "confirmed",
+    }
+    assert verdict.unit_m == pytest.approx(UNIT_M, rel=0.005)
+    assert verdict.encoding == DepthEncoding(unit_m=UNIT_M)
+
+
+@pytest.mark.parametrize("factor", [0.98, 1.03, 1000.0, 0.001])
+def test_a_wrong_unit_is_measured(verdict_on, factor):
+    verdict = verdict_on(
+        lambda folder: rewrite_depth(folder, lambda u: u, unit_factor=factor), frames=2
+    )
+
+    assert wrong_topics(verdict) == {"metres a unit"}
+    assert verdict.unit_m == pytest.approx(UNIT_M, rel=0.005)
+    assert verdict.gain.low_db > 0
+
+
+def test_ray_depth_is_told_from_planar(verdict_on):
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, as_ray(folder)), frames=2)
+
+    assert wrong_topics(verdict) == {"depth along"}
+    assert verdict.encoding == DepthEncoding(unit_m=UNIT_M, kind="ray")
+
+
+def test_inverse_depth_is_found_with_its_unit(verdict_on):
+    seen = {}
+
+    def corrupt(folder):
+        change = as_inverse(folder)
+        seen["unit_m"] = UNIT_M * 1e4 * float(change(np.full((1, 1, 1), 10000)).item())
+        rewrite_depth(folder, change)
+
+    verdict = verdict_on(corrupt)
+
+    assert verdict.encoding.form == "inverse"
+    assert verdict.unit_m == pytest.approx(seen["unit_m"], rel=0.005)
+
+
+@pytest.mark.parametrize("lag", [-1, 2])
+def test_a_lag_is_found(verdict_on, lag):
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, lagged(lag)), frames=2)
+
+    assert wrong_topics(verdict) == {"frame lag"}
+    assert verdict.encoding == DepthEncoding(unit_m=UNIT_M, frame_lag=lag)
+
+
+@pytest.mark.parametrize(
+    ("kinds", "cameras", "found"),
+    [
+        (("rgb.mp4", "depth.mkv"), {0: 1, 1: 0}, "primary pair swapped"),
+        (("rgb.mp4",), {0: 1, 1: 0}, "pictures of the primary pair swapped"),
+        (("depth.mkv",), {c: 5 - c for c in range(6)}, "depth reversed"),
+    ],
+)
+def test_exchanged_files_are_found(verdict_on, kinds, cameras, found):
+    verdict = verdict_on(lambda folder: exchange(folder, cameras, kinds=kinds))
+
+    assert wrong_topics(verdict) == {"left and right"}
+    assert answer(verdict, "left and right").found == found
+    assert found in " ".join(verdict.beside)
+
+
+def test_a_primary_pair_named_the_wrong_way_round_is_found(verdict_on):
+    def corrupt(folder):
+        def swap(document):
+            pair = document["primary_stereo_pair"]
+            pair["left_camera"], pair["right_camera"] = pair["right_camera"], pair["left_camera"]
+
+        edit_baseline(folder, swap)
+
+    verdict = verdict_on(corrupt)
+
+    assert wrong_topics(verdict) == {"left and right"}
+    assert answer(verdict, "left and right").found == "left 0, right 1"
+
+
+@pytest.mark.parametrize(("flip", "axis"), [("vertical", 1), ("horizontal", 2)])
+def test_flipped_depth_is_found(verdict_on, flip, axis):
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, lambda u: np.flip(u, axis)))
+
+    assert wrong_topics(verdict) == {"flip of depth"}
+    assert answer(verdict, "flip of depth").found == flip
+
+
+def test_a_shifted_camera_is_found(verdict_on):
+    verdict = verdict_on(
+        lambda folder: rewrite_rgb(folder, 1, lambda pictures: np.roll(pictures, 3, axis=2))
+    )
+
+    assert wrong_topics(verdict) == {"disparity offset"}
+    told = answer(verdict, "disparity offset").found
+    assert told.startswith("camera 1's picture is +")
+    assert float(told.split("+")[1].split()[0]) == pytest.approx(3, abs=0.2)
+
+
+def test_a_focal_length_that_belongs_to_the_height_is_blamed_where_a_tag_states_the_unit(
+    verdict_on,
+):
+    def corrupt(folder):
+        def change(document):
+            camera = document["camera_intrinsics"]
+            by_width = document["image_width"] / camera["sensor_width_mm"]
+            camera["sensor_height_mm"] = document["image_height"] / by_width
+            camera["sensor_width_mm"] *= 1.25
+
+        edit_baseline(folder, change)
+
+    verdict = verdict_on(corrupt)
+
+    assert wrong_topics(verdict) == {"focal length"}
+    assert answer(verdict, "focal length").found == "f / sensor height * picture height"
+    assert "only focal length / unit is seen" in answer(verdict, "focal length").note
+
+
+def test_pictures_without_texture_decide_nothing(verdict_on):
+    def corrupt(folder):
+        for camera in range(6):
+            rewrite_rgb(folder, camera, lambda pictures: np.full_like(pictures, 120))
+
+    verdict = verdict_on(corrupt)
+
+    assert not verdict.is_wrong
+    assert {answer.status for answer in verdict.answers} == {"cannot tell"}
+    assert "no texture" in verdict.answers[0].note
+
+
+def test_six_equal_views_decide_nothing(verdict_on):
+    def corrupt(folder):
+        exchange(folder, dict.fromkeys(range(6), 0))
+
+    verdict = verdict_on(corrupt)
+
+    assert not verdict.is_wrong
+    assert "too little parallax" in verdict.answers[0].note
+
+
+def test_a_scene_in_which_nothing_moves_does_not_tell_the_lag(verdict_on):
+    def still(frames):
+        return np.repeat(frames[:1], len(frames), axis=0)
+
+    def corrupt(folder):
+        rewrite_depth(folder, still)
+        for camera in range(6):
+            rewrite_rgb(folder, camera, still)
+
+    verdict = verdict_on(corrupt)
+
+    assert not verdict.is_wrong
+    assert answer(verdict, "frame lag").status == "cannot tell"
+    assert answer(verdict, "metres a unit").status == "confirmed"
+
+
+def test_the_contract_asked_about_may_be_given(verdict_on):
+    verdict = verdict_on(lambda folder: None, depth=DepthEncoding(unit_m=0.1, kind="ray"))
+
+    assert wrong_topics(verdict) == {"metres a unit", "depth along"}
+    assert verdict.encoding.unit_m == pytest.approx(UNIT_M, rel=0.005)
+    assert verdict.encoding.kind == "planar"
+
+
+def test_scenes_with_different_contracts_get_verdicts_of_their_own(right_scene, tmp_path):
+    first = copied(right_scene, tmp_path)
+    rewrite_depth(first, lambda units: units, unit_factor=10.0)
+    first.rename(first.with_name("scene_000007"))
+    copied(right_scene, tmp_path)
+
+    report = diagnose(tmp_path, frames=1, workers=1)
+
+    assert [verdict.is_wrong for verdict in report.verdicts].count(True) == 1
+    assert len(report.verdicts) == 2
+    assert report.is_wrong
+
+
+def test_the_scene_that_was_rendered_elsewhere_is_confirmed(shared_scenes):
+    (verdict,) = diagnose(shared_scenes, frames=1, workers=1).verdicts
+
+    assert not verdict.is_wrong
+    assert verdict.unit_m == pytest.approx(0.001, rel=0.005)
+
+
+@pytest.mark.parametrize("number", ["scenes", "frames"])
+def test_none_cannot_be_looked_at(right_scene, number):
+    with pytest.raises(SelectionError, match="at least 1"):
+        diagnose(right_scene.parents[3], **{number: 0})
+
+
+def test_matching_finds_a_shift_of_either_sign_to_a_part_of_a_pixel():
+    texture = np.random.default_rng(0).normal(120, 40, (40, 96)).astype(np.float32)
+    smooth = (texture[:, :-2] + 2 * texture[:, 1:-1] + texture[:, 2:]) / 4
+    left, right = smooth[:, 10:80], smooth[:, 13:83]
+
+    for pictures, shift_px in (((left, right), 3.0), ((right, left), -3.0)):
+        matches = match_rows(*pictures)
+
+        assert len(matches.rows) > 1000
+        np.testing.assert_allclose(matches.disparity_px, shift_px, atol=0.2)
+
+
+@pytest.mark.parametrize("order", Structure().alternatives("order"), ids=lambda s: s.order)
+def test_an_exchange_of_files_pairs_each_picture_with_the_depth_of_its_camera(order):
+    for file in range(6):
+        camera = order.camera_of(file, content="rgb", primary=(0, 1))
+
+        depth = order.depth_file(file, primary=(0, 1))
+
+        assert order.camera_of(depth, content="depth", primary=(0, 1)) == camera
+
+
+def test_an_interval_is_students():
+    mean, low, high = interval([1.0, 2.0, 3.0])
+
+    assert mean == 2.0
+    assert high - mean == pytest.approx(4.303 / math.sqrt(3))
+    assert mean - low == pytest.approx(high - mean)
+
+
+def test_two_scenes_that_each_are_clear_are_clear_together():
+    assert pooled([Evidence(9.0, 0.5), Evidence(15.0, 0.5)]).is_clear
+    assert not pooled([Evidence(9.0, 0.5), Evidence(0.1, 0.5)]).is_clear
+    assert not pooled([]).is_clear
+
+
+@pytest.mark.parametrize(
+    ("metres", "rounded"), [(0.00100051, 0.001), (0.0009801, 0.00098), (0.012346, 0.01235)]
+)
+def test_a_unit_is_rounded_to_the_shortest_number_near_it(metres, rounded):
+    assert Unit(metres, 0.002).rounded_m == pytest.approx(rounded, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("offsets_px", "words"),
+    [
+        ({(0, 1): 2.0, (1, 2): 2.1}, "+2.05 px for every pair"),
+        ({(0, 1): -3.0, (1, 2): 3.0, (2, 4): 0.0}, "camera 1's picture is +3.00 px to the right"),
+        ({(0, 1): 1.0, (2, 3): 5.0}, "+1.00 px for 0-1, +5.00 px for 2-3"),
+    ],
+)
+def test_offsets_are_said_of_all_of_one_camera_or_of_each_pair(offsets_px, words):
+    assert offset_words(offsets_px) == words
