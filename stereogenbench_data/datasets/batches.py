@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from typing import Any, Protocol, TypedDict, Unpack, runtime_checkable
+from typing import Any, Final, Protocol, TypedDict, Unpack, runtime_checkable
 
 import numpy as np
 import torch.distributed
@@ -26,6 +26,10 @@ from stereogenbench_data.storage.index import SceneIndex
 State = dict[str, Any]
 """A position: a flat dict of numbers and texts, which JSON and `torch.save` take."""
 
+_STATES: Final = (
+    "Pass what state_dict() of a loader, of EpochBatches or of a stream returned, unchanged."
+)
+
 
 class EpochOptions(TypedDict, total=False):
     """How an epoch is ordered and shared out.
@@ -46,7 +50,9 @@ class EpochOptions(TypedDict, total=False):
             world_size * num_workers divides ``lanes``; make it a multiple of (or equal to) that
             product. Selections too small for so many lanes have fewer.
         open_scenes: How many scenes each lane interleaves; if left out 16, or the batch size where
-            that is more. Fewer take less memory and shuffle less well.
+            that is more, but of large pictures no more than about 0.9 GB of decoders hold: of
+            1280x1280 pixels 16 with one pair a scene, and 4 with all pairs. Fewer take less memory
+            and shuffle less well.
         order: "shuffled" (the default) or "sequential".
     """
 
@@ -75,6 +81,11 @@ class Numbered(Protocol):
         """Go to another epoch."""
         ...
 
+    @property
+    def scenes_at_once(self) -> int:
+        """How many scenes a lane may interleave before their open videos take too much memory."""
+        ...
+
 
 class EpochBatches(Sampler[list[int]]):
     """A batch sampler: the samples of each batch of an epoch, for one rank.
@@ -98,7 +109,8 @@ class EpochBatches(Sampler[list[int]]):
         """Order the samples of a dataset; nothing is computed before the first batch.
 
         Args:
-            dataset: Such as `StereoPairs`; its epoch is the epoch of the batches.
+            dataset: Such as `StereoPairs`; its epoch is the epoch of the batches, and of all
+                others made for the same dataset object. A ``loader(...)`` has its own.
             batch_size: Samples in a batch of one rank.
             **options: See `EpochOptions`.
 
@@ -116,7 +128,9 @@ class EpochBatches(Sampler[list[int]]):
             batch_size=batch_size,
             seed=options.get("seed", dataset.plan.seed),
             lanes=options.get("lanes", LANES),
-            open_scenes=options.get("open_scenes", max(OPEN_SCENES, batch_size)),
+            open_scenes=options.get(
+                "open_scenes", min(max(OPEN_SCENES, batch_size), dataset.scenes_at_once)
+            ),
             kind=options.get("order", "shuffled"),
         )
         self.tail = options.get("tail", "drop")
@@ -223,7 +237,7 @@ class EpochBatches(Sampler[list[int]]):
         return {
             "version": ORDER_VERSION,
             "epoch": epoch,
-            "batches_consumed": batches,
+            "batches_consumed": min(batches, self.batches_of_all),
             **self._identity,
         }
 
@@ -233,38 +247,45 @@ class EpochBatches(Sampler[list[int]]):
         Raises:
             StateError: If it belongs to other samples or another order, naming what differs.
         """
+        if not isinstance(state, Mapping):
+            raise StateError(
+                f"a state is a dict as state_dict() returns it, got {state!r:.60}: {_STATES}"
+            )
         own = {"version": ORDER_VERSION, **self._identity}
         missing = sorted({*own, "epoch", "batches_consumed"} - state.keys())
         if missing:
             raise StateError(
                 f"the state has no {', '.join(missing)} (it has {', '.join(map(str, state))}). "
-                "Pass what state_dict() of a loader, of EpochBatches or of a stream returned."
+                f"{_STATES}"
             )
         differing = [
-            f"{name} is {own[name]!r} here and {state[name]!r} there"
-            for name in own
-            if state[name] != own[name]
+            f"{name} is {value!r} here and {state[name]!r} there"
+            for name, value in own.items()
+            if type(state[name]) is not type(value) or state[name] != value
         ]
         if differing:
             raise StateError(
                 f"the state was saved for other batches: {'; '.join(differing)}. Open the same "
                 "data with the same selection and options, or begin the epoch anew without it."
             )
-        epoch, batches = state["epoch"], state["batches_consumed"]
-        for name, value in (("epoch", epoch), ("batches_consumed", batches)):
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                raise StateError(f"the state's {name} is {value!r}, no whole number from 0.")
-        return epoch, batches
+        epoch = require_count(state, "epoch")
+        return epoch, require_count(state, "batches_consumed", most=self.batches_of_all)
+
+    @property
+    def batches_of_all(self) -> int:
+        """How many batches hold all samples of an epoch, whatever ranks and tail there are."""
+        return -(-len(self.dataset.plan) // self.rule.batch_size)
 
     @cached_property
     def _identity(self) -> State:
         """What must be equal where a state is saved and where it is loaded."""
+        rule = self.rule.in_effect(np.diff(self.dataset.plan.first_sample))
         return {
-            "seed": self.rule.seed,
-            "batch_size": self.rule.batch_size,
-            "lanes": self.rule.lanes,
-            "open_scenes": self.rule.open_scenes,
-            "order": self.rule.kind,
+            "seed": rule.seed,
+            "batch_size": rule.batch_size,
+            "lanes": rule.lanes,
+            "open_scenes": rule.open_scenes,
+            "order": rule.kind,
             "tail": self.tail,
             "selection": self.dataset.plan.digest,
             "index": self.dataset.index.digest,
@@ -306,6 +327,20 @@ class BatchPass(Iterator[list[int]]):
         self._epoch, self._start, self._given = epoch, start, 0
         self._end = self._batches.end(start)
         self._left = iter(self._batches.share(start))
+
+
+def require_count(state: Mapping[str, Any], name: str, *, most: int | None = None) -> int:
+    """Return a whole number from 0 of a state.
+
+    Raises:
+        StateError: If it is none, or more than there can be.
+    """
+    value = state.get(name)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise StateError(f"the state's {name} is {value!r}, no whole number from 0. {_STATES}")
+    if most is not None and value > most:
+        raise StateError(f"the state's {name} is {value}, and there are {most}. {_STATES}")
+    return value
 
 
 def _group() -> tuple[int, int] | None:

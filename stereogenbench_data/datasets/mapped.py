@@ -1,73 +1,104 @@
 """Map-style datasets: a sample by its number, for torch's own `DataLoader`."""
 
+import copy
 import operator
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal, Unpack
+from typing import Any, Final, Literal, Self, Unpack
 
 import numpy as np
-import torch
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, get_worker_info
 
+from stereogenbench_data.datasets.asked import (
+    Check,
+    requested,
+    require_cameras,
+    require_check,
+    require_seed,
+)
 from stereogenbench_data.datasets.batches import EpochBatches
-from stereogenbench_data.datasets.loader import LoaderOptions, PairsLoader, split_options
-from stereogenbench_data.datasets.open_videos import videos_to_keep
+from stereogenbench_data.datasets.loader import (
+    LoaderOptions,
+    PairsLoader,
+    require_options,
+    split_options,
+)
+from stereogenbench_data.datasets.open_videos import scenes_at_once, videos_to_keep
+from stereogenbench_data.datasets.parcels import Shelf
+from stereogenbench_data.datasets.room import BatchRoom, Memory
+from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.samples.derive import RECTIFIED_PX
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,
     DEFAULT_VIEW_FIELDS,
-    PAIR_FIELDS,
-    VIEW_FIELDS,
-    require_fields,
 )
 from stereogenbench_data.samples.load import (
     Request,
     Sample,
     SampleLoader,
     Transform,
-    require_whole_depth,
 )
+from stereogenbench_data.samples.needed import require_videos
+from stereogenbench_data.samples.places import Room, fresh_room
+from stereogenbench_data.samples.whole_depth import require_whole_depth
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.plan import Plan, Selection, plan_pairs, plan_views
 from stereogenbench_data.selection.windows import FramesSpec
 from stereogenbench_data.storage.cache import ShardCache
 from stereogenbench_data.storage.index import SceneIndex
 
-LARGEST_SIDE_PX: Final = 16384
-
-_CAMERAS: Final = frozenset(range(CAMERA_COUNT))
-
 Data = str | Path | SceneIndex
+_FOLLOWS: Final = -1
+"""Stands for the epoch of the dataset that a loader was made from."""
 
 
 class _MappedScenes(Dataset[Sample]):
     """Samples of a plan by number, loaded in whatever process asks."""
 
     def __init__(
-        self, index: SceneIndex, plan: Plan, request: Request, *, cache: ShardCache | None = None
+        self,
+        index: SceneIndex,
+        plan: Plan,
+        request: Request,
+        *,
+        cache: ShardCache | None,
+        check: Check,
     ) -> None:
+        require_videos(index, plan, request)
         require_whole_depth(index, plan, request)
         _warn_of_odd_scenes(index, plan, request)
         self.index = index
         self.plan = plan
-        self._loader = SampleLoader(index, request, cache=cache)
+        opened = _opens_checked(require_check(check), plan)
+        self._loader = SampleLoader(
+            index,
+            request,
+            cache=cache,
+            check="opened" if opened else "metadata",
+            frames="shared" if (np.diff(plan.first_pair) > 1).any() else "used once",
+        )
+        self._memory = Memory()
+        # Set by a loader for its own workers.
+        self.shelf: Shelf | None = None
         self._streams = request.streams
         self._access: Literal["random", "in order"] = "random"
-        # A shared tensor, because workers that persist over epochs hold copies of the dataset.
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
+        # Shared memory, because workers that persist over epochs hold copies of the dataset.
+        self._epoch = self._followed = shared_full((), 0)
 
     @property
     def epoch(self) -> int:
         """The epoch that random frames and transforms are drawn for."""
-        return int(self._epoch)
+        own = int(self._epoch)
+        return int(self._followed) if own == _FOLLOWS else own
 
     def set_epoch(self, epoch: int) -> None:
         """Draw random frames and transforms anew, in this process and in running workers.
+
+        Loaders that were made before, and were not told an epoch themselves, go with it.
 
         Args:
             epoch: Number of the epoch, from 0.
@@ -91,6 +122,25 @@ class _MappedScenes(Dataset[Sample]):
             StorageError: If a file is missing or altered.
             MediaError: If a video does not decode to what the index says.
         """
+        return to_tensors(self._sample(number))
+
+    def __getitems__(self, numbers: Sequence[int]) -> list[Sample]:
+        """Return several samples in the order asked, each stream read forwards on the way.
+
+        Samples of one shape lie side by side in memory, so that `collate` need not copy them.
+        """
+        if self.shelf is None or get_worker_info() is None:
+            room = BatchRoom(len(numbers), self._memory.take)
+        else:
+            room = self.shelf.room(len(numbers), self._memory)
+        loaded: dict[int, Sample] = {}
+        for place, number in sorted(enumerate(numbers), key=operator.itemgetter(1)):
+            sample = self._sample(number, room=room.at(place))
+            loaded[place] = room.as_tensors(place, sample)
+        return [loaded[place] for place in range(len(numbers))]
+
+    def _sample(self, number: int, room: Room = fresh_room) -> Sample:
+        """Return a sample of arrays, written where the room says."""
         number = operator.index(number)
         if not -len(self) <= number < len(self):
             raise IndexError(f"no sample {number}: there are {len(self)}")
@@ -101,15 +151,11 @@ class _MappedScenes(Dataset[Sample]):
             address,
             clip="clip" if self.plan.windows.is_clip else "frame",
             generator=np.random.default_rng(seeds),
+            room=room,
         )
         if self._access == "in order" and self.plan.is_last_of_scene(number):
             self._loader.release(address.row)
-        return to_tensors(sample)
-
-    def __getitems__(self, numbers: Sequence[int]) -> list[Sample]:
-        """Return several samples in the order asked, each stream read forwards on the way."""
-        loaded = {number: self[number] for number in sorted(set(numbers))}
-        return [loaded[number] for number in numbers]
+        return sample
 
     def loader(
         self, batch_size: int, *, num_workers: int = 0, **options: Unpack[LoaderOptions]
@@ -122,12 +168,31 @@ class _MappedScenes(Dataset[Sample]):
             **options: How the epoch is ordered and shared out (`EpochOptions`: seed, rank,
                 world_size, tail, lanes, open_scenes, order); and what `DataLoader` takes.
 
+        Returns:
+            A loader with an epoch and open videos of its own: any number of them can be used side
+            by side.
+
         Raises:
-            SelectionError: If an option is out of its range, or every batch would be dropped.
+            SelectionError: If there is no such option, it is out of its range, or every batch would
+                be dropped.
         """
+        require_options(options)
         ordering, others = split_options(options)
-        batches = EpochBatches(self, batch_size, **ordering)
-        return PairsLoader(self, batches, num_workers=num_workers, **others)
+        own = self._apart()
+        batches = EpochBatches(own, batch_size, **ordering)
+        return PairsLoader(own, batches, num_workers=num_workers, **others)
+
+    def _apart(self) -> Self:
+        """Return the same samples, to be loaded side by side with these."""
+        apart = copy.copy(self)
+        apart._loader, apart._memory = self._loader.apart(), Memory()
+        apart._epoch, apart._followed = shared_full((), _FOLLOWS), self._epoch
+        return apart
+
+    @property
+    def scenes_at_once(self) -> int:
+        """How many scenes a lane interleaves at the most, unless ``open_scenes`` says otherwise."""
+        return scenes_at_once(self.index, self.plan)
 
     def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Read by these batches, in one of so many processes: each video is opened once.
@@ -141,7 +206,10 @@ class _MappedScenes(Dataset[Sample]):
         self._access = "in order"
 
     def close(self) -> None:
-        """Close the videos that this process holds open; the dataset can be used again."""
+        """Close the videos that this process holds open; the dataset can be used again.
+
+        A loader has its own, which its ``close()`` closes.
+        """
         self._loader.close()
 
     def __repr__(self) -> str:
@@ -205,6 +273,7 @@ class StereoPairs(_MappedScenes):
         depth: DepthEncoding | None = None,
         seed: int = 0,
         cache: ShardCache | None = None,
+        check: Check = "read",
         **selection: Unpack[Selection],
     ) -> None:
         """Select the samples; no video is opened before the first sample is asked for.
@@ -220,6 +289,12 @@ class StereoPairs(_MappedScenes):
             seed: Seed of random frames, transforms and the balanced subsample.
             cache: Where to keep on disk what is read from a URL; None fetches, each time, just the
                 bytes that samples need.
+            check: Which videos of shards are compared whole with the checksums of the index, by
+                each process that opens them: "opened" all; "read" (the default) where at least half
+                the frames of a scene are asked for, so that it costs little beside decoding them;
+                "metadata" none. Those in shards on disk and in the cache are compared before a
+                frame is given, those from a URL when their last byte has come. Metadata files are
+                always compared; the files of a released folder have no checksums.
             **selection: Filters on scenes (`SceneFilters`), pairs, direction, baseline_cm,
                 balance and limit (`PairOptions`), and frames (`parse_frames`).
 
@@ -233,15 +308,15 @@ class StereoPairs(_MappedScenes):
         """
         index = open_index(data)
         plan = plan_pairs(index, seed=require_seed(seed), **selection)
-        request = Request(
-            kind="pairs",
-            fields=require_fields(fields, known=PAIR_FIELDS),
-            layout="stacked" if selection.get("pairs") == "sweep" else "single",
-            size=require_size(size),
-            depth=require_depth(depth),
-            transform=require_transform(transform),
+        request = requested(
+            "pairs",
+            "stacked" if selection.get("pairs") == "sweep" else "single",
+            fields=fields,
+            size=size,
+            depth=depth,
+            transform=transform,
         )
-        super().__init__(index, plan, request, cache=cache)
+        super().__init__(index, plan, request, cache=cache, check=check)
 
 
 class SceneViews(_MappedScenes):
@@ -265,6 +340,7 @@ class SceneViews(_MappedScenes):
         depth: DepthEncoding | None = None,
         seed: int = 0,
         cache: ShardCache | None = None,
+        check: Check = "read",
         **filters: Unpack[SceneFilters],
     ) -> None:
         """Select the samples; no video is opened before the first sample is asked for.
@@ -279,6 +355,7 @@ class SceneViews(_MappedScenes):
             depth: A depth contract instead of the one that files and release state.
             seed: Seed of random frames and transforms.
             cache: As for `StereoPairs`.
+            check: As for `StereoPairs`.
             **filters: Filters on scenes (`SceneFilters`).
 
         Raises:
@@ -286,11 +363,18 @@ class SceneViews(_MappedScenes):
             FieldError: If a field does not exist, or the transform swaps views.
             StorageError: If the data are not there, or hold broken scenes (all are named).
         """
-        transform = require_transform(transform)
-        if transform is not None and transform.swaps_views:
+        each = isinstance(cameras, str) and cameras == "each"
+        request = requested(
+            "views",
+            "single" if each else "stacked",
+            fields=fields,
+            size=size,
+            depth=depth,
+            transform=transform,
+        )
+        if request.transform is not None and request.transform.swaps_views:
             raise FieldError("SceneViews takes no flip: it swaps the two views of a pair.")
         index = open_index(data)
-        each = isinstance(cameras, str) and cameras == "each"
         plan = plan_views(
             index,
             cameras="each" if each else require_cameras(cameras),
@@ -298,94 +382,17 @@ class SceneViews(_MappedScenes):
             seed=require_seed(seed),
             filters=filters,
         )
-        request = Request(
-            kind="views",
-            fields=require_fields(fields, known=VIEW_FIELDS),
-            layout="single" if each else "stacked",
-            size=require_size(size),
-            depth=require_depth(depth),
-            transform=require_transform(transform),
-        )
-        super().__init__(index, plan, request, cache=cache)
+        super().__init__(index, plan, request, cache=cache, check=check)
+
+
+def _opens_checked(check: Check, plan: Plan) -> bool:
+    """Return whether videos are compared with their checksums when they are opened."""
+    frames = int(plan.frame_counts[0])
+    clip = len(plan.windows.window(0, frames=frames, draw=(0,)))
+    is_mostly_read = 2 * clip * plan.windows.count(frames) >= frames
+    return check == "opened" or (check == "read" and is_mostly_read)
 
 
 def open_index(data: Data) -> SceneIndex:
     """Return the index of a folder, an index file, or an index as it is."""
     return data if isinstance(data, SceneIndex) else SceneIndex.open(data)
-
-
-def require_size(size: Any) -> tuple[int, int] | None:
-    """Return a (height, width) in pixels, or None.
-
-    Raises:
-        FieldError: If it is not two whole numbers of 1 to 16384.
-    """
-    if size is None:
-        return None
-    try:
-        height, width = (int(side) for side in size)
-        whole = (height, width) == tuple(size)
-    except (TypeError, ValueError):
-        whole = False
-    if not whole or not (0 < height <= LARGEST_SIDE_PX and 0 < width <= LARGEST_SIDE_PX):
-        raise FieldError(
-            f"size must be (height, width) of 1 to {LARGEST_SIDE_PX} pixels, got {size!r}."
-        )
-    return height, width
-
-
-def require_transform(transform: Any) -> Transform | None:
-    """Return a transform, or None.
-
-    Raises:
-        FieldError: If it cannot be called, or does not say whether it swaps the views.
-    """
-    says = isinstance(getattr(transform, "swaps_views", None), bool)
-    if transform is None or (says and callable(transform) and not isinstance(transform, type)):
-        return transform
-    raise FieldError(
-        f"a transform is called with (views, generator) and has an attribute swaps_views, True or "
-        f"False; got {transform!r}."
-    )
-
-
-def require_depth(depth: Any) -> DepthEncoding | None:
-    """Return a depth contract, or None.
-
-    Raises:
-        FieldError: If it is something else.
-    """
-    if depth is not None and not isinstance(depth, DepthEncoding):
-        raise FieldError(f"depth must be a DepthEncoding(...), got {depth!r}.")
-    return depth
-
-
-def require_seed(seed: Any) -> int:
-    """Return a seed.
-
-    Raises:
-        SelectionError: If it is not a whole number from 0.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise SelectionError(f"seed must be a whole number from 0, got {seed!r}.")
-    return int(seed)
-
-
-def require_cameras(cameras: Any) -> tuple[int, ...]:
-    """Return camera numbers, in the order given.
-
-    Raises:
-        SelectionError: If one is not of 0 to 5 or is given twice, or there is none.
-    """
-    if isinstance(cameras, str) and cameras == "all":
-        return tuple(range(CAMERA_COUNT))
-    found: tuple[Any, ...] = (cameras,)
-    if isinstance(cameras, Sequence | np.ndarray):
-        found = tuple(np.asarray(cameras, dtype=object).tolist())
-    whole = all(isinstance(camera, int | np.integer) for camera in found)
-    if not (whole and found and len(set(found)) == len(found) and set(found) <= _CAMERAS):
-        raise SelectionError(
-            f"cameras must be 'all', 'each' or different numbers of 0 to {CAMERA_COUNT - 1}, "
-            f"got {cameras!r}."
-        )
-    return tuple(int(camera) for camera in found)

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from typing import Final
 
 import numpy as np
 
@@ -10,9 +11,21 @@ from stereogenbench_data.samples.fields import Stream
 from stereogenbench_data.samples.streams import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.plan import Plan
+from stereogenbench_data.storage.index import SceneIndex
 
 SPARE_FILES = 128
 """Open files that are left to everything else."""
+
+
+LANE_BYTES: Final = 900_000_000
+"""Memory for the open scenes of a lane, where nobody asks for a number of them."""
+
+_DECODER_BYTES: Final = 17
+"""Of a camera's decoders for each pixel: 12.6 of H.264 with its reference pictures, 4.3 of FFV1,
+measured at 1280x1280."""
+
+_KEPT_BYTES: Final = 4
+"""Of the current picture and what is measured in it, kept for each pixel for other pairs."""
 
 
 class OpenVideosWarning(UserWarning):
@@ -42,6 +55,20 @@ def videos_to_keep(
             stacklevel=5,
         )
     return min(wanted, allowed)
+
+
+def scenes_at_once(index: SceneIndex, plan: Plan) -> int:
+    """Return how many scenes with all their videos fit into the memory meant for a lane.
+
+    It depends on the selected pairs and the stored size of their pictures alone, not on fields,
+    ranks or workers: so does the order.
+    """
+    rows = plan.scene_rows
+    pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
+    cameras = videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
+    is_shared = (np.diff(plan.first_pair) > 1).any()
+    scene_bytes = int(pixels) * cameras * (_DECODER_BYTES + (_KEPT_BYTES if is_shared else 0))
+    return max(2, LANE_BYTES // max(1, scene_bytes))
 
 
 def _most_files() -> int:

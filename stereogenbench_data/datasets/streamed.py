@@ -6,9 +6,16 @@ from typing import Any, Unpack
 import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
-from stereogenbench_data.datasets.batches import EpochBatches, EpochOptions, State
+from stereogenbench_data.datasets.asked import Check
+from stereogenbench_data.datasets.batches import (
+    EpochBatches,
+    EpochOptions,
+    State,
+    require_count,
+)
 from stereogenbench_data.datasets.loader import split_options
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.load import Sample, Transform
 from stereogenbench_data.schema.records import DepthEncoding
@@ -26,6 +33,7 @@ class StreamOptions(Selection, EpochOptions, total=False):
     transform: Transform | None
     depth: DepthEncoding | None
     cache: ShardCache | None
+    check: Check
 
 
 class StereoPairStream(IterableDataset[Sample]):
@@ -34,7 +42,8 @@ class StereoPairStream(IterableDataset[Sample]):
     ``DataLoader(stream, batch_size=B, num_workers=W)``, with the batch size of the stream, gives
     the batches that ``StereoPairs(...).loader(B, num_workers=W)`` gives: each rank and worker
     yields its own, without duplicates or holes, also where there are more workers than scenes. With
-    ``tail="wrap"`` a sample has the field ``is_padding``, a bool.
+    ``tail="wrap"`` a sample has the field ``is_padding``, a bool. A stream holds one position: make
+    one for each `DataLoader` that is used side by side with others.
 
     >>> from stereogenbench_data import StereoPairStream
     >>> stream = StereoPairStream(getfixture("small_release"), 2, tail="uneven")
@@ -63,7 +72,7 @@ class StereoPairStream(IterableDataset[Sample]):
         self.pairs = StereoPairs(data, **others)
         self.batches = EpochBatches(self.pairs, batch_size, **ordering)
         # Which worker has begun since a state was loaded: workers may be new copies every epoch.
-        self._begun = torch.zeros(MOST_WORKERS, dtype=torch.bool).share_memory_()  # type: ignore[no-untyped-call]
+        self._begun = shared_full((MOST_WORKERS,), 0)
         self._latest: SamplePass | None = None
 
     @property
@@ -94,7 +103,7 @@ class StereoPairStream(IterableDataset[Sample]):
         epoch, start = self.batches.next_position()
         if self._begun[worker % MOST_WORKERS]:
             start = 0
-        self._begun[worker % MOST_WORKERS] = True
+        self._begun[worker % MOST_WORKERS] = 1
         self.pairs.keep_open(self.batches, processes=self.batches.world_size * workers)
         self._latest = SamplePass(self, epoch=epoch, start=start, worker=worker, workers=workers)
         return self._latest
@@ -199,8 +208,11 @@ class SamplePass(Iterator[Sample]):
                 f"the position is that of another worker: {'; '.join(differing)}. Load it under "
                 "the same ranks and workers; the state of a stream itself goes with any."
             )
+        start = require_count(state, "start", most=batches.batches_of_all)
+        share = len(batches.share(start)[self._place["worker"] :: self._place["workers"]])
+        given = require_count(state, "samples_given", most=share * batches.rule.batch_size)
         self._stream.set_epoch(epoch)
-        self._go_to(epoch, int(state["start"]), given=int(state["samples_given"]))
+        self._go_to(epoch, start, given=given)
 
     @property
     def _own_place(self) -> dict[str, int]:

@@ -43,5 +43,24 @@ def collate(samples: Sequence[Sample]) -> dict[str, Any]:
                     f"{tuple(first[name].shape)} in {first.get('__key__', 'the first')}: give "
                     "size=(height, width), or batch sweeps one by one."
                 )
-    batch: dict[str, Any] = default_collate(list(samples))
-    return batch
+    return {name: _stacked([sample[name] for sample in samples]) for name in first}
+
+
+def _stacked(values: list[Any]) -> Any:
+    """Return values as one tensor: without a copy where they lie side by side in memory."""
+    first = values[0]
+    if isinstance(first, torch.Tensor) and first.is_contiguous() and _are_neighbours(values):
+        return first.as_strided((len(values), *first.shape), (first.numel(), *first.stride()))
+    return default_collate(values)
+
+
+def _are_neighbours(values: list[torch.Tensor]) -> bool:
+    first = values[0]
+    memory, start = first.untyped_storage().data_ptr(), first.storage_offset()
+    return all(
+        value.untyped_storage().data_ptr() == memory
+        and value.storage_offset() == start + place * first.numel()
+        and value.is_contiguous()
+        and value.dtype == first.dtype
+        for place, value in enumerate(values)
+    )

@@ -5,10 +5,10 @@ column floor(u). Camera axes are x right, y down, z forward; lengths are metres.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
-from array_api_compat import array_namespace
+from array_api_compat import array_namespace, is_numpy_array
 from jaxtyping import Bool, Float, Float64, Int64
 
 from stereogenbench_data.errors import GeometryError
@@ -29,6 +29,29 @@ class Projection:
     u_px: Float[Any, "*batch h w"]
     v_px: Float[Any, "*batch h w"] | None
     depth_m: Float[Any, "*batch h w"]
+
+
+_BLOCK_PIXELS: Final = 24 * 1280
+"""Pixels of which the maps of one step stay in a processor's cache for the next."""
+
+
+def row_blocks(projection: Projection, *, height_px: int) -> list[slice]:
+    """Return the rows of a projection in blocks that can be worked on one after another.
+
+    Several where rows do not change, the target has as many, and the maps are numpy's; else one.
+    What is worked out of each block for itself is the same, and up to four times as fast.
+    """
+    rows, columns = projection.u_px.shape[-2:]
+    apart = is_numpy_array(projection.u_px) and projection.v_px is None and rows == height_px
+    step = max(1, _BLOCK_PIXELS // max(1, columns)) if apart else max(1, rows)
+    return [slice(top, top + step) for top in range(0, max(1, rows), step)]
+
+
+def rows_of(projection: Projection, rows: slice) -> Projection:
+    """Return some rows of a rectified projection."""
+    return Projection(
+        u_px=projection.u_px[..., rows, :], v_px=None, depth_m=projection.depth_m[..., rows, :]
+    )
 
 
 def project_rectified(

@@ -8,11 +8,17 @@ either side: a point in front of what the target sees is as wrong as one behind 
 import math
 from typing import Any
 
+import numpy as np
 from array_api_compat import array_namespace
 from jaxtyping import Bool, Float
 
 from stereogenbench_data.geometry.arrays import take_flat
-from stereogenbench_data.geometry.projection import Projection, landing_pixels
+from stereogenbench_data.geometry.projection import (
+    Projection,
+    landing_pixels,
+    row_blocks,
+    rows_of,
+)
 from stereogenbench_data.geometry.warp import front_pixels
 
 
@@ -49,6 +55,19 @@ def visible_in_target(
     Source: the StereoGenBench paper, appendix on the geometry audit, which compares projected
     points with the target's depth buffer; the tolerance is ours.
     """
+    blocks = row_blocks(projection, height_px=target_depth_m.shape[-2])
+    if len(blocks) > 1:
+        visible = np.empty(projection.u_px.shape, dtype=np.bool_)
+        for rows in blocks:
+            visible[..., rows, :] = visible_in_target(
+                rows_of(projection, rows),
+                measured=measured[..., rows, :],
+                target_depth_m=target_depth_m[..., rows, :],
+                target_measured=target_measured[..., rows, :],
+                quantum_m=_rows_of_step(quantum_m, rows),
+                tolerance=tolerance,
+            )
+        return visible
     xp = array_namespace(target_depth_m)
     height_px, width_px = target_depth_m.shape[-2:]
     inside, pixel = landing_pixels(projection, height_px=height_px, width_px=width_px)
@@ -81,6 +100,17 @@ def visible_from_source(
     Returns:
         True where nothing in the source view hides the pixel and it lands inside the image.
     """
+    blocks = row_blocks(projection, height_px=projection.u_px.shape[-2])
+    if len(blocks) > 1:
+        visible = np.empty(projection.u_px.shape, dtype=np.bool_)
+        for rows in blocks:
+            visible[..., rows, :] = visible_from_source(
+                rows_of(projection, rows),
+                measured=measured[..., rows, :],
+                quantum_m=_rows_of_step(quantum_m, rows),
+                tolerance=tolerance,
+            )
+        return visible
     front, hole = front_pixels(projection, measured=measured)
     return visible_in_target(
         projection,
@@ -90,3 +120,8 @@ def visible_from_source(
         quantum_m=quantum_m,
         tolerance=tolerance,
     )
+
+
+def _rows_of_step(quantum_m: Any, rows: slice) -> Any:
+    """Return the depth step of some rows, where it is a map."""
+    return quantum_m if isinstance(quantum_m, float) else quantum_m[..., rows, :]

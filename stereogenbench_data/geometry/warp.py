@@ -7,6 +7,7 @@ channel-first, (..., c, h, w).
 import math
 from typing import Any, Final
 
+import numpy as np
 from array_api_compat import array_namespace
 from jaxtyping import Bool, Float, Int64, Shaped
 
@@ -16,7 +17,9 @@ from stereogenbench_data.geometry.projection import (
     image_starts,
     landing_pixels,
     lands_inside,
+    row_blocks,
     row_starts,
+    rows_of,
 )
 
 _INDEX_BITS: Final = 2**32 - 1
@@ -69,6 +72,14 @@ def splat(
     Returns:
         The target image in the same dtype, 0 in holes; and the holes, True where nothing landed.
     """
+    blocks = row_blocks(projection, height_px=image.shape[-2])
+    if len(blocks) > 1:
+        out, holes = np.empty(image.shape, dtype=image.dtype), np.empty(measured.shape, np.bool_)
+        for rows in blocks:
+            out[..., rows, :], holes[..., rows, :] = splat(
+                image[..., rows, :], rows_of(projection, rows), measured=measured[..., rows, :]
+            )
+        return out, holes
     xp = array_namespace(image)
     front, hole = front_pixels(projection, measured=measured)
     warped = take_pixels(image, front)
@@ -96,6 +107,15 @@ def backward_warp(
     """
     xp = array_namespace(image)
     dtype = image.dtype if xp.isdtype(image.dtype, "real floating") else xp.float32
+    blocks = row_blocks(projection, height_px=image.shape[-2])
+    if len(blocks) > 1:
+        shape = (*image.shape[:-1], projection.u_px.shape[-1])
+        out, landed = np.empty(shape, dtype=dtype), np.empty(projection.u_px.shape, np.bool_)
+        for rows in blocks:
+            out[..., rows, :], landed[..., rows, :] = backward_warp(
+                image[..., rows, :], rows_of(projection, rows)
+            )
+        return out, landed
     size = {"height_px": image.shape[-2], "width_px": image.shape[-1]}
     inside = lands_inside(projection, **size)
     left, right, to_right = _neighbours(projection.u_px, inside, size_px=size["width_px"])

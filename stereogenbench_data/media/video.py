@@ -26,6 +26,8 @@ from stereogenbench_data.media.container import (
     stream_facts,
 )
 from stereogenbench_data.media.decoder import Astray, Decoder
+from stereogenbench_data.media.depth_frame_file import PACKED_SUFFIX
+from stereogenbench_data.media.depth_frames import probe_packed
 from stereogenbench_data.media.planes import plane_numbers
 
 __all__ = ["StreamFacts", "VideoReader", "probe", "read_rgb"]
@@ -44,7 +46,8 @@ def probe(
 
     Args:
         file: A path, or a seekable binary file; the latter stays the caller's to close.
-        name: What messages call the file.
+        name: What messages call the file. One that ends in ``.b2frame`` is of depth that blosc2
+            packed.
         pixel_format: "later" spares the decoding of a picture (tens of milliseconds of large
             H.264), where only that would tell the pixel format.
 
@@ -52,6 +55,8 @@ def probe(
         StorageError: If the file cannot be read.
         MediaError: If it is no MP4 or Matroska video, is cut short or holds no frame.
     """
+    if name.endswith(PACKED_SUFFIX):
+        return probe_packed(file, name=name)
     with open_container(file, name=name, pixel_format=pixel_format) as container:
         require_whole_payload(container, name=name)
         frames = _told_frames(container)

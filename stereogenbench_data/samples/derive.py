@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -12,7 +12,7 @@ from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.disparity import (
     disparity_error_px,
     disparity_from_depth,
-    disparity_from_units,
+    write_disparity,
 )
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.projection import (
@@ -94,34 +94,55 @@ class PairGeometry:
         recorded_m = self._facts.scene.rig.baseline_cm(self._source, self._target) / 100
         return recorded_m if to_the_right else -recorded_m
 
-    @cached_property
+    @property
     def depth_m(self) -> MapF32:
-        """Depth along the optical axis, 0 where not measured."""
-        return depth_m_from_units(
-            self.stored.units,
-            measured=self.stored.measured,
-            encoding=self._encoding,
-            intrinsics=self._views.intrinsics,
-        )
+        """Depth along the optical axis, 0 where not measured; worked out once for all pairs."""
+        derived, key = self.stored.derived, ("depth_m", self._views.intrinsics)
+        if key not in derived:
+            derived[key] = depth_m_from_units(
+                self.stored.units,
+                measured=self.stored.measured,
+                encoding=self._encoding,
+                intrinsics=self._views.intrinsics,
+            )
+        depth_m: MapF32 = derived[key]
+        return depth_m
 
     @cached_property
     def disparity(self) -> MapF32:
         """Disparity in pixels, 0 where depth was not measured."""
-        if not self._facts.is_rectified:
-            u_px = np.arange(self.depth_m.shape[-1]) + 0.5
-            moved: MapF32 = np.where(self.stored.measured, u_px - self.projection.u_px, 0).astype(
-                np.float32
-            )
-            return moved
-        rig = {"focal_px": self._views.intrinsics.fx_px, "baseline_m": self.baseline_m}
-        if self._encoding.kind == "ray":
-            by_depth: MapF32 = disparity_from_depth(self.depth_m, **rig)
-            return by_depth
-        disparity: MapF32 = disparity_from_units(
-            self.stored.units, **rig, unit_m=self._encoding.known_unit_m, form=self._encoding.form
-        )
-        disparity *= self.stored.measured
+        disparity = np.empty(self.stored.units.shape, dtype=np.float32)
+        self.write_disparity(disparity)
         return disparity
+
+    def write_disparity(self, out: MapF32, *, sign: Literal[1, -1] = 1) -> None:
+        """Write disparity, times a sign, into an array."""
+        if "disparity" in self.__dict__:
+            np.multiply(self.disparity, np.float32(sign), out=out)
+        elif not self._facts.is_rectified:
+            u_px = np.arange(self.depth_m.shape[-1]) + 0.5
+            moved = np.where(self.stored.measured, u_px - self.projection.u_px, 0)
+            np.multiply(moved, sign, out=out, casting="same_kind")
+        elif self._encoding.kind == "ray":
+            rig = {"focal_px": self._views.intrinsics.fx_px, "baseline_m": self.baseline_m}
+            np.multiply(disparity_from_depth(self.depth_m, **rig), np.float32(sign), out=out)
+        else:
+            shift_m = self._views.intrinsics.fx_px * self.baseline_m
+            write_disparity(
+                out,
+                self.stored.units,
+                measured=self._nonzero_measured,
+                shift_units=sign * shift_m / self._encoding.known_unit_m,
+                form=self._encoding.form,
+            )
+
+    @property
+    def _nonzero_measured(self) -> MapBool:
+        """Where disparity is not 0: a contract may say that a stored 0 was measured."""
+        if 0 in self._encoding.no_depth or self._encoding.form == "inverse":
+            return self.stored.measured
+        nonzero: MapBool = self.stored.measured & (self.stored.units != 0)
+        return nonzero
 
     @cached_property
     def projection(self) -> Projection:
@@ -242,6 +263,12 @@ class PairSample:
         """From the target to the source."""
         return PairGeometry(self.views, self.facts, source=self.target, target=self.views.source)
 
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, height and width of the sample's maps."""
+        intrinsics = self.views.intrinsics
+        return len(self.views.frames), intrinsics.height_px, intrinsics.width_px
+
     def world_from(self, camera: int) -> Motions:
         """Return a camera's poses at the sample's frames."""
         poses = self.facts.camera_poses()
@@ -256,14 +283,12 @@ Builder = Callable[[PairSample], Any]
 PAIR_BUILDERS: Final[dict[str, Builder]] = {
     "left": lambda s: s.views.pictures[s.views.source],
     "right": lambda s: s.views.pictures[s.target],
-    "disparity": lambda s: s.ahead.disparity[:, None],
     "valid": lambda s: s.ahead.stored.measured[:, None],
     "visible": lambda s: s.ahead.visible(s.back)[:, None],
     "visible_from_left": lambda s: s.ahead.visible_from_source[:, None],
     "disparity_error": lambda s: s.ahead.disparity_error[:, None],
     "depth": lambda s: s.ahead.depth_m[:, None],
     "depth_right": lambda s: s.back.depth_m[:, None],
-    "disparity_right": lambda s: 0 - s.back.disparity[:, None],
     "valid_right": lambda s: s.back.stored.measured[:, None],
     "visible_right": lambda s: s.back.visible(s.ahead)[:, None],
     "warped_right": lambda s: s.ahead.splatted[0],
@@ -275,6 +300,12 @@ PAIR_BUILDERS: Final[dict[str, Builder]] = {
     "frame_index": lambda s: np.array(s.views.frames, dtype=np.int64),
     "pair": lambda s: np.array([s.views.source, s.target], dtype=np.int64),
 }
+
+PAIR_WRITERS: Final[dict[str, Callable[[PairSample, MapF32], None]]] = {
+    "disparity": lambda s, out: s.ahead.write_disparity(out),
+    "disparity_right": lambda s, out: s.back.write_disparity(out, sign=-1),
+}
+"""What writes maps that are too large to be made first and copied then, into (t, h, w) float32."""
 
 VIEW_BUILDERS: Final[dict[str, Builder]] = {
     "image": lambda s: s.views.pictures[s.target],

@@ -2,8 +2,8 @@
 
 from collections import OrderedDict
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Final, Literal, NoReturn, Protocol, runtime_checkable
+from copy import copy
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Shaped
@@ -14,226 +14,177 @@ from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.media.depth import (
     depth_frame_index,
     measured,
-    require_depth_stream,
 )
 from stereogenbench_data.samples.derive import (
-    PAIR_BUILDERS,
+    PAIR_WRITERS,
     RECTIFIED_PX,
     TEXT_BUILDERS,
-    VIEW_BUILDERS,
-    Builder,
     PairSample,
     SceneFacts,
 )
-from stereogenbench_data.samples.fields import (
-    PAIR_FIELDS,
-    VIEW_FIELDS,
-    Field,
-    Stream,
-    streams_of,
-)
-from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.samples.places import Places, Room, fresh_room
+from stereogenbench_data.samples.request import Clip, Request, Sample, Transform
+from stereogenbench_data.samples.streams import OPEN_STREAMS, Streams
 from stereogenbench_data.samples.views import StoredDepth, Views
 from stereogenbench_data.schema.parse import parse_trajectory
 from stereogenbench_data.schema.records import DepthEncoding, Scene
-from stereogenbench_data.schema.release import TRAJECTORY_JSON, depth_name, rgb_name
-from stereogenbench_data.selection.plan import Address, Plan
+from stereogenbench_data.schema.release import (
+    CAMERA_COUNT,
+    TRAJECTORY_JSON,
+    depth_name,
+    rgb_name,
+)
+from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.storage.cache import ShardCache
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.source import MemberSource
 
-Sample = dict[str, Any]
-Clip = Literal["frame", "clip"]
+__all__ = ["Clip", "Request", "Sample", "SampleLoader", "Transform", "resized_nearest"]
 
-
-@runtime_checkable
-class Transform(Protocol):
-    """What changes pictures and cameras together.
-
-    ``swaps_views`` says whether source and target may change places, so that what one view needs
-    must be read of both.
-    """
-
-    @property
-    def swaps_views(self) -> bool:
-        """Whether source and target may change places."""
-        ...
-
-    def __call__(self, views: Views, generator: np.random.Generator) -> Views:
-        """Return the changed views."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class Request:
-    """What a dataset asks of every sample.
-
-    Attributes:
-        kind: "pairs" (fields of `PAIR_FIELDS`) or "views" (of `VIEW_FIELDS`).
-        fields: The fields, in order.
-        layout: "single": what each target has stands for itself; "stacked": with an axis of
-            targets in front.
-        size: (height, width) to which the decoder scales, None for the stored size.
-        depth: A depth contract that overrides what the index says, or None.
-        transform: What changes the views before fields are derived, or None.
-    """
-
-    kind: Literal["pairs", "views"]
-    fields: tuple[str, ...]
-    layout: Literal["single", "stacked"]
-    size: tuple[int, int] | None = None
-    depth: DepthEncoding | None = None
-    transform: Transform | None = None
-
-    @property
-    def known(self) -> dict[str, Field]:
-        """The table of fields of this kind of sample."""
-        return PAIR_FIELDS if self.kind == "pairs" else VIEW_FIELDS
-
-    @property
-    def builders(self) -> dict[str, Builder]:
-        """What builds each field that is not text."""
-        return PAIR_BUILDERS if self.kind == "pairs" else VIEW_BUILDERS
-
-    @property
-    def streams(self) -> frozenset[Stream]:
-        """The videos that the fields are made from, whichever way the transform turns."""
-        streams = streams_of(self.fields, known=self.known)
-        if self.transform is not None and self.transform.swaps_views:
-            streams |= {SWAPPED[stream] for stream in streams}
-        return streams
-
-
-SWAPPED: Final[dict[Stream, Stream]] = {
-    "source_rgb": "target_rgb",
-    "target_rgb": "source_rgb",
-    "source_depth": "target_depth",
-    "target_depth": "source_depth",
-}
 KEPT_POSES: Final = 32
 """Of how many scenes the poses are kept (46 kB a scene of 81 frames)."""
 
-
-def require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None:
-    """Refuse, before anything is read, depth that cannot have been stored whole.
-
-    Raises:
-        MediaError: Naming the first file that a sample needs whose codec or pixel format loses
-            depth, unless the request's depth contract accepts it.
-    """
-    if not request.streams & {"source_depth", "target_depth"}:
-        return
-    encoding = request.depth or DepthEncoding()
-    units_told = index.column("depth_unit_source") != "unreadable"
-    stored = np.stack([index.column("depth_codec"), index.column("depth_pixel_format")], axis=-1)
-    whole = np.zeros(units_told.shape, dtype=bool)
-    for codec, pixel_format in set(map(tuple, stored.reshape(-1, 2))):
-        try:
-            require_depth_stream(
-                codec=codec, pixel_format=pixel_format, encoding=encoding, name="depth"
-            )
-        except MediaError:
-            continue
-        whole |= (stored == (codec, pixel_format)).all(axis=-1)
-    usable = whole & (units_told | (encoding.unit_m is not None))
-    if usable.all():
-        return
-    for row, camera in _depth_reads(plan, request):
-        if not usable[row, camera]:
-            _refuse_depth(index.scene(row), camera, encoding=encoding)
-
-
-def _refuse_depth(scene: Scene, camera: int, *, encoding: DepthEncoding) -> NoReturn:
-    name = scene.members[depth_name(camera)].path
-    if not name.endswith(depth_name(camera)):
-        name = f"{name}: {scene.id.key}.{depth_name(camera)}"
-    require_depth_stream(
-        codec=scene.depth_codec[camera],
-        pixel_format=scene.depth_pixel_format[camera],
-        encoding=encoding,
-        name=name,
-    )
-    raise MediaError(
-        f"{name}: its tags do not tell one positive number of metres in a stored unit of depth. "
-        "Correct the tags, or pass DepthEncoding(unit_m=...)."
-    )
-
-
-def _depth_reads(plan: Plan, request: Request) -> Iterator[tuple[int, int]]:
-    """Yield the (row, camera) of every depth video that samples need."""
-    pairs = plan.pairs
-    if "source_depth" in request.streams:
-        yield from zip(pairs.row.tolist(), pairs.source.tolist(), strict=True)
-    if "target_depth" in request.streams:
-        for row, targets in zip(pairs.row.tolist(), pairs.targets.tolist(), strict=True):
-            yield from ((row, target) for target in targets if target >= 0)
+KEPT_SCENES: Final = 256
+"""Of how many scenes the row of the index is kept."""
 
 
 class SampleLoader:
     """Loads samples as flat dicts of numpy arrays and texts; open files stay in this process."""
 
     def __init__(
-        self, index: SceneIndex, request: Request, *, cache: ShardCache | None = None
+        self,
+        index: SceneIndex,
+        request: Request,
+        *,
+        cache: ShardCache | None = None,
+        check: Literal["opened", "metadata"] = "metadata",
+        frames: Literal["shared", "used once"] = "shared",
     ) -> None:
-        """Prepare to load what is requested from the index's data; nothing is opened yet."""
+        """Prepare to load what is requested from the index's data; nothing is opened yet.
+
+        Args:
+            index: The scenes.
+            request: What to load of them.
+            cache: Where to keep what comes from a URL, or None.
+            check: What is compared with its checksum, as `MemberSource` says.
+            frames: Whether several samples may show a frame of a camera, which is kept for them.
+        """
         self._index = index
         self._request = request
         self._source = MemberSource(
-            index.root, shards=index.shards, revision=index.digest, cache=cache
+            index.root, shards=index.shards, revision=index.digest, cache=cache, check=check
         )
         self._streams = Streams(self._source)
+        self._shares_frames = frames == "shared"
+        # A transform may write into what it is given.
+        self._is_changed = request.transform is not None
+        self._scenes: dict[int, Scene] = {}
+        self._depths: OrderedDict[tuple[int, int], tuple[int, StoredDepth]] = OrderedDict()
+        self._videos = OPEN_STREAMS
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
 
-    def load(self, address: Address, *, clip: Clip, generator: np.random.Generator) -> Sample:
+    def load(
+        self,
+        address: Address,
+        *,
+        clip: Clip,
+        generator: np.random.Generator,
+        room: Room = fresh_room,
+    ) -> Sample:
         """Return one sample.
 
         Args:
             address: Where it comes from.
             clip: "clip" where the fields have a time axis, else "frame".
             generator: The random numbers of the transform.
+            room: What gives the array that a field is written into, once.
 
         Raises:
             StorageError: If a file is missing or is not the one that was indexed.
             MediaError: If a video does not decode to what the index says.
             SchemaError: If the trajectory does not follow the format.
         """
-        scene = self._index.scene(address.row)
+        scene = self._scene(address.row)
+        places = self._places(address, clip=clip, room=room)
         try:
-            views, facts = self._decode_or_again(scene, address)
+            for step in self._steps(address, places):
+                views, facts = self._decode_or_again(scene, step, places)
+                if self._request.transform is not None:
+                    views = self._request.transform(views, generator)
+                self._write_fields(views, facts, places)
         except (StorageError, MediaError, SchemaError) as error:
             raise type(error)(f"{scene.id.key}, frames {address.frames}: {error}") from error
-        if self._request.transform is not None:
-            views = self._request.transform(views, generator)
-        return self._fields(views, facts, clip=clip)
+        if "__key__" in self._request.fields:
+            places.sample["__key__"] = _sample_key(views, facts, frames=address.frames)
+        return {name: places.sample[name] for name in self._request.fields}
+
+    def _places(self, address: Address, *, clip: Clip, room: Room) -> Places:
+        places = Places(self._request.known, room, frames=len(address.frames))
+        places.is_clip = clip == "clip"
+        if self._request.layout == "stacked":
+            places.targets = len(address.targets) + (self._request.kind == "views")
+        return places
+
+    def _steps(self, address: Address, places: Places) -> Iterator[Address]:
+        """Yield what is decoded at a time: a frame, or all that a transform treats alike."""
+        if self._is_changed:
+            yield address
+            return
+        for number, frame in enumerate(address.frames):
+            places.at = slice(number, number + 1)
+            yield address._replace(frames=(frame,))
+
+    def apart(self) -> "SampleLoader":
+        """Return a loader of the same samples with open videos of its own."""
+        apart = copy(self)
+        apart._streams = Streams(self._source)
+        apart._scenes, apart._depths, apart._poses = {}, OrderedDict(), OrderedDict()
+        return apart
 
     def keep_open(self, videos: int) -> None:
         """Keep up to so many videos open, in this process and in copies of this loader."""
         self._streams.keep(videos)
+        self._videos = videos
 
     def release(self, row: int) -> None:
         """Close the videos of a scene that has been read to its end."""
-        self._streams.release(self._index.scene(row))
+        self._streams.release(self._scene(row))
+        self._scenes.pop(row, None)
+        for camera in range(CAMERA_COUNT):
+            self._depths.pop((row, camera), None)
 
     def close(self) -> None:
         """Close the videos that are open in this process."""
         self._streams.close()
+        self._scenes.clear()
+        self._depths.clear()
 
-    def _decode_or_again(self, scene: Scene, address: Address) -> tuple[Views, SceneFacts]:
+    def _scene(self, row: int) -> Scene:
+        """Return a scene of the index; those of the last rows asked for are kept."""
+        if row not in self._scenes:
+            self._scenes[row] = self._index.scene(row)
+            if len(self._scenes) > KEPT_SCENES:
+                del self._scenes[next(iter(self._scenes))]
+        return self._scenes[row]
+
+    def _decode_or_again(
+        self, scene: Scene, address: Address, places: Places
+    ) -> tuple[Views, SceneFacts]:
         """Decode; again, where what was decoded came from a cache that was damaged since."""
         try:
-            return self._decode(scene, address)
+            return self._decode(scene, address, places)
         except (MediaError, SchemaError, ShardError):
             names = [
                 *(rgb_name(camera) for camera in self._cameras(address, suffix="rgb")),
                 *(depth_name(camera) for camera in self._cameras(address, suffix="depth")),
                 TRAJECTORY_JSON,
             ]
-            if not self._source.drop_damaged(scene, names):
+            if not self._source.drop_damaged(scene, map(scene.held_name, names)):
                 raise
-            self._streams.close()
-            return self._decode(scene, address)
+            self.close()
+            return self._decode(scene, address, places)
 
-    def _decode(self, scene: Scene, address: Address) -> tuple[Views, SceneFacts]:
+    def _decode(self, scene: Scene, address: Address, places: Places) -> tuple[Views, SceneFacts]:
         encodings = {
             camera: self._encoding(scene, camera) for camera in {address.source, *address.targets}
         }
@@ -241,25 +192,34 @@ class SampleLoader:
         if self._request.size is not None:
             height, width = self._request.size
             intrinsics = intrinsics.resized(width_px=width, height_px=height)
-        pictures: dict[int, list[Any]] = {}
-        depths: dict[int, list[StoredDepth]] = {}
-        for frame in address.frames:
-            for camera in self._cameras(address, suffix="rgb"):
-                pictures.setdefault(camera, []).append(self._picture(scene, camera, frame))
-            for camera in self._cameras(address, suffix="depth"):
-                stored = self._stored(scene, camera, frame, encoding=encodings[camera])
-                depths.setdefault(camera, []).append(stored)
+        size = (intrinsics.height_px, intrinsics.width_px)
+        straight = self._straight_places(address, places, size=size)
+        cameras = self._cameras(address, suffix="rgb")
+        pictures: dict[int, Any] = {}
+        for camera in cameras:
+            if camera in straight:
+                pictures[camera] = straight[camera]
+            elif self._is_changed:
+                pictures[camera] = np.empty((len(address.frames), 3, *size), dtype=np.uint8)
+        for number, frame in enumerate(address.frames):
+            for camera in cameras:
+                name = rgb_name(camera)
+                if not self._shares_frames and camera in pictures:
+                    self._streams.write_rgb(scene, name, frame, out=pictures[camera][number])
+                    continue
+                kept = self._streams.rgb(scene, name, frame, size=self._request.size)
+                if camera in pictures:
+                    pictures[camera][number] = kept
+                else:
+                    pictures[camera] = kept[None]
         views = Views(
             source=address.source,
             targets=address.targets,
             frames=address.frames,
-            pictures={camera: np.stack(found) for camera, found in pictures.items()},
+            pictures=pictures,
             depths={
-                camera: StoredDepth(
-                    units=np.stack([stored.units for stored in found]),
-                    measured=np.stack([stored.measured for stored in found]),
-                )
-                for camera, found in depths.items()
+                camera: self._depth(scene, address, camera, encoding=encodings[camera])
+                for camera in self._cameras(address, suffix="depth")
             },
             intrinsics=intrinsics,
         )
@@ -282,22 +242,65 @@ class SampleLoader:
             return contract
         return contract.with_file_unit(scene.depth_unit_m[camera], source=source)
 
-    def _picture(self, scene: Scene, camera: int, frame: int) -> Any:
-        return self._streams.rgb(scene, rgb_name(camera), frame, size=self._request.size)
+    def _straight_places(
+        self, address: Address, places: Places, *, size: tuple[int, int]
+    ) -> dict[int, Any]:
+        """Return where pictures that go into one field of one sample alone are decoded to."""
+        if self._shares_frames or self._is_changed:
+            return {}
+        shape = (len(address.frames), 3, *size)
+        found = {}
+        for name, cameras in (
+            ("left", (address.source,)),
+            ("right", address.targets),
+            ("image", (address.source, *address.targets)),
+        ):
+            if name in self._request.fields and name in self._request.known:
+                for place, camera in enumerate(cameras):
+                    found[camera] = places.of(name, place, shape=shape, dtype="u1")
+        return found
+
+    def _depth(
+        self, scene: Scene, address: Address, camera: int, *, encoding: DepthEncoding
+    ) -> StoredDepth:
+        """Return a camera's stored depth over the frames; that of a single frame is kept."""
+        if len(address.frames) > 1:
+            parts = [
+                self._stored(scene, camera, frame, encoding=encoding) for frame in address.frames
+            ]
+            return StoredDepth(
+                units=np.concatenate([part.units for part in parts]),
+                measured=np.concatenate([part.measured for part in parts]),
+            )
+        key, frame = (address.row, camera), address.frames[0]
+        if key not in self._depths or self._depths[key][0] != frame:
+            stored = self._stored(scene, camera, frame, encoding=encoding)
+            self._depths[key] = (frame, stored)
+            if len(self._depths) > self._videos:
+                self._depths.popitem(last=False)
+        self._depths.move_to_end(key)
+        stored = self._depths[key][1]
+        if self._is_changed:
+            return StoredDepth(stored.units.copy(), stored.measured.copy())
+        return stored
 
     def _stored(
         self, scene: Scene, camera: int, frame: int, *, encoding: DepthEncoding
     ) -> StoredDepth:
+        """Return a camera's stored depth of one frame, (1, h, w)."""
         name = depth_name(camera)
         stored_frame = depth_frame_index(frame, encoding=encoding, frames=scene.frames)
         if stored_frame is None:
             size = self._request.size or (scene.rig.image_height_px, scene.rig.image_width_px)
-            return StoredDepth(np.zeros(size, dtype=np.uint16), np.zeros(size, dtype=bool))
+            return StoredDepth(
+                np.zeros((1, *size), dtype=np.uint16), np.zeros((1, *size), dtype=bool)
+            )
         units = self._streams.depth_units(scene, name, stored_frame, encoding=encoding)
         if self._request.size is not None:
             units = resized_nearest(units, size=self._request.size)
         pixel_format = self._streams.pixel_format(scene, name)
-        return StoredDepth(units, measured(units, encoding=encoding, pixel_format=pixel_format))
+        known = measured(units, encoding=encoding, pixel_format=pixel_format)
+        return StoredDepth(units[None], known[None])
 
     def _camera_poses(self, scene: Scene) -> CameraPoses | None:
         needs = {self._request.known[name].needs_poses for name in self._request.fields}
@@ -313,28 +316,30 @@ class SampleLoader:
                 self._poses.popitem(last=False)
         return self._poses[scene.id.key]
 
-    def _fields(self, views: Views, facts: SceneFacts, *, clip: Clip) -> Sample:
+    def _write_fields(self, views: Views, facts: SceneFacts, places: Places) -> None:
         targets = views.targets
         if self._request.kind == "views":
             targets = (views.source, *targets)
         pairs = [PairSample(views, facts, target=target) for target in targets]
-        sample: Sample = {}
         for name in self._request.fields:
-            field = self._request.known[name]
-            if name == "__key__":
-                sample[name] = _sample_key(views, facts)
-            elif name in TEXT_BUILDERS:
-                sample[name] = TEXT_BUILDERS[name](facts)
-            else:
-                build = self._request.builders[name]
-                cut = field.per_frame and clip == "frame"
-                found = [
-                    build(pair)[0] if cut else build(pair)
-                    for pair in (pairs if field.per_target else pairs[:1])
-                ]
-                stacked = field.per_target and self._request.layout == "stacked"
-                sample[name] = np.stack(found) if stacked else found[0]
-        return sample
+            if name in TEXT_BUILDERS:
+                places.sample[name] = TEXT_BUILDERS[name](facts)
+            elif name != "__key__":
+                chosen = pairs if self._request.known[name].per_target else pairs[:1]
+                for number, pair in enumerate(chosen):
+                    self._write(name, pair, places, number=number)
+
+    def _write(self, name: str, pair: PairSample, places: Places, *, number: int) -> None:
+        """Write what a field has of one target into its place."""
+        if self._request.kind == "pairs" and name in PAIR_WRITERS:
+            frames, height, width = pair.shape
+            place = places.of(name, number, shape=(frames, 1, height, width), dtype="f4")
+            PAIR_WRITERS[name](pair, place[:, 0])
+            return
+        value = self._request.builders[name](pair)
+        place = places.of(name, number, shape=value.shape, dtype=value.dtype)
+        if not np.may_share_memory(value, place):
+            np.copyto(place, value)
 
 
 def resized_nearest(
@@ -352,11 +357,11 @@ def resized_nearest(
     return np.ascontiguousarray(maps[..., rows[:, None], columns])
 
 
-def _sample_key(views: Views, facts: SceneFacts) -> str:
+def _sample_key(views: Views, facts: SceneFacts, *, frames: tuple[int, ...]) -> str:
     """Return scene, cameras and frames: scene/00-01/017, or scene/00-01/016-031 for a clip."""
     cameras = f"{views.source:02d}"
     if views.targets:
         cameras += "-" + "+".join(f"{target:02d}" for target in views.targets)
-    first, last = views.frames[0], views.frames[-1]
-    frames = f"{first:03d}" if first == last else f"{first:03d}-{last:03d}"
-    return f"{facts.scene.id.key}/{cameras}/{frames}"
+    first, last = frames[0], frames[-1]
+    shown = f"{first:03d}" if first == last else f"{first:03d}-{last:03d}"
+    return f"{facts.scene.id.key}/{cameras}/{shown}"

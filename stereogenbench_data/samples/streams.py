@@ -6,11 +6,13 @@ anew if it is asked for again.
 """
 
 import os
+import sys
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,14 +20,18 @@ import numpy as np
 from jaxtyping import UInt8, UInt16
 
 from stereogenbench_data.errors import MediaError, StorageError
-from stereogenbench_data.media.depth import read_depth_units
+from stereogenbench_data.media.depth import open_depth, read_depth_units
 from stereogenbench_data.media.video import VideoReader, read_rgb
 from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
 from stereogenbench_data.storage.ranged_file import MemberFile, RangedFile
 from stereogenbench_data.storage.source import MemberSource
 
 OPEN_STREAMS: Final = 24
 """How many videos a process keeps open: two scenes with all their cameras' colour and depth."""
+
+_KNOWN_HERE: Final = 3
+"""How many references to a picture there are while `_unused` looks at it and nobody else has it."""
 
 _inherited: Final[list[object]] = []
 """Readers that came over a fork. They share file offsets with the parent, so they are neither read
@@ -34,9 +40,9 @@ nor closed here: the operating system takes them back when the process ends."""
 
 @dataclass(slots=True)
 class _Stream:
-    reader: VideoReader
+    reader: Any  # a VideoReader or, of depth that blosc2 packed, DepthFrames
     file: Path | MemberFile
-    last: dict[object, Any] = field(default_factory=dict)
+    last: dict[Any, Any] = field(default_factory=dict)
 
     def close(self) -> None:
         self.reader.close()
@@ -68,10 +74,28 @@ class Streams:
             StorageError: If the video cannot be read.
             MediaError: If it does not decode to the scene's number of frames.
         """
-        picture: UInt8[np.ndarray, "3 h w"] = self._read(
-            scene, name, (index, size), lambda reader: read_rgb(reader, index, size=size)
-        )
-        return picture
+        with self._stream(scene, name) as stream:
+            key = (index, size)
+            if key not in stream.last:
+                room = _unused(stream.last, height_width=size)
+                stream.last = {}
+                stream.last[key] = _read_only(read_rgb(stream.reader, index, size=size, out=room))
+            picture: UInt8[np.ndarray, "3 h w"] = stream.last[key]
+            return picture
+
+    def write_rgb(
+        self, scene: Scene, name: str, index: int, *, out: UInt8[np.ndarray, "3 h w"]
+    ) -> None:
+        """Write one frame of a scene's video as RGB, scaled to the array's height and width.
+
+        The picture is not kept: for who asks for it once.
+
+        Raises:
+            StorageError: If the video cannot be read.
+            MediaError: If it does not decode to the scene's number of frames.
+        """
+        with self._stream(scene, name) as stream:
+            read_rgb(stream.reader, index, size=(out.shape[-2], out.shape[-1]), out=out)
 
     def depth_units(
         self, scene: Scene, name: str, index: int, *, encoding: DepthEncoding
@@ -82,10 +106,12 @@ class Streams:
             StorageError: If the video cannot be read.
             MediaError: If it is not one that the encoding describes or does not decode.
         """
-        units: UInt16[np.ndarray, "h w"] = self._read(
-            scene, name, index, lambda reader: read_depth_units(reader, index, encoding=encoding)
-        )
-        return units
+        with self._stream(scene, name) as stream:
+            if index not in stream.last:
+                units = read_depth_units(stream.reader, index, encoding=encoding)
+                stream.last = {index: _read_only(units)}
+            kept: UInt16[np.ndarray, "h w"] = stream.last[index]
+            return kept
 
     def pixel_format(self, scene: Scene, name: str) -> str:
         """Return the pixel format of a scene's video.
@@ -95,7 +121,8 @@ class Streams:
             MediaError: If its header does not tell.
         """
         with self._stream(scene, name) as stream:
-            return stream.reader.facts.pixel_format
+            pixel_format: str = stream.reader.facts.pixel_format
+            return pixel_format
 
     def keep(self, limit: int) -> None:
         """Keep at most so many videos open from now on."""
@@ -117,22 +144,12 @@ class Streams:
             while self._open:
                 self._open.popitem()[1].close()
 
-    def _read(
-        self, scene: Scene, name: str, key: object, read: Callable[[VideoReader], Any]
-    ) -> Any:
-        """Return what a stream gave last, if that is what is asked for; else read and keep it."""
-        with self._stream(scene, name) as stream:
-            if key not in stream.last:
-                picture = read(stream.reader)
-                picture.flags.writeable = False
-                stream.last = {key: picture}
-            return stream.last[key]
-
     @contextmanager
     def _stream(self, scene: Scene, name: str) -> Iterator[_Stream]:
         """Give an open video, to be read within; it stays open unless it fails."""
         self._drop_inherited()
         with self._lock:
+            name = scene.held_name(name)
             member = scene.members[name]
             place = (member.path, member.offset)
             if place not in self._open:
@@ -141,7 +158,8 @@ class Streams:
                 file = self._source.open(scene, name)
                 with _cause_told(file):
                     label = self._source.label(scene, name)
-                    reader = VideoReader(file, name=label, frames=scene.frames)
+                    kind = open_depth if name in PACKED_DEPTH_NAMES.values() else VideoReader
+                    reader = kind(file, name=label, frames=scene.frames)
                 self._open[place] = _Stream(reader, file)
             self._open.move_to_end(place)
             stream = self._open[place]
@@ -159,11 +177,27 @@ class Streams:
             self._lock = threading.RLock()
             self._process = os.getpid()
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"source": self._source, "limit": self._limit}
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what another process makes a pool of its own from."""
+        return partial(Streams, limit=self._limit), (self._source,)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(**state)  # type: ignore[misc]
+
+def _read_only(picture: Any) -> Any:
+    picture.flags.writeable = False
+    return picture
+
+
+def _unused(last: dict[Any, Any], *, height_width: tuple[int, int] | None) -> Any:
+    """Return the array of the last picture to be written again, where nobody else has it.
+
+    Memory that is new costs more than what is written into it: the system clears it first.
+    """
+    for (_, size), picture in last.items():
+        # Known here by the dict, by the name and by the call.
+        if size == height_width and sys.getrefcount(picture) == _KNOWN_HERE:
+            picture.flags.writeable = True
+            return picture
+    return None
 
 
 @contextmanager

@@ -67,8 +67,8 @@ class Compose:
 
 
 @dataclass(frozen=True, slots=True)
-class Resize:
-    """Stretch to a size in pixels; fx, cx and fy, cy scale by the realised factors."""
+class _Sized:
+    """What makes views of a size in pixels."""
 
     height: int
     width: int
@@ -77,6 +77,11 @@ class Resize:
     def __post_init__(self) -> None:
         """Refuse a size of nothing."""
         _require_size(self.height, self.width)
+
+
+@dataclass(frozen=True, slots=True)
+class Resize(_Sized):
+    """Stretch to a size in pixels; fx, cx and fy, cy scale by the realised factors."""
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return resized views."""
@@ -84,16 +89,8 @@ class Resize:
 
 
 @dataclass(frozen=True, slots=True)
-class Letterbox:
+class Letterbox(_Sized):
     """Scale to fit a size in pixels without stretching, centred; the rest is black, unmeasured."""
-
-    height: int
-    width: int
-    swaps_views: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        """Refuse a size of nothing."""
-        _require_size(self.height, self.width)
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return scaled and padded views."""
@@ -139,16 +136,8 @@ class Crop:
 
 
 @dataclass(frozen=True, slots=True)
-class RandomCrop:
+class RandomCrop(_Sized):
     """Cut a window of a size in pixels, anywhere inside the picture."""
-
-    height: int
-    width: int
-    swaps_views: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        """Refuse a size of nothing."""
-        _require_size(self.height, self.width)
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return cropped views."""

@@ -4,7 +4,7 @@ Transforms map one `Views` to another: they move pictures, stored depth and came
 never see a disparity, so that all that is derived afterwards fits by construction.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -22,10 +22,12 @@ class StoredDepth:
     Attributes:
         units: (t, h, w) or (h, w) uint16, stored numbers.
         measured: (t, h, w) or (h, w) bool, where they mean a depth.
+        derived: What was worked out of these numbers and will be wanted again, by what it is.
     """
 
     units: UInt16[np.ndarray, "*t h w"]
     measured: Bool[np.ndarray, "*t h w"]
+    derived: dict[object, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

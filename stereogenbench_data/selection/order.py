@@ -12,7 +12,7 @@ Random numbers are the raw stream of PCG64, which numpy keeps the same for ever.
 """
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -78,6 +78,21 @@ class OrderRule:
         shown = min(self.batch_size, self.open_scenes)
         most = max(1, min(self.lanes, as_long_as_the_longest // shown))
         return max(lanes for lanes in range(1, most + 1) if self.lanes % lanes == 0)
+
+    def in_effect(self, lengths: Numbers) -> "OrderRule":
+        """Return what the order of scenes of so many samples depends on: equal for equal orders.
+
+        With few scenes other lanes and open scenes are used than were asked for; a sequential
+        order depends on the batch size alone.
+        """
+        if self.kind == "sequential":
+            return OrderRule(self.batch_size, lanes=1, open_scenes=1, kind="sequential")
+        all_are_open = len(lengths) < 2 * self.open_scenes
+        return replace(
+            self,
+            lanes=self.lanes_of(lengths),
+            open_scenes=len(lengths) if all_are_open else self.open_scenes,
+        )
 
     def tracks_of(self, scenes: int) -> int:
         """Return how many of a lane's scenes are open at a time: equally long tracks of them."""

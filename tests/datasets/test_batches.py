@@ -84,8 +84,8 @@ def test_a_position_is_flat_json_and_says_what_it_belongs_to(keyed):
         "batches_consumed": 4,
         "seed": 3,
         "batch_size": 4,
-        "lanes": 4,
-        "open_scenes": 16,
+        "lanes": 1,
+        "open_scenes": 4,
         "order": "shuffled",
         "tail": "drop",
         "selection": keyed.plan.digest,
@@ -107,8 +107,8 @@ def test_what_is_loaded_goes_on_once_and_then_epochs_are_whole(keyed):
     [
         ({"batch_size": 5}, "batch_size is 5 here and 4 there"),
         ({"seed": 1}, "seed is 1 here and 0 there"),
-        ({"lanes": 2}, "lanes is 2 here and 4 there"),
-        ({"open_scenes": 3}, "open_scenes is 3 here and 16 there"),
+        ({"batch_size": 1, "lanes": 2}, "lanes is 2 here and 4 there"),
+        ({"batch_size": 1, "open_scenes": 2}, "open_scenes is 2 here and 4 there"),
         ({"order": "sequential"}, "order is 'sequential' here and 'shuffled' there"),
         ({"tail": "wrap"}, "tail is 'wrap' here and 'drop' there"),
         ({"tail": "wrap", "seed": 2}, "seed is 2 here.*; tail is 'wrap' here"),
@@ -116,10 +116,28 @@ def test_what_is_loaded_goes_on_once_and_then_epochs_are_whole(keyed):
     ids=str,
 )
 def test_a_position_in_another_order_is_refused_by_name(keyed, options, message):
-    state = EpochBatches(keyed, 4).state_dict()
+    size = 1 if options.get("batch_size") == 1 else 4
+    state = EpochBatches(keyed, size).state_dict()
 
     with pytest.raises(StateError, match=message):
-        EpochBatches(keyed, **({"batch_size": 4} | options)).load_state_dict(state)
+        EpochBatches(keyed, **({"batch_size": size} | options)).load_state_dict(state)
+
+
+@pytest.mark.parametrize(
+    "options", [{"lanes": 2}, {"lanes": 12, "open_scenes": 40}, {"open_scenes": 3}], ids=str
+)
+def test_options_that_few_scenes_leave_without_effect_are_the_same_order(keyed, options):
+    asked, plain = EpochBatches(keyed, 4, **options), EpochBatches(keyed, 4)
+    asked.load_state_dict(plain.state_at(0, 5))
+
+    assert list(asked) == list(plain)[5:]
+
+
+def test_a_sequential_position_goes_with_any_seed(keyed):
+    batches = EpochBatches(keyed, 4, order="sequential", seed=3, lanes=2)
+    batches.load_state_dict(EpochBatches(keyed, 4, order="sequential").state_at(0, 34))
+
+    assert list(batches) == [[136, 137, 138, 139]]
 
 
 def test_a_position_in_another_selection_is_refused_by_name(keyed, small_index):
@@ -148,6 +166,9 @@ def test_a_position_in_another_index_is_refused_by_name(keyed):
         ({"batches_consumed": -1}, "batches_consumed is -1, no whole number"),
         ({"epoch": "2"}, "epoch is '2', no whole number"),
         ({"version": 0}, "version is 1 here and 0 there"),
+        ({"version": True}, "version is 1 here and True there"),
+        ({"batches_consumed": 36}, "batches_consumed is 36, and there are 35"),
+        ({"batches_consumed": True}, "batches_consumed is True, no whole number"),
     ],
 )
 def test_a_damaged_position_is_refused(keyed, change, message):
@@ -155,6 +176,13 @@ def test_a_damaged_position_is_refused(keyed, change, message):
 
     with pytest.raises(StateError, match=message):
         batches.load_state_dict(batches.state_dict() | change)
+
+
+@pytest.mark.parametrize("state", [None, [], "state", 3], ids=repr)
+def test_what_is_no_dict_is_refused(keyed, state):
+    for target in (EpochBatches(keyed, 4), keyed.loader(4)):
+        with pytest.raises(StateError, match=r"a state is a dict as .* returns it, got"):
+            target.load_state_dict(state)
 
 
 def test_something_else_than_a_position_is_refused(keyed):

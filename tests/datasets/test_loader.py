@@ -5,11 +5,19 @@ import json
 import os
 import signal
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 import torch
 
-from stereogenbench_data import PairsLoader, SceneViews, SelectionError, StateError, StereoPairs
+from stereogenbench_data import (
+    PairsLoader,
+    SceneIndex,
+    SceneViews,
+    SelectionError,
+    StateError,
+    StereoPairs,
+)
 from stereogenbench_data.datasets.open_videos import OpenVideosWarning, videos_per_scene
 from stereogenbench_data.samples import streams
 from stereogenbench_data.samples.fields import streams_of
@@ -58,7 +66,54 @@ def test_workers_that_persist_follow_the_epoch(keyed):
     alone = keyed.loader(9, tail="uneven")
     for epoch in range(3):
         loader.set_epoch(epoch)
+        alone.set_epoch(epoch)
         assert keys_of(loader) == keys_of(alone)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_loaders_of_one_dataset_leave_each_other_alone(keyed, workers):
+    options = {"num_workers": workers, "persistent_workers": workers > 0, "tail": "uneven"}
+    training, validating = keyed.loader(9, **options), keyed.loader(9, **options)
+    first = keys_of(validating)
+    training.set_epoch(3)
+    begun = iter(training)
+    taken = [next(begun)["__key__"]]
+    assert keys_of(validating) == first
+    validating.load_state_dict(validating.state_dict() | {"epoch": 1, "batches_consumed": 2})
+    taken += keys_of(begun)
+
+    assert [training.epoch, validating.epoch, keyed.epoch] == [3, 1, 0]
+    keyed.set_epoch(3)
+    assert taken == keys_of(keyed.loader(9, tail="uneven"))
+    keyed.set_epoch(1)
+    assert keys_of(validating) == keys_of(keyed.loader(9, tail="uneven"))[2:]
+
+
+def test_a_loader_that_was_told_no_epoch_goes_with_its_dataset(keyed):
+    follows, told = keyed.loader(9), keyed.loader(9)
+    told.set_epoch(0)
+    keyed.set_epoch(2)
+
+    assert [follows.epoch, told.epoch] == [2, 0]
+    assert keys_of(follows) == keys_of(keyed.loader(9)) != keys_of(told)
+
+
+def test_loaders_of_one_dataset_have_their_own_videos(small_index):
+    pairs = StereoPairs(small_index, frames="all")
+    one, other = pairs.loader(4), pairs.loader(4)
+    samples = iter(one)
+    next(samples)
+    for _ in other:
+        pass
+    opened = len(one.dataset._loader._streams._open)
+    other.close()
+
+    assert opened == len(one.dataset._loader._streams._open) > 0
+    assert len(pairs._loader._streams._open) == 0
+    one.close()
+    assert len(one.dataset._loader._streams._open) == 0
+    assert len(list(samples)) == 6
+    one.close()
 
 
 def test_a_sequential_order_is_that_of_the_dataset(keyed):
@@ -202,8 +257,14 @@ def test_a_state_of_something_else_is_refused(keyed, small_index):
 def test_an_option_that_does_not_exist_is_refused(keyed):
     with pytest.raises(SelectionError, match=r"tail must be .*, got 'even'"):
         keyed.loader(9, tail="even")
-    with pytest.raises(TypeError, match="batchsize"):
+    with pytest.raises(SelectionError, match="there is no option 'batchsize'; there are seed"):
         keyed.loader(9, batchsize=3)
+
+
+@pytest.mark.parametrize("name", ["shuffle", "drop_last", "sampler", "batch_sampler"])
+def test_what_would_undo_the_order_is_refused_with_what_to_use_instead(keyed, name):
+    with pytest.raises(SelectionError, match=rf"takes no {name}: use (order|tail|seed)="):
+        keyed.loader(9, **{name: True})
 
 
 def test_a_killed_worker_ends_the_loop_with_an_error_that_says_so(keyed):
@@ -284,10 +345,10 @@ def test_videos_are_closed_after_their_scenes_last_sample(small_index):
     loader = pairs.loader(2, lanes=1, open_scenes=1, tail="uneven")
     most = 0
     for _ in loader:
-        most = max(most, len(pairs._loader._streams._open))
+        most = max(most, len(loader.dataset._loader._streams._open))
 
     assert most == 11
-    assert len(pairs._loader._streams._open) == 0
+    assert len(loader.dataset._loader._streams._open) == 0
 
 
 def test_a_scene_needs_the_videos_that_its_fields_are_made_from(small_index):
@@ -309,5 +370,35 @@ def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):
     pairs = StereoPairs(small_index, pairs="all", frames="all")
 
     with pytest.warns(OpenVideosWarning, match=r"up to 55 videos .* may open 32.*ulimit -n 183"):
-        pairs.loader(4)
-    assert pairs._loader._streams._limit == 32
+        loader = pairs.loader(4)
+    assert loader.dataset._loader._streams._limit == 32
+
+
+@pytest.mark.parametrize(
+    ("side_px", "selection", "expected"),
+    [
+        (1280, {}, 16),
+        (1280, {"pairs": "all"}, 4),
+        (1280, {"pairs": "sweep"}, 5),
+        (480, {"pairs": "all"}, 16),
+        (8192, {"pairs": "all"}, 2),
+    ],
+    ids=str,
+)
+def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
+    small_index, side_px, selection, expected
+):
+    scenes = [
+        replace(scene, rig=replace(scene.rig, image_width_px=side_px, image_height_px=side_px))
+        for scene in map(small_index.scene, range(4))
+    ]
+    index = SceneIndex.from_scenes(scenes, small_index.root)
+    options = {"frames": "all", "fields": ("__key__",), **selection}
+    pairs = StereoPairs(index, **options)
+
+    assert pairs.loader(4).batches.rule.open_scenes == expected
+    assert pairs.loader(4, num_workers=3).batches.rule.open_scenes == expected
+    assert StereoPairs(index, **(options | {"fields": ("depth",)})).scenes_at_once == (
+        pairs.scenes_at_once
+    )
+    assert pairs.loader(4, open_scenes=7).batches.rule.open_scenes == 7

@@ -169,6 +169,24 @@ def test_a_workers_own_position_is_refused_by_another_worker(stream_of):
     assert [s["__key__"] for s in same] == [s["__key__"] for s in samples]
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"start": 17}, "start is 17, and there are 16"),
+        ({"start": None}, "start is None, no whole number"),
+        ({"samples_given": 145}, "samples_given is 145, and there are 144"),
+        ({"samples_given": True}, "samples_given is True, no whole number"),
+    ],
+    ids=str,
+)
+def test_a_workers_damaged_position_is_refused(stream_of, change, message):
+    samples = iter(stream_of())
+    next(samples)
+
+    with pytest.raises(StateError, match=message):
+        samples.load_state_dict(samples.state_dict() | change)
+
+
 def test_the_shares_of_many_ranks_and_workers_are_the_selection(stream_of):
     for world in range(1, 6):
         shares = [stream_of(rank=rank, world_size=world) for rank in range(world)]

@@ -4,6 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.geometry import disparity as disparity_module
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import (
     depth_from_disparity,
@@ -12,6 +13,7 @@ from stereogenbench_data.geometry.disparity import (
     disparity_from_units,
     planar_from_ray,
     ray_from_planar,
+    write_disparity,
 )
 
 focals_px = st.floats(900.0, 4600.0)
@@ -246,3 +248,36 @@ def test_a_unit_of_no_length_is_refused():
 def test_a_negative_quantum_is_refused():
     with pytest.raises(GeometryError, match=r"quantum_m must be .* 0 or more, got -0\.1"):
         disparity_error_px(np.ones((1, 1)), focal_px=1.0, baseline_m=1.0, quantum_m=-0.1)
+
+
+@given(
+    stored=st.lists(st.integers(0, 65535), min_size=6, max_size=6),
+    measured=st.lists(st.booleans(), min_size=6, max_size=6),
+    shift=st.floats(1e-3, 1e9),
+    sign=st.sampled_from([1, -1]),
+    form=st.sampled_from(["depth", "inverse"]),
+)
+def test_what_is_written_is_what_is_returned_and_0_where_not_measured(
+    stored, measured, shift, sign, form
+):
+    units = np.array(stored, dtype=np.uint16).reshape(1, 3, 2)
+    known = np.array(measured).reshape(1, 3, 2) & ((units > 0) | (form == "inverse"))
+    out = np.full((1, 3, 2), np.nan, dtype=np.float32)
+    write_disparity(out, units, measured=known, shift_units=sign * shift, form=form)
+    returned = disparity_from_units(
+        units, focal_px=shift, baseline_m=float(sign), unit_m=1.0, form=form
+    )
+
+    np.testing.assert_array_equal(out, np.where(known, returned, 0))
+
+
+@pytest.mark.parametrize("rows", [1, 2, 1000])
+def test_blocks_of_rows_change_nothing(monkeypatch, rows):
+    rng = np.random.default_rng(1)
+    units = rng.integers(0, 65536, (2, 7, 5)).astype(np.uint16)
+    monkeypatch.setattr(disparity_module, "_BLOCK_PIXELS", rows * 5)
+    out = np.empty(units.shape, dtype=np.float32)
+    write_disparity(out, units, measured=units > 9, shift_units=123.456)
+
+    expected = np.where(units > 9, 123.456 / np.maximum(units, 1).astype(np.float64), 0)
+    np.testing.assert_allclose(out, expected, rtol=1e-7)

@@ -5,7 +5,9 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
 from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.geometry import projection as projection_module
 from stereogenbench_data.geometry.projection import Projection, project_rectified
+from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
 from stereogenbench_data.geometry.warp import backward_warp, splat
 
 
@@ -153,3 +155,33 @@ def test_a_rectified_warp_of_an_image_with_other_rows_is_refused():
 
     with pytest.raises(GeometryError, match="of 4 rows cannot land in an image of 5 rows"):
         backward_warp(np.ones((3, 5, 6)), projection)
+
+
+@pytest.mark.parametrize("quantum", ["a number", "a map"])
+def test_rows_are_worked_on_in_blocks_as_in_one(monkeypatch, quantum):
+    rng = np.random.default_rng(3)
+    shape = (2, 9, 16)
+    depth_m, target_m = rng.uniform(1, 4, (2, *shape)).astype(np.float32)
+    measured, seen = rng.random((2, *shape)) > 0.2
+    image = rng.integers(0, 256, (2, 3, 9, 16)).astype(np.uint8)
+    projection = project_rectified(depth_m, (8 / depth_m).astype(np.float32))
+    quantum_m = 0.01 if quantum == "a number" else rng.uniform(0, 0.1, shape).astype(np.float32)
+
+    def all_of_it():
+        return (
+            *splat(image, projection, measured=measured),
+            *backward_warp(image, projection),
+            visible_from_source(projection, measured=measured, quantum_m=quantum_m),
+            visible_in_target(
+                projection, measured=measured, target_depth_m=target_m, target_measured=seen,
+                quantum_m=quantum_m,
+            ),
+        )  # fmt: skip
+
+    whole = all_of_it()
+    monkeypatch.setattr(projection_module, "_BLOCK_PIXELS", 2 * 16)
+    assert len(projection_module.row_blocks(projection, height_px=9)) == 5
+
+    for one, other in zip(whole, all_of_it(), strict=True):
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)

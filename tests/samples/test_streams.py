@@ -73,6 +73,33 @@ def test_a_picture_is_handed_out_read_only_and_not_decoded_twice(data):
     pool.close()
 
 
+def test_a_picture_that_somebody_holds_is_not_written_again(data):
+    pool, scene = pool_of(data), data.scene(0)
+    expected = [pool.rgb(scene, RGB[0], frame, size=None).copy() for frame in range(4)]
+    held = [pool.rgb(scene, RGB[0], frame, size=None)[None] for frame in range(4)]
+    assert all(np.array_equal(one[0], other) for one, other in zip(held, expected, strict=True))
+
+    for _ in range(2):
+        places = {
+            pool.rgb(scene, RGB[1], frame, size=None).__array_interface__["data"][0]
+            for frame in range(4)
+        }
+        assert len(places) < 4
+    pool.close()
+
+
+def test_a_picture_can_be_written_where_it_is_wanted_and_is_not_kept(data):
+    pool, scene = pool_of(data), data.scene(0)
+    out = np.empty((2, 3, 64, 64), dtype=np.uint8)
+    pool.write_rgb(scene, RGB[0], 2, out=out[1])
+
+    assert np.array_equal(out[1], pool.rgb(scene, RGB[0], 2, size=None))
+    small = np.empty((3, 10, 20), dtype=np.uint8)
+    pool.write_rgb(scene, RGB[0], 0, out=small)
+    assert np.array_equal(small, pool.rgb(scene, RGB[0], 0, size=(10, 20)))
+    pool.close()
+
+
 def test_another_size_is_another_picture(data):
     pool, scene = pool_of(data), data.scene(0)
 

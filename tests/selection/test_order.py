@@ -281,6 +281,22 @@ def test_a_rule_that_orders_nothing_is_refused(rule, message):
         OrderRule(**({"batch_size": 4} | rule))
 
 
+@given(
+    lengths=st.lists(st.integers(1, 12), min_size=1, max_size=40),
+    size=st.integers(1, 6),
+    asked=st.lists(st.tuples(st.integers(1, 6), st.integers(1, 24)), min_size=2, max_size=6),
+    kind=st.sampled_from(KINDS),
+)
+@settings(deadline=None, max_examples=60)
+def test_rules_that_are_the_same_in_effect_give_the_same_order(lengths, size, asked, kind):
+    found = {}
+    for lanes, open_scenes in asked:
+        rule = OrderRule(batch_size=size, lanes=lanes, open_scenes=open_scenes, kind=kind)
+        batches = all_batches(EpochOrder(np.concatenate([[0], np.cumsum(lengths)]), rule, epoch=0))
+
+        assert found.setdefault(rule.in_effect(np.array(lengths)), batches) == batches
+
+
 @pytest.mark.parametrize("number", [-1, 9])
 def test_a_batch_beyond_the_last_is_an_index_error(number):
     with pytest.raises(IndexError, match=f"no batch {number}: the epoch has 9"):

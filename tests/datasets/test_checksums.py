@@ -1,0 +1,146 @@
+"""A flipped bit that still decodes: found by the checksums of whole members, never trained on."""
+
+import os
+import shutil
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from stereogenbench_data import SceneViews, SelectionError, StereoPairs
+from stereogenbench_data.errors import ShardError
+from stereogenbench_data.schema.release import rgb_name
+from stereogenbench_data.storage.cache import ShardCache
+
+SCENE = "train/IPD_Gaussian/SynthStage/scene_000000"
+SHARD = "train-IPD_Gaussian-000000.tar"
+WRONG = rf"{SHARD}: {rgb_name(0)}: has crc32 [0-9a-f]{{8}}, and the index says [0-9a-f]{{8}}. It"
+
+
+@pytest.fixture
+def shards(small_shards, tmp_path):
+    """A copy of the shards that may be damaged."""
+    return shutil.copytree(small_shards, tmp_path / "shards")
+
+
+def selected(root, **options):
+    return StereoPairs(root, scenes=SCENE, fields=("left", "right"), **options)
+
+
+def flip(path, member, *, place=0.5):
+    """Flip the lowest bit of a byte within a member, in place."""
+    with path.open("r+b") as file:
+        file.seek(member.offset + int(member.size * place))
+        byte = file.read(1)[0]
+        file.seek(-1, 1)
+        file.write(bytes([byte ^ 1]))
+
+
+def harmless_flip(root):
+    """Flip a bit of the first view's video after which all its frames decode, some differently."""
+    pairs = selected(root, frames="all", check="metadata")
+    before = [sample["left"] for sample in pairs]
+    member = pairs.index.scene(pairs.plan.locate(0, epoch=0).row).members[rgb_name(0)]
+    for step in range(20, 90):
+        flip(root / SHARD, member, place=step / 100)
+        pairs.close()
+        try:
+            after = [sample["left"] for sample in pairs]
+        except (ValueError, OSError):
+            after = before
+        if not all(map(torch.equal, before, after)):
+            pairs.close()
+            return
+        flip(root / SHARD, member, place=step / 100)
+    raise AssertionError("no flipped bit decodes to another picture")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"frames": "all"},
+        {"frames": ("random", 4)},
+        {"frames": ("clips", 4)},
+        {"frames": "first", "check": "opened"},
+    ],
+    ids=str,
+)
+def test_a_flipped_bit_that_decodes_is_found_when_most_frames_are_read(shards, options):
+    harmless_flip(shards)
+
+    with pytest.raises(ShardError, match=WRONG):
+        selected(shards, **options)[0]
+    views = {name: value for name, value in options.items() if name != "pairs"}
+    with pytest.raises(ShardError, match=WRONG):
+        SceneViews(shards, scenes=SCENE, fields=("image",), **views)[0]
+
+
+def test_it_is_found_in_workers_and_by_the_loader(shards):
+    harmless_flip(shards)
+    pairs = selected(shards, frames="all")
+
+    with pytest.raises(ShardError, match=WRONG):
+        list(DataLoader(pairs, batch_size=None, num_workers=1))
+    with pytest.raises(ShardError, match=WRONG):
+        list(pairs.loader(2))
+
+
+@pytest.mark.parametrize("options", [{"frames": "first"}, {"frames": "all", "check": "metadata"}])
+def test_single_frames_are_given_without_reading_the_rest(shards, options, small_shards):
+    pairs = selected(shards, **options)
+    member = pairs.index.scene(pairs.plan.locate(0, epoch=0).row).members[rgb_name(0)]
+    # The very last byte: of the MP4's table behind the pictures, in a text.
+    flip(shards / SHARD, member, place=1 - 1 / member.size)
+
+    assert torch.equal(pairs[0]["left"], selected(small_shards)[0]["left"])
+    pairs.close()
+
+
+def test_a_video_is_compared_once_a_process(shards):
+    pairs = selected(shards, frames="all")
+    assert pairs[0]["left"].shape == (3, 64, 64)
+    pairs.close()
+    member = pairs.index.scene(pairs.plan.locate(0, epoch=0).row).members[rgb_name(0)]
+    flip(shards / SHARD, member, place=1 - 1 / member.size)
+
+    assert pairs[0]["left"].shape == (3, 64, 64)
+    pairs.close()
+    with pytest.raises(ShardError, match=WRONG):
+        selected(shards, frames="all")[0]
+
+
+def test_from_a_url_it_is_found_when_the_last_byte_has_come(shards, web):
+    harmless_flip(shards)
+    shutil.copytree(shards, web.folder, dirs_exist_ok=True)
+
+    with pytest.raises(ShardError, match=WRONG):
+        list(selected(web.url, frames="all"))
+    assert len(list(selected(web.url, frames="all", check="metadata"))) == 7
+    assert "left" in selected(web.url)[0]
+
+
+def test_in_the_cache_it_is_mended(shards, small_shards, web, tmp_path):
+    shutil.copytree(small_shards, web.folder, dirs_exist_ok=True)
+    cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
+    first = selected(web.url, frames="all", cache=cache)
+    expected = [sample["left"] for sample in first]
+    first.close()
+    for item in (tmp_path / "cache").rglob("*.member"):
+        times = item.stat()
+        data = bytearray(item.read_bytes())
+        data[-1] ^= 1
+        item.write_bytes(data)
+
+        os.utime(item, ns=(times.st_atime_ns, times.st_mtime_ns))
+    web.asked.clear()
+    again = selected(web.url, frames="all", cache=cache)
+
+    assert all(map(torch.equal, expected, [sample["left"] for sample in again]))
+    assert SHARD in {asked.path for asked in web.asked}
+    again.close()
+
+
+@pytest.mark.parametrize("check", ["always", None, True], ids=repr)
+def test_another_kind_of_check_is_refused(small_shards, check):
+    with pytest.raises(SelectionError, match="check must be one of 'read', 'opened', 'metadata'"):
+        selected(small_shards, check=check)

@@ -1,0 +1,156 @@
+"""Memory of batches: written once, not copied, and used again only when nobody holds any of it."""
+
+import pytest
+import torch
+from torch.utils.data import DataLoader, default_collate
+
+from stereogenbench_data import PAIR_FIELDS, StereoPairs, collate
+from stereogenbench_data.datasets.parcels import SLOTS
+from stereogenbench_data.datasets.room import KEPT_BUFFERS
+
+FIELDS = ("left", "disparity", "valid", "baseline_m", "frame_index", "__key__")
+
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
+
+
+@pytest.fixture
+def pairs(small_index):
+    return StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
+
+
+def tensors(batch):
+    return {name: value for name, value in batch.items() if isinstance(value, torch.Tensor)}
+
+
+def same(one, other):
+    assert one.keys() == other.keys()
+    return all(
+        torch.equal(value, other[name]) if isinstance(value, torch.Tensor) else value == other[name]
+        for name, value in one.items()
+    )
+
+
+def test_a_batch_is_its_samples_where_they_were_written(pairs):
+    samples = pairs.__getitems__([7, 3, 9])
+    batch = collate(samples)
+
+    assert same(batch, default_collate(samples))
+    for name, value in tensors(batch).items():
+        assert value.is_contiguous()
+        assert value.data_ptr() == samples[0][name].data_ptr()
+    pairs.close()
+
+
+def test_samples_from_elsewhere_are_copied_as_torch_does(pairs):
+    samples = [pairs[number] for number in (7, 3, 9)]
+
+    assert same(collate(samples), default_collate(samples))
+    assert same(collate(samples[::-1]), default_collate(samples[::-1]))
+    neighbours = pairs.__getitems__([1, 2, 3])
+    for some in (neighbours[::2], neighbours[::-1], neighbours[1:], neighbours[:1] * 2):
+        assert same(collate(some), default_collate(some))
+    pairs.close()
+
+
+def test_a_sample_that_comes_twice_in_a_batch_is_there_twice(pairs):
+    batch = collate(pairs.__getitems__([4, 11, 4]))
+
+    assert batch["__key__"][0] == batch["__key__"][2]
+    assert torch.equal(batch["left"][0], batch["left"][2])
+    batch["left"][0] = 0
+    assert batch["left"][2].any()
+    pairs.close()
+
+
+@pytest.mark.parametrize("fields", [tuple(PAIR_FIELDS), ("right", "visible")], ids=len)
+def test_every_field_of_a_batch_is_that_of_single_samples(small_index, fields):
+    for selection in ({"pairs": "adjacent"}, {"pairs": "sweep"}, {"frames": ("clips", 3)}):
+        pairs = StereoPairs(small_index, fields=fields, **selection)
+        batch = collate(pairs.__getitems__([0, 2]))
+
+        assert same(batch, default_collate([pairs[0], pairs[2]]))
+        pairs.close()
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2])
+def test_batches_that_a_loop_keeps_are_never_written_again(pairs, workers):
+    expected = {sample["__key__"]: sample for sample in pairs}
+    kept = list(pairs.loader(9, num_workers=workers, tail="uneven"))
+
+    assert len(kept) == 16
+    for batch in kept:
+        samples = [expected[key] for key in batch["__key__"]]
+        assert same(batch, default_collate(samples))
+    pairs.close()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_part_of_a_batch_keeps_all_of_it(pairs, workers):
+    """A slice, a numpy view and a flattened view hold the memory as the batch itself does."""
+    expected = {sample["__key__"]: sample["left"] for sample in pairs}
+    kept = []
+    for batch in pairs.loader(9, num_workers=workers):
+        take = [lambda left: left[3], lambda left: left.numpy()[3], lambda left: left[3].flatten()]
+        kept.append((batch["__key__"][3], take[len(kept) % 3](batch["left"])))
+
+    for key, part in kept:
+        assert torch.equal(torch.as_tensor(part).reshape(3, 64, 64), expected[key])
+    pairs.close()
+
+
+@pytest.mark.parametrize(("workers", "most"), [(0, KEPT_BUFFERS), (1, SLOTS + 2)])
+def test_a_loop_that_lets_its_batches_go_uses_the_same_memory_again(pairs, workers, most):
+    places = set()
+    loader = pairs.loader(9, num_workers=workers)
+    for batch in loader:
+        places.add(batch["left"].data_ptr())
+        del batch
+
+    assert len(loader) == 15
+    assert len(places) <= most
+    loader.close()
+
+
+def test_workers_send_parcels(pairs):
+    expected = list(pairs.loader(9))
+    loader = pairs.loader(9, num_workers=1)
+    count = 0
+    for one, other in zip(expected, loader, strict=True):
+        assert same(one, other)
+        count += 1
+        del other
+
+    assert len(loader._shelf._memory) == SLOTS
+    assert count == 15
+
+
+def test_workers_that_persist_go_on_with_their_slots(pairs):
+    loader = pairs.loader(9, num_workers=1, persistent_workers=True)
+    for epoch in range(2):
+        loader.set_epoch(epoch)
+        alone = pairs.loader(9)
+        alone.set_epoch(epoch)
+        assert all(same(one, other) for one, other in zip(loader, alone, strict=True))
+        for _ in zip(range(2), loader, strict=False):
+            pass
+
+    assert len(loader._shelf._memory) == SLOTS
+
+
+def test_a_collate_function_of_ones_own_gets_plain_samples(pairs):
+    loader = pairs.loader(9, num_workers=1, collate_fn=default_collate)
+
+    assert all(same(one, other) for one, other in zip(loader, pairs.loader(9), strict=True))
+    assert loader._shelf._memory == {}
+
+
+def test_the_loaders_parts_serve_another_loader(pairs):
+    """Others build loaders of their own from a loader's dataset, batch sampler and collate."""
+    loader = pairs.loader(9, num_workers=1)
+    next(iter(loader))
+    other = DataLoader(
+        loader.dataset, batch_sampler=loader.batch_sampler, collate_fn=loader.collate_fn,
+        num_workers=1,
+    )  # fmt: skip
+
+    assert all(same(one, two) for one, two in zip(other, pairs.loader(9), strict=True))
