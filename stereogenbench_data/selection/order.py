@@ -69,14 +69,16 @@ class OrderRule:
     def lanes_of(self, lengths: Numbers) -> int:
         """Return into how many lanes scenes of so many samples are parted.
 
-        So few that the longest scene need not come twice in a batch, as far as that can be; and a
-        divisor of ``lanes``, so that processes that share ``lanes`` out share these too.
+        So few that the longest scene need not come twice in a batch, but two at least, of two
+        scenes each, so that two processes need not decode the same; and a divisor of ``lanes``, so
+        that processes that share ``lanes`` out share these too.
         """
         if self.kind == "sequential":
             return 1
         as_long_as_the_longest = round(int(lengths.sum()) / int(lengths.max()))
         shown = min(self.batch_size, self.open_scenes)
-        most = max(1, min(self.lanes, as_long_as_the_longest // shown))
+        at_least = 2 if as_long_as_the_longest >= 4 else 1
+        most = min(self.lanes, max(at_least, as_long_as_the_longest // shown))
         return max(lanes for lanes in range(1, most + 1) if self.lanes % lanes == 0)
 
     def in_effect(self, lengths: Numbers) -> "OrderRule":

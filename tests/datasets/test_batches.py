@@ -84,7 +84,7 @@ def test_a_position_is_flat_json_and_says_what_it_belongs_to(keyed):
         "batches_consumed": 4,
         "seed": 3,
         "batch_size": 4,
-        "lanes": 1,
+        "lanes": 2,
         "open_scenes": 4,
         "order": "shuffled",
         "tail": "drop",

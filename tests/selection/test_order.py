@@ -249,7 +249,7 @@ def test_frames_of_a_batch_come_from_all_over_their_scenes():
 
 
 @pytest.mark.parametrize(
-    ("scenes", "lanes"), [(1, 1), (15, 1), (32, 2), (63, 2), (64, 4), (9000, 4)]
+    ("scenes", "lanes"), [(1, 1), (3, 1), (4, 2), (15, 2), (63, 2), (64, 4), (9000, 4)]
 )
 def test_small_selections_have_fewer_lanes(scenes, lanes):
     assert order_of([5] * scenes).lanes == lanes
