@@ -188,3 +188,35 @@ def test_without_datasets_the_extra_is_named():
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
     assert "pip install 'stereogenbench-data[huggingface]'" in said.stdout
+
+
+DERIVED = {
+    "shuffled": lambda stream: stream.shuffle(seed=0, buffer_size=1),
+    "mapped": lambda stream: stream.map(lambda sample: sample),
+    "a rank's": lambda stream: split_dataset_by_node(stream, rank=0, world_size=2),
+    "a shard's": lambda stream: stream.shard(num_shards=2, index=1),
+    "shuffled, a rank's": lambda stream: split_dataset_by_node(
+        stream.shuffle(seed=0, buffer_size=1), rank=1, world_size=2
+    ),
+}
+
+
+@pytest.mark.parametrize("workers", [None, 2])
+@pytest.mark.parametrize("name", DERIVED)
+def test_what_is_derived_draws_for_the_epoch_that_it_is_set_to(small_shards, name, workers):
+    options = {"fields": ("frame_index", "__key__"), "frames": ("random", 3)}
+    expected = StereoPairs(small_shards, **options)
+    derived = DERIVED[name](huggingface.iterable(small_shards, **options))
+    loader = DataLoader(derived, batch_size=None, num_workers=workers or 0)
+
+    def drawn(epoch):
+        derived.set_epoch(epoch)
+        return {sample["__key__"] for sample in (derived if workers is None else loader)}
+
+    epochs = {epoch: drawn(epoch) for epoch in (3, 0, 1)}
+
+    for epoch, found in epochs.items():
+        expected.set_epoch(epoch)
+        assert found <= set(keys(expected))
+        assert len(found) in {6, 12}
+    assert epochs[0] != epochs[1] != epochs[3]

@@ -1,0 +1,68 @@
+"""The documentation is built as a site: no page, link or docstring gives a warning."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+
+from stereogenbench_data.cli.main import app
+from tests.servers.tools import require_module
+
+HOME = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """What the build said, and where the site is."""
+    for module in ("mkdocs", "material", "mkdocstrings"):
+        require_module(module)
+    site = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(site)],
+        cwd=HOME, capture_output=True, text=True, check=False, timeout=300,
+        env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+    )  # fmt: skip
+    return done, site
+
+
+def text_of(site, page):
+    return re.sub(r"<[^>]+>", "", (site / page / "index.html").read_text())
+
+
+def test_the_strict_build_has_no_warning(built):
+    done, _ = built
+
+    said = [line for line in done.stderr.splitlines() if line.startswith(("WARNING", "ERROR"))]
+    assert said == []
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def test_the_page_of_commands_names_every_command_and_option(built):
+    page = text_of(built[1], "commands")
+
+    for name, command in typer.main.get_command(app).commands.items():
+        assert f"stereogenbench {name}" in page
+        for option in (option for parameter in command.params for option in parameter.opts):
+            assert option in page or not option.startswith("--"), f"{name} {option}"
+
+
+def test_examples_in_docstrings_are_shown_as_code_that_a_reader_can_type(built):
+    _, site = built
+    page = (site / "api" / "index.html").read_text()
+
+    blocks = re.findall(r'<div class="highlight">.*?</div>', page, flags=re.DOTALL)
+    prompts = sum(block.count("&gt;&gt;&gt; ") for block in blocks)
+    assert prompts == page.count("&gt;&gt;&gt; ") > 5
+    assert "getfixture" not in page
+    assert "doctest:" not in page
+
+
+def test_tables_of_fields_and_pictures_stand_in_the_pages(built):
+    _, site = built
+
+    assert "x_right = x_left - d; 0 where not valid" in text_of(site, "fields")
+    assert (site / "pictures" / "sheet.png").stat().st_size < 400_000
