@@ -7,6 +7,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from stereogenbench_data.storage.arrow_arrays import (
+    as_numpy,
+    stored_numbers,
+    stored_texts,
+)
+
 
 def table_digest(table: pa.Table) -> str:
     """Return a sha256 over the names and values of all columns, as 64 hexadecimal digits."""
@@ -22,7 +28,8 @@ def table_digest(table: pa.Table) -> str:
 def _feed(digest: "hashlib._Hash", values: Any) -> None:
     kind = values.type
     digest.update(np.array([len(values)], dtype="<i8").tobytes())
-    digest.update(np.packbits(values.is_valid().to_numpy(zero_copy_only=False)).tobytes())
+    known = as_numpy(values.is_valid()) if values.null_count else np.ones(len(values), dtype=bool)
+    digest.update(np.packbits(known).tobytes())
     if pa.types.is_struct(kind):
         for field in values.flatten():
             _feed(digest, field)
@@ -32,14 +39,19 @@ def _feed(digest: "hashlib._Hash", values: Any) -> None:
     elif pa.types.is_fixed_size_list(kind):
         _feed(digest, values.flatten())
     elif pa.types.is_string(kind):
-        texts = values.fill_null("").cast(pa.binary())
-        _feed_numbers(digest, pc.binary_length(texts))
-        whole = pa.ListArray.from_arrays([0, len(texts)], texts)
-        digest.update(pc.binary_join(whole, b"")[0].as_py())
+        lengths, texts = stored_texts(values)
+        _feed_array(digest, lengths)
+        digest.update(texts)
     else:
-        _feed_numbers(digest, values.fill_null(0))
+        _feed_numbers(digest, values)
 
 
 def _feed_numbers(digest: "hashlib._Hash", values: Any) -> None:
-    numbers = values.to_numpy(zero_copy_only=False)
+    numbers = stored_numbers(values)
+    if values.null_count:
+        numbers = np.where(as_numpy(values.is_valid()), numbers, numbers.dtype.type(0))
+    _feed_array(digest, numbers)
+
+
+def _feed_array(digest: "hashlib._Hash", numbers: np.ndarray) -> None:
     digest.update(numbers.astype(numbers.dtype.newbyteorder("<")).tobytes())

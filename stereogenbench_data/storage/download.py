@@ -155,9 +155,16 @@ def download(
 
 
 def _is_whole(wanted: WantedFile, dest: Path) -> bool:
-    """Return whether a file was fetched before: it is moved into place only once it is checked."""
-    path = dest / wanted.key / wanted.name
-    return path.is_file() and path.stat().st_size == wanted.member.size
+    """Return whether a file was fetched before: it is moved into place only once it is checked.
+
+    Metadata files of another revision may have the same size, so they are compared whole.
+    """
+    path, member = dest / wanted.key / wanted.name, wanted.member
+    if not path.is_file() or path.stat().st_size != member.size:
+        return False
+    if member.crc32 is None or wanted.name not in METADATA_FILES:
+        return True
+    return zlib.crc32(path.read_bytes()) == member.crc32
 
 
 def _require_room(dest: Path, needed: int) -> None:

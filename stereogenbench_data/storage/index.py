@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.schema.records import Scene, ShardFacts
+from stereogenbench_data.storage.arrow_arrays import as_numpy
 from stereogenbench_data.storage.digest import table_digest
 from stereogenbench_data.storage.filesystems import MissingObject
 from stereogenbench_data.storage.index_file import (
@@ -265,12 +266,12 @@ class SceneIndex:
         return self._columns[name]
 
     def video_counts(self) -> np.ndarray:
-        """Return how many videos each scene has, (n,) int64: fewer than 12 in a part of a release."""
+        """Return how many videos each scene has, (n,) int64: below 12 in a part of a release."""
         lists = self._table.column("members").combine_chunks()
         lists = lists.chunk(0) if isinstance(lists, pa.ChunkedArray) else lists
         names = pc.struct_field(lists.flatten(), "name")
-        is_video = pc.starts_with(names, "cam_").to_numpy(zero_copy_only=False)
-        rows = pc.list_parent_indices(lists).to_numpy(zero_copy_only=False)
+        is_video = as_numpy(pc.starts_with(names, "cam_"))
+        rows = as_numpy(pc.list_parent_indices(lists))
         return np.bincount(rows[is_video], minlength=len(self))
 
     @property
@@ -299,13 +300,7 @@ class SceneIndex:
 
 def _array(values: Any) -> np.ndarray:
     values = values.chunk(0) if isinstance(values, pa.ChunkedArray) else values
-    kind = values.type
-    if pa.types.is_fixed_size_list(kind):
-        flat = values.flatten().to_numpy(zero_copy_only=False)
-        array = flat.reshape(-1, kind.list_size)
-    else:
-        array = values.to_numpy(zero_copy_only=False)
-    array = np.array(array) if array.flags.writeable else array
+    array = as_numpy(values)
     array.setflags(write=False)
     return array
 

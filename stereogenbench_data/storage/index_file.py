@@ -7,6 +7,7 @@ out of the data's root, are refused.
 import itertools
 import json
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -27,6 +28,7 @@ _OF_SHARDS: Final = (
 )
 
 _FORMAT: Final = 1
+_UNSAFE: Final = re.compile(UNSAFE_PATH)
 _METADATA_KEY: Final = b"stereogenbench_data.index"
 
 
@@ -140,6 +142,7 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
         not all(isinstance(each, dict) for each in tables)
         or not isinstance(head.get("root"), str)
         or not all(map(_are_shard_facts, head["shards"].values()))
+        or any(map(_UNSAFE.search, head["shards"]))
     ):
         raise StorageError(f"{where}: its description of itself was altered. {made_again(where)}")
     return head
@@ -170,8 +173,12 @@ def require_sound(table: pa.Table, *, where: str) -> None:
                 f"{where}: scene {following!r} is there twice or out of order. {made_again(where)}"
             )
     members = pc.list_flatten(table.column("members"))
-    for paths in (table.column("key"), pc.struct_field(members, "path")):
-        unsafe = paths.filter(pc.match_substring_regex(paths, UNSAFE_PATH))
+    for paths, unfit in (
+        (table.column("key"), UNSAFE_PATH),
+        (pc.struct_field(members, "path"), UNSAFE_PATH),
+        (pc.struct_field(members, "name"), f"{UNSAFE_PATH}|/"),
+    ):
+        unsafe = paths.filter(pc.match_substring_regex(paths, unfit))
         if len(unsafe):
             raise StorageError(
                 f"{where}: {unsafe[0].as_py()!r} is no path inside the data's root. The index "

@@ -101,8 +101,7 @@ class MemberSource:
         Raises:
             StorageError: If it is missing, unreadable or not the one that was indexed.
         """
-        name = scene.held_name(name)
-        member = scene.members[name]
+        member, name = scene.member(name), scene.held_name(name)
         if not is_remote(self._root):
             found = open_local(self._root, member, shard=self._shards.get(member.path))
             return found if isinstance(found, Path) else self._checked(found, scene, name)

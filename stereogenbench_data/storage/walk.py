@@ -24,6 +24,7 @@ from stereogenbench_data.storage.scene_folder import (
 
 Progress = Callable[[int, int], None]
 
+_NAMED: Final = 6
 POOL_FROM: Final = 64
 """How many scenes there must be for worker processes to be worth their start."""
 
@@ -108,7 +109,12 @@ def _chosen(
 ) -> SceneFolders:
     keys = tuple(key for key in folders.keys if wanted(parse_scene_key(key)))
     if not keys:
-        raise StorageError(f"{shown(str(root))}: none of its {len(folders.keys)} scenes is wanted.")
+        there = sorted({key.rpartition("/")[0] for key in folders.keys})
+        more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
+        raise StorageError(
+            f"{shown(str(root))}: none of its {len(folders.keys)} scenes is asked for; there are "
+            f"scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
+        )
     return SceneFolders(keys, folders.refused)
 
 

@@ -119,6 +119,14 @@ def test_an_option_that_is_off_is_a_usage_error(small_shards, run, words, told):
     assert told in " ".join(result.stderr.replace("│", " ").split())
 
 
+def test_a_filter_that_no_folder_matches_says_what_folders_there_are(small_release, run):
+    result = run(small_release, "--workers", "1", "--family", "uniform")
+
+    assert result.exit_code == 2
+    assert "none of its 4 scenes is asked for; there are scenes in " in str(result.exception)
+    assert "train/IPD_Gaussian/SynthStage, train/Uniform/SynthStage. Check" in str(result.exception)
+
+
 def test_all_frames_can_be_audited(small_shards, run):
     result = run(small_shards, "--workers", "1", "--scene", SCENE, "--frames", "all")
 

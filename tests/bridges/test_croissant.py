@@ -12,8 +12,11 @@ import pytest
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.croissant import Publication, write_descriptor
+from stereogenbench_data.bridges.croissant_check import check_descriptor
 from stereogenbench_data.errors import DescriptorError
+from stereogenbench_data.storage.download import download, plan_download
 from stereogenbench_data.storage.pack import pack
+from tests.servers.tools import require_module
 
 HOME = Path(__file__).resolve().parents[2]
 SHIPPED = HOME / "croissant"
@@ -141,6 +144,42 @@ def test_a_released_tree_is_read_from_its_own_files(small_release, tmp_path):
         zip(tree.column("key"), tree.column("focal_mm"), strict=True)
     )
     assert sorted(told["baselines"]) == sorted(tree.column("baselines_cm").reshape(-1).tolist())
+
+
+def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_path):
+    require_module("blosc2")
+    pack(small_release, tmp_path / "shards", workers=1, depth_codec="blosc2")
+    packed = SceneIndex.open(tmp_path / "shards")
+    path = tmp_path / "data.json"
+    write_descriptor(packed, path, publication=DAY)
+
+    told = loaded(path, tmp_path / "cache")
+
+    assert validated(path) == [(0, [])]
+    cameras = range(6)
+    depth = stored(packed, *((camera, f"cam_{camera:02d}_depth.b2frame") for camera in cameras))
+    assert told["contents"]["depth_videos"] == depth
+    assert told["counts"]["media_files"] == 12 * len(packed)
+    assert check_descriptor(path) == []
+
+
+@pytest.mark.parametrize("stream", ["rgb", "depth"])
+def test_a_part_is_described_by_the_videos_that_it_has(small_shards, tmp_path, stream):
+    """Two cameras, one kind of video: as a tree and packed again."""
+    whole = SceneIndex.open(small_shards)
+    part = plan_download(whole, [0, 1], cameras=(2, 3), streams=(stream,))
+    tree = download(whole, part, tmp_path / "tree")
+    pack(tmp_path / "tree", tmp_path / "shards", workers=1)
+    places = {"tree": {"repository": tmp_path / "tree"}, "shards": {}}
+
+    for name, mapping in places.items():
+        index = tree if name == "tree" else SceneIndex.open(tmp_path / name)
+        path = tmp_path / f"{name}.json"
+        written = write_descriptor(index, path, publication=DAY)
+
+        kinds = [each["@id"] for each in written["recordSet"] if each["@id"].endswith("_videos")]
+        assert kinds == [f"{stream}_videos"]
+        assert check_descriptor(path, mapping=mapping) == []
 
 
 def test_shards_of_any_folder_are_named_relative_to_the_descriptor(index, tmp_path):

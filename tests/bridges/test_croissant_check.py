@@ -111,6 +111,45 @@ MUTATIONS = {
         lambda d: node(d, "splits")["data"][0].update({"splits/url": "x"}),
         "splits: has data for splits/url",
     ),
+    "no record sets": (lambda d: d.update(recordSet=[]), "recordSet: is empty"),
+    "empty responsible-AI value": (
+        lambda d: d.update({"rai:dataBiases": []}), "rai:dataBiases: is empty",
+    ),
+    "several values where one is kept": (
+        lambda d: d.update({"rai:dataSocialImpact": ["a", "b"]}), "readers keep the first",
+    ),
+    "misspelt provenance": (
+        lambda d: d.update({"prov:wasDerivedfrom": "x"}), "prov:wasDerivedfrom: is none of label",
+    ),
+    "constant values in the context": (
+        lambda d: d["@context"].update(value="cr:value"), "constant fields are then read as nothing",
+    ),
+    "tar of another kind": (
+        lambda d: first_tar(d).update(encodingFormat="application/tar"),
+        r"\.tar: has the encodingFormat 'application/tar', and must be application/x-tar",
+    ),
+    "property that files have not": (
+        lambda d: node(d, "media_files/file")["source"]["extract"].update(fileProperty="name"),
+        "media_files/file: takes 'name' of each file; there are fullpath, filename",
+    ),
+    "regex that matches nothing": (
+        lambda d: node(d, "rgb_videos/camera")["source"].update(transform={"regex": r"^x(\d)"}),
+        "rgb_videos/camera: takes .*, which does not match scene_",
+    ),
+    "join key that is not left as it is": (
+        lambda d: node(d, "rgb_videos/scene_id")["source"].update(
+            transform={"regex": r"^(.+?)\.cam_\d{2}_rgb\.mp4$"}
+        ),
+        "which changes its own result: a join applies it twice",
+    ),
+    "join key that another field reads": (
+        lambda d: node(d, "rgb_videos/camera")["source"]["extract"].update(fileProperty="fullpath"),
+        "rgb_videos/camera: reads what rgb_videos/scene_id reads, fullpath of rgb-files",
+    ),
+    "value that no enumeration has": (
+        lambda d: node(d, "families")["data"].pop(),
+        "scene_categories/family: has the value '[A-Z].*', which families/name has not",
+    ),
     "not shaped as one": (lambda d: d.update(recordSet=[1]), "is not shaped as a descriptor is"),
 }  # fmt: skip
 
@@ -136,6 +175,12 @@ def test_a_file_named_by_url_is_checked_where_it_is_at_hand(written, small_shard
     assert check_descriptor(written) == []
     told = check_descriptor(written, mapping={tar["@id"]: small_shards / tar["@id"]})
     assert "was replaced or damaged" in " ".join(told)
+
+
+def test_a_place_for_no_file_is_named(written, tmp_path):
+    told = check_descriptor(written, mapping={"scene.parquet": tmp_path})
+
+    assert told == ["scene.parquet: is mapped to a place, and is no file of the descriptor"]
 
 
 def test_what_is_no_json_is_refused(tmp_path):

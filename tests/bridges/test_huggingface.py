@@ -14,6 +14,8 @@ from torchdata.stateful_dataloader import StatefulDataLoader
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.bridges import huggingface
 from stereogenbench_data.errors import SelectionError, StorageError
+from stereogenbench_data.storage.pack import pack
+from tests.servers.tools import require_module
 
 FIELDS = ("left", "right", "disparity", "valid", "intrinsics", "pair", "scene", "__key__")
 SELECTION = {"fields": FIELDS, "pairs": "adjacent", "frames": [0, 6]}
@@ -125,9 +127,9 @@ def test_running_workers_follow_the_epoch(small_shards):
     assert drawn(0) == drawn(0)
 
 
-def raw(urls):
+def raw(urls, **options):
     return datasets.load_dataset(
-        "webdataset", data_files={"train": urls}, features=huggingface.features(),
+        "webdataset", data_files={"train": urls}, features=huggingface.features(**options),
         streaming=True, split="train",
     )  # fmt: skip
 
@@ -220,3 +222,33 @@ def test_what_is_derived_draws_for_the_epoch_that_it_is_set_to(small_shards, nam
         assert found <= set(keys(expected))
         assert len(found) in {6, 12}
     assert epochs[0] != epochs[1] != epochs[3]
+
+
+@pytest.fixture(scope="module")
+def packed_depth_urls(small_release, tmp_path_factory):
+    require_module("blosc2")
+    folder = tmp_path_factory.mktemp("packed") / "shards"
+    pack(small_release, folder, workers=1, depth_codec="blosc2")
+    return sorted(map(str, folder.glob("*.tar")))
+
+
+def test_raw_shards_of_packed_depth_are_read_by_its_suffix(packed_depth_urls, expected):
+    rows = raw(packed_depth_urls, depth_suffix="b2frame")
+
+    found = list(rows.map(huggingface.decode(FIELDS), remove_columns=rows.column_names))
+
+    truth = {sample["__key__"]: sample for sample in expected}
+    assert len(found) == 4
+    for sample in found:
+        np.testing.assert_allclose(
+            sample["disparity"], truth[sample["__key__"]]["disparity"], rtol=1e-6
+        )
+
+
+def test_the_wrong_suffix_of_depth_is_named(packed_depth_urls):
+    row = next(iter(raw(packed_depth_urls)))
+
+    with pytest.raises(StorageError, match=r'no cam_00_depth\.mkv.*features\(depth_suffix="b2f'):
+        huggingface.decode(FIELDS)(row)
+    with pytest.raises(SelectionError, match=r"depth_suffix is 'b2nd'; there are 'mkv', 'b2frame'"):
+        huggingface.features(depth_suffix="b2nd")

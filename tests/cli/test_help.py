@@ -91,6 +91,20 @@ def test_completion_knows_the_scenes_of_data_with_an_index(small_shards):
     ]
 
 
+def test_completion_knows_the_scenes_that_an_option_may_name(small_shards):
+    assert completed(f"stereogenbench audit {small_shards} --scene train/I") == [
+        "train/IPD_Gaussian/SynthStage/scene_000000"
+    ]
+    assert completed(f"stereogenbench stats {small_shards} --scene ")[-1] == (
+        "train/Uniform/SynthStage/scene_000001"
+    )
+
+
+def test_completion_knows_limits_and_what_depth_may_have_lost():
+    assert completed("stereogenbench audit x --limit base") == ["baseline_cm="]
+    assert completed("stereogenbench audit x --accept ") == ["8-bit", "chroma", "lossy"]
+
+
 def test_a_completion_script_can_be_had():
     ended = subprocess.run(
         [sys.executable, "-m", "stereogenbench_data", "--show-completion", "bash"],

@@ -88,6 +88,37 @@ def test_a_tree_with_a_broken_scene_shows_the_others(small_release, tmp_path):
     bad = run("show", tmp_path / "data", SCENE, "-o", tmp_path / "sheet.png")
     assert (good.exit_code, bad.exit_code) == (0, 2)
     assert f"'{SCENE}' is no key of 3 scenes" in bad.stderr
+    assert f"1 broken of 4 scenes left out: {SCENE}/baseline.json: " in good.stderr
+    assert f"`stereogenbench index {tmp_path / 'data'}` lists them all." in good.stderr
+
+
+def test_statistics_count_the_whole_scenes_of_a_tree_and_say_which_they_leave_out(
+    small_release, tmp_path
+):
+    shutil.copytree(small_release, tmp_path / "data")
+    (tmp_path / "data" / SCENE / "baseline.json").write_text("{}")
+    (tmp_path / "data" / SCENE.replace("001", "000") / "_scene_complete.json").unlink()
+
+    counted = run("stats", tmp_path / "data", "--json")
+
+    assert counted.exit_code == 0
+    assert json.loads(counted.stdout)["counts"][-1]["scenes"] == 2
+    assert "1 broken and 1 incomplete of 4 scenes left out: " in counted.stderr
+    assert "(and 1 more)" in counted.stderr
+
+
+def test_a_part_that_is_whole_folders_of_one_key_is_that_scene(small_release, tmp_path):
+    for family in ("Uniform", "Pairwise_Uniform"):
+        folder = tmp_path / "data" / "train" / family / "Stage" / "scene_000000"
+        shutil.copytree(small_release / SCENE, folder)
+    out = tmp_path / "sheet.png"
+
+    whole = run("show", tmp_path / "data", "uniform", "-o", out)
+    part = run("show", tmp_path / "data", "niform", "-o", out)
+
+    assert whole.stdout == f"{out}: train/Uniform/Stage/scene_000000\n"
+    assert part.exit_code == 2
+    assert "'niform' is a part of 2 keys: " in part.stderr
 
 
 def test_reports_as_json_are_one_document(small_release, tmp_path):

@@ -69,6 +69,7 @@ def test_missing_weights_are_named_with_source_licence_and_place(load, name, wei
 
     assert weights.source in str(caught.value)
     assert f"licence: {weights.licence}" in str(caught.value)
+    assert "pip install 'stereogenbench-data[evaluation]'" in str(caught.value)
 
 
 def test_weights_are_looked_for_where_torch_hub_keeps_them(monkeypatch, tmp_path):
@@ -83,16 +84,17 @@ def test_weights_are_looked_for_where_torch_hub_keeps_them(monkeypatch, tmp_path
     [(load_keypoint_matcher, "dedode", "kornia"), (load_pair_metric, "lpips", "lpips")],
 )
 def test_a_missing_package_is_named_with_its_extra_and_its_weights(
-    monkeypatch, load, name, package
+    monkeypatch, tmp_path, load, name, package
 ):
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.setattr("stereogenbench_data.evaluation.perceptual.find_spec", lambda _: None)
 
-    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[\w+\]'") as caught:
-        load(name)
+    with pytest.raises(ExtraError, match=rf"pip install 'stereogenbench-data\[{name}\]'") as caught:
+        load(name, Where(weights=tmp_path))
 
     assert "https://" in str(caught.value)
     assert "licence: " in str(caught.value)
+    assert f"put it at {tmp_path}/" in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["sift", "sgbm"])
@@ -252,9 +254,15 @@ def test_foundation_stereo_is_padded_for_and_its_answer_cut_to_the_picture(check
     assert sys.path == path_before
 
 
-@pytest.mark.parametrize("place", [None, Path("/nowhere/FoundationStereo")])
-def test_without_a_checkout_the_repository_weights_and_licence_are_named(place):
-    with pytest.raises(ExtraError, match=f"FoundationStereo is not at {place}: clone") as caught:
+@pytest.mark.parametrize(
+    ("place", "lacking"),
+    [
+        (None, "has no checkout"),
+        (Path("/nowhere/FoundationStereo"), "is not at /nowhere/FoundationStereo"),
+    ],
+)
+def test_without_a_checkout_the_repository_weights_and_licence_are_named(place, lacking):
+    with pytest.raises(ExtraError, match=f"FoundationStereo {lacking}: clone") as caught:
         load_stereo_matcher("foundation-stereo", Where(checkout=place))
 
     for told in ("github.com/NVlabs/FoundationStereo", "drive.google.com", "non-commercial"):

@@ -133,6 +133,11 @@ def test_floats_of_0_to_1_are_rounded_to_8_bits(scored_index, protocol):
         (lambda inputs: inputs["left"].float(), r"returned floats of \d+ to \d+; expected 0 to 1"),
         (lambda inputs: inputs["left"].float() * math.nan, r"returned floats of nan to nan"),
         (lambda inputs: inputs["left"].int(), r"gave int32 \(3, 48, 64\) for a frame"),
+        (lambda inputs: inputs["left"].float()[..., :0], r"returned float32 \(3, 3, 48, 0\)"),
+        (
+            lambda inputs: [each[:, : 9 + n] for n, each in enumerate(inputs["left"].numpy())],
+            r"returned a list that is no one array",
+        ),
     ],
 )
 def test_what_a_callable_returns_is_checked(scored_index, protocol, method, message):
@@ -169,10 +174,20 @@ def test_a_missing_prediction_is_an_error_before_anything_is_scored(scored_index
     done = []
 
     with pytest.raises(
-        EvaluationError, match=rf"1 predictions are missing or unusable and 0 are allowed.*{scene}"
+        EvaluationError,
+        match=rf"1 predictions are missing or unusable and 0 are allowed.*{scene}.* expected a "
+        rf"folder or video {scene}/00-01 or {item_name(scene, (0, 1))}\.$",
     ):
         scored(scored_index, copied, protocol, progress=lambda *counts: done.append(counts))
     assert done == []
+
+
+def test_two_predictions_of_one_pair_are_told_not_taken_for_none(scored_index, copied, protocol):
+    scene = keys(scored_index)[1]
+    (copied / f"{item_name(scene, (0, 1))}.mp4").touch()
+
+    with pytest.raises(EvaluationError, match=rf"{scene}, cameras 00-01: has several predictions"):
+        scored(scored_index, copied, protocol)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Right views on disk: where they belong, and what each that is not right is told."""
 
 import av
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -145,8 +146,26 @@ def test_pictures_without_three_channels_are_refused(item, mode, shape):
     for frame in (0, 2):
         write_png(item, frame, np.zeros(shape, dtype=np.uint8))
 
-    with pytest.raises(PredictionFault, match=rf"pixels of mode {mode}: write 8-bit RGB"):
+    with pytest.raises(PredictionFault, match=rf"pixels of mode {mode} of 8 bits: write 8-bit RGB"):
         open_prediction(item, WANTED).read(0)
+
+
+def test_pictures_of_16_bits_are_refused_not_halved(item):
+    item.mkdir()
+    for frame in (0, 2):
+        cv2.imwrite(str(item / frame_name(frame)), np.full((8, 16, 3), 300, dtype=np.uint16))
+
+    with pytest.raises(PredictionFault, match=r"000\.png has pixels of mode RGB of 16 bits"):
+        open_prediction(item, WANTED).read(0)
+
+
+def test_a_link_to_nowhere_is_a_picture_that_cannot_be_read(item):
+    write_png(item, 0, picture(1))
+    (item / frame_name(2)).symlink_to(item / "gone.png")
+
+    assert stamp_prediction(item)
+    with pytest.raises(PredictionFault, match=r"002\.png is no picture that can be read"):
+        open_prediction(item, WANTED).read(2)
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "payload"])

@@ -1,15 +1,14 @@
 """All that works offline, on a synthesised pair whose geometry is known."""
 
-import json
-import subprocess
-import sys
-
+import cv2
 import numpy as np
 import pytest
+import torch
 
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.evaluation.matching import match_error, target_matches
 from stereogenbench_data.evaluation.patches import outside_window, patch_psnr
+from stereogenbench_data.evaluation.picture_statistics import ColourStatistics
 from stereogenbench_data.evaluation.pixels import psnr_db, ssim
 from stereogenbench_data.evaluation.scale import fit_scale
 from stereogenbench_data.evaluation.sgbm import Sgbm
@@ -95,51 +94,35 @@ def test_the_scale_of_the_target_is_right_and_of_a_wrong_baseline_the_ratio_of_t
     assert scores["random"]["scale"].drift == pytest.approx(1, abs=0.2)
 
 
-MEASURE = """
-import json, sys
-import cv2, numpy, torch
-from stereogenbench_data.evaluation.matching import match_error, target_matches
-from stereogenbench_data.evaluation.patches import patch_psnr
-from stereogenbench_data.evaluation.picture_statistics import ColourStatistics
-from stereogenbench_data.evaluation.pixels import psnr_db, ssim
-from stereogenbench_data.evaluation.scale import fit_scale
-from stereogenbench_data.evaluation.sgbm import Sgbm
-from stereogenbench_data.evaluation.sift import Sift
-from stereogenbench_data.evaluation.threads import use_one_thread
-
-threads = int(sys.argv[1])
-use_one_thread()
-if threads > 1:
+def measured(left, right, *, threads):
+    """Return scores, computed by so many threads, and the numbers of threads there were."""
+    before = cv2.getNumThreads(), torch.get_num_threads()
     cv2.setNumThreads(threads)
     torch.set_num_threads(threads)
-with numpy.load(sys.argv[2]) as views:
-    left, right = views["left"], views["right"]
-noisy = right // 2 + 30
-against = target_matches(left, right, matcher=Sift())
-disparity = Sgbm(disparities=48)(left, noisy)
-fit = fit_scale(disparity, disparity * 2 + left[0] / 100, scored=numpy.isfinite(disparity))
-print(json.dumps([
-    cv2.getNumThreads(), torch.get_num_threads(), psnr_db(noisy, right), ssim(noisy, right),
-    patch_psnr(left, noisy).mean_db, match_error(noisy, against=against, matcher=Sift()).error,
-    fit.slope, fit.residual_std_px, *ColourStatistics()(noisy[None])[0],
-]))
-"""
+    try:
+        found = cv2.getNumThreads(), torch.get_num_threads()
+        noisy = right // 2 + 30
+        against = target_matches(left, right, matcher=Sift())
+        disparity = Sgbm(disparities=48)(left, noisy)
+        fit = fit_scale(disparity, disparity * 2 + left[0] / 100, scored=np.isfinite(disparity))
+        return found, [
+            psnr_db(noisy, right),
+            ssim(noisy, right),
+            patch_psnr(left, noisy).mean_db,
+            match_error(noisy, against=against, matcher=Sift()).error,
+            fit.slope,
+            fit.residual_std_px,
+            *ColourStatistics()(noisy[None])[0],
+        ]
+    finally:
+        cv2.setNumThreads(before[0])
+        torch.set_num_threads(before[1])
 
 
-def test_scores_are_the_same_to_the_last_digit_on_one_thread_and_on_three(pairs, tmp_path):
-    np.savez(tmp_path / "views.npz", left=pairs[0]["left"], right=pairs[0]["right"])
+def test_scores_are_the_same_to_the_last_digit_on_one_thread_and_on_three(pairs):
+    left, right = pairs[0]["left"], pairs[0]["right"]
+    one, scores_of_one = measured(left, right, threads=1)
+    three, scores_of_three = measured(left, right, threads=3)
 
-    one, three = (
-        json.loads(
-            subprocess.run(
-                [sys.executable, "-c", MEASURE, threads, str(tmp_path / "views.npz")],
-                check=True,
-                capture_output=True,
-                text=True,
-            ).stdout
-        )
-        for threads in ("1", "3")
-    )
-
-    assert (one[:2], three[:2]) == ([1, 1], [3, 3])
-    assert one[2:] == three[2:]
+    assert (one, three) == ((1, 1), (3, 3))
+    assert scores_of_one == scores_of_three

@@ -108,7 +108,7 @@ def test_what_is_not_comparable_with_the_paper_is_said(scores):
     assert "SD (sgbm)↓" in text
     assert "43.85 †" in text
     assert "The paper scores at 832x480, this at 416x240: not comparable" in text
-    assert "The paper scores 81 frames a scene, this [2]" in text
+    assert "The paper scores 81 frames a scene, this 2." in text
 
 
 def test_the_papers_own_backends_are_not_marked(scores):
@@ -196,10 +196,10 @@ def test_the_csv_has_a_line_for_each_row_and_column(scores, tmp_path):
 
 
 def test_latex_has_its_signs_escaped_and_its_columns_counted(scores):
-    text = latex(branch_table([scores("50 % & more_{x}")]))
+    text = latex(branch_table([scores("[50 % & more_{x} < y|")]))
     rows_of_text = [line for line in text.splitlines() if line.endswith(r"\\")]
 
-    assert r"50 \% \& more\_\{x\}" in text
+    assert r"{[}50 \% \& more\_\{x\} $<$ y$|$" in text
     assert r"31.00" not in text
     assert r"$\pm$" in text
     assert len({line.replace(r"\&", "").count("&") for line in rows_of_text}) == 1

@@ -360,6 +360,27 @@ def test_a_header_of_another_version_is_refused(packed):
         parse_header(content[:2000], file_bytes=len(content), name="x")
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "found"),
+    [
+        (b'"codec":"ffv1"', b'"codec":"h264"', "h264, gray16le"),
+        (b'"pixel_format":"gray16le"', b'"pixel_format":"rgb48lel"', "ffv1, rgb48lel"),
+        (b'"width_px":56', b'"width_px":1e', "description of itself is of another version"),
+        (b'"height_px":40', b'"height_px":{}', "odd or lacks something .TypeError"),
+        (b'"rate":[15,1]', b'"rate":[1e99]', "odd or lacks something .IndexError"),
+        (b'"rate":[15,1]', b'"rate":[9e9,1]'[:13], "odd or lacks something .ValueError"),
+        (b'"rate":[15,1]', b'"rate":[1e999]'[:13], "odd or lacks something"),
+        (b'"tags":{', b'"tagz":{', "odd or lacks something .KeyError"),
+        (b'"pts":[0,', b'"pts":[9,', "times of frames that do not ascend"),
+    ],
+)
+def test_a_header_that_describes_no_packed_depth_is_refused(packed, old, new, found):
+    content = with_text(packed, parse_text(packed).replace(old, new))
+
+    with pytest.raises(MediaError, match=found):
+        opened(content)
+
+
 def test_an_open_reader_stays_in_its_process(packed):
     import pickle
 

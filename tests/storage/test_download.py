@@ -1,6 +1,9 @@
 """Downloading a part of a release: only what is asked for, checked, gone on with, usable."""
 
 import json
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -133,3 +136,55 @@ def test_a_camera_that_does_not_exist_is_refused(small_release, tmp_path):
 
     assert done.exit_code == 2
     assert "write numbers from 0 to 5" in done.output
+
+
+def test_a_metadata_file_of_another_revision_is_fetched_again(shards_on_the_web, tmp_path):
+    dest = tmp_path / "part"
+    fetched(shards_on_the_web, dest)
+    changed = next(dest.rglob("baseline.json"))
+    text = changed.read_bytes()
+    changed.write_bytes(text.replace(b"1", b"2"))
+
+    fetched(shards_on_the_web, dest)
+
+    assert changed.read_bytes() == text
+
+
+def test_commands_that_need_all_cameras_name_what_a_part_lacks(shards_on_the_web, tmp_path):
+    dest = tmp_path / "part"
+    fetched(shards_on_the_web, dest)
+
+    shown = CliRunner().invoke(app, ["show", str(dest), "--out", str(tmp_path / "sheet.png")])
+
+    assert shown.exit_code == 2
+    assert "cam_02_rgb.mp4 is not among its files; there are cam_00_rgb.mp4" in shown.stderr
+
+
+def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(
+    shards_on_the_web, small_release, web, tmp_path
+):
+    """The process is killed while a server that answers slowly has sent some files."""
+    dest = tmp_path / "part"
+    command = ["download", shards_on_the_web, "--dest", str(dest), "--workers", "1"]
+    for name in sorted(path.relative_to(web.folder) for path in web.folder.rglob("*.tar")):
+        web.always[str(name)] = Answer(delay_s=0.1)
+    killed = subprocess.Popen(
+        [sys.executable, "-m", "stereogenbench_data.cli.main", *command],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not list(dest.rglob("cam_00_rgb.mp4")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    killed.kill()
+    killed.wait()
+    there = [path for path in dest.rglob("*.*") if not path.name.startswith(".") and path.is_file()]
+    web.always.clear()
+
+    done = CliRunner().invoke(app, command)
+
+    assert 0 < len(there) < 4 * 17
+    for path in there:
+        assert path.read_bytes() == (small_release / path.relative_to(dest)).read_bytes()
+    assert done.exit_code == 0, done.output
+    assert len(StereoPairs(dest, pairs="all")) == 4 * 15
+    assert not list(dest.rglob("*.part"))
