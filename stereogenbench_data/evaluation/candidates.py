@@ -52,7 +52,11 @@ class Candidate(Protocol):
         ...
 
     def stamp(self, wanted: Wanted) -> str:
-        """Return a text that changes when the right views of a pair do."""
+        """Return a text that changes when the right views of a pair do.
+
+        Raises:
+            PredictionFault: If there are none, or several that could be meant.
+        """
         ...
 
     def open(self, index: SceneIndex) -> Views:
@@ -75,11 +79,12 @@ class PredictionFolder:
     inputs: tuple[str, ...] = ()
 
     def stamp(self, wanted: Wanted) -> str:
-        """Return a text that changes when the files do, "" where there are none."""
-        try:
-            return stamp_prediction(find_prediction(self.root, wanted))
-        except PredictionFault:
-            return ""
+        """Return a text that changes when the files do.
+
+        Raises:
+            PredictionFault: If there are none, or several that could be meant.
+        """
+        return stamp_prediction(find_prediction(self.root, wanted))
 
     def open(self, index: SceneIndex) -> "_FolderViews":
         """Begin to read a scene's predictions."""
@@ -157,8 +162,14 @@ def _as_pictures(given: Any, *, count: int, wanted: Wanted, where: str) -> Seque
     if hasattr(given, "detach"):
         tensor = given.detach().cpu()
         given = (tensor.float() if tensor.is_floating_point() else tensor).numpy()
-    array = np.asarray(given)
-    if array.ndim != 4 or len(array) != count:
+    try:
+        array = np.asarray(given)
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise PredictionFault(
+            f"{wanted.scene}: {where} returned a {type(given).__name__} that is no one array "
+            f"({error}); expected ({count}, 3, {wanted.size[0]}, {wanted.size[1]})."
+        ) from error
+    if array.ndim != 4 or len(array) != count or array.size == 0:
         raise PredictionFault(
             f"{wanted.scene}: {where} was given {count} frames and returned {array.dtype} "
             f"{tuple(array.shape)}; expected ({count}, 3, {wanted.size[0]}, {wanted.size[1]})."

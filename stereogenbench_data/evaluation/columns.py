@@ -54,6 +54,9 @@ COLUMNS: Final[dict[str, Column]] = {
     "sd_answered": Column(
         "answered", "neither", 3, "share of visible pixels with a found disparity", "stereo_matcher"
     ),
+    "sd_outliers": Column(
+        "outliers", "neither", 3, "share of answered pixels left out of the fit", "stereo_matcher"
+    ),
     "sd_residual_px": Column(
         "residual", "neither", 2, "px; standard deviation of the residuals", "stereo_matcher"
     ),
@@ -70,7 +73,8 @@ FRAME_METRICS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "p_psnr": ("p_psnr", "p_psnr_pooled", "p_psnr_ceiling", "p_psnr_outside"),
     "sd": (
-        "sd", "sd_slope", "sd_offset_px", "sd_valid", "sd_answered", "sd_residual_px", "sd_r2",
+        "sd", "sd_slope", "sd_offset_px", "sd_valid", "sd_answered", "sd_outliers",
+        "sd_residual_px", "sd_r2",
     ),
 }  # fmt: skip
 """The columns of each metric that is computed frame by frame, its headline first."""

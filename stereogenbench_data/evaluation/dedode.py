@@ -17,7 +17,9 @@ from stereogenbench_data.evaluation.pictures import require_pictures
 from stereogenbench_data.evaluation.protocols import Keypoints, Picture, Settings
 from stereogenbench_data.evaluation.weights import (
     Weights,
+    fetch,
     fingerprint,
+    install,
     load_into,
     read_weights,
     weights_path,
@@ -29,12 +31,14 @@ DETECTOR: Final = Weights(
     file="dedode_detector_L.pth",
     source=f"{_RELEASE}dedode_detector_L.pth",
     licence="MIT",
+    extra="dedode",
 )
 DESCRIPTOR: Final = Weights(
     what="DeDoDe's descriptor B-upright",
     file="dedode_descriptor_B.pth",
     source=f"{_RELEASE}dedode_descriptor_B.pth",
     licence="MIT",
+    extra="dedode",
 )
 
 
@@ -61,8 +65,9 @@ class DeDoDeMatcher:
             kornia = importlib.import_module("kornia")
         except ImportError as error:
             raise ExtraError(
-                "DeDoDe needs kornia: pip install 'stereogenbench-data[dedode]'; its weights are "
-                f"{DETECTOR.source} and {DESCRIPTOR.source} (licence: {DETECTOR.licence})"
+                f"DeDoDe needs kornia: {install(DETECTOR.extra)}; and its weights: "
+                f"{fetch(DETECTOR, folder=weights)}; {fetch(DESCRIPTOR, folder=weights)}; or name "
+                f"the folder that they are in (--weights)."
             ) from error
         network: Any = kornia.feature.DeDoDe(
             detector_model="L", descriptor_model="B", amp_dtype=torch.float32

@@ -20,6 +20,7 @@ from stereogenbench_data.evaluation.protocols import Picture, Settings
 from stereogenbench_data.evaluation.weights import (
     Weights,
     fingerprint,
+    install,
     load_into,
     read_weights,
     weights_path,
@@ -62,10 +63,13 @@ class FoundationStereoMatcher:
             EvaluationError: If the file does not hold this network's weights.
         """
         if checkout is None or not (checkout / "core" / "foundation_stereo.py").is_file():
+            lacking = "has no checkout" if checkout is None else f"is not at {checkout}"
+            place = Path("CHECKOUT") if checkout is None else checkout
             raise ExtraError(
-                f"FoundationStereo is not at {checkout}: clone {REPOSITORY} (licence: "
-                f"{CHECKPOINT.licence}), install what it asks for, fetch its weights from "
-                f"{CHECKPOINT.source} and name the checkout."
+                f"FoundationStereo {lacking}: clone {REPOSITORY} (licence: {CHECKPOINT.licence}), "
+                f"install what it asks for and {install(CHECKPOINT.extra)}, fetch its weights and "
+                f"{_CONFIGURATION} from {CHECKPOINT.source} into "
+                f"{weights or place / _DEFAULT_FOLDER}, and name the clone (--checkout)."
             )
         folder = checkout / _DEFAULT_FOLDER if weights is None else weights
         path = weights_path(CHECKPOINT, folder=folder)

@@ -178,6 +178,7 @@ def _sd(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float]:
         "sd_offset_px": fit.offset_px,
         "sd_valid": fit.valid_ratio,
         "sd_answered": fit.answered_ratio,
+        "sd_outliers": fit.outlier_ratio,
         "sd_residual_px": fit.residual_std_px,
         "sd_r2": fit.r_squared,
     }

@@ -24,7 +24,7 @@ from stereogenbench_data.storage.unfinished import write_whole
 Stamps = Mapping[tuple[str, Pair], str]
 
 STATE_JSON: Final = "evaluation.json"
-_FORMAT: Final = 1
+_FORMAT: Final = 2
 _SCENES: Final = "scenes"
 _ODD: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 

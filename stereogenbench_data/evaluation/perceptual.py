@@ -15,7 +15,9 @@ from stereogenbench_data.evaluation.pictures import require_batch
 from stereogenbench_data.evaluation.protocols import Pictures, Settings
 from stereogenbench_data.evaluation.weights import (
     Weights,
+    fetch,
     fingerprint,
+    install,
     load_into,
     read_weights,
     weights_path,
@@ -26,6 +28,7 @@ TRUNK: Final = Weights(
     file="alexnet-owt-7be5be79.pth",
     source="https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
     licence="BSD-3-Clause, torchvision",
+    extra="lpips",
 )
 HEADS: Final = Path("weights") / "v0.1" / "alex.pth"
 _SHIFT: Final = (-0.030, -0.088, -0.188)
@@ -58,7 +61,7 @@ class Lpips:
             ExtraError: If the package or the file is missing.
             EvaluationError: If a file does not hold this network's weights.
         """
-        heads = _heads_path()
+        heads = _heads_path(weights)
         path = weights_path(TRUNK, folder=weights)
         trunk = {
             name: value
@@ -153,7 +156,7 @@ class PerceptualDistance(nn.Module):
         return found
 
 
-def _heads_path() -> Path:
+def _heads_path(weights: Path | None) -> Path:
     """Return the file of LPIPS' own weights, in its package, which is not imported.
 
     Raises:
@@ -162,7 +165,7 @@ def _heads_path() -> Path:
     package = find_spec("lpips")
     if package is None or package.origin is None:
         raise ExtraError(
-            "LPIPS needs the package lpips: pip install 'stereogenbench-data[lpips]'; and the "
-            f"weights of AlexNet, {TRUNK.source} (licence: {TRUNK.licence})"
+            f"LPIPS needs the package lpips: {install(TRUNK.extra)}; and the weights of AlexNet: "
+            f"{fetch(TRUNK, folder=weights)}, or name the folder that it is in (--weights)."
         )
     return Path(package.origin).parent / HEADS

@@ -32,6 +32,8 @@ Size = tuple[int, int]
 
 VIDEO_SUFFIXES: Final = (".mp4", ".mkv")
 _ITEM_DIGITS: Final = 16
+_PNG_BITS_AT: Final = 24
+"""Where a PNG's header has the bits of a channel: Pillow halves 16 of them without a word."""
 _RED_GREEN_BLUE: Final = (2, 0, 1)
 """Where the planes of FFmpeg's gbrp are."""
 
@@ -129,11 +131,14 @@ def find_prediction(root: Path, wanted: Wanted) -> Path:
 
 
 def stamp_prediction(path: Path) -> str:
-    """Return a text that changes when the files of a prediction do: names, sizes, times."""
+    """Return a text that changes when the files of a prediction do: names, sizes, times.
+
+    A link to nowhere is a file like others: reading it is the fault.
+    """
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     digest = hashlib.sha256()
     for file in files:
-        facts = file.stat()
+        facts = file.stat() if file.exists() else file.lstat()
         digest.update(f"{file.name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
     return digest.hexdigest()[:_ITEM_DIGITS]
 
@@ -173,9 +178,11 @@ class _PngFrames:
     def read(self, frame: int) -> Any:
         path = self._folder / frame_name(frame)
         try:
-            with Image.open(path, formats=["PNG"]) as image:
-                self._require(image, path)
-                pixels = np.asarray(image)
+            with path.open("rb") as file:
+                bits = file.read(_PNG_BITS_AT + 1)[_PNG_BITS_AT:]
+                with Image.open(file, formats=["PNG"]) as image:
+                    self._require(image, path, bits=bits)
+                    pixels = np.asarray(image)
         except (OSError, SyntaxError, ValueError, zlib.error) as error:
             if isinstance(error, PredictionFault):
                 raise
@@ -188,10 +195,12 @@ class _PngFrames:
             ) from error
         return scaled_rgb(pixels, size=self._wanted.size, scaler=self._scaler)
 
-    def _require(self, image: Image.Image, path: Path) -> None:
-        if image.mode != "RGB":
+    def _require(self, image: Image.Image, path: Path, *, bits: bytes) -> None:
+        if image.mode != "RGB" or bits != b"\x08":
+            depth = f" of {bits[0]} bits" if bits else ""
             raise PredictionFault(
-                f"{_told(self._wanted)}: {path} has pixels of mode {image.mode}: write 8-bit RGB."
+                f"{_told(self._wanted)}: {path} has pixels of mode {image.mode}{depth}: write "
+                f"8-bit RGB."
             )
         _require_size((image.height, image.width), path, self._wanted)
 

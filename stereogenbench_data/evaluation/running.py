@@ -3,14 +3,13 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Final
 
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.candidates import Candidate
 from stereogenbench_data.evaluation.partial import PartialResults
-from stereogenbench_data.evaluation.predictions import Pair, Wanted, pair_name
+from stereogenbench_data.evaluation.predictions import Pair, PredictionFault, Wanted
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.evaluation.scoring import SceneScores, SceneWork, score_scene
 from stereogenbench_data.selection.plan import Plan
@@ -21,7 +20,7 @@ from stereogenbench_data.storage.pool import AfterBytes, run_tasks
 Progress = Callable[[int, int], None]
 Place = tuple[str, Pair]
 
-_TOLD: Final = 3
+_TOLD: Final = 2
 
 
 def no_progress(done: int, total: int) -> None:
@@ -121,13 +120,14 @@ def score_all(extent: Extent, run: Run, *, partial: PartialResults, progress: Pr
     """
     stamps: dict[str, dict[Place, str]] = {}
     works: list[SceneWork] = []
+    missing: list[str] = []
     faults: list[str] = []
     done = 0
     rows = {str(key): row for row, key in enumerate(extent.index.column("key"))}
     for pairs in extent.wanted:
         scene = pairs[0].scene
         stamps[scene] = {
-            (candidate.name, each.pair): candidate.stamp(each)
+            (candidate.name, each.pair): _stamp(candidate, each, missing=missing)
             for candidate in run.candidates
             for each in pairs
         }
@@ -145,7 +145,7 @@ def score_all(extent: Extent, run: Run, *, partial: PartialResults, progress: Pr
                 faults="count" if run.allow_missing else "raise",
             )
         )
-    _require_few(_missing(stamps), allowed=run.allow_missing)
+    _require_few(missing, allowed=run.allow_missing)
     total = extent.frames
 
     def after_frames(count: int) -> None:
@@ -174,14 +174,13 @@ def _score(work: SceneWork, after_frames: AfterBytes) -> tuple[str, SceneScores]
     return work.scene, score_scene(work, after_frames)
 
 
-def _missing(stamps: dict[str, dict[Place, str]]) -> list[str]:
-    """Return the right views of which there is nothing at all, before any work is done."""
-    return [
-        f"{scene}, cameras {pair_name(pair)} has no prediction ({name})"
-        for scene, places in stamps.items()
-        for (name, pair), stamp in places.items()
-        if not stamp
-    ]
+def _stamp(candidate: Candidate, wanted: Wanted, *, missing: list[str]) -> str:
+    """Return the stamp of a pair's right views; "" where there are none, which is noted."""
+    try:
+        return candidate.stamp(wanted)
+    except PredictionFault as fault:
+        missing.append(str(fault))
+        return ""
 
 
 def _require_few(faults: Sequence[str], *, allowed: int) -> None:
@@ -190,7 +189,7 @@ def _require_few(faults: Sequence[str], *, allowed: int) -> None:
     more = f"; and {len(faults) - _TOLD} more" if len(faults) > _TOLD else ""
     raise EvaluationError(
         f"{len(faults)} predictions are missing or unusable and {allowed} are allowed "
-        f"(--allow-missing): {'; '.join(islice(faults, _TOLD))}{more}."
+        f"(--allow-missing): {'; '.join(each.rstrip('.') for each in faults[:_TOLD])}{more}."
     )
 
 

@@ -58,6 +58,11 @@ class ScaleFit:
     r_squared: float
     reason: str
 
+    @property
+    def outlier_ratio(self) -> float:
+        """The share of the answered pixels that were left out of the fit; nan without a fit."""
+        return self.outliers / (self.pixels + self.outliers) if self.pixels else float("nan")
+
 
 def fit_scale(
     estimated_px: Float[np.ndarray, "h w"],

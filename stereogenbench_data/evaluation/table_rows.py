@@ -114,7 +114,8 @@ def notes_of(
             )
         frames = {pair.frames for one in results for pair in one.pairs if not pair.fault}
         if frames - {FRAME_COUNT}:
-            notes.append(f"The paper scores {FRAME_COUNT} frames a scene, this {sorted(frames)}.")
+            ours = ", ".join(map(str, sorted(frames)))
+            notes.append(f"The paper scores {FRAME_COUNT} frames a scene, this {ours}.")
     if any(found.underdetermined for row in rows for found in row.distances.values()):
         notes.append(
             "! No more samples than dimensions: the distance is biased upwards, and more so the "

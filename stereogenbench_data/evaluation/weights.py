@@ -21,12 +21,36 @@ class Weights:
         file: The name of the file.
         source: Where to fetch it.
         licence: Under which terms it comes.
+        extra: The extra of this package with what the network needs.
     """
 
     what: str
     file: str
     source: str
     licence: str
+    extra: str = "evaluation"
+
+
+def install(extra: str) -> str:
+    """Return the command that installs an extra.
+
+    >>> install("lpips")
+    "pip install 'stereogenbench-data[lpips]'"
+    """
+    return f"pip install 'stereogenbench-data[{extra}]'"
+
+
+def fetch(weights: Weights, *, folder: Path | None) -> str:
+    """Return where to fetch a file of weights, under which terms, and where to put it."""
+    return (
+        f"fetch {weights.source} (licence: {weights.licence}) and put it at "
+        f"{_place(weights, folder)}"
+    )
+
+
+def _place(weights: Weights, folder: Path | None) -> Path:
+    place = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
+    return place / weights.file
 
 
 def weights_path(weights: Weights, *, folder: Path | None) -> Path:
@@ -39,13 +63,12 @@ def weights_path(weights: Weights, *, folder: Path | None) -> Path:
     Raises:
         ExtraError: If it is not there; it says where to fetch it and where to put it.
     """
-    place = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
-    path = place / weights.file
+    path = _place(weights, folder)
     if not path.is_file():
         raise ExtraError(
-            f"the weights of {weights.what} are not at {path}. Fetch {weights.source} "
-            f"(licence: {weights.licence}) and put it there as {weights.file}, or name the folder "
-            "that it is in."
+            f"the weights of {weights.what} are not at {path}: {fetch(weights, folder=folder)}, or "
+            f"name the folder that it is in (--weights). The packages it needs: "
+            f"{install(weights.extra)}."
         )
     return path
 

@@ -17,7 +17,10 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from stereogenbench_data import EvaluationError, EvaluationProtocol, evaluate
 from stereogenbench_data.evaluation.predictions import PredictionFault, frame_name, item_name
 from stereogenbench_data.schema.release import rgb_name
+from stereogenbench_data.storage.pack import pack
 from tests.evaluation.conftest import FRAMES, SIZE, rendered, write_pngs
+from tests.servers.fault import serving
+from tests.servers.tools import require_module
 
 
 def scored(index, predictions, protocol, **options):
@@ -423,3 +426,15 @@ def test_predictions_of_some_frames_suffice_where_these_are_scored(
     scores = scored(scored_index, folder, protocol, frames=("every", 2))
 
     assert [pair.frames for pair in scores.pairs] == [2, 2, 2]
+
+
+def test_packed_depth_and_a_url_score_as_the_tree(scored_index, right_views, tmp_path):
+    require_module("blosc2")
+    protocol = EvaluationProtocol(metrics=("psnr", "p_psnr"), size=SIZE)
+    shards = tmp_path / "shards"
+    pack(Path(scored_index.root), shards, workers=1, depth_codec="blosc2")
+    with serving(shards) as server:
+        places = [scored_index, shards, server.url]
+        results = [scored(place, right_views, protocol, frames=[0, 3]) for place in places]
+
+    assert numbers(results[0]) == numbers(results[1]) == numbers(results[2])

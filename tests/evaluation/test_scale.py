@@ -74,6 +74,7 @@ def test_few_gross_outliers_ruin_least_squares_and_are_left_out_by_the_filter(tr
     assert filtered.drift == pytest.approx(0.5, abs=1e-3)
     assert median.drift == pytest.approx(0.5, abs=0.01)
     assert (filtered.pixels, filtered.outliers) == (588, 12)
+    assert filtered.outlier_ratio == 12 / 600
     assert filtered.valid_ratio == pytest.approx(588 / 600)
     assert filtered.answered_ratio == 1
 
