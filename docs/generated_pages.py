@@ -59,7 +59,8 @@ def _parameters(command: Any) -> list[str]:
         if parameter.param_type_name == "argument":
             names = f"`{parameter.name.upper()}`"
         default = parameter.default
-        shown = "" if default in (None, False, ()) or callable(default) else f"`{default}`"
+        is_shown = default is not None and default is not False and default != ()
+        shown = f"`{default}`" if is_shown and not callable(default) else ""
         if parameter.required:
             shown = "required"
         rows.append(f"| {names} | {_cell(getattr(parameter, 'help', '') or '')} | {shown} |")

@@ -243,10 +243,18 @@ def _depth(index: SceneIndex) -> list[str]:
     formats = sorted(set(index.column("depth_pixel_format").ravel().tolist()))
     sources = set(np.asarray(index.column("depth_unit_source")).ravel().tolist())
     told = "each file's own tag" if sources == {"tag"} else "each file's tag, else 0.1 m"
+    care = [
+        "Decode them in their own pixel format: a decoder that gives 8 bits destroys them.",
+    ]
+    if "blosc2" in codecs:
+        care = [
+            "They are blosc2 frames (`.b2frame`), which no decoder of videos reads: `StereoPairs`",
+            "takes them as they are, and `stereogenbench unpack` turns them back into videos.",
+        ]
     return [
-        f"Depth videos hold whole numbers ({', '.join(codecs)}, {', '.join(formats)}).",
+        f"Depth files hold whole numbers ({', '.join(codecs)}, {', '.join(formats)}).",
         f"Metres along the optical axis are the number times {told}",
         f"({', '.join(f'{unit:g}' for unit in units)} m here); 0 and the largest number mean that",
-        "nothing was measured. Decode them in their own pixel format: a decoder that gives 8 bits",
-        "destroys them.",
+        "nothing was measured.",
+        *care,
     ]

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from stereogenbench_data.bridges.croissant_check_fields import check_fields
 from stereogenbench_data.bridges.croissant_check_files import (
     Descriptor,
     check_files,
@@ -42,6 +43,15 @@ REQUIRED: Final = (
     "name", "description", "url", "license", "creator", "version", "datePublished", "citeAs",
     "keywords", "distribution", "recordSet",
 )  # fmt: skip
+RAI_ONCE: Final = (
+    "dataCollection", "dataCollectionMissingData", "dataCollectionRawData",
+    "dataImputationProtocol", "annotationsPerItem", "dataSocialImpact",
+    "dataReleaseMaintenancePlan",
+)  # fmt: skip
+"""Those of which mlcroissant keeps the first value alone."""
+PROV_NAMES: Final = frozenset(
+    {"wasGeneratedBy", "wasDerivedFrom", "wasAttributedTo", "type", "label"}
+)
 _KNOWN: Final = frozenset(
     {
         *CONTEXT, *REQUIRED, "affiliation", "contentSize", "contentUrl", "encodingFormat",
@@ -71,7 +81,7 @@ def check_descriptor(path: Path, *, mapping: Mapping[str, Path] | None = None) -
         raise DescriptorError(f"{path}: is no JSON object but a {type(node).__name__}.")
     told = Descriptor(node, path.parent, mapping or {})
     try:
-        for check in (_context, _properties, _ids, check_files, check_sets, _records):
+        for check in (_context, _properties, _ids, check_files, check_sets, _records, check_fields):
             check(told)
     except (AttributeError, TypeError) as error:
         told.say(path.name, f"is not shaped as a descriptor is ({error}): write it anew")
@@ -94,18 +104,33 @@ def _context(told: Descriptor) -> None:
                 f"{term} is {context.get(term)!r} and must be {meaning!r}: with another version's "
                 "context, files are not found and no record is loaded",
             )
+    if "value" in context:
+        told.say(
+            "@context", "defines value: constant fields are then read as nothing; leave it out"
+        )
 
 
 def _properties(told: Descriptor) -> None:
     for name in (*REQUIRED, *REQUIRED_RAI):
-        if name not in told.node:
-            told.say(name, "is missing")
+        if told.node.get(name) in (None, "", [], {}):
+            told.say(name, "is missing" if name not in told.node else "is empty")
+    for local in RAI_ONCE:
+        if len(listed(told.node.get(f"rai:{local}"))) > 1:
+            told.say(
+                f"rai:{local}", "has several values, of which readers keep the first: join them"
+            )
     if not _VERSION.fullmatch(str(told.node.get("version", ""))):
         told.say("version", f"is {told.node.get('version')!r}, and must be MAJOR.MINOR.PATCH")
+    _known_names(told)
+
+
+def _known_names(told: Descriptor) -> None:
     for place, name in _names(told.node, at=""):
         prefix, _, local = name.rpartition(":")
         if prefix == "rai" and local not in RAI_NAMES:
             told.say(f"{place}{name}", "is no property of RAI 1.0: is it misspelt?")
+        elif prefix == "prov" and local not in PROV_NAMES:
+            told.say(f"{place}{name}", f"is none of {', '.join(sorted(PROV_NAMES))}: misspelt?")
         elif not prefix and name not in _KNOWN:
             told.say(f"{place}{name}", "is no property of Croissant 1.1: is it misspelt?")
         elif prefix and prefix not in {"rai", "prov", "sc", "cr", "dct"}:

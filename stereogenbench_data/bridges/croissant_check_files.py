@@ -11,7 +11,7 @@ from typing import Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from stereogenbench_data.bridges.croissant_terms import PARQUET, TAR, Node
+from stereogenbench_data.bridges.croissant_terms import PARQUET, TAR, TEXT, Node
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.storage.tar import read_members
 
@@ -28,6 +28,7 @@ class Descriptor:
     folder: Path
     mapping: Mapping[str, Path]
     problems: list[str] = field(default_factory=list)
+    _members: dict[str, list[str] | None] = field(default_factory=dict)
 
     def say(self, where: str, what: str) -> None:
         """Note what is wrong, and where."""
@@ -54,9 +55,17 @@ class Descriptor:
             return self.mapping[name]
         return None if "://" in url else self.folder / url
 
+    def members(self, name: str) -> list[str] | None:
+        """Return the files in a container, None where it is not at hand or is no container."""
+        if name not in self._members:
+            self._members[name] = _members(self, name)
+        return self._members[name]
+
 
 def check_files(told: Descriptor) -> None:
     """Check that files exist, are those that were described, and have pinned addresses."""
+    for name in told.mapping.keys() - told.files.keys():
+        told.say(name, "is mapped to a place, and is no file of the descriptor")
     for name, file in told.files.items():
         if file.get("@type") != "cr:FileObject":
             continue
@@ -68,6 +77,8 @@ def check_files(told: Descriptor) -> None:
             told.say(name, f"has the sha256 {file.get('sha256')!r}, and must have 64 hex digits")
         if _MOVING.search(str(file["contentUrl"])) and not is_repository:
             told.say(name, f"{file['contentUrl']} is a branch, which moves: pin a revision")
+        if name.endswith(".tar") and TAR not in listed(file["encodingFormat"]):
+            told.say(name, f"has the encodingFormat {file['encodingFormat']!r}, and must be {TAR}")
         path = told.local(file)
         if path is None or is_repository:
             continue
@@ -110,13 +121,25 @@ def check_sets(told: Descriptor) -> None:
         for container in containers:
             if container not in told.files:
                 told.say(name, f"is contained in {container!r}, which is not in the descriptor")
-        found = [_members(told, each) for each in containers if each in told.files]
-        if any(members is None for members in found) or not found:
-            continue
-        names = [member for members in found for member in members or ()]
-        patterns = [str(each) for each in listed(files["includes"])]
-        if not any(fnmatch.fnmatch(each, pattern) for each in names for pattern in patterns):
-            told.say(name, f"includes {', '.join(patterns)}, which matches none of its files")
+        if files_of_set(told, name) == []:
+            patterns = ", ".join(str(each) for each in listed(files["includes"]))
+            told.say(name, f"includes {patterns}, which matches none of its files")
+
+
+def files_of_set(told: Descriptor, name: str) -> list[str] | None:
+    """Return the paths of a set's files in what holds them, None where that is not at hand."""
+    files = told.files.get(name, {})
+    containers = [_container(each) for each in listed(files.get("containedIn"))]
+    found = [told.members(each) for each in containers if each in told.files]
+    if any(members is None for members in found) or not found:
+        return None
+    patterns = [str(each) for each in listed(files.get("includes"))]
+    return [
+        member
+        for members in found
+        for member in members or ()
+        if any(fnmatch.fnmatch(member, pattern) for pattern in patterns)
+    ]
 
 
 def _container(node: Node) -> str:
@@ -134,7 +157,8 @@ def _members(told: Descriptor, name: str) -> list[str] | None:
         return [each.relative_to(path).as_posix() for each in path.rglob("*") if each.is_file()]
     if not path.is_file():
         return None
-    if TAR in listed(file.get("encodingFormat")):
+    encodings = listed(file.get("encodingFormat"))
+    if TAR in encodings:
         try:
             with path.open("rb") as opened:
                 size = path.stat().st_size
@@ -142,7 +166,7 @@ def _members(told: Descriptor, name: str) -> list[str] | None:
         except StorageError as error:
             told.say(name, str(error))
             return None
-    return path.read_text().splitlines()
+    return path.read_text().splitlines() if TEXT in encodings else None
 
 
 def columns_at_hand(told: Descriptor) -> dict[str, list[str]]:

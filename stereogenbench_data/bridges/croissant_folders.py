@@ -7,7 +7,13 @@ nothing depends on how many scenes there are.
 from typing import Any, Final
 
 from stereogenbench_data.bridges.croissant_enumerations import enumerations
-from stereogenbench_data.bridges.croissant_media import text_records, video_records
+from stereogenbench_data.bridges.croissant_media import (
+    ENCODINGS,
+    UNKNOWN_ENCODING,
+    suffixes_of,
+    text_records,
+    video_records,
+)
 from stereogenbench_data.bridges.croissant_terms import (
     GIT,
     GIT_CHECKSUM,
@@ -31,26 +37,18 @@ REPOSITORY: Final = "repository"
 _KEY: Final = r"^.*?((?:train|eval)/.+?/[^/.]+?)(?:/[^/]*\.[^/]*)?$"
 """The scene of a file in a folder: it leaves a key as it is, so that a join may apply it twice."""
 
-_FILES: Final[dict[str, tuple[str | list[str], str, str]]] = {
-    "scene-files": ("application/json", BASELINE_JSON, "Intrinsics of the scenes."),
-    "pair-files": ("application/json", BASELINE_JSON, "Baselines of the pairs."),
-    "description-files": (TEXT, DESCRIPTION_TXT, "Descriptions."),
-    "rgb-files": (["video/mp4", TEXT], "cam_??_rgb.mp4", "RGB videos."),
-    "depth-files": (["video/x-matroska", TEXT], "cam_??_depth.mkv", "Depth videos."),
-    "baseline-files": (TEXT, BASELINE_JSON, "Intrinsics and baselines, as text."),
-    "trajectory-files": (TEXT, TRAJECTORY_JSON, "Poses, as text."),
-    "scene_complete-files": (TEXT, COMPLETE_JSON, "Marks of completion, as text."),
-}
-"""Id: encodings, name and meaning. mlcroissant has no reader of videos: as text they are bytes."""
+_VIDEOS: Final = {"rgb": "RGB videos.", "depth": "Depth videos."}
 
 
 def folder_nodes(index: SceneIndex | None, *, repository_url: str) -> tuple[list[Node], list[Node]]:
     """Return the files and the record sets of a tree in the released layout.
 
     Args:
-        index: Of such a tree, for the names of families and maps; None for those of the paper.
+        index: Of such a tree, for the names of families, maps and files; None for those of the
+            paper.
         repository_url: URL of the git repository that holds it.
     """
+    suffixes = suffixes_of(index)
     files = [
         file_object(
             REPOSITORY,
@@ -62,18 +60,41 @@ def folder_nodes(index: SceneIndex | None, *, repository_url: str) -> tuple[list
     ]
     files += [
         file_set(name, within=[REPOSITORY], encoding=encoding, includes=f"**/{file}", about=about)
-        for name, (encoding, file, about) in _FILES.items()
+        for name, (encoding, file, about) in _file_sets(suffixes).items()
     ]
     records = [
         *enumerations(index),
         _scenes(),
         _pairs(),
         _descriptions(),
-        video_records("rgb", key=_KEY),
-        video_records("depth", key=_KEY),
+        *(video_records(kind, key=_KEY) for kind in suffixes),
         *text_records(scene_of=_KEY),
     ]
     return files, records
+
+
+def _file_sets(suffixes: dict[str, str]) -> dict[str, tuple[str | list[str], str, str]]:
+    """Return id to encodings, name and meaning.
+
+    mlcroissant has no reader of videos: as text they are bytes.
+    """
+    videos = {
+        f"{kind}-files": (
+            [ENCODINGS.get(suffix, UNKNOWN_ENCODING), TEXT],
+            f"cam_??_{kind}.{suffix}",
+            _VIDEOS[kind],
+        )
+        for kind, suffix in suffixes.items()
+    }
+    return {
+        "scene-files": ("application/json", BASELINE_JSON, "Intrinsics of the scenes."),
+        "pair-files": ("application/json", BASELINE_JSON, "Baselines of the pairs."),
+        "description-files": (TEXT, DESCRIPTION_TXT, "Descriptions."),
+        **videos,
+        "baseline-files": (TEXT, BASELINE_JSON, "Intrinsics and baselines, as text."),
+        "trajectory-files": (TEXT, TRAJECTORY_JSON, "Poses, as text."),
+        "scene_complete-files": (TEXT, COMPLETE_JSON, "Marks of completion, as text."),
+    }
 
 
 def _in_json(files: str, path: str, *, then: str | None = None) -> dict[str, Any]:

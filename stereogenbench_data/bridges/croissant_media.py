@@ -1,5 +1,7 @@
 """Record sets of files that both layouts have: videos as bytes, JSON files as text."""
 
+from typing import Final
+
 from stereogenbench_data.bridges.croissant_terms import (
     Node,
     field,
@@ -8,12 +10,31 @@ from stereogenbench_data.bridges.croissant_terms import (
     refers_to,
 )
 from stereogenbench_data.schema.release import BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON
+from stereogenbench_data.storage.index import SceneIndex
+
+RELEASED_SUFFIXES: Final = {"rgb": "mp4", "depth": "mkv"}
+ENCODINGS: Final = {"mp4": "video/mp4", "mkv": "video/x-matroska"}
+"""Suffix of videos to media type; depth packed by blosc2 has none of its own."""
+UNKNOWN_ENCODING: Final = "application/octet-stream"
 
 TEXT_FILES = {
     "baseline": (BASELINE_JSON, "Intrinsics and baselines"),
     "trajectory": (TRAJECTORY_JSON, "Poses"),
     "scene_complete": (COMPLETE_JSON, "Marks of completion"),
 }
+
+
+def suffixes_of(index: SceneIndex | None) -> dict[str, str]:
+    """Return how names end by kind of video, "rgb" and "depth", of the kinds that there are.
+
+    A part of the release may hold one kind alone, and depth may be packed. Without an index it is
+    the release.
+    """
+    if index is None:
+        return dict(RELEASED_SUFFIXES)
+    names = index.scene(0).held_videos
+    ends = {kind: [name for name in names if f"_{kind}." in name] for kind in RELEASED_SUFFIXES}
+    return {kind: found[0].rpartition(".")[2] for kind, found in ends.items() if found}
 
 
 def video_records(kind: str, *, key: str) -> Node:

@@ -9,7 +9,13 @@ from collections.abc import Sequence
 from typing import Final
 
 from stereogenbench_data.bridges.croissant_enumerations import enumerations
-from stereogenbench_data.bridges.croissant_media import text_records, video_records
+from stereogenbench_data.bridges.croissant_media import (
+    ENCODINGS,
+    UNKNOWN_ENCODING,
+    suffixes_of,
+    text_records,
+    video_records,
+)
 from stereogenbench_data.bridges.croissant_tables import (
     MOST_SHARD_FILES,
     PAIRS,
@@ -37,8 +43,8 @@ from stereogenbench_data.storage.index import SceneIndex
 MOST_MEDIA_BYTES: Final = 1_000_000_000
 """Beyond so many bytes of shards, record sets of files are bound to the smallest of each family."""
 
-_KEY: Final = r"^(.+?)(?:\.cam_\d{2}_rgb\.mp4)?$"
-"""The scene of an RGB file in a shard. A key is left as it is: a join may apply the regex twice."""
+_KEY: Final = r"^(.+?)(?:\.cam_\d{{2}}_{kind}\.{suffix})?$"
+"""The scene of a video in a shard. A key is left as it is: a join may apply the regex twice."""
 
 
 def packed_nodes(
@@ -52,7 +58,7 @@ def packed_nodes(
         data_url: URL or relative path of the folder of shards.
         tables_url: URL or relative path of the folder of tables.
     """
-    bound, suffix = _bound_shards(index), _depth_suffix(index)
+    bound, suffixes = _bound_shards(index), suffixes_of(index)
     is_listed = len(index.shards) > MOST_SHARD_FILES
     files = [
         file_object(
@@ -75,7 +81,7 @@ def packed_nodes(
         )
         for shard in (bound if is_listed else sorted(index.shards))
     ]
-    files += _file_sets(bound, depth_suffix=suffix)
+    files += _file_sets(bound, suffixes)
     if is_listed:
         files.append(_listed_shards())
     records = [
@@ -85,7 +91,7 @@ def packed_nodes(
         _pairs(),
         _shards(),
         _descriptions(),
-        *_media(depth_suffix=suffix),
+        *_media(suffixes),
     ]
     return files, records
 
@@ -111,18 +117,14 @@ def _bound_shards(index: SceneIndex) -> list[str]:
     return sorted(smallest.values())
 
 
-def _depth_suffix(index: SceneIndex) -> str:
-    """Return how depth members' names end: ``mkv`` as released."""
-    names = index.scene(0).members
-    return next(name.rpartition(".")[2] for name in names if name.startswith("cam_00_depth."))
-
-
-def _file_sets(shards: list[str], *, depth_suffix: str) -> list[Node]:
-    depth_kind = _DEPTH_KINDS.get(depth_suffix, "application/octet-stream")
+def _file_sets(shards: list[str], suffixes: dict[str, str]) -> list[Node]:
+    kinds = {kind: ENCODINGS.get(suffix, UNKNOWN_ENCODING) for kind, suffix in suffixes.items()}
     sets: dict[str, tuple[str | list[str], str, str]] = {
-        "rgb-files": ("video/mp4", "**/*.cam_??_rgb.mp4", "RGB videos."),
-        "depth-files": (depth_kind, f"**/*.cam_??_depth.{depth_suffix}", "Depth videos."),
-        "media-files": (["video/mp4", depth_kind], "**/*.cam_??_*.*", "All videos, by name."),
+        f"{kind}-files": (kinds[kind], f"**/*.cam_??_{kind}.{suffix}", _VIDEOS[kind])
+        for kind, suffix in suffixes.items()
+    }
+    sets |= {
+        "media-files": (list(kinds.values()), "**/*.cam_??_*.*", "All videos, by name."),
         "baseline-files": ("application/json", f"**/*.{BASELINE_JSON}", "Intrinsics, baselines."),
         "trajectory-files": ("application/json", f"**/*.{TRAJECTORY_JSON}", "Poses."),
         "scene_complete-files": ("application/json", f"**/*.{COMPLETE_JSON}", "Completion marks."),
@@ -133,7 +135,7 @@ def _file_sets(shards: list[str], *, depth_suffix: str) -> list[Node]:
     ]
 
 
-_DEPTH_KINDS: Final = {"mkv": "video/x-matroska"}
+_VIDEOS: Final = {"rgb": "RGB videos.", "depth": "Depth videos."}
 
 
 def _listed_shards() -> Node:
@@ -265,7 +267,7 @@ def _descriptions() -> Node:
     return record_set("descriptions", "What a model says of every scene.", fields)
 
 
-def _media(*, depth_suffix: str) -> list[Node]:
+def _media(suffixes: dict[str, str]) -> list[Node]:
     """Return the record sets of files in shards."""
     names = record_set(
         "media_files", "Every video by name.", [
@@ -276,10 +278,9 @@ def _media(*, depth_suffix: str) -> list[Node]:
             field("media_files/file", "sc:Text", "Its name.", **of_file("media-files", "filename")),
         ],
     )  # fmt: skip
-    depth_key = _KEY.replace("rgb", "depth").replace("mp4", depth_suffix)
     videos = [
-        video_records("rgb", key=_KEY),
-        video_records("depth", key=depth_key),
+        video_records(kind, key=_KEY.format(kind=kind, suffix=suffix))
+        for kind, suffix in suffixes.items()
     ]
     texts = text_records(scene_of=r"^(.+)\.{file}$")
     return [names, *videos, *texts]

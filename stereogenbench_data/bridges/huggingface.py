@@ -1,15 +1,23 @@
 """Stereo samples as a Hugging Face ``datasets.IterableDataset``, and the features of raw shards."""
 
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, Unpack
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, Final, Unpack
 
 from stereogenbench_data.bridges.arrays import to_arrays
 from stereogenbench_data.bridges.scene_bytes import SampleOptions, samples_of
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.errors import ExtraError, SelectionError
+from stereogenbench_data.errors import ExtraError, SelectionError, StorageError
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS
 from stereogenbench_data.samples.load import Sample
-from stereogenbench_data.schema.release import DESCRIPTION_TXT, METADATA_FILES, VIDEO_FILES
+from stereogenbench_data.schema.release import (
+    DESCRIPTION_TXT,
+    METADATA_FILES,
+    PACKED_DEPTH_NAMES,
+    VIDEO_FILES,
+)
+
+_DEPTH_NAMES: Final[dict[str, Mapping[str, str]]] = {"mkv": {}, "b2frame": PACKED_DEPTH_NAMES}
+"""Suffix of depth members to their names by their released ones."""
 
 if TYPE_CHECKING:
     from datasets import Features
@@ -27,7 +35,8 @@ def iterable(data: Data, **options: Any) -> "SampleIterable":
 
     ``shuffle(seed=0, buffer_size=1)`` orders the scenes anew; a larger buffer holds whole samples
     in memory. The loader of `StereoPairs` mixes scenes without one, and resumes without decoding
-    again what was seen.
+    again what was seen. ``set_epoch``, also of what was derived, draws random frames and transforms
+    anew.
 
     Args:
         data: As for `StereoPairs`.
@@ -52,11 +61,18 @@ def features(*, depth_suffix: str = "mkv") -> "Features":
     bytes, JSON as parsed.
 
     Args:
-        depth_suffix: How the names of depth members end: "mkv" as released.
+        depth_suffix: How the names of depth members end: "mkv" as released, "b2frame" in shards
+            that were packed with ``--depth-codec blosc2``.
 
     Raises:
+        SelectionError: If depth has no such suffix.
         ExtraError: If ``datasets`` is not installed.
     """
+    names = _DEPTH_NAMES.get(depth_suffix)
+    if names is None:
+        raise SelectionError(
+            f"depth_suffix is {depth_suffix!r}; there are {', '.join(map(repr, _DEPTH_NAMES))}."
+        )
     try:
         from datasets import Features, Json, Value
     except ImportError as error:
@@ -65,7 +81,7 @@ def features(*, depth_suffix: str = "mkv") -> "Features":
         name: Value("string") if name == DESCRIPTION_TXT else Json() for name in METADATA_FILES
     }
     for name in VIDEO_FILES:
-        kinds[name.replace("depth.mkv", f"depth.{depth_suffix}")] = Value("binary")
+        kinds[names.get(name, name)] = Value("binary")
     return Features(kinds | {"__key__": Value("string"), "__url__": Value("string")})
 
 
@@ -105,6 +121,12 @@ class _RowDecoder:
         return {name: [sample[name] for sample in found] for name in self._fields}
 
     def _samples(self, row: dict[str, Any]) -> list[Sample]:
+        absent = [name for name in VIDEO_FILES if name in row and row[name] is None]
+        if absent:
+            raise StorageError(
+                f"{row['__key__']}: the shard has no {', '.join(absent)}. Shards that were packed "
+                'with --depth-codec blosc2 are read with features(depth_suffix="b2frame").'
+            )
         found = samples_of(row["__key__"], row, fields=self._fields, epoch=0, options=self._options)
         return [to_arrays(sample) for sample in found]
 

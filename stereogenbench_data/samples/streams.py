@@ -149,8 +149,7 @@ class Streams:
         """Give an open video, to be read within; it stays open unless it fails."""
         self._drop_inherited()
         with self._lock:
-            name = scene.held_name(name)
-            member = scene.members[name]
+            member, name = scene.member(name), scene.held_name(name)
             place = (member.path, member.offset)
             if place not in self._open:
                 while len(self._open) >= self._limit:

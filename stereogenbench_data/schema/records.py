@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.errors import SchemaError, StorageError
 from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
     PACKED_DEPTH_NAMES,
@@ -260,6 +260,21 @@ class Scene:
     def held_name(self, name: str) -> str:
         """Return by what name ``members`` has one of the release's files: depth may be packed."""
         return name if name in self.members else PACKED_DEPTH_NAMES.get(name, name)
+
+    def member(self, name: str) -> Member:
+        """Return where one of the release's files lies.
+
+        Raises:
+            StorageError: If the index does not have it: a download may hold some cameras alone.
+        """
+        found = self.members.get(self.held_name(name))
+        if found is None:
+            there = ", ".join(self.held_videos) or "no video"
+            raise StorageError(
+                f"{self.id.key}: {name} is not among its files; there are {there}. Ask for these, "
+                "or download the others too."
+            )
+        return found
 
     @property
     def held_videos(self) -> tuple[str, ...]:

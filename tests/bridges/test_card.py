@@ -13,6 +13,7 @@ import yaml
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import MARK, card, write_card
 from stereogenbench_data.errors import DescriptorError
+from stereogenbench_data.storage.pack import pack
 from tests.servers.fault import serving
 from tests.servers.hub import REPOSITORY, HubHandler
 from tests.servers.tools import require_module
@@ -109,6 +110,19 @@ def test_a_card_is_written_again_but_no_other_text_is_replaced(tmp_path):
     (tmp_path / "README.md").write_text("mine")
     with pytest.raises(DescriptorError, match="was not made by this package"):
         write_card(index, tmp_path, repository="a/b")
+
+
+def test_packed_depth_is_told_with_its_features(small_release, tmp_path):
+    require_module("blosc2")
+    pack(small_release, tmp_path / "shards", workers=1, depth_codec="blosc2")
+
+    text = card(SceneIndex.open(tmp_path / "shards"), repository="a/b")
+
+    head = yaml.safe_load(text.split("---")[1])
+    names = [each["name"] for each in head["dataset_info"][0]["features"]]
+    assert "cam_05_depth.b2frame" in names
+    assert "cam_05_depth.mkv" not in names
+    assert "`stereogenbench unpack` turns them back into videos" in text
 
 
 def test_a_tree_of_folders_has_no_card(small_release):

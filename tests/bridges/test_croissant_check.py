@@ -122,7 +122,7 @@ MUTATIONS = {
         lambda d: d.update({"prov:wasDerivedfrom": "x"}), "prov:wasDerivedfrom: is none of label",
     ),
     "constant values in the context": (
-        lambda d: d["@context"].update(value="cr:value"), "constant fields are then read as nothing",
+        lambda d: d["@context"].update(value="cr:value"), "constant fields are then read as",
     ),
     "tar of another kind": (
         lambda d: first_tar(d).update(encodingFormat="application/tar"),

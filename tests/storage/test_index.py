@@ -177,6 +177,14 @@ def test_a_path_that_could_leave_the_root_is_refused(scenes, tmp_path, path):
         SceneIndex.from_scenes([bad], tmp_path)
 
 
+@pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/b", "..", ""])
+def test_a_file_name_that_could_leave_its_scene_is_refused(scenes, tmp_path, name):
+    bad = dataclasses.replace(scenes[0], members={name: Member("train/a.tar", 0, 1)})
+
+    with pytest.raises(StorageError, match="is no path inside the data's root"):
+        SceneIndex.from_scenes([bad], tmp_path)
+
+
 def written(scenes, root):
     SceneIndex.from_scenes(scenes, root).write(root / "index.parquet")
     return root / "index.parquet"
@@ -208,6 +216,12 @@ def with_path(path):
         (lambda table, head: head["shards"].update(x=3), "description of itself was altered"),
         (
             lambda table, head: head["shards"].update(x={"size": "1", "sha256": "", "members": 1}),
+            "description of itself was altered",
+        ),
+        (
+            lambda table, head: head["shards"].update(
+                {"../x.tar": {"size": 1, "sha256": "", "members": 1}}
+            ),
             "description of itself was altered",
         ),
         (lambda table, head: table.drop_columns(["frames"]), r"not those of an index \(see frames"),
