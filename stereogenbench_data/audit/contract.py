@@ -18,7 +18,8 @@ from typing import Final
 
 import numpy as np
 
-from stereogenbench_data.audit.contract_search import SceneDiagnosis, diagnose_scene
+from stereogenbench_data.audit.contract_diagnosis import SceneDiagnosis
+from stereogenbench_data.audit.contract_search import diagnose_scene
 from stereogenbench_data.audit.contract_verdict import Verdict, grouped, judge
 from stereogenbench_data.audit.contract_views import SceneViews
 from stereogenbench_data.errors import SelectionError

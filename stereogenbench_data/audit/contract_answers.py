@@ -7,9 +7,21 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from stereogenbench_data.audit.contract_diagnosis import (
+    LEAST_LOG_SCALE,
+    LEAST_OFFSET_PX,
+    Rival,
+    SceneDiagnosis,
+    allowed_log_scale,
+)
 from stereogenbench_data.audit.contract_hypotheses import Question
-from stereogenbench_data.audit.contract_search import LEAST_OFFSET_PX, Rival, SceneDiagnosis
-from stereogenbench_data.audit.contract_statistics import LEAST_ERRORS, Gain, interval, pooled
+from stereogenbench_data.audit.contract_statistics import (
+    LEAST_DB,
+    LEAST_ERRORS,
+    Gain,
+    interval,
+    pooled,
+)
 
 Status = Literal["confirmed", "wrong", "cannot tell", "does not matter"]
 
@@ -27,6 +39,10 @@ _WORDS: Final[dict[Any, str]] = {
 }
 _BIAS: Final = 0.002
 """Share by which units may be off however many pixels agree: interpolation, rounding of depth."""
+_BIAS_PX: Final = 0.05
+"""The same in pixels of disparity; measured up to that on small pictures with little parallax."""
+_OFFSET_SPREAD: Final = 0.1
+"""Share by which one camera's shift may differ from pair to pair."""
 _VAGUE: Final = 0.05
 """Half the 95 % interval of log(unit) beyond which the unit is not told."""
 
@@ -94,6 +110,8 @@ def structure_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     note = ""
     if untested and question == "frame_lag":
         note = f"not tested, for want of frames: {', '.join(map(said, untested))}"
+    if nearest is not None and nearest.by_shape and nearest.mean_db < LEAST_DB:
+        note = "told by how disparity grows towards the corners, not by the dB"
     if best == declared and close:
         told = ", ".join(said(answer) for answer in [best, *close])
         return Answer(topic, said(declared), "", "cannot tell", nearest, f"fit alike: {told}")
@@ -108,7 +126,8 @@ def structure_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     if declared in close:
         note += ", each with its own unit"
         return Answer(topic, said(declared), "", "cannot tell", rivals[declared], note)
-    return Answer(topic, said(declared), said(best), "wrong", rivals.get(declared), note)
+    found = " or ".join(said(answer) for answer in [best, *close])
+    return Answer(topic, said(declared), found, "wrong", rivals.get(declared), note)
 
 
 def _behind(scenes: Sequence[SceneDiagnosis], rival: Rival) -> Gain:
@@ -129,6 +148,9 @@ def said(answer: Any) -> str:
 def common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     """Return the unit that scenes agree on, weighted by how sure each is."""
     told = [scene for scene in scenes if math.isfinite(scene.scale_error)]
+    coarse = max(allowed_log_scale(scene.depth_step) for scene in scenes)
+    seen_px = max(scene.disparity_px for scene in scenes)
+    bias = coarse if coarse > LEAST_LOG_SCALE else max(_BIAS, _BIAS_PX / seen_px)
     if not told:
         return Unit(scenes[0].unit_m / scenes[0].scale, math.inf)
     logs = np.array([math.log(scene.unit_m / scene.scale) for scene in told])
@@ -138,7 +160,7 @@ def common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     if len(told) > 2:
         _, low, high = interval([float(log) for log in logs])
         half = max(half, (high - low) / 2)
-    return Unit(math.exp(float(weights @ logs)), math.hypot(half, _BIAS))
+    return Unit(math.exp(float(weights @ logs)), math.hypot(half, bias))
 
 
 def length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer, Answer]:
@@ -147,8 +169,10 @@ def length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer
     where = {"tag": "by the files' tag", "default": "by default", "user": "as given"}
     declared = f"{first.unit_m:g} m, {where.get(first.unit_source, 'tags unreadable')}"
     note = first.problem
-    if not note and unit.uncertainty > _VAGUE:
-        note = f"known to {unit.uncertainty:.0%} alone: too little parallax"
+    if not note and unit.uncertainty > _VAGUE and not changes(first, "scale"):
+        coarse = allowed_log_scale(first.depth_step) > _VAGUE
+        why = "depth is stored in too large steps" if coarse else "too little parallax"
+        note = f"known to {unit.uncertainty:.0%} alone: {why}"
     if note:
         blank = Answer(_UNIT, declared, "", "cannot tell", note=note)
         return blank, _focal(first, status="cannot tell", note=note)
@@ -159,6 +183,11 @@ def length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer
         return _wrong_length(scenes, unit, declared=declared, found=found)
     if first.unit_source == "unreadable":
         return Answer(_UNIT, declared, found, "wrong"), _focal(first, status="cannot tell")
+    off = abs(math.log(unit.metres / first.unit_m))
+    if off > LEAST_LOG_SCALE and allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE:
+        note = f"{found} fits best; depth is stored in too large steps to tell"
+        unsure = Answer(_UNIT, declared, "", "cannot tell", note=note)
+        return unsure, _focal(first, status="cannot tell", note=note)
     known = Answer(_UNIT, declared, found, "confirmed")
     return known, _focal(first, status="confirmed", note="with the declared unit")
 
@@ -169,6 +198,11 @@ def _wrong_length(
     """Return the same where disparity is off by a factor."""
     first = scenes[0]
     gain = pooled([scene.gain for scene in scenes])
+    if kind_explains_scale(scenes):
+        note = f"{found} if depth is along {said(first.best.kind)}, as declared if it is not"
+        return Answer(_UNIT, declared, "", "cannot tell", gain, note), _focal(
+            first, status="cannot tell"
+        )
     reading = _focal_reading(scenes, unit)
     if reading is None:
         note = "no other reading of the sensor explains the factor"
@@ -183,6 +217,21 @@ def _wrong_length(
     return (
         Answer(_UNIT, declared, found, "wrong", gain, f"or the focal length is {reading}"),
         Answer(_FOCAL, _WIDTH, "", "cannot tell", note=f"{reading} is {alike}"),
+    )
+
+
+def kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
+    """Tell whether the other kind of depth explains all that a scale does, and is not ruled out."""
+    first = scenes[0]
+    if first.best != first.declared or first.changed != "scale":
+        return False
+    if any(_behind(scenes, rival).is_clear for rival in first.rivals if rival.question == "kind"):
+        return False
+    return all(
+        abs(math.log(scene.other_kind_scale))
+        <= allowed_log_scale(scene.depth_step) + LEAST_ERRORS * min(scene.scale_error, 1.0)
+        for scene in scenes
+        if scene.other_kind_scale > 0
     )
 
 
@@ -241,7 +290,9 @@ def offset_words(offsets_px: dict[tuple[int, int], float]) -> str:
             if camera in pair
         ]
         others = [px for pair, px in offsets_px.items() if camera not in pair]
-        alike = bool(shifts) and max(shifts) - min(shifts) < LEAST_OFFSET_PX
+        alike = bool(shifts) and max(shifts) - min(shifts) < max(
+            LEAST_OFFSET_PX, _OFFSET_SPREAD * abs(float(np.mean(shifts)))
+        )
         if alike and max(map(abs, others), default=0.0) < LEAST_OFFSET_PX:
             return f"camera {camera}'s picture is {np.mean(shifts):+.2f} px to the right"
     return ", ".join(f"{px:+.2f} px for {a}-{b}" for (a, b), px in offsets_px.items())

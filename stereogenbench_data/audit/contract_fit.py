@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float32, Float64
 
 from stereogenbench_data.audit.contract_hypotheses import Structure
 from stereogenbench_data.audit.contract_scoring import Pair, Scored, differences, scored
@@ -25,10 +25,13 @@ _LOG_RANGE: Final = 32.0
 _STEPS: Final = 10
 _LARGEST_STEP_PX: Final = 1.0
 _DRAWS: Final = 300
+_FEWEST_USABLE: Final = 10
+NEAR_PX: Final = 3 * _TOLERANCE_PX
+"""Matches that a prediction misses by more take no part in refining it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Term:
+class Term:
     """A shot with the disparity that a structure predicts for the pixels of which it tells.
 
     ``large_px`` is the 90th percentile of the predicted sizes.
@@ -42,12 +45,13 @@ class _Term:
 
     @property
     def pair(self) -> Pair:
+        """The two files."""
         return self.shot.left, self.shot.right
 
 
 def fitted(views: SceneViews, shots: Sequence[Shot], structure: Structure, *, free: Free) -> Scored:
     """Return a structure with the scale and offsets that explain the pictures best."""
-    terms = _terms(views, shots, structure)
+    terms = fit_terms(views, shots, structure)
     if free == "nothing" or not terms:
         return scored(views, shots, structure)
     scale, offsets_px = _start(terms, free=free)
@@ -55,7 +59,8 @@ def fitted(views: SceneViews, shots: Sequence[Shot], structure: Structure, *, fr
     return scored(views, shots, structure, scale=scale, offsets_px=offsets_px, scale_error=error)
 
 
-def _terms(views: SceneViews, shots: Sequence[Shot], structure: Structure) -> list[_Term]:
+def fit_terms(views: SceneViews, shots: Sequence[Shot], structure: Structure) -> list[Term]:
+    """Return the shots of which a structure tells anything, with what it predicts."""
     terms = []
     for shot in shots:
         predicted = views.predicted(shot, structure)
@@ -63,11 +68,11 @@ def _terms(views: SceneViews, shots: Sequence[Shot], structure: Structure) -> li
             disparity_px, known = predicted
             told_px = disparity_px[known]
             large_px = float(np.percentile(np.abs(told_px), 90))
-            terms.append(_Term(shot, known, told_px, shot.matched_px[known], large_px))
+            terms.append(Term(shot, known, told_px, shot.matched_px[known], large_px))
     return terms
 
 
-def _start(terms: Sequence[_Term], *, free: Free) -> tuple[float, dict[Pair, float]]:
+def _start(terms: Sequence[Term], *, free: Free) -> tuple[float, dict[Pair, float]]:
     """Return a scale and offsets from the matches alone."""
     found = np.concatenate([term.matched_px for term in terms])
     predicted = np.concatenate([term.predicted_px for term in terms])
@@ -139,7 +144,7 @@ def _densest(values: Points) -> float:
 
 def _refined(
     views: SceneViews,
-    terms: Sequence[_Term],
+    terms: Sequence[Term],
     scale: float,
     offsets_px: dict[Pair, float],
     *,
@@ -153,7 +158,7 @@ def _refined(
     error = math.inf
     for _ in range(_STEPS):
         normals, rights = _equations(views, terms, scale, offsets_px, unknowns=unknowns)
-        step, spread = _solved(normals, rights)
+        step, spread = solved(normals, rights)
         limit = max(np.abs(_moved(term, scale, step, unknowns)).max() for term in terms)
         step *= min(1.0, _LARGEST_STEP_PX / max(limit, 1e-12))
         for name, change in zip(unknowns, step, strict=True):
@@ -168,7 +173,7 @@ def _refined(
     return scale, offsets_px, error
 
 
-def _moved(term: _Term, scale: float, step: Points, unknowns: Sequence[object]) -> Points:
+def _moved(term: Term, scale: float, step: Points, unknowns: Sequence[object]) -> Points:
     """Return how far a step moves a term's matches, but for those that tell nothing."""
     moved = np.zeros(1)
     for name, change in zip(unknowns, step, strict=True):
@@ -181,7 +186,7 @@ def _moved(term: _Term, scale: float, step: Points, unknowns: Sequence[object]) 
 
 def _equations(
     views: SceneViews,
-    terms: Sequence[_Term],
+    terms: Sequence[Term],
     scale: float,
     offsets_px: dict[Pair, float],
     *,
@@ -197,12 +202,10 @@ def _equations(
         difference, slope, inside = (
             part[term.known] for part in differences(views, term.shot, full + shift_px)
         )
-        near = np.abs(full[term.known] + shift_px - term.matched_px) < 3 * _TOLERANCE_PX
-        usable = inside & near
-        if usable.sum() < 10:
+        near = np.abs(full[term.known] + shift_px - term.matched_px) < NEAR_PX
+        weight = robust_weights(difference, inside & near)
+        if weight is None:
             continue
-        spread = 1.4826 * np.median(np.abs(difference[usable])) + 1e-3
-        weight = usable / (1 + (difference / (2 * spread)) ** 2) ** 2 / spread**2
         columns = np.zeros((len(difference), len(unknowns)))
         for place, name in enumerate(unknowns):
             if name == "scale":
@@ -214,7 +217,20 @@ def _equations(
     return normals, rights
 
 
-def _solved(
+def robust_weights(
+    difference: Float32[np.ndarray, " n"], usable: Bool[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"] | None:
+    """Return how much each pixel counts, 0 for those not usable; None where these are too few."""
+    if usable.sum() < _FEWEST_USABLE:
+        return None
+    spread = 1.4826 * float(np.median(np.abs(difference[usable]))) + 1e-3
+    weight: Float64[np.ndarray, " n"] = (
+        usable / (1 + (difference.astype(np.float64) / (2 * spread)) ** 2) ** 2 / spread**2
+    )
+    return weight
+
+
+def solved(
     normals: Float64[np.ndarray, "terms k k"], rights: Float64[np.ndarray, "terms k"]
 ) -> tuple[Points, Points]:
     """Return the step and its standard errors, from how much single shots disagree with it."""

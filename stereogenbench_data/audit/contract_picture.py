@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from stereogenbench_data.audit.contract import DoctorReport, scene_task
+from stereogenbench_data.audit.contract_diagnosis import SceneDiagnosis
 from stereogenbench_data.audit.contract_hypotheses import Structure
 from stereogenbench_data.audit.contract_scoring import scored
-from stereogenbench_data.audit.contract_search import SceneDiagnosis
 from stereogenbench_data.audit.contract_views import SceneViews, Shot
 from stereogenbench_data.errors import ExtraError, SelectionError
 from stereogenbench_data.storage.index import SceneIndex

@@ -2,19 +2,28 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
+import numpy as np
+
+from stereogenbench_data.audit.contract_diagnosis import (
+    LEAST_LOG_SCALE,
+    LEAST_OFFSET_PX,
+    Rival,
+    SceneDiagnosis,
+    allowed_log_scale,
+)
 from stereogenbench_data.audit.contract_fit import Free, fitted
-from stereogenbench_data.audit.contract_hypotheses import QUESTIONS, Question, Structure
+from stereogenbench_data.audit.contract_hypotheses import QUESTIONS, Structure
+from stereogenbench_data.audit.contract_ray import RayPower, ray_power
 from stereogenbench_data.audit.contract_scoring import Pair, Scored, agreement, evidence, scored
 from stereogenbench_data.audit.contract_statistics import LEAST_ERRORS, Evidence
 from stereogenbench_data.audit.contract_views import SceneViews, Shot
 from stereogenbench_data.schema.records import Rig, Scene
 
-LEAST_LOG_SCALE: Final = 0.01
-"""A unit that is off by less is not called wrong."""
-LEAST_OFFSET_PX: Final = 0.3
+_COARSEST_STEP: Final = 0.5
+"""With depths further apart, as a share, nothing is told."""
 _LEAST_SCALE_DB: Final = 0.02
 _SCALE_ERRORS: Final = 1.5
 """Less is asked of the score of a scale, which has an error of its own to be judged by."""
@@ -24,72 +33,6 @@ FEWEST_MATCHES: Final = 200
 _LENGTHS: Final[dict[Free, tuple[str, ...]]] = {
     "nothing": (), "scale": ("scale",), "offset": ("offset",), "both": ("scale", "offset"),
 }  # fmt: skip
-_NOTHING: Final = Evidence(math.nan, math.inf)
-
-
-@dataclass(frozen=True, slots=True)
-class Rival:
-    """Another answer to one question, all else as in the best contract but for the scale.
-
-    ``behind`` is by how much the best contract is better.
-    """
-
-    question: Question
-    answer: Any
-    behind: Evidence
-
-
-@dataclass(frozen=True, slots=True)
-class SceneDiagnosis:
-    """What one scene's pictures say about its depth contract.
-
-    Attributes:
-        key: The scene.
-        views: How many views (a pair in a frame) were compared.
-        pairs: The pairs.
-        matches: Pixels that were found in both pictures of a view.
-        textured: Pixels that were looked for.
-        unit_m: The declared unit of the primary pair's left depth, in metres.
-        unit_source: Where it comes from: "tag", "default", "user" or "unreadable".
-        focal_ratios: In words, other readings of focal length and sensor, and what disparity
-            each gives over that of the width; those that give the same are left out.
-        recorded_pair: The primary pair as it is recorded, if its left camera stands to the right
-            of the other by the poses; None if it does not.
-        declared: The declared answers.
-        best: The answers of the best contract.
-        changed: What else the best contract changes: the scale, the offset, or both.
-        scale: Found over declared disparity, fitted with the best contract's answers.
-        scale_error: Standard error of log(scale).
-        offsets_px: Constant disparity of each pair at the best contract.
-        gain: By how much the best contract beats the declared one.
-        parallax: By how much it beats no disparity at all.
-        agreement: Share of matches that the best contract explains to a pixel.
-        rivals: The other answers.
-        equals: Contracts with as few changes that are not clearly worse, in words.
-        problem: Why nothing could be told; empty where something could.
-    """
-
-    key: str
-    views: int
-    pairs: tuple[Pair, ...]
-    matches: int
-    textured: int
-    unit_m: float
-    unit_source: str
-    focal_ratios: dict[str, float]
-    recorded_pair: Pair | None
-    declared: Structure
-    best: Structure
-    changed: Free = "nothing"
-    scale: float = 1.0
-    scale_error: float = math.inf
-    offsets_px: dict[Pair, float] = field(default_factory=dict)
-    gain: Evidence = _NOTHING
-    parallax: Evidence = _NOTHING
-    agreement: float = math.nan
-    rivals: tuple[Rival, ...] = ()
-    equals: tuple[tuple[Structure, Free, float], ...] = ()
-    problem: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,11 +50,15 @@ class _Candidate:
 class Search:
     """Contracts of one scene, each fitted once."""
 
-    def __init__(self, views: SceneViews, shots: Sequence[Shot]) -> None:
-        """Take what the contracts are judged by."""
+    def __init__(
+        self, views: SceneViews, shots: Sequence[Shot], *, least_log_scale: float = LEAST_LOG_SCALE
+    ) -> None:
+        """Take what the contracts are judged by, and how far off a unit may be."""
         self._views = views
+        self._least_log_scale = least_log_scale
         self._shots = shots
         self._fitted: dict[tuple[Structure, Free], _Candidate] = {}
+        self._powers: dict[tuple[Structure, Free], RayPower] = {}
         self.declared = self.candidate(Structure.declared(views.encoding), free="nothing")
 
     def candidate(self, structure: Structure, *, free: Free) -> _Candidate:
@@ -133,7 +80,17 @@ class Search:
                 current = two
             else:
                 break
-        return self._pruned(current)
+        return self._settled(self._pruned(current))
+
+    def _settled(self, current: _Candidate) -> _Candidate:
+        """Take the other kind of depth where the shape of disparity asks for it.
+
+        A scale makes up for most of the difference, so that the search may have taken one instead.
+        """
+        (other,) = current.structure.alternatives("kind")
+        free = _freed(current.free, "scale")
+        mine, theirs = (self.candidate(each, free=free) for each in (current.structure, other))
+        return self._pruned(theirs) if self.gain(theirs, mine).by_shape else current
 
     def _one_change(self, current: _Candidate) -> Iterator[_Candidate]:
         """Yield contracts that change one answer, or let one length be fitted."""
@@ -216,7 +173,23 @@ class Search:
 
     def gain(self, better: _Candidate, worse: _Candidate) -> Evidence:
         """Return by how much one contract is better than another."""
-        return evidence(self._shots, better.score, worse.score)
+        found = evidence(self._shots, better.score, worse.score)
+        kind = better.structure.kind
+        only_kind = better.structure.changes_from(worse.structure) == ("kind",)
+        if only_kind and worse.free in (better.free, _freed(better.free, "scale")):
+            told = self._power(better).kind
+            if told is not None and (told != kind or found.mean_db > 0):
+                return replace(found, by_shape=told == kind)
+        return found
+
+    def _power(self, candidate: _Candidate) -> RayPower:
+        """Return the power of the ray's length at a contract, whichever its kind and scale."""
+        planar = candidate.structure.changed("kind", "planar")
+        free = _freed(candidate.free, "scale")
+        if (planar, free) not in self._powers:
+            start = self.candidate(planar, free=free).score
+            self._powers[planar, free] = ray_power(self._views, self._shots, start)
+        return self._powers[planar, free]
 
     def _is_better(self, other: _Candidate, current: _Candidate) -> bool:
         """Tell whether a contract is clearly better, and what it fits worth mentioning."""
@@ -226,7 +199,7 @@ class Search:
             ("nothing", "scale"), ("offset", "both"),
         ):  # fmt: skip
             off = abs(math.log(other.score.scale))
-            sure = off > LEAST_LOG_SCALE + LEAST_ERRORS * min(other.score.scale_error, 1e3)
+            sure = off > self._least_log_scale + LEAST_ERRORS * min(other.score.scale_error, 1e3)
             return sure and gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
         if other.free in ("offset", "both") and current.free in ("nothing", "scale"):
             largest_px = max(map(abs, other.score.offsets_px.values()), default=0.0)
@@ -296,7 +269,16 @@ def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
             problem=f"no texture: {basics['textured']:,} pixels have any, and "
             f"{basics['matches']:,} were found in both pictures",
         )  # fmt: skip
-    search = Search(views, shots)
+    basics["depth_step"] = views.depth_step(shots[0].frame)
+    if basics["depth_step"] > _COARSEST_STEP:
+        return SceneDiagnosis(
+            **basics, best=declared,
+            problem=f"stored depth is too coarse: its steps are {basics['depth_step']:.0%} of it",
+        )  # fmt: skip
+    least_log_scale = allowed_log_scale(basics["depth_step"])
+    found_px = np.concatenate([shot.matched_px for shot in shots])
+    basics["disparity_px"] = float(np.sqrt((found_px**2).mean()))
+    search = Search(views, shots, least_log_scale=least_log_scale)
     best = search.best()
     share_told = agreement(views, shots, best.score)
     parallax = search.without_parallax(best)
@@ -307,7 +289,11 @@ def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
             else "too little parallax: no disparity at all explains the pictures as well"
         )
         return SceneDiagnosis(**basics, best=declared, parallax=parallax, problem=problem)
-    with_scale = search.candidate(best.structure, free=_freed(best.free, "scale")).score
+    (other_kind,) = best.structure.alternatives("kind")
+    with_scale, of_other_kind = (
+        search.candidate(structure, free=_freed(best.free, "scale")).score
+        for structure in (best.structure, other_kind)
+    )
     shifted: Free = "offset" if best.free in ("nothing", "offset") else "both"
     return SceneDiagnosis(
         **basics,
@@ -315,6 +301,7 @@ def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
         changed=best.free,
         scale=with_scale.scale,
         scale_error=with_scale.scale_error,
+        other_kind_scale=of_other_kind.scale,
         offsets_px=search.candidate(best.structure, free=shifted).score.offsets_px,
         gain=search.gain(best, search.declared),
         parallax=parallax,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -21,13 +21,20 @@ _T_975: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """By how many dB one contract is better than another in one scene, and its standard error."""
+    """By how many dB one contract is better than another in one scene, and its standard error.
+
+    ``by_shape`` is whether it is the better one by the shape of disparity over the picture, which
+    then decides; None where that does not tell.
+    """
 
     mean_db: float
     error_db: float
+    by_shape: bool | None = None
 
     def is_clear(self, *, least_db: float = LEAST_DB, errors: float = LEAST_ERRORS) -> bool:
         """Tell whether the difference is large and sure enough to be believed."""
+        if self.by_shape is not None:
+            return self.by_shape
         return self.mean_db >= max(least_db, errors * self.error_db)
 
 
@@ -42,6 +49,7 @@ class Gain:
         over: What the interval is over: scenes or, where one alone tells, parts of its pictures.
         count: How many scenes tell.
         is_clear: Whether the difference may be believed.
+        by_shape: Whether that is so by the shape of disparity, however few dB it makes.
     """
 
     mean_db: float
@@ -50,6 +58,7 @@ class Gain:
     over: Literal["scenes", "parts of the pictures"]
     count: int
     is_clear: bool
+    by_shape: bool = False
 
 
 def t_975(freedom: int) -> float:
@@ -68,15 +77,23 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
 def pooled(scenes: Sequence[Evidence]) -> Gain:
     """Return the mean over scenes.
 
-    It is clear if the interval over scenes leaves no doubt or, because an interval over two or
-    three says little, if it is clear in each of them.
+    It is clear if the interval over scenes leaves no doubt, or if it is clear in some scene and
+    its opposite in none: what one scene rules out is ruled out for all with the same contract,
+    however little the others tell (of a lag where nothing moves).
     """
     told = [scene for scene in scenes if math.isfinite(scene.mean_db)]
+    by_shape = any(scene.by_shape for scene in told)
     if len(told) <= 1:
         scene = told[0] if told else Evidence(math.nan, math.inf)
         half = _NORMAL_975 * scene.error_db
         ends = (scene.mean_db - half, scene.mean_db + half)
-        return Gain(scene.mean_db, *ends, "parts of the pictures", len(told), scene.is_clear())
+        return Gain(
+            scene.mean_db, *ends, "parts of the pictures", len(told), scene.is_clear(), by_shape
+        )
     mean, low, high = interval([scene.mean_db for scene in told])
-    clear = mean >= LEAST_DB and (low > 0 or all(scene.is_clear() for scene in told))
-    return Gain(mean, low, high, "scenes", len(told), clear)
+    against = (replace(scene, mean_db=-scene.mean_db) for scene in told if scene.by_shape is None)
+    opposed = any(scene.is_clear() for scene in against)
+    clear = (mean >= LEAST_DB and low > 0) or (
+        not opposed and any(scene.is_clear() for scene in told)
+    )
+    return Gain(mean, low, high, "scenes", len(told), clear, by_shape)

@@ -13,14 +13,19 @@ from stereogenbench_data.audit.contract_answers import (
     Unit,
     changes,
     common_unit,
+    kind_explains_scale,
     length_answers,
     offset_answer,
     offset_words,
     said,
     structure_answer,
 )
+from stereogenbench_data.audit.contract_diagnosis import (
+    LEAST_LOG_SCALE,
+    SceneDiagnosis,
+    allowed_log_scale,
+)
 from stereogenbench_data.audit.contract_hypotheses import QUESTIONS, Structure
-from stereogenbench_data.audit.contract_search import LEAST_LOG_SCALE, SceneDiagnosis
 from stereogenbench_data.audit.contract_statistics import LEAST_ERRORS, Gain, pooled
 from stereogenbench_data.schema.records import DepthEncoding
 
@@ -88,7 +93,8 @@ def _encoding(
     first: SceneDiagnosis, unit: Unit, declared: DepthEncoding, *, unit_answer: Answer
 ) -> DepthEncoding:
     """Return the contract to paste: with a unit where the files' own is not right."""
-    keep_unit = unit_answer.status in ("confirmed", "cannot tell")
+    # A unit that is right for the other kind alone is pasted with the kind that it is fitted to.
+    keep_unit = unit_answer.status in ("confirmed", "cannot tell") and unit_answer.behind is None
     unit_m = first.unit_m if keep_unit else unit.rounded_m
     return DepthEncoding(
         unit_m=unit_m,
@@ -120,6 +126,14 @@ def _beside(scenes: Sequence[SceneDiagnosis], unit: Unit, answers: Sequence[Answ
             "Correct the sensor's size or the focal length in baseline.json; until then "
             f"DepthEncoding(unit_m={unit.rounded_m:g}) gives right disparity, but wrong metres."
         )
+    if not first.problem and allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE:
+        lines.append(
+            f"Stored depth is coarse: its steps are {first.depth_step:.1%} of it or more in a "
+            "quarter of the picture, and the unit is no better known."
+        )
+    if kind_explains_scale(scenes):
+        (other,) = first.best.alternatives("kind")
+        lines.append(f"Fits alike: depth along {said(other.kind)}, the unit as declared.")
     for structure, free, scale in dict.fromkeys(
         other for scene in scenes[:1] for other in scene.equals
     ):
@@ -172,7 +186,8 @@ def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
     """Tell whether a scene may have the contract of another."""
     if scene.declared != leader.declared:
         return False
-    error = LEAST_LOG_SCALE + LEAST_ERRORS * min(scene.scale_error, 1.0)
+    error = allowed_log_scale(max(scene.depth_step, leader.depth_step))
+    error += LEAST_ERRORS * min(scene.scale_error, 1.0)
     if _is_changed(scene):
         units = (found.unit_m / found.scale for found in (scene, leader))
         same_unit = abs(math.log(next(units) / next(units))) <= error

@@ -134,6 +134,11 @@ class SceneViews:
             self._stored[key] = (shot, numbers)
         return self._stored[key][1]
 
+    def depth_step(self, frame: int) -> float:
+        """Return how far apart neighbouring depths of a frame lie, as a share: `relative_step`."""
+        units, known = self.depth(frame, self.primary[0])
+        return relative_step(units[known])
+
     @cached_property
     def ray_per_planar(self) -> Float64[np.ndarray, "h w"]:
         """The length of each pixel's ray to depth 1."""
@@ -220,6 +225,21 @@ def chosen_frames(available: int, *, count: int) -> list[int]:
     margin = min(max(LAGS), max(0, (available - 1) // 2))
     spread = np.linspace(margin, available - 1 - margin, min(count, available - 2 * margin))
     return sorted({round(float(frame)) for frame in spread})
+
+
+def relative_step(numbers: UInt16[np.ndarray, " n"]) -> float:
+    """Return the step to the next number that occurs, over the number: the pixels' upper quartile.
+
+    0 where there is no number at all.
+    """
+    values, counts = np.unique(numbers, return_counts=True)
+    if not len(values):
+        return 0.0
+    gaps = np.diff(values.astype(np.float64))
+    nearest = np.minimum(np.append(np.inf, gaps), np.append(gaps, np.inf))
+    shares = np.where(np.isfinite(nearest), nearest, 1.0) / np.maximum(values, 1)
+    order = shares.argsort()
+    return float(shares[order][np.searchsorted(counts[order].cumsum(), 0.75 * len(numbers))])
 
 
 def band_passed(luma: Luma) -> Luma:

@@ -2,8 +2,9 @@
 
 import hashlib
 import json
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -19,12 +20,19 @@ from stereogenbench_data.cli.options import (
     SplitOption,
     SubsetOption,
     WorkersOption,
+    complete_from,
     scene_filters,
 )
 from stereogenbench_data.cli.outcome import FINDINGS, STOPPED
 from stereogenbench_data.cli.progress import progress_bar
 
 _ALL = "all"
+
+
+def _complete_limit(incomplete: str) -> list[str]:
+    from stereogenbench_data.audit.audit_records import AuditLimits
+
+    return complete_from(f"{limit.name}=" for limit in fields(AuditLimits))(incomplete)
 
 
 def audit(  # noqa: PLR0913 - one parameter an option
@@ -47,14 +55,22 @@ def audit(  # noqa: PLR0913 - one parameter an option
     depth_unit_m: Annotated[
         float | None, typer.Option(help="Metres in a stored unit of depth [as tagged, else 0.1].")
     ] = None,
-    depth_kind: Annotated[str, typer.Option(help="planar or ray.")] = "planar",
+    depth_kind: Annotated[
+        Literal["planar", "ray"], typer.Option(help="Depth along the axis, or along the ray.")
+    ] = "planar",
     accept: Annotated[
         list[str] | None,
-        typer.Option(help="Depth that lost something: 8-bit, lossy, chroma; may be given again."),
+        typer.Option(
+            help="Depth that lost something: 8-bit, lossy, chroma; may be given again.",
+            autocompletion=complete_from(("8-bit", "lossy", "chroma")),
+        ),
     ] = None,
     limit: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=NUMBER, such as baseline_cm=0.01; may be given again."),
+        typer.Option(
+            help="NAME=NUMBER, such as baseline_cm=0.01; may be given again.",
+            autocompletion=_complete_limit,
+        ),
     ] = None,
     out: OutOption = None,
     journal: Annotated[

@@ -33,6 +33,12 @@ if TYPE_CHECKING:
     from stereogenbench_data.schema.records import DepthEncoding
 
 
+_DB_NOTE = (
+    "dB of unit, kind, focal length and offset count small differences under a tight cap: they "
+    "are not comparable with dB of flips, lags and orders."
+)
+
+
 def doctor(  # noqa: PLR0913 - one parameter an option
     data: DataArgument,
     *,
@@ -116,6 +122,8 @@ def _lines(report: "DoctorReport") -> list[str]:
         lines += [f"{scene.key}: cannot tell: {scene.problem}" for scene in silent]
     for verdict in report.verdicts:
         lines += ["", *_verdict_lines(verdict, report)]
+    if any(math.isfinite(scene.gain.mean_db) for scene in report.scenes):
+        lines += ["", _DB_NOTE]
     return lines
 
 

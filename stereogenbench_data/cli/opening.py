@@ -1,27 +1,34 @@
-"""DATA as commands open it: what has to be walked is walked with a progress bar."""
+"""DATA as commands open it: walked with a progress bar, and what is left out is said."""
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import typer
 
 from stereogenbench_data.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from stereogenbench_data.storage.index import SceneIndex
+    from stereogenbench_data.storage.walk import TreeReport
 
 
 def open_data(data: str) -> "SceneIndex":
-    """Return the index of some data, without scenes that are broken: it names these.
+    """Return the index of some data, without scenes that are broken: stderr is told of these.
 
     Raises:
         StorageError: If there is no such data, or no scene of it is whole.
     """
     from stereogenbench_data.errors import StorageError
     from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
+    from stereogenbench_data.storage.location import is_remote, local_path
     from stereogenbench_data.storage.walk import walk
 
-    root = Path(data)
-    if "://" in data or not root.is_dir() or (root / INDEX_NAME).is_file():
-        return SceneIndex.open(data)
+    if is_remote(data):
+        return _opened(data)
+    root = local_path(data)
+    if not root.is_dir() or (root / INDEX_NAME).is_file():
+        return _opened(data)
     with progress_bar("reading scenes", unit="scenes") as progress:
         report = walk(root, progress=progress)
     if not report.scenes:
@@ -31,4 +38,32 @@ def open_data(data: str) -> "SceneIndex":
             f"{root}: no scene is whole: {reasons[0]}{more}. `stereogenbench index {root}` lists "
             f"them all."
         )
+    _tell_left_out(root, report)
     return SceneIndex.from_report(report)
+
+
+def _opened(data: str) -> "SceneIndex":
+    """Return an index that exists; its warnings are said as a command says things."""
+    from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
+
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always", IncompleteSceneWarning)
+        index = SceneIndex.open(data)
+    for warning in told:
+        typer.echo(str(warning.message), err=True)
+    return index
+
+
+def _tell_left_out(root: Path, report: "TreeReport") -> None:
+    reasons = [*report.broken.values(), *report.incomplete.values()]
+    if not reasons:
+        return
+    counts = {"broken": len(report.broken), "incomplete": len(report.incomplete)}
+    said = " and ".join(f"{count} {name}" for name, count in counts.items() if count)
+    found = len(report.scenes) + len(reasons)
+    typer.echo(
+        f"{root}: {said} of {found} scenes left out: {reasons[0]}"
+        + (f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else "")
+        + f" `stereogenbench index {root}` lists them all.",
+        err=True,
+    )

@@ -22,7 +22,8 @@ def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
     from stereogenbench_data.errors import StereoGenBenchError
     from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
 
-    data = Path(str(context.params.get("data")))
+    # Before an option without its value yet, the arguments are parsed but not assigned.
+    data = Path(str(context.params.get("data") or next(iter(context.args), "")))
     if not (data.is_file() or (data / INDEX_NAME).is_file()):
         return []
     try:
@@ -64,7 +65,10 @@ MapOption = Annotated[
     ),
 ]
 SceneOption = Annotated[
-    list[str] | None, typer.Option("--scene", help="Key of a scene; may be given again.")
+    list[str] | None,
+    typer.Option(
+        "--scene", help="Key of a scene; may be given again.", autocompletion=complete_scene
+    ),
 ]
 FocalOption = Annotated[
     tuple[float, float] | None,

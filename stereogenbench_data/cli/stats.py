@@ -1,13 +1,13 @@
 """``stereogenbench stats``: the paper's tables of any data, from their index alone."""
 
 import json
-import warnings
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from stereogenbench_data.cli.opening import open_data
 from stereogenbench_data.cli.options import (
     CaptionOption,
     DataArgument,
@@ -55,13 +55,8 @@ def stats(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.audit.paper_figures import SPLITS
     from stereogenbench_data.audit.statistics import statistics
     from stereogenbench_data.audit.statistics_table import statistics_markdown
-    from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
 
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always", IncompleteSceneWarning)
-        index = SceneIndex.open(data)
-    for warning in told:
-        typer.echo(str(warning.message), err=True)
+    index = open_data(data)
     filters = scene_filters(
         split=split,
         subset=subset,

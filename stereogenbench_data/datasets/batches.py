@@ -1,6 +1,7 @@
 """The batches of an epoch as one rank gets them, and positions in them that can be saved."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, Final, Protocol, TypedDict, Unpack, runtime_checkable
 
@@ -124,15 +125,14 @@ class EpochBatches(Sampler[list[int]]):
                 f"{', '.join(EpochOptions.__annotations__)}."
             )
         self.dataset = dataset
-        self.rule = OrderRule(
+        rule = OrderRule(
             batch_size=batch_size,
             seed=options.get("seed", dataset.plan.seed),
             lanes=options.get("lanes", LANES),
-            open_scenes=options.get(
-                "open_scenes", min(max(OPEN_SCENES, batch_size), dataset.scenes_at_once)
-            ),
             kind=options.get("order", "shuffled"),
         )
+        most_open = min(max(OPEN_SCENES, rule.batch_size), dataset.scenes_at_once)
+        self.rule = replace(rule, open_scenes=options.get("open_scenes", most_open))
         self.tail = options.get("tail", "drop")
         self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
         self._follows_the_group = "rank" not in options

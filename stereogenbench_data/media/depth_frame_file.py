@@ -16,6 +16,7 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from typing import Any, Final
 
 from stereogenbench_data.errors import ExtraError, MediaError
@@ -31,11 +32,14 @@ _FORMAT: Final = 1
 _BYTES_A_FRAME: Final = 64
 _BLOCK_BYTES: Final = 256 * 1024
 _LEVEL: Final = 6
+_TOO_LARGE: Final = 2**31
+_TOO_LATE: Final = 2**62
 _FIXED: Final = struct.Struct(">2x8sxixQ5xxqxqxixixixhxhx2x16s")
 """Magic, sizes of header and frame, of all units and chunks, of a unit, a block and a chunk."""
 _MAGIC: Final = b"b2frame\0"
 _NAME_AT: Final = _FIXED.size + len(b"\x93\xcd__\xde__")
 _NAME: Final = bytes([0xA0 + len(LAYER)]) + LAYER.encode()
+_LAYER_AT: Final = struct.Struct(">xi")
 
 _CHUNK: Final = struct.Struct("<4B3i16s")
 """Versions, flags, size of a unit; bytes of units, of a block, of the chunk; filters and codec."""
@@ -190,8 +194,10 @@ def parse_header(header: bytes, *, file_bytes: int, name: str) -> FrameHeader:
     try:
         clip = _clip(told["clip"])
         sizes, crc32s = tuple(map(int, told["sizes"])), tuple(map(int, told["crc32s"]))
-    except (KeyError, TypeError, ValueError) as error:
-        raise _unfit(name, f"its description of itself lacks something ({error!r})") from error
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise _unfit(
+            name, f"its description of itself is odd or lacks something ({error!r})"
+        ) from error
     offsets = tuple(size + sum(sizes[:number]) for number in range(len(sizes)))
     expected = (len(sizes) * clip.frame_bytes, sum(sizes), UNIT_BYTES, clip.frame_bytes)
     found = (units, chunks, typesize, chunk_bytes)
@@ -210,9 +216,9 @@ def parse_header(header: bytes, *, file_bytes: int, name: str) -> FrameHeader:
 def _told(header: bytes, *, name: str) -> dict[str, Any]:
     """Return the metalayer's content."""
     content_at = _NAME_AT + len(_NAME)
-    if header[_NAME_AT:content_at] != _NAME:
+    if header[_NAME_AT:content_at] != _NAME or len(header) < content_at + _LAYER_AT.size:
         raise _unfit(name, f"it has no metalayer {LAYER!r} of its own")
-    (start,) = struct.unpack_from(">xi", header, content_at)
+    (start,) = _LAYER_AT.unpack_from(header, content_at)
     # Of a layer: a mark and four bytes of size; of its bytes: a mark and one, two or four.
     packed = header[start + 5 :] if 0 < start < len(header) else b""
     width = {0xC4: 1, 0xC5: 2, 0xC6: 4}.get(packed[0] if packed else 0, 0)
@@ -246,8 +252,13 @@ def _clip(told: Mapping[str, Any]) -> StoredClip:
         tags=tags,
         stream_tags=stream_tags,
     )
-    if min(clip.width_px, clip.height_px, *rate, *time_base) < 1:
+    numbers = (clip.width_px, clip.height_px, *rate, *time_base)
+    if not 1 <= min(numbers) <= max(numbers) < _TOO_LARGE:
         raise ValueError(f"{clip.width_px}x{clip.height_px}, {rate}, {time_base}")
+    if clip.codec != "ffv1" or not clip.pixel_format.startswith("gray"):
+        raise ValueError(f"{clip.codec}, {clip.pixel_format}")
+    if any(not -_TOO_LATE < here < there < _TOO_LATE for here, there in pairwise(clip.pts)):
+        raise ValueError("times of frames that do not ascend")
     return clip
 
 

@@ -10,7 +10,9 @@ _SHOWN: Final = 6
 
 
 def find_scene(index: SceneIndex, text: str) -> int:
-    """Return the row of the one scene whose key is a text, or else ends in it, or else holds it.
+    """Return the row of the one scene whose key is a text, or ends in it, or holds it.
+
+    A text that is whole folders of one key is that scene's, whatever other keys it is a part of.
 
     Args:
         index: Where to look.
@@ -25,6 +27,7 @@ def find_scene(index: SceneIndex, text: str) -> int:
     for matches in (
         [row for row, key in enumerate(keys) if key == text],
         [row for row, key in enumerate(lowered) if f"/{key}".endswith(f"/{wanted}")],
+        [row for row, key in enumerate(lowered) if f"/{wanted}/" in f"/{key}/"],
         [row for row, key in enumerate(lowered) if wanted in key],
     ):
         if len(matches) == 1:

@@ -171,7 +171,7 @@ def test_filters_count_and_the_copied_selection_gives_the_same_scenes(page):
     assert len(pairs.plan.pairs) == 1200
     chosen = set(pairs.index.column("key")[pairs.plan.scene_rows].tolist())
     assert set(keys_listed(page)) <= chosen
-    assert page.text("key") in chosen
+    page.until(lambda: page.text("key") in chosen)
 
 
 def test_a_baseline_range_dims_the_pairs_outside_and_moves_to_one_inside(page):
@@ -223,6 +223,32 @@ def test_the_numbers_under_the_cursor_are_those_of_the_maps(page):
     y, x = (~whole["valid"][0]).nonzero().tolist()[0]
     page.point("left", x, y)
     assert page.text("disparity-here") == "not measured"
+
+
+@pytest.mark.parametrize(("width", "height"), [(1400, 900), (800, 600)])
+def test_a_picture_and_the_numbers_of_its_pixel_are_in_sight_together(page, width, height):
+    size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+    page.browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        page.open()
+        left, readout = (
+            page.script(
+                "const box = document.querySelector(arguments[0]).getBoundingClientRect();"
+                "return [box.left, box.top, box.right, box.bottom];", place,
+            )
+            for place in ("[data-pane=left] canvas", "#readout")
+        )  # fmt: skip
+        overlap = page.script("return document.documentElement.scrollWidth - innerWidth")
+    finally:
+        page.browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+    for box in (left, readout):
+        assert box[0] >= 0
+        assert box[1] >= 0
+        assert box[2] <= width
+        assert box[1] < height - 40
+    assert readout[3] <= height
+    assert overlap <= 0
 
 
 def test_pictures_and_maps_are_drawn_as_they_are(page):

@@ -2,9 +2,11 @@
 
 import http.client
 import json
+import re
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from importlib import resources
 from urllib.parse import urlencode
 
 import numpy as np
@@ -107,6 +109,19 @@ def test_no_path_leads_out_of_the_page(server, path):
 
     assert status == 404
     assert json.loads(content) == {"error": "there is nothing here"}
+
+
+def test_every_file_of_the_page_is_served_and_scripts_import_only_such(server):
+    folder = resources.files("stereogenbench_data.audit.browser") / "static"
+    names = {file.name for file in folder.iterdir()}
+
+    assert {name for name, _ in STATIC.values()} == names
+    for path, (name, _) in STATIC.items():
+        status, content, _ = ask(server, path)
+        imported = re.findall(r'from "(/[^"]+)"', content.decode())
+
+        assert (status, content) == (200, (folder / name).read_bytes())
+        assert set(imported) <= STATIC.keys()
 
 
 @pytest.mark.parametrize("key", ["../../etc/passwd", "/etc/passwd", "", "train", SCENE + "/"])

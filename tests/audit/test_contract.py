@@ -1,15 +1,20 @@
 """Scenes with one thing wrong each: what the pictures say of them, and what they cannot say."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from stereogenbench_data.audit.contract import diagnose
 from stereogenbench_data.audit.contract_answers import Unit, offset_words
+from stereogenbench_data.audit.contract_diagnosis import Rival, SceneDiagnosis
 from stereogenbench_data.audit.contract_hypotheses import Structure
 from stereogenbench_data.audit.contract_matching import match_rows
+from stereogenbench_data.audit.contract_ray import RayPower
 from stereogenbench_data.audit.contract_statistics import Evidence, interval, pooled
+from stereogenbench_data.audit.contract_verdict import judge
+from stereogenbench_data.audit.contract_views import relative_step
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.synthesis import SynthRequest, synthesise
@@ -33,7 +38,17 @@ def right_scene(tmp_path_factory):
     root = tmp_path_factory.mktemp("right")
     (key,) = synthesise(
         root,
-        SynthRequest(family="Uniform", size_px=176, height_px=112, frames=9, seed=21, focal_mm=20),
+        SynthRequest(family="Uniform", size_px=160, height_px=104, frames=9, seed=21, focal_mm=20),
+    )
+    return root / key
+
+
+@pytest.fixture(scope="module")
+def long_lens(tmp_path_factory):
+    """The folder of a scene in whose corners a ray is 2.5 % longer than depth along the axis."""
+    root = tmp_path_factory.mktemp("long_lens")
+    (key,) = synthesise(
+        root, SynthRequest(family="Uniform", size_px=128, frames=3, seed=109, focal_mm=75)
     )
     return root / key
 
@@ -77,11 +92,9 @@ def test_a_right_contract_is_confirmed_question_by_question(verdict_on):
     assert verdict.encoding == DepthEncoding(unit_m=UNIT_M)
 
 
-@pytest.mark.parametrize("factor", [0.98, 1.03, 1000.0, 0.001])
+@pytest.mark.parametrize("factor", [0.98, 1.03, 1000.0])
 def test_a_wrong_unit_is_measured(verdict_on, factor):
-    verdict = verdict_on(
-        lambda folder: rewrite_depth(folder, lambda u: u, unit_factor=factor), frames=2
-    )
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, lambda u: u, unit_factor=factor))
 
     assert wrong_topics(verdict) == {"metres a unit"}
     assert verdict.unit_m == pytest.approx(UNIT_M, rel=0.005)
@@ -89,10 +102,83 @@ def test_a_wrong_unit_is_measured(verdict_on, factor):
 
 
 def test_ray_depth_is_told_from_planar(verdict_on):
-    verdict = verdict_on(lambda folder: rewrite_depth(folder, as_ray(folder)), frames=2)
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, as_ray(folder)))
 
     assert wrong_topics(verdict) == {"depth along"}
     assert verdict.encoding == DepthEncoding(unit_m=UNIT_M, kind="ray")
+
+
+def test_ray_depth_behind_a_long_lens_is_told_from_a_unit_that_is_a_little_off(long_lens, tmp_path):
+    folder = copied(long_lens, tmp_path)
+    rewrite_depth(folder, as_ray(folder))
+
+    (ray,) = diagnose(tmp_path, frames=2, workers=1).verdicts
+    rewrite_depth(copied(long_lens, tmp_path / "unit"), lambda u: u, unit_factor=1.013)
+    (unit,) = diagnose(tmp_path / "unit", frames=2, workers=1).verdicts
+
+    assert ray.encoding == DepthEncoding(unit_m=UNIT_M, kind="ray")
+    assert ray.unit_m == pytest.approx(UNIT_M, rel=0.005)
+    assert wrong_topics(ray) == {"depth along"}
+    assert unit.encoding.kind == "planar"
+    assert answer(unit, "depth along").status == "confirmed"
+    assert unit.unit_m == pytest.approx(UNIT_M, rel=0.005)
+
+
+def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
+    planar = Structure()
+    scene = SceneDiagnosis(
+        key="scene", views=1, pairs=((0, 1),), matches=999, textured=999, unit_m=UNIT_M,
+        unit_source="tag", focal_ratios={}, recorded_pair=None, declared=planar, best=planar,
+        changed="scale", scale=1.02, scale_error=0.001, other_kind_scale=1.001,
+        agreement=0.9, offsets_px={(0, 1): 0.0},
+        gain=Evidence(0.3, 0.05), rivals=(Rival("kind", "ray", Evidence(0.01, 0.02)),),
+    )  # fmt: skip
+
+    verdict = judge([scene], declared=DepthEncoding())
+    told = judge(
+        [replace(scene, rivals=(Rival("kind", "ray", Evidence(0.01, 0.02, by_shape=True)),))],
+        declared=DepthEncoding(),
+    )
+
+    assert verdict.is_wrong
+    assert answer(verdict, "metres a unit").status == "cannot tell"
+    assert "depth along the ray, the unit as declared" in " ".join(verdict.beside)
+    assert wrong_topics(told) == {"metres a unit"}
+
+
+@pytest.mark.parametrize(
+    ("power", "error", "kind"),
+    [
+        (0.1, 0.05, "planar"),
+        (0.9, 0.05, "ray"),
+        (0.45, 0.01, None),
+        (0.1, 0.2, None),
+        (3.0, 0.1, None),
+        (0.0, math.inf, None),
+    ],
+)
+def test_a_power_of_the_ray_tells_only_what_it_is_near_and_sure_of(power, error, kind):
+    assert RayPower(power, error).kind == kind
+
+
+@pytest.mark.parametrize(
+    ("numbers", "step"),
+    [([1000, 1001, 1002, 1003], 0.001), ([100, 200, 200, 200], 0.5), ([50] * 9, 0.02), ([], 0.0)],
+)
+def test_the_step_of_depth_is_a_share_of_it(numbers, step):
+    assert relative_step(np.array(numbers, np.uint16)) == pytest.approx(step, rel=1e-3)
+
+
+@pytest.mark.parametrize(("bits", "status"), [(10, "cannot tell"), (13, "cannot tell")])
+def test_depth_in_few_steps_gives_no_false_alarm(verdict_on, bits, status):
+    def coarse(units):
+        known = (units > 0) & (units < 65535)
+        return np.where(known, (units >> bits << bits) | 1 << (bits - 1), units)
+
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, coarse))
+
+    assert not verdict.is_wrong
+    assert answer(verdict, "metres a unit").status == status
 
 
 def test_inverse_depth_is_found_with_its_unit(verdict_on):
@@ -287,10 +373,19 @@ def test_an_interval_is_students():
     assert mean - low == pytest.approx(high - mean)
 
 
-def test_two_scenes_that_each_are_clear_are_clear_together():
-    assert pooled([Evidence(9.0, 0.5), Evidence(15.0, 0.5)]).is_clear
-    assert not pooled([Evidence(9.0, 0.5), Evidence(0.1, 0.5)]).is_clear
-    assert not pooled([]).is_clear
+@pytest.mark.parametrize(
+    ("scenes", "clear"),
+    [
+        ([Evidence(9.0, 0.5), Evidence(15.0, 0.5)], True),
+        ([Evidence(9.0, 0.5), Evidence(0.1, 0.5)], True),
+        ([Evidence(0.4, 0.2), Evidence(0.1, 0.5)], False),
+        ([Evidence(9.0, 0.5), Evidence(-8.0, 0.5)], False),
+        ([Evidence(0.01, 0.02, by_shape=True), Evidence(0.0, 0.02)], True),
+        ([], False),
+    ],
+)
+def test_what_one_scene_rules_out_is_ruled_out_unless_another_says_the_opposite(scenes, clear):
+    assert pooled(scenes).is_clear == clear
 
 
 @pytest.mark.parametrize(
@@ -305,6 +400,7 @@ def test_a_unit_is_rounded_to_the_shortest_number_near_it(metres, rounded):
     [
         ({(0, 1): 2.0, (1, 2): 2.1}, "+2.05 px for every pair"),
         ({(0, 1): -3.0, (1, 2): 3.0, (2, 4): 0.0}, "camera 1's picture is +3.00 px to the right"),
+        ({(0, 1): -8.0, (1, 2): 8.3, (1, 3): 8.6}, "camera 1's picture is +8.30 px to the right"),
         ({(0, 1): 1.0, (2, 3): 5.0}, "+1.00 px for 0-1, +5.00 px for 2-3"),
     ],
 )

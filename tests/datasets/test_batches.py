@@ -205,6 +205,12 @@ def test_options_that_no_epoch_has_are_refused(keyed, options, message):
         EpochBatches(keyed, 4, **options)
 
 
+@pytest.mark.parametrize("size", ["4", None, 2.0, True])
+def test_a_batch_size_that_is_no_whole_number_is_refused(keyed, size):
+    with pytest.raises(SelectionError, match="batch_size must be a whole number from 1, got"):
+        EpochBatches(keyed, size)
+
+
 def test_batches_made_before_the_process_group_are_refused_in_it(keyed, tmp_path):
     early, told = EpochBatches(keyed, 4), EpochBatches(keyed, 4, rank=1, world_size=2)
     torch.distributed.init_process_group(

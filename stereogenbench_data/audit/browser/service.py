@@ -20,13 +20,14 @@ from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED
 
 Query = Mapping[str, list[str]]
 
+_SCRIPTS: Final = (
+    "choosing", "copying", "keys", "moment", "page", "panes", "pixel", "reading", "state", "views",
+)  # fmt: skip
 STATIC: Final = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/page.css": ("page.css", "text/css; charset=utf-8"),
-    "/page.js": ("page.js", "text/javascript; charset=utf-8"),
-    "/views.js": ("views.js", "text/javascript; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
-}
+} | {f"/{name}.js": (f"{name}.js", "text/javascript; charset=utf-8") for name in _SCRIPTS}
 """The files of the page, by their paths: nothing else on disk can be asked for."""
 
 _JPEG_QUALITY: Final = 95
