@@ -1,0 +1,49 @@
+/** What each key does. */
+
+import { selectPlace } from "/choosing.js";
+import { copy } from "/copying.js";
+import { play, selectFrame, selectPair, selectView } from "/moment.js";
+import { movePoint } from "/pixel.js";
+import { $, VIEWS, state } from "/state.js";
+
+const KEYS = {
+  ArrowLeft: (event) => selectFrame(state.frame - (event.shiftKey ? 10 : 1)),
+  ArrowRight: (event) => selectFrame(state.frame + (event.shiftKey ? 10 : 1)),
+  ArrowUp: () => selectPair(state.pair - 1),
+  ArrowDown: () => selectPair(state.pair + 1),
+  Home: () => selectFrame(0),
+  End: () => selectFrame(Infinity),
+  j: () => selectPlace(state.scene.place + 1),
+  k: () => selectPlace(state.scene.place - 1),
+  w: (event) => movePoint(0, event.shiftKey ? -10 : -1),
+  a: (event) => movePoint(event.shiftKey ? -10 : -1, 0),
+  s: (event) => movePoint(0, event.shiftKey ? 10 : 1),
+  d: (event) => movePoint(event.shiftKey ? 10 : 1, 0),
+  c: () => copy("sample-line", $("copy-sample")),
+  "/": () => $("caption").focus(),
+  "?": () => $("help").showModal(),
+  " ": () => play(),
+};
+const LIST_KEYS = {
+  ArrowUp: () => selectPlace(state.scene.place - 1),
+  ArrowDown: () => selectPlace(state.scene.place + 1),
+  Home: () => selectPlace(0),
+  End: () => selectPlace(state.total - 1),
+  PageUp: () => selectPlace(Math.max(state.scene.place - 10, 0)),
+  PageDown: () => selectPlace(Math.min(state.scene.place + 10, state.total - 1)),
+};
+
+export function pressed(event) {
+  if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+  const at = event.target;
+  const types = at.matches("select, textarea, input:not([type=range], [type=checkbox])");
+  if (types || !state.scene) return;
+  if (event.key === " " && at.matches("button, summary, input[type=checkbox]")) return;
+  const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+  const views = Object.keys(VIEWS);
+  const act = (at.id === "list" && LIST_KEYS[name]) || KEYS[name]
+    || (name >= "1" && name <= String(views.length) && (() => selectView(views[name - 1])));
+  if (!act) return;
+  event.preventDefault();
+  act(event);
+}
