@@ -176,7 +176,9 @@ class Search:
         found = evidence(self._shots, better.score, worse.score)
         kind = better.structure.kind
         only_kind = better.structure.changes_from(worse.structure) == ("kind",)
-        if only_kind and worse.free in (better.free, _freed(better.free, "scale")):
+        # Coarse depth has a shape of its own.
+        is_fine = self._least_log_scale <= LEAST_LOG_SCALE
+        if is_fine and only_kind and worse.free in (better.free, _freed(better.free, "scale")):
             told = self._power(better).kind
             if told is not None and (told != kind or found.mean_db > 0):
                 return replace(found, by_shape=told == kind)
