@@ -250,7 +250,7 @@ def changes(scene: SceneDiagnosis, length: str) -> bool:
 
 def _focal_reading(scenes: Sequence[SceneDiagnosis], unit: Unit) -> str | None:
     """Return the reading of the focal length that explains all the scale, if one does."""
-    tolerance = max(LEAST_ERRORS * unit.uncertainty / 1.96, 0.005)
+    tolerance = min(max(LEAST_ERRORS * unit.uncertainty / 1.96, 0.005), LEAST_LOG_SCALE)
     for words in scenes[0].focal_ratios:
         if all(
             abs(math.log(scene.scale / scene.focal_ratios.get(words, 1.0))) <= tolerance
