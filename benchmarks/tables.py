@@ -7,6 +7,7 @@ from benchmarks.field import LIMIT, NAIVE, OURS, title
 from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios
 from benchmarks.ways import DEFAULT
 from benchmarks.workloads import WORKLOADS, Workload
+from stereogenbench_data.schema.problems import counted
 
 Rows = list[list[str]]
 
@@ -131,7 +132,7 @@ def _race(workload: Workload, race: dict[str, Any]) -> str:
         *(["MB a sample"] if workload.source == "web" else []),
     ]  # fmt: skip
     failed = [f"- {title(name.split('/')[0])}: {why}" for name, why in race["failed"].items()]
-    text = f"## {workload.title}\n\n{len(rounds)} rounds.\n\n" + _table(head, rows)
+    text = f"## {workload.title}\n\n{counted(len(rounds), 'round')}.\n\n" + _table(head, rows)
     return text + ("\nDid not race:\n" + "\n".join(failed) + "\n" if failed else "")
 
 

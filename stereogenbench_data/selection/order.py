@@ -102,9 +102,12 @@ class OrderRule:
 
     def most_open(self, lengths: Numbers) -> int:
         """Return a bound on the scenes that one lane of a selection has open at a time."""
-        mean = -(-len(lengths) // self.lanes_of(lengths))
-        in_turn = max(1, mean // self.open_scenes // 2)
-        return min(mean, self.open_scenes + self.open_scenes // in_turn) + 1
+        samples = int(lengths.sum())
+        turns = -(-samples // self.batch_size // self.lanes_of(lengths))
+        longest_lane = min(samples, turns * self.batch_size)
+        scenes = -(-longest_lane * len(lengths) // samples)
+        in_turn = max(1, scenes // self.open_scenes // 2)
+        return min(scenes, self.open_scenes + self.open_scenes // in_turn) + 1
 
 
 class EpochOrder:

@@ -369,7 +369,7 @@ def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):
     monkeypatch.setattr("stereogenbench_data.datasets.open_videos._most_files", lambda: 160)
     pairs = StereoPairs(small_index, pairs="all", frames="all")
 
-    with pytest.warns(OpenVideosWarning, match=r"up to 66 videos .* may open 32.*ulimit -n 194"):
+    with pytest.warns(OpenVideosWarning, match=r"up to 88 videos .* may open 32.*ulimit -n 216"):
         loader = pairs.loader(4)
     assert loader.dataset._loader._streams._limit == 32
 
