@@ -65,7 +65,7 @@ def hard_pairs(count: int = CASES) -> Iterator[tuple[Pair, np.ndarray]]:
                 float(rng.uniform(-180, 180)),
                 float(rng.uniform(-180, 180)),
             ),
-            offset_cm=tuple(rng.choice([-1e6, 1e6, 1e5, 0.0], 3).tolist()),  # type: ignore[arg-type]
+            offset_cm=tuple(rng.choice([-1e6, 1e6, 1e5, 0.0], 3).tolist()),  # type: ignore[arg-type]  # three numbers
         )
         yield pair, units
 

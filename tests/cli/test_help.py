@@ -14,7 +14,7 @@ from stereogenbench_data.cli.main import app
 from stereogenbench_data.cli.synth import RotationForm
 from stereogenbench_data.schema.release import FAMILIES
 
-COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]  # a group has commands
 
 
 def shown(*arguments):
