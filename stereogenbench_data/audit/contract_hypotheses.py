@@ -1,7 +1,7 @@
 """What may be wrong with a depth contract: a table of questions, and what each answer changes."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 from stereogenbench_data.schema.records import DepthEncoding, DepthForm, DepthKind
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -24,8 +24,8 @@ _ANSWERS: Final[dict[Question, tuple[Any, ...]]] = {
     "kind": ("planar", "ray"),
     "form": ("depth", "inverse"),
     "frame_lag": LAGS,
-    "order": Order.__args__,  # type: ignore[attr-defined]  # typing does not tell of Literal
-    "flip": Flip.__args__,  # type: ignore[attr-defined]  # typing does not tell of Literal
+    "order": get_args(Order),
+    "flip": get_args(Flip),
 }
 QUESTIONS: Final = tuple(_ANSWERS)
 
