@@ -8,7 +8,7 @@ import typer
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS, Field
 
 _TABLES: Mapping[str, Mapping[str, Field]] = {"pairs": PAIR_FIELDS, "views": VIEW_FIELDS}

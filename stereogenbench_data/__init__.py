@@ -1,13 +1,17 @@
 """Train and evaluate on StereoGenBench: every stereo pair of six-camera scenes, right to the pixel.
 
-Names are imported when first used, so that what does not need torch starts without it.
+Names are imported when first used, so that what does not need torch starts without it. Not even
+`typing` is imported at first: the command takes care of Ctrl-C only after this module.
 """
 
-from importlib import import_module
-from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
 
+from importlib import import_module
+
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from stereogenbench_data.datasets.adapters import to_raft_stereo, to_torchvision
     from stereogenbench_data.datasets.batches import EpochBatches
     from stereogenbench_data.datasets.loader import PairsLoader
@@ -50,8 +54,6 @@ if TYPE_CHECKING:
     from stereogenbench_data.selection.quality import order_quality
     from stereogenbench_data.storage.cache import ShardCache
     from stereogenbench_data.storage.index import SceneIndex
-
-__version__ = version("stereogenbench-data")
 
 _HOMES = {
     "datasets.adapters": ("to_raft_stereo", "to_torchvision"),
@@ -146,6 +148,10 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Import a public name from the module that holds it."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("stereogenbench-data")
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from tests.servers.tools import require_module
 
 HOME = Path(__file__).resolve().parents[1]

@@ -71,7 +71,7 @@ def test_the_imports_have_no_cycle():
         "stereogenbench_data.media.depth",
         "stereogenbench_data.storage.index",
         "stereogenbench_data.selection.plan",
-        "stereogenbench_data.cli.main",
+        "stereogenbench_data.cli.commands",
     ],
 )
 def test_what_does_not_need_torch_starts_without_it(module):

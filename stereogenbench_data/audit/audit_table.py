@@ -20,6 +20,7 @@ from stereogenbench_data.audit.audit_records import (
 from stereogenbench_data.audit.paper_figures import AUDIT, AUDIT_TABLE, FRAMES_A_SCENE
 from stereogenbench_data.audit.reprojection import TOLERANCES
 from stereogenbench_data.audit.scene_audit import LONG_PAIR
+from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import ADJACENT_PAIRS
 
 _LISTED: Final = 500
@@ -232,12 +233,12 @@ def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:
 
 def audit_markdown(report: AuditReport) -> str:
     """Return a report as Markdown: the table, the definitions that it needs, and the findings."""
-    frames = "all frames" if report.frames == 0 else f"up to {report.frames} frames"
+    frames = "all frames" if report.frames == 0 else f"up to {counted(report.frames, 'frame')}"
     lines = [
         f"# Audit of {report.root}",
         "",
-        f"{report.scenes_audited} of {report.scenes_there} scenes, {frames} of each. Under paper: "
-        f"{AUDIT_TABLE}.",
+        f"{report.scenes_audited} of {counted(report.scenes_there, 'scene')}, {frames} of "
+        f"each. Under paper: {AUDIT_TABLE}.",
         "",
         "| check | quantity | here | paper | limit |",
         "|---|---|---|---|---|",

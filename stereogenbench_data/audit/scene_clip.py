@@ -128,6 +128,11 @@ def write_clip(
         with unfinished.open("wb") as file:
             write(file, _counted(pages, frames=frames, progress=progress), rate_hz)
         unfinished.replace(path)
+    except av.FFmpegError as error:
+        # PyAV says only that writing to the file object failed; why is what it came upon.
+        if isinstance(error.__context__, OSError):
+            raise error.__context__ from None
+        raise
     finally:
         unfinished.unlink(missing_ok=True)
 

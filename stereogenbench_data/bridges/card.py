@@ -14,6 +14,7 @@ import numpy as np
 
 from stereogenbench_data.bridges import about
 from stereogenbench_data.errors import DescriptorError
+from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     CAMERA_COUNT,
@@ -54,12 +55,12 @@ def write_card(index: SceneIndex, folder: Path, *, repository: str) -> Path:
     path = folder / CARD_NAME
     text = card(index, repository=repository)
     try:
-        if path.exists() and MARK not in path.read_text():
+        if path.exists() and MARK.encode() not in path.read_bytes():
             raise DescriptorError(
                 f"{path}: is there and was not made by this package: move it away, or add "
                 f"{MARK!r} to it if it may be replaced."
             )
-        path.write_text(text)
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise DescriptorError(f"{path}: cannot be written ({error.strerror}).") from error
     return path
@@ -225,13 +226,13 @@ def _facts(index: SceneIndex) -> list[str]:
         zip(index.column("image_width_px"), index.column("image_height_px"), strict=True)
     )
     frames = Counter(index.column("frames").tolist())
-    focal_mm = index.column("focal_mm")
+    focal_mm, maps = index.column("focal_mm"), set(index.column("map_name"))
     bytes_ = sum(shard.size for shard in index.shards.values())
     listed = ", ".join(f"{width}x{height}" for (width, height), _ in sizes.most_common())
     counts = ", ".join(str(count) for count, _ in frames.most_common())
     return [
-        f"- {len(index)} scenes on {len(set(index.column('map_name')))} maps, in "
-        f"{len(index.shards)} shards of {bytes_ / 1e9:.3g} GB together",
+        f"- {counted(len(index), 'scene')} on {counted(len(maps), 'map')}, in "
+        f"{counted(len(index.shards), 'shard')} of {bytes_ / 1e9:.3g} GB together",
         f"- {CAMERA_COUNT} cameras a scene: pictures of {listed}, {counts} frames",
         f"- focal lengths of {focal_mm.min():.1f} to {focal_mm.max():.1f} mm",
     ]

@@ -80,7 +80,8 @@ def write_descriptor(
     descriptor = _head(told, url=data_url) | {"distribution": files, "recordSet": records}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(descriptor, indent=1, ensure_ascii=False) + "\n")
+        text = json.dumps(descriptor, indent=1, ensure_ascii=False) + "\n"
+        path.write_text(text, encoding="utf-8")
     except OSError as error:
         raise DescriptorError(f"{path}: cannot be written ({error.strerror}).") from error
     return descriptor

@@ -11,6 +11,8 @@ from stereogenbench_data.bridges import about
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant import Publication, write_descriptor
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
+from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.storage.filesystems import network_errors
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
 from stereogenbench_data.storage.location import local_path
 
@@ -64,6 +66,7 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
     write_descriptor(index, folder / DESCRIPTOR_NAME)
     api = HfApi(library_name="stereogenbench-data")
     patterns = [*sorted(index.shards), *_COMPANIONS]
+    refusals: tuple[type[BaseException], ...] = (HfHubHTTPError, ValueError, *network_errors())
     try:
         api.create_repo(repository, repo_type="dataset", exist_ok=True)
         api.upload_folder(
@@ -72,7 +75,8 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
             folder_path=folder,
             revision=branch,
             allow_patterns=patterns,
-            commit_message=f"{about.TITLE}: {len(index)} scenes in {len(index.shards)} shards",
+            commit_message=f"{about.TITLE}: {counted(len(index), 'scene')} in "
+            f"{counted(len(index.shards), 'shard')}",
         )
         revision = str(api.dataset_info(repository, revision=branch).sha)
         address = f"{api.endpoint}/datasets/{repository}/resolve/{revision}"
@@ -86,7 +90,7 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
             revision=branch,
             commit_message=f"Croissant descriptor of {revision[:12]}",
         )
-    except (HfHubHTTPError, ValueError, OSError) as error:
+    except refusals as error:
         if isinstance(error, StorageError | DescriptorError):
             raise
         raise StorageError(
@@ -112,7 +116,7 @@ def _require_whole(index: SceneIndex, folder: Path) -> None:
             )
 
 
-def _reason(error: Exception) -> str:
+def _reason(error: BaseException) -> str:
     """Return what happened without an address, which may hold secrets."""
     status = getattr(getattr(error, "response", None), "status_code", None)
     if status is not None:

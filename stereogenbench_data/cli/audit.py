@@ -23,8 +23,10 @@ from stereogenbench_data.cli.options import (
     complete_from,
     scene_filters,
 )
-from stereogenbench_data.cli.outcome import FINDINGS, STOPPED
+from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.stopping import STOPPED
+from stereogenbench_data.cli.writing import write_report, writing
 
 _ALL = "all"
 
@@ -121,8 +123,9 @@ def audit(  # noqa: PLR0913 - one parameter an option
     try:
         with progress_bar("reading the index", unit="scenes") as progress:
             index = open_for_audit(data, workers=workers, progress=progress, **filters)
-        kept = audit_journal(journal or _journal(out, data, request), index, request)
-        with kept, progress_bar("auditing", unit="frames") as progress:
+        notes = journal or _journal(out, data, request)
+        kept = audit_journal(notes, index, request)
+        with writing(notes), kept, progress_bar("auditing", unit="frames") as progress:
             report = audited(
                 index, request, workers=workers, progress=progress, journal=kept, **filters
             )
@@ -131,8 +134,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
         raise typer.Exit(STOPPED) from None
     document, markdown = json.dumps(report.to_json(), indent=1), audit_markdown(report)
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(document if out.suffix == ".json" else markdown, encoding="utf-8")
+        write_report(out, document if out.suffix == ".json" else markdown)
     typer.echo(document if as_json else markdown.rstrip())
     kept.delete()
     if report.findings:
@@ -158,5 +160,7 @@ def _journal(out: Path | None, data: str, request: Any) -> Path:
     if out is not None:
         return out.with_name(f"{out.name}.journal")
     place = data if "://" in data else str(Path(data).resolve())
-    name = hashlib.sha256(repr((place, request.frames, request.depth)).encode()).hexdigest()[:16]
+    name = hashlib.sha256(
+        repr((place, request.frames, request.depth)).encode(errors="replace")
+    ).hexdigest()[:16]
     return Path.home() / ".cache" / "stereogenbench" / f"audit-{name}.journal"

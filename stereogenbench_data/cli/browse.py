@@ -8,6 +8,7 @@ import typer
 
 from stereogenbench_data.cli.opening import open_data
 from stereogenbench_data.cli.options import DataArgument, DepthUnitOption
+from stereogenbench_data.schema.problems import counted
 
 
 def browse(
@@ -40,7 +41,7 @@ def browse(
     reader = SceneReader(index, depth=depth)
     service = Service(Catalogue(index, shown_data=shown_data, depth=depth), reader)
     with PageServer(service, port=port) as server:
-        typer.echo(f"{server.url}: {len(index)} scenes of {shown_data}; Ctrl-C ends it")
+        typer.echo(f"{server.url}: {counted(len(index), 'scene')} of {shown_data}; Ctrl-C ends it")
         if open_page:
             webbrowser.open(server.url)
         try:

@@ -41,8 +41,9 @@ from stereogenbench_data.cli.options import (
     WorkersOption,
     scene_filters,
 )
-from stereogenbench_data.cli.outcome import FINDINGS, STOPPED
+from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.stopping import STOPPED
 
 
 def controls(  # noqa: PLR0913 - one parameter an option

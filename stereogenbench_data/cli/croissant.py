@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from stereogenbench_data.schema.problems import counted
+
 
 def croissant(  # noqa: PLR0913 - one parameter an option
     data: Annotated[
@@ -48,7 +50,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         typer.Option("--map-file", help="ID=PATH with --check: where a file named by URL lies."),
     ] = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="With --check: findings as JSON.")
+        bool, typer.Option("--json", help="Report as JSON; with --check the findings.")
     ] = False,
 ) -> None:
     """Write a Croissant 1.1 descriptor with responsible-AI fields, or check one.
@@ -74,10 +76,12 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         tables_url=None if tables_url is None else tables_url.rstrip("/"),
     )
     descriptor = write_descriptor(index, out, publication=publication)
-    typer.echo(
-        f"{out}: {len(descriptor['distribution'])} files and sets of files, "
-        f"{len(descriptor['recordSet'])} record sets"
-    )
+    files, records = len(descriptor["distribution"]), len(descriptor["recordSet"])
+    if as_json:
+        told = {"descriptor": str(out), "distribution": files, "record_sets": records}
+        typer.echo(json.dumps(told, indent=2))
+    else:
+        typer.echo(f"{out}: {files} files and sets of files, {counted(records, 'record set')}")
 
 
 def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
@@ -97,7 +101,6 @@ def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
     else:
         for problem in problems:
             typer.echo(problem)
-        count = len(problems)
-        typer.echo(f"{data}: {count or 'no'} problem{'' if count == 1 else 's'}")
+        typer.echo(f"{data}: {counted(len(problems), 'problem')}")
     if problems:
         raise typer.Exit(1)

@@ -19,6 +19,8 @@ from stereogenbench_data.cli.options import (
     scene_filters,
 )
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.stopping import STOPPED
+from stereogenbench_data.schema.problems import counted
 
 _MEGABYTE = 1_000_000
 
@@ -71,7 +73,8 @@ def download(  # noqa: PLR0913 - one parameter an option
     kinds = ("rgb", "depth") if streams == "both" else (streams,)
     wanted = plan_download(index, rows.tolist(), cameras=numbers, streams=kinds)
     size = wanted.size_bytes / _MEGABYTE
-    typer.echo(f"{len(rows)} scenes, {len(wanted.files)} files, {size:,.1f} MB", err=True)
+    scenes_told, files_told = counted(len(rows), "scene"), counted(len(wanted.files), "file")
+    typer.echo(f"{scenes_told}, {files_told}, {size:,.1f} MB", err=True)
     if not dry_run:
         try:
             with progress_bar("downloading", unit="MB") as bar:
@@ -84,12 +87,12 @@ def download(  # noqa: PLR0913 - one parameter an option
                 )
         except KeyboardInterrupt:
             typer.echo("stopped; run the same command again to go on from here", err=True)
-            raise typer.Exit(130) from None
+            raise typer.Exit(STOPPED) from None
     told = {"scenes": len(rows), "files": len(wanted.files), "bytes": wanted.size_bytes}
     if as_json:
         typer.echo(json.dumps(told | {"dest": None if dry_run else str(dest)}, indent=2))
     elif not dry_run:
-        typer.echo(f"{dest}: {len(rows)} scenes, {size:,.1f} MB")
+        typer.echo(f"{dest}: {scenes_told}, {size:,.1f} MB")
 
 
 def _cameras(text: str) -> list[int]:

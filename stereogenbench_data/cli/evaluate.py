@@ -44,8 +44,8 @@ from stereogenbench_data.cli.options import (
     WorkersOption,
     scene_filters,
 )
-from stereogenbench_data.cli.outcome import STOPPED
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.stopping import STOPPED
 
 
 def evaluate(  # noqa: PLR0913 - one parameter an option

@@ -30,8 +30,9 @@ from stereogenbench_data.cli.options import (
     WorkersOption,
     scene_filters,
 )
-from stereogenbench_data.cli.outcome import STOPPED
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.stopping import STOPPED
+from stereogenbench_data.schema.problems import counted
 
 
 def export_inputs(  # noqa: PLR0913 - one parameter an option
@@ -90,4 +91,4 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
     except KeyboardInterrupt:
         typer.echo("stopped; run the same command again to go on from here", err=True)
         raise typer.Exit(STOPPED) from None
-    typer.echo(f"{out}: {len(items)} items of tier {tier}")
+    typer.echo(f"{out}: {counted(len(items), 'item')} of tier {tier}")

@@ -10,6 +10,9 @@ from rich.console import Console
 
 from stereogenbench_data.cli.options import FamilyOption, JsonOption, MapOption, SplitOption
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.stopping import STOPPED
+from stereogenbench_data.cli.writing import writing
+from stereogenbench_data.schema.problems import counted
 
 if TYPE_CHECKING:
     from stereogenbench_data.schema.records import SceneId
@@ -68,9 +71,12 @@ def index(  # noqa: PLR0913 - one parameter an option
         raise typer.BadParameter(
             f"{target} is a folder: name a file, such as {target / _INDEX_NAME}."
         )
+    if target.exists() and not target.is_file():
+        raise typer.BadParameter(f"{target} is no regular file, which an index would replace.")
     done_before = target.with_name(f"{target.name}.journal")
     try:
         with (
+            writing(done_before),
             Journal(done_before, walk=f"{_whole(root)} valid_depth={mode}") as journal,
             progress_bar("indexing", unit="scenes") as progress,
         ):
@@ -87,7 +93,7 @@ def index(  # noqa: PLR0913 - one parameter an option
                 journal.delete()
     except KeyboardInterrupt:
         console.print("stopped; run the same command again to go on from here")
-        raise typer.Exit(130) from None
+        raise typer.Exit(STOPPED) from None
     if as_json:
         found = {"scenes": len(report.scenes), "incomplete": dict(report.incomplete)}
         found |= {"broken": dict(report.broken), "notes": list(report.notes)}
@@ -100,7 +106,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     if not report.scenes:
         console.print(f"{shown(root)}: no scene is whole, so there is nothing to index")
         raise typer.Exit(1)
-    typer.echo(f"{target}: {len(report.scenes)} scenes")
+    typer.echo(f"{target}: {counted(len(report.scenes), 'scene')}")
     if report.broken:
         raise typer.Exit(1)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.schema.problems import counted
 
 if TYPE_CHECKING:
     from stereogenbench_data.storage.index import SceneIndex
@@ -62,7 +63,7 @@ def _tell_left_out(root: Path, report: "TreeReport") -> None:
     said = " and ".join(f"{count} {name}" for name, count in counts.items() if count)
     found = len(report.scenes) + len(reasons)
     typer.echo(
-        f"{root}: {said} of {found} scenes left out: {reasons[0]}"
+        f"{root}: {said} of {counted(found, 'scene')} left out: {reasons[0]}"
         + (f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else "")
         + f" `stereogenbench index {root}` lists them all.",
         err=True,

@@ -6,18 +6,17 @@ import os
 import sys
 import warnings
 from types import TracebackType
-from typing import Final
+from typing import Final, TextIO
 
 import typer
 
+from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.errors import StereoGenBenchError
 
 FINDINGS: Final = 1
 """Exit status where something is wrong with the data."""
 NOT_DONE: Final = 2
 """Exit status where the command could not do what it was asked to."""
-STOPPED: Final = 130
-"""Exit status after Ctrl-C: 128 and the number of the signal."""
 PIPE_CLOSED: Final = 141
 """Exit status where whoever read the output has closed it, as ``head`` does."""
 
@@ -27,6 +26,7 @@ _CURES: Final = {
     errno.EROFS: "Choose a place that can be written.",
     errno.ENOSPC: "Make room, or choose another place.",
     errno.EDQUOT: "Make room, or choose another place.",
+    errno.EFBIG: "Choose a place that takes files of this size.",
     errno.ENOENT: "Check the path.",
     errno.ENOTDIR: "Check the path.",
     errno.EISDIR: "Name a file, not a folder.",
@@ -58,25 +58,34 @@ class OutcomeTold:
         warnings.formatwarning = self._formatwarning
         error = _unwritten() or error
         if isinstance(error, BrokenPipeError):
-            _forget_stdout()
+            _forget(sys.stdout)
             raise SystemExit(PIPE_CLOSED) from None
         if isinstance(error, KeyboardInterrupt):
-            typer.echo("stopped", err=True)
+            _say("stopped")
             raise SystemExit(STOPPED) from None
         message = "" if error is None else _message(error)
         if message:
-            typer.echo(message, err=True)
+            _say(message)
             raise SystemExit(NOT_DONE) from None
 
 
 def _unwritten() -> OSError | None:
     """Write out what was printed; return why that failed, None where it did not."""
     try:
-        sys.stdout.flush()
+        if sys.stdout is not None:  # as it is where the shell closed it
+            sys.stdout.flush()
     except OSError as error:
-        _forget_stdout()
+        _forget(sys.stdout)
         return error
     return None
+
+
+def _say(message: str) -> None:
+    """Write a line to stderr; where that cannot be, the exit status alone has to tell."""
+    try:
+        typer.echo(message, err=True)
+    except OSError:
+        _forget(sys.stderr)
 
 
 def _message(error: BaseException) -> str:
@@ -105,10 +114,10 @@ def _is_said_elsewhere(error: BaseException) -> bool:
     ) or type(error).__module__.startswith(("typer.", "click."))  # fmt: skip
 
 
-def _forget_stdout() -> None:
-    """Point stdout at nothing, so that what is left of it is not written when Python ends."""
+def _forget(stream: TextIO) -> None:
+    """Point a stream at nothing, so that what is left of it is not written when Python ends."""
     with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _warning_line(

@@ -9,6 +9,7 @@ import typer
 
 from stereogenbench_data.cli.options import JsonOption
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.stopping import STOPPED
 
 _MEGABYTE = 1_000_000
 
@@ -90,7 +91,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
                 )
     except KeyboardInterrupt:
         typer.echo("stopped; run the same command again to go on from here", err=True)
-        raise typer.Exit(130) from None
+        raise typer.Exit(STOPPED) from None
     if as_json:
         place = None if report.index is None else str(report.index)
         packed = {"packed": list(report.packed), "part": list(report.part)}

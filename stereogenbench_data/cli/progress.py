@@ -1,7 +1,12 @@
-"""The progress bar of every long command: done, rate and time left, on stderr."""
+"""The progress bar of every long command: done, rate and time left, on stderr.
 
+Where stderr is no terminal, such as in the log of a batch job, it is a line a minute.
+"""
+
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Final
 
 from rich.console import Console
 from rich.progress import (
@@ -15,6 +20,9 @@ from rich.progress import (
 from rich.text import Text
 
 Report = Callable[[int, int], None]
+
+_ROOM_FOR_BAR: Final = 60
+_LOGGED_EVERY_S: Final = 60
 
 
 class _DoneColumn(ProgressColumn):
@@ -48,13 +56,23 @@ class _RateColumn(ProgressColumn):
 @contextmanager
 def progress_bar(doing: str, *, unit: str) -> Iterator[Report]:
     """Show a bar while the block runs; it yields what is to be called with (done, total)."""
+    console = Console(stderr=True)
     columns = (
         TextColumn(doing),
-        BarColumn(),
+        *([BarColumn()] if console.width >= _ROOM_FOR_BAR else []),
         _DoneColumn(unit),
         _RateColumn(unit),
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with Progress(*columns, console=console) as bar:
         task = bar.add_task(doing, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        told = time.monotonic()
+
+        def report(done: int, total: int) -> None:
+            nonlocal told
+            bar.update(task, completed=done, total=total)
+            if not console.is_terminal and time.monotonic() - told >= _LOGGED_EVERY_S:
+                told = time.monotonic()
+                console.print(bar)
+
+        yield report

@@ -8,6 +8,7 @@ import typer
 from stereogenbench_data.cli.opening import open_data
 from stereogenbench_data.cli.options import DataArgument, DepthUnitOption, complete_scene
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.writing import writing
 
 if TYPE_CHECKING:
     from stereogenbench_data.audit.scene_reader import SceneReader
@@ -64,13 +65,14 @@ def show(  # noqa: PLR0913 - one parameter an option
     target = out or Path(key.replace("/", "_") + (".mp4" if clip else ".png"))
     depth = None if depth_unit_m is None else DepthEncoding(unit_m=depth_unit_m)
     reader = SceneReader(index, depth=depth)
-    if clip:
-        _write_clip(reader, row, target, pair=cameras, size=size)
-    else:
-        from stereogenbench_data.audit.scene_sheet import scene_sheet
-        from stereogenbench_data.samples.picture import write_png
+    with writing(target):
+        if clip:
+            _write_clip(reader, row, target, pair=cameras, size=size)
+        else:
+            from stereogenbench_data.audit.scene_sheet import scene_sheet
+            from stereogenbench_data.samples.picture import write_png
 
-        write_png(target, scene_sheet(reader, row, pair=cameras, frame=frame, tile_px=size))
+            write_png(target, scene_sheet(reader, row, pair=cameras, frame=frame, tile_px=size))
     typer.echo(f"{target}: {key}")
 
 

@@ -22,6 +22,7 @@ from stereogenbench_data.cli.options import (
     scene_filters,
 )
 from stereogenbench_data.cli.outcome import FINDINGS
+from stereogenbench_data.cli.writing import write_report, writing
 
 
 def stats(  # noqa: PLR0913 - one parameter an option
@@ -77,11 +78,12 @@ def stats(  # noqa: PLR0913 - one parameter an option
     if plots is not None:
         from stereogenbench_data.audit.statistics_plots import write_plots
 
-        for path in write_plots(index, plots, **filters):
+        with writing(plots):
+            written = write_plots(index, plots, **filters)
+        for path in written:
             typer.echo(str(path), err=True)
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(text if out.suffix == ".json" else markdown, encoding="utf-8")
+        write_report(out, text if out.suffix == ".json" else markdown)
     typer.echo(text if as_json else markdown.rstrip())
     if compare == "always" and not all(line.agrees for line in lines):
         raise typer.Exit(FINDINGS)

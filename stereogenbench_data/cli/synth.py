@@ -9,6 +9,8 @@ import typer
 
 from stereogenbench_data.cli.options import JsonOption, complete_from
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.stopping import STOPPED
+from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import (
     FAMILIES,
     FRAME_COUNT,
@@ -81,11 +83,11 @@ def synth(  # noqa: PLR0913 - one parameter an option
         keys = _drawn(out, request, workers=workers or os.cpu_count() or 1)
     except KeyboardInterrupt:
         typer.echo("stopped; run the same command again to go on from here", err=True)
-        raise typer.Exit(130) from None
+        raise typer.Exit(STOPPED) from None
     if as_json:
         typer.echo(json.dumps({"root": str(out), "scenes": keys}, indent=2))
     else:
-        typer.echo(f"{out}: {len(keys)} scenes in {request.folder}")
+        typer.echo(f"{out}: {counted(len(keys), 'scene')} in {request.folder}")
 
 
 def _drawn(out: Path, request: "SynthRequest", *, workers: int) -> list[str]:

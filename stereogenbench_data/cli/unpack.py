@@ -8,6 +8,7 @@ import typer
 
 from stereogenbench_data.cli.options import JsonOption, WorkersOption
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.stopping import STOPPED
 
 _MEGABYTE = 1_000_000
 
@@ -37,7 +38,7 @@ def unpack(
             report = unpacked(shards, out, workers=workers, progress=progress)
     except KeyboardInterrupt:
         typer.echo("stopped; run the same command again to go on from here", err=True)
-        raise typer.Exit(130) from None
+        raise typer.Exit(STOPPED) from None
     if as_json:
         told = {"unpacked": list(report.unpacked), "kept": list(report.kept)}
         typer.echo(json.dumps({"out": str(out)} | told, indent=2))

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from stereogenbench_data.cli.options import JsonOption
+from stereogenbench_data.schema.problems import counted
 
 
 def upload(
@@ -28,4 +29,4 @@ def upload(
     if as_json:
         typer.echo(json.dumps(asdict(report), indent=2))
         return
-    typer.echo(f"{report.files} files: StereoPairs({report.url!r})")
+    typer.echo(f"{counted(report.files, 'file')}: StereoPairs({report.url!r})")

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.stopping import STOPPED
 
 _MEGABYTE = 1_000_000
 
@@ -40,7 +41,7 @@ def verify(
             report = verified(shards, mode=mode, workers=workers, progress=progress)
     except KeyboardInterrupt:
         typer.echo("stopped", err=True)
-        raise typer.Exit(130) from None
+        raise typer.Exit(STOPPED) from None
     if as_json:
         typer.echo(json.dumps(asdict(report), indent=2))
     else:

@@ -16,6 +16,7 @@ from stereogenbench_data.evaluation.render import csv_text, latex, markdown, pla
 from stereogenbench_data.evaluation.results import CONTROL, Scores
 from stereogenbench_data.evaluation.table_rows import Table
 from stereogenbench_data.evaluation.tiers import TIERS
+from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.storage.unfinished import write_whole
 
 Verdict = Mapping[bool | None, str]
@@ -64,8 +65,9 @@ def page(
     for one in results:
         told = _coverage(one)
         lines.append(
-            f"- {one.name}: {told['pairs']} pairs of {told['scenes']} scenes, {told['frames']} "
-            f"frames" + (f", {len(told['missing'])} pairs missing" if told["missing"] else "")
+            f"- {one.name}: {counted(told['pairs'], 'pair')} of "
+            f"{counted(told['scenes'], 'scene')}, {counted(told['frames'], 'frame')}"
+            + (f", {counted(len(told['missing']), 'pair')} missing" if told["missing"] else "")
         )
         lines += [f"  - missing: {each}" for each in told["missing"][:_GAPS_TOLD]]
     lines += ["", *(f"{markdown(table)}" for table in tables)]

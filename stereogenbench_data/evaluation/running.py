@@ -12,6 +12,7 @@ from stereogenbench_data.evaluation.partial import PartialResults
 from stereogenbench_data.evaluation.predictions import Pair, PredictionFault, Wanted
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.evaluation.scoring import SceneScores, SceneWork, score_scene
+from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.selection.plan import Plan
 from stereogenbench_data.selection.windows import Random
 from stereogenbench_data.storage.index import SceneIndex
@@ -188,7 +189,7 @@ def _require_few(faults: Sequence[str], *, allowed: int) -> None:
         return
     more = f"; and {len(faults) - _TOLD} more" if len(faults) > _TOLD else ""
     raise EvaluationError(
-        f"{len(faults)} predictions are missing or unusable and {allowed} are allowed "
+        f"{counted(len(faults), 'prediction')} missing or unusable, and {allowed} allowed "
         f"(--allow-missing): {'; '.join(each.rstrip('.') for each in faults[:_TOLD])}{more}."
     )
 

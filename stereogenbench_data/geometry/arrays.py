@@ -7,7 +7,8 @@ be of one library and on one device.
 import math
 from typing import Any
 
-from array_api_compat import array_namespace, device, is_torch_array
+import numpy as np
+from array_api_compat import array_namespace, device, is_numpy_array, is_torch_array
 
 Array = Any
 """A numpy array or a torch tensor; jaxtyping checks its shape and dtype under test."""
@@ -33,9 +34,43 @@ def quotient(number: float, divisor: Array) -> Array:
     return xp.asarray(number, dtype=divisor.dtype, device=device(divisor)) / divisor
 
 
+def whole_where(mask: Array, values: Array) -> Array:
+    """Return values rounded towards 0 as int64, and 0 where the mask is False.
+
+    They are below 2 ** 31 where it is True: numpy converts to int32 and on faster than to int64.
+    """
+    xp = array_namespace(values)
+    if not is_numpy_array(values):
+        return xp.astype(xp.where(mask, values, 0.0), xp.int64)
+    with np.errstate(invalid="ignore"):
+        whole = values.astype(np.int32)
+    whole *= mask
+    return whole.astype(np.int64)
+
+
+def values_where(mask: Array, values: Array, *, otherwise: float) -> Array:
+    """Return ``xp.where(mask, values, otherwise)``; where all are kept, maybe ``values`` itself.
+
+    numpy copies and then overwrites runs up to three times as fast as it chooses each number.
+    """
+    xp = array_namespace(values)
+    if not is_numpy_array(values):
+        return xp.where(mask, values, otherwise)
+    if mask.all():
+        return values
+    chosen = values.copy()
+    np.copyto(chosen, otherwise, where=~mask)
+    return chosen
+
+
 def take_flat(values: Array, index: Array) -> Array:
-    """Return ``values`` (any shape, read in row-major order) at ``index``, in the index's shape."""
+    """Return ``values`` (any shape, read in row-major order) at ``index``, in the index's shape.
+
+    The index must be in range: numpy's quickest way does not look.
+    """
     xp = array_namespace(values, index)
+    if is_numpy_array(values):
+        return np.take(values.reshape(-1), index, mode="wrap")
     taken = xp.take(xp.reshape(values, (-1,)), xp.reshape(index, (-1,)), axis=0)
     return xp.reshape(taken, index.shape)
 
@@ -63,6 +98,18 @@ def scatter_max(values: Array, index: Array, *, size: int, empty: int) -> Array:
         return cells.scatter_reduce(0, index, values, reduce="amax")
     xp.maximum.at(cells, index, values)
     return cells
+
+
+def scatter_min(values: Array, index: Array, *, shape: tuple[int, ...]) -> Array:
+    """Return cells of a shape, each the least of the floats sent to its flat index, or inf."""
+    xp = array_namespace(values, index)
+    cells = xp.full((math.prod(shape),), math.inf, dtype=values.dtype, device=device(values))
+    values, index = xp.reshape(values, (-1,)), xp.reshape(index, (-1,))
+    if is_torch_array(values):
+        cells = cells.scatter_reduce(0, index, values, reduce="amin")
+    else:
+        xp.minimum.at(cells, index, values)
+    return xp.reshape(cells, shape)
 
 
 def leading_offsets(shape: tuple[int, ...], *, step: int, like: Array) -> Array:

@@ -136,8 +136,8 @@ def write_disparity(
 ) -> None:
     """Write what `disparity_from_units` returns, and 0 where depth was not measured, into an array.
 
-    A few rows at a time, which stay in the processor's cache from the first step to the last: six
-    times as fast as one step after another over the whole map.
+    A few rows at a time, which stay in the processor's cache from the first step to the last, so
+    that no step makes a map of its own.
 
     Args:
         out: Where to write, in pixels.
@@ -151,23 +151,21 @@ def write_disparity(
     dtype = "float64" if form == "inverse" else dtype
     rows = max(1, _BLOCK_PIXELS // max(1, out.shape[-1]))
     room = np.empty((rows, out.shape[-1]), dtype=np.float64) if dtype == "float64" else None
-    for place in np.ndindex(out.shape[:-2]):
-        for top in range(0, out.shape[-2], rows):
-            here = (*place, slice(top, top + rows))
-            block = out[here]
-            work = block if room is None else room[: len(block)]
+    blocks = [slice(top, top + rows) for top in range(0, out.shape[-2], rows)]
+    with np.errstate(divide="ignore"):
+        for here in ((*place, block) for place in np.ndindex(out.shape[:-2]) for block in blocks):
+            found, known = out[here], measured[here]
+            work = found if room is None else room[: len(found)]
             np.copyto(work, units[here])
             if form == "inverse":
                 np.multiply(work, shift_units, out=work)
             else:
                 np.multiply(work, work.dtype.type(factor), out=work)
-                with np.errstate(divide="ignore"):
-                    np.divide(work.dtype.type(product), work, out=work)
+                np.divide(work.dtype.type(product), work, out=work)
             if room is not None:
-                np.copyto(block, work, casting="same_kind")
-            missing = ~measured[here]
-            if missing.any():
-                np.copyto(block, 0, where=missing)
+                np.copyto(found, work, casting="same_kind")
+            if not known.all():
+                np.copyto(found, 0, where=~known)
 
 
 def _exact_quotient(shift_units: float) -> tuple[float, float, Literal["float32", "float64"]]:

@@ -4,6 +4,7 @@ Pixel (u, v) is column, row; the centre of the top-left pixel is (0.5, 0.5), so 
 column floor(u). Camera axes are x right, y down, z forward; lengths are metres.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -12,7 +13,12 @@ from array_api_compat import array_namespace, is_numpy_array
 from jaxtyping import Bool, Float, Float64, Int64
 
 from stereogenbench_data.errors import GeometryError
-from stereogenbench_data.geometry.arrays import as_float64, leading_offsets, pixel_centres
+from stereogenbench_data.geometry.arrays import (
+    as_float64,
+    leading_offsets,
+    pixel_centres,
+    whole_where,
+)
 from stereogenbench_data.geometry.camera import Intrinsics, require_size
 
 
@@ -31,19 +37,19 @@ class Projection:
     depth_m: Float[Any, "*batch h w"]
 
 
-_BLOCK_PIXELS: Final = 24 * 1280
-"""Pixels of which the maps of one step stay in a processor's cache for the next."""
+_BLOCK_PIXELS: Final = 64 * 1280
+"""Pixels, of all images of a batch, whose maps stay in a processor's cache between steps."""
 
 
 def row_blocks(projection: Projection, *, height_px: int) -> list[slice]:
     """Return the rows of a projection in blocks that can be worked on one after another.
 
     Several where rows do not change, the target has as many, and the maps are numpy's; else one.
-    What is worked out of each block for itself is the same, and up to four times as fast.
+    What is worked out of each block for itself is the same, and up to twice as fast.
     """
-    rows, columns = projection.u_px.shape[-2:]
+    *images, rows, columns = projection.u_px.shape
     apart = is_numpy_array(projection.u_px) and projection.v_px is None and rows == height_px
-    step = max(1, _BLOCK_PIXELS // max(1, columns)) if apart else max(1, rows)
+    step = max(1, _BLOCK_PIXELS // max(1, columns * math.prod(images)) if apart else rows)
     return [slice(top, top + step) for top in range(0, max(1, rows), step)]
 
 
@@ -137,14 +143,12 @@ def landing_pixels(
     Raises:
         GeometryError: If rows do not change but the two images differ in height.
     """
-    xp = array_namespace(projection.u_px)
     inside = lands_inside(projection, height_px=height_px, width_px=width_px)
-    pixel = xp.astype(xp.where(inside, projection.u_px, 0.0), xp.int64)
+    pixel = whole_where(inside, projection.u_px)
     if projection.v_px is None:
         pixel += row_starts(projection, height_px=height_px, width_px=width_px)
     else:
-        row = xp.astype(xp.where(inside, projection.v_px, 0.0), xp.int64)
-        pixel += row * width_px
+        pixel += whole_where(inside, projection.v_px) * width_px
         pixel += image_starts(projection, height_px=height_px, width_px=width_px)
     return inside, pixel
 

@@ -9,17 +9,15 @@ import math
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace
 from jaxtyping import Bool, Float
 
-from stereogenbench_data.geometry.arrays import take_flat
+from stereogenbench_data.geometry.arrays import scatter_min, take_flat, values_where
 from stereogenbench_data.geometry.projection import (
     Projection,
     landing_pixels,
     row_blocks,
     rows_of,
 )
-from stereogenbench_data.geometry.warp import front_pixels
 
 
 def visible_in_target(
@@ -68,10 +66,9 @@ def visible_in_target(
                 tolerance=tolerance,
             )
         return visible
-    xp = array_namespace(target_depth_m)
     height_px, width_px = target_depth_m.shape[-2:]
     inside, pixel = landing_pixels(projection, height_px=height_px, width_px=width_px)
-    seen_m = take_flat(xp.where(target_measured, target_depth_m, -math.inf), pixel)
+    seen_m = take_flat(values_where(target_measured, target_depth_m, otherwise=-math.inf), pixel)
     inside &= measured
     inside &= seen_m >= projection.depth_m * (1.0 - tolerance) - 2.0 * quantum_m
     inside &= seen_m <= projection.depth_m * (1.0 + tolerance) + 2.0 * quantum_m
@@ -111,15 +108,13 @@ def visible_from_source(
                 tolerance=tolerance,
             )
         return visible
-    front, hole = front_pixels(projection, measured=measured)
-    return visible_in_target(
-        projection,
-        measured=measured,
-        target_depth_m=take_flat(projection.depth_m, front),
-        target_measured=~hole,
-        quantum_m=quantum_m,
-        tolerance=tolerance,
-    )
+    depth_m, (height_px, width_px) = projection.depth_m, projection.u_px.shape[-2:]
+    inside, pixel = landing_pixels(projection, height_px=height_px, width_px=width_px)
+    inside &= measured
+    landed_m = values_where(inside, depth_m, otherwise=math.inf)
+    front_m = take_flat(scatter_min(landed_m, pixel, shape=depth_m.shape), pixel)
+    inside &= front_m >= depth_m * (1.0 - tolerance) - 2.0 * quantum_m
+    return inside
 
 
 def _rows_of_step(quantum_m: Any, rows: slice) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.storage.index import SceneIndex
 
 Range = tuple[float, float]
@@ -74,7 +75,7 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
         if not keep.any():
             before = f" of those left by {', '.join(applied)}" if applied else ""
             raise SelectionError(
-                f"{name}={wanted!r} matches none of {len(rows)} scenes{before}; "
+                f"{name}={wanted!r} matches none of {counted(len(rows), 'scene')}{before}; "
                 f"{name} there is {there()}."
             )
         rows = rows[keep]
@@ -95,7 +96,8 @@ def _apply(
         nowhere = sorted(set(names) - set(column.tolist()))
         if nowhere and len(nowhere) < len(set(names)):
             raise SelectionError(
-                f"{name}={nowhere[0]!r} matches none of {len(column)} scenes of the index; {name} "
+                f"{name}={nowhere[0]!r} matches none of {counted(len(column), 'scene')} of the "
+                f"index; {name} "
                 f"there is {_listed(column, near=nowhere)}."
             )
         return np.isin(values.astype(str), names), lambda: _listed(values, near=names)
@@ -104,7 +106,8 @@ def _apply(
         low, high = require_range(name, wanted)
         if np.isnan(numbers).all():
             raise SelectionError(
-                f"{name}={wanted!r}: the index does not know it for any of {len(rows)} scenes. "
+                f"{name}={wanted!r}: the index does not know it for any of "
+                f"{counted(len(rows), 'scene')}. "
                 "Make the index with `stereogenbench index ROOT --valid-depth`."
             )
         return (numbers >= low) & (numbers <= high), lambda: _spanned(numbers)

@@ -4,6 +4,7 @@ import difflib
 from typing import Final
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.storage.index import SceneIndex
 
 _SHOWN: Final = 6
@@ -39,7 +40,7 @@ def find_scene(index: SceneIndex, text: str) -> int:
             )
     near = _near(wanted, keys)
     raise SelectionError(
-        f"{text!r} is no key of {len(keys)} scenes, nor a part of one. "
+        f"{text!r} is no key of {counted(len(keys), 'scene')}, nor a part of one. "
         + (f"Did you mean {_listed(near)}?" if near else f"There is {_listed(keys)}.")
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     BASELINE_BINS,
@@ -183,8 +184,9 @@ def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairLis
     if not keep.any():
         bins = sorted({baseline_bin(value) for value in found[~np.isnan(found)]})
         raise SelectionError(
-            f"baseline_cm={wanted!r} matches none of {len(pairs)} pairs; baselines there are "
-            f"{np.nanmin(found):g} to {np.nanmax(found):g} cm, in the bins {', '.join(bins)}."
+            f"baseline_cm={wanted!r} matches none of {counted(len(pairs), 'pair')}; "
+            f"baselines there are {np.nanmin(found):g} to {np.nanmax(found):g} cm, in the bins "
+            f"{', '.join(bins)}."
         )
     kept = PairList(pairs.row, pairs.source, _packed(pairs.targets, keep))
     return kept[keep.any(axis=1)]

@@ -116,7 +116,7 @@ class FilesystemTransport:
                 f"{self._where}: is no URL that fsspec can open. Correct it, or fetch the data and "
                 f"pass the folder."
             ) from None
-        except _loaded(_NETWORK_ERRORS) as error:
+        except network_errors() as error:
             if _status(error) in _REFUSED:
                 raise StorageError(f"{self._where}: {_reason(error)}. {_MISSING}") from None
             raise Fault(_reason(error)) from None
@@ -144,6 +144,11 @@ def _reason(error: BaseException) -> str:
         return f"the server answers {_status(error)}"
     text = error.strerror if isinstance(error, OSError) else None
     return f"{type(error).__name__}: {text}" if text and "://" not in text else type(error).__name__
+
+
+def network_errors() -> tuple[type[BaseException], ...]:
+    """Return what file systems and the Hub's client raise where a server cannot be reached."""
+    return _loaded(_NETWORK_ERRORS)
 
 
 def _loaded(kinds: tuple[tuple[str, str], ...]) -> tuple[type[BaseException], ...]:

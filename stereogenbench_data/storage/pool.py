@@ -134,4 +134,5 @@ def _run_task(work: Callable[[Task, AfterBytes], Result], task: Task) -> Result:
         if shared.stop.is_set():
             raise _Stopped
 
+    after_bytes(0)
     return work(task, after_bytes)

@@ -7,6 +7,7 @@ from typing import Final, Literal
 
 from stereogenbench_data.errors import StereoGenBenchError, StorageError
 from stereogenbench_data.schema.parse import parse_scene_key
+from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.records import Scene, SceneId
 from stereogenbench_data.schema.release import TRAIN_MAPS
 from stereogenbench_data.storage.journal import Journal
@@ -112,8 +113,8 @@ def _chosen(
         there = sorted({key.rpartition("/")[0] for key in folders.keys})
         more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
         raise StorageError(
-            f"{shown(str(root))}: none of its {len(folders.keys)} scenes is asked for; there are "
-            f"scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
+            f"{shown(str(root))}: none of its {counted(len(folders.keys), 'scene')} is asked for; "
+            f"there are scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
         )
     return SceneFolders(keys, folders.refused)
 

@@ -33,7 +33,7 @@ def test_data_that_are_right_are_told_as_a_table_with_exit_code_0(small_shards, 
     result = run(small_shards, *FEW)
 
     assert result.exit_code == 0
-    assert "1 of 4 scenes, up to 1 frames of each." in result.stdout
+    assert "1 of 4 scenes, up to 1 frame of each." in result.stdout
     assert "| 0 px | 0 px | 0.001 px |" in result.stdout
     assert "1/1 frames" in result.stderr
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.croissant import write_descriptor
 from stereogenbench_data.bridges.croissant_check import check_descriptor
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import DescriptorError
 
 

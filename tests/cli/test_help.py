@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.cli.synth import RotationForm
 from stereogenbench_data.schema.release import FAMILIES
 
@@ -117,7 +117,7 @@ def test_a_completion_script_can_be_had():
 
 def test_help_imports_neither_torch_nor_numpy():
     code = (
-        "import sys; from stereogenbench_data.cli.main import app\n"
+        "import sys; from stereogenbench_data.cli.commands import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: pass\n"
         "heavy = {'torch', 'numpy', 'pyarrow', 'av', 'PIL'} & sys.modules.keys()\n"

@@ -13,7 +13,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.cli.outcome import OutcomeTold
 from stereogenbench_data.errors import ExtraError, SelectionError
 
@@ -141,7 +141,8 @@ def test_debug_may_stand_after_the_command_too(tmp_path):
     assert "Traceback" in ended.stderr
 
 
-def test_ctrl_c_ends_the_browser_at_once_with_130(small_shards):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_browser_at_once_with_130(small_shards, number):
     with subprocess.Popen(
         [*COMMAND, "browse", str(small_shards), "--no-open"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -150,7 +151,7 @@ def test_ctrl_c_ends_the_browser_at_once_with_130(small_shards):
         assert browsing.stdout is not None
         line = browsing.stdout.readline()
         time.sleep(0.2)
-        browsing.send_signal(signal.SIGINT)
+        browsing.send_signal(number)
         _, said = browsing.communicate(timeout=60)
 
     assert line.startswith("http://127.0.0.1:")

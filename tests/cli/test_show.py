@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 from typer.testing import CliRunner
 
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.cli.progress import _RateColumn
 
 SCENE = "train/Uniform/SynthStage/scene_000001"

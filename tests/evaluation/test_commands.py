@@ -5,7 +5,7 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 
 SMALL = ("--metrics", "psnr,ssim", "--size", "64x48", "--workers", "1")
 
@@ -58,7 +58,7 @@ def test_a_missing_prediction_ends_with_2_and_is_named(scenes, tmp_path):
     )
 
     assert shown.exit_code == 2
-    assert "3 predictions are missing or unusable and 0 are allowed" in shown.stderr
+    assert "3 predictions missing or unusable, and 0 allowed" in shown.stderr
 
 
 @pytest.mark.parametrize(

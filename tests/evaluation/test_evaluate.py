@@ -178,7 +178,7 @@ def test_a_missing_prediction_is_an_error_before_anything_is_scored(scored_index
 
     with pytest.raises(
         EvaluationError,
-        match=rf"1 predictions are missing or unusable and 0 are allowed.*{scene}.* expected a "
+        match=rf"1 prediction missing or unusable, and 0 allowed.*{scene}.* expected a "
         rf"folder or video {scene}/00-01 or {item_name(scene, (0, 1))}\.$",
     ):
         scored(scored_index, copied, protocol, progress=lambda *counts: done.append(counts))
@@ -221,7 +221,7 @@ def test_more_gaps_than_allowed_are_an_error(scored_index, copied, protocol):
     for scene in keys(scored_index)[:2]:
         (copied / item_name(scene, (0, 1)) / frame_name(0)).write_bytes(b"")
 
-    with pytest.raises(EvaluationError, match=r"2 predictions are missing or unusable and 1 are"):
+    with pytest.raises(EvaluationError, match=r"2 predictions missing or unusable, and 1 allowed"):
         scored(scored_index, copied, protocol, allow_missing=1)
 
 

@@ -4,6 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from stereogenbench_data.geometry.arrays import (
+    scatter_min,
+    take_flat,
+    values_where,
+    whole_where,
+)
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import (
     depth_from_disparity,
@@ -82,3 +88,41 @@ def test_maps_stay_on_the_device_that_they_are_given(inputs):
     made = maps(*(torch.from_numpy(values).to("meta") for values in inputs))
 
     assert {str(values.device) for values in made.values()} == {"meta"}
+
+
+def test_what_is_no_whole_number_does_not_matter_where_the_mask_is_false(library):
+    values = np.array([[2.9, -2.9, 0.0, np.nan, np.inf, -1e30]], dtype=np.float32)
+    mask = np.array([[True, True, True, False, False, False]])
+
+    whole = whole_where(library.array(mask), library.array(values))
+
+    assert library.numpy(whole).dtype == np.int64
+    assert library.numpy(whole).tolist() == [[2, -2, 0, 0, 0, 0]]
+
+
+@pytest.mark.parametrize("mask", [[True, True], [True, False], [False, False]])
+def test_choosing_values_changes_nothing_in_the_array_that_they_come_from(library, mask):
+    values = library.array(np.array([1.5, 2.5], dtype=np.float32))
+
+    chosen = values_where(library.array(np.array(mask)), values, otherwise=-np.inf)
+
+    assert library.numpy(chosen).dtype == np.float32
+    assert library.numpy(chosen).tolist() == np.where(mask, [1.5, 2.5], -np.inf).tolist()
+    assert library.numpy(values).tolist() == [1.5, 2.5]
+
+
+def test_values_are_taken_in_row_major_order_of_any_part_of_an_array(library):
+    values = library.array(np.arange(12.0).reshape(3, 4)[:, 1:3])
+
+    taken = take_flat(values, library.array(np.array([[0, 5], [3, 0]])))
+
+    assert library.numpy(taken).tolist() == [[1.0, 10.0], [6.0, 1.0]]
+
+
+def test_of_all_values_sent_to_a_cell_the_least_stays(library):
+    values = library.array(np.array([[3.0, 2.0, 4.0], [np.inf, 7.0, 6.0]], dtype=np.float32))
+    index = library.array(np.array([[1, 1, 1], [3, 0, 0]]))
+
+    cells = scatter_min(values, index, shape=(2, 2))
+
+    assert library.numpy(cells).tolist() == [[6.0, 2.0], [np.inf, np.inf]]

@@ -157,6 +157,37 @@ def test_whole_maps_are_decided_as_pixel_by_pixel(library, seed, rows):
     np.testing.assert_array_equal(library.numpy(visible), expected)
 
 
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 2**32 - 1), rows=st.sampled_from(["kept", "moved"]))
+def test_a_pixel_is_hidden_where_a_nearer_one_lands_beside_it(library, seed, rows):
+    """Against each pixel's nearest rival, found by comparing all pixels with all."""
+    rng = np.random.default_rng(seed)
+    shape = height, width = 5, 9
+    depth_m = np.where(rng.random(shape) < 0.1, np.inf, rng.uniform(1.0, 1.3, shape))
+    u_px, v_px = rng.uniform(-2.0, width + 2.0, shape), rng.uniform(-2.0, height + 2.0, shape)
+    u_px[0, 0] = v_px[0, 0] = np.nan
+    measured = rng.random(shape) < 0.8
+    row_px = np.arange(height)[:, None] + 0.5 if rows == "kept" else v_px
+    landed = measured & (u_px >= 0) & (u_px < width) & (row_px >= 0) & (row_px < height)
+    cells = np.broadcast_to(np.floor(row_px) * width + np.floor(u_px), shape)
+    beside = (cells[..., None, None] == cells) & landed
+    nearest_m = np.where(beside, depth_m, np.inf).min(axis=(-1, -2))
+
+    visible = visible_from_source(
+        Projection(
+            library.array(u_px),
+            None if rows == "kept" else library.array(v_px),
+            library.array(depth_m),
+        ),
+        measured=library.array(measured),
+        quantum_m=0.01,
+        tolerance=0.03,
+    )
+
+    expected = landed & (nearest_m >= depth_m * 0.97 - 0.02)
+    np.testing.assert_array_equal(library.numpy(visible), expected)
+
+
 @pytest.mark.parametrize("rows", ["kept", "moved"])
 def test_a_batch_is_decided_image_by_image(library, rows):
     rng = np.random.default_rng(5)

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.storage import download as download_module
 from stereogenbench_data.storage.download import download, plan_download
@@ -123,7 +123,7 @@ def test_the_command_says_the_size_first_and_reports(small_release, tmp_path):
     done = CliRunner().invoke(app, arguments)
 
     assert said.exit_code == done.exit_code == 0, done.output
-    assert "1 scenes, 9 files" in said.stderr
+    assert "1 scene, 9 files" in said.stderr
     assert json.loads(said.stdout)["dest"] is None
     assert json.loads(done.stdout)["bytes"] == json.loads(said.stdout)["bytes"]
     assert len(StereoPairs(dest, pairs=[(0, 5)])) == 1

@@ -28,7 +28,7 @@ def test_a_whole_tree_is_indexed_in_its_root(make_scene, root, run):
     result = run(root)
 
     assert result.exit_code == 0
-    assert result.stdout == f"{root / 'index.parquet'}: 1 scenes\n"
+    assert result.stdout == f"{root / 'index.parquet'}: 1 scene\n"
     assert len(SceneIndex.open(root)) == 1
     assert sorted(path.name for path in root.iterdir()) == ["index.parquet", "train"]
 

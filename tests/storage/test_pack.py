@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.storage import shard_writer
 from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex

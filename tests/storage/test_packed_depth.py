@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from stereogenbench_data import PAIR_FIELDS, SceneViews, StereoPairs, StereoPairStream
 from stereogenbench_data.bridges.scene_bytes import samples_of
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import ExtraError, MediaError, ShardError, StorageError
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.video import VideoReader

@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.storage import index as index_module
 from stereogenbench_data.storage.remote_tree import find_remote_scenes

@@ -13,7 +13,7 @@ from hashlib import sha256
 import pytest
 from typer.testing import CliRunner
 
-from stereogenbench_data.cli.main import app
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Member, ShardFacts

@@ -1,0 +1,60 @@
+"""Signals that come while the command is still being imported."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+STARTING = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == "typer":
+            os.kill(os.getpid(), signal.SIGNAL)
+
+SETTING
+sys.meta_path.insert(0, Interrupting())
+sys.argv = ["stereogenbench", "--version"]
+from stereogenbench_data.cli.main import main
+main()
+"""
+
+
+def started(name, *, setting=""):
+    """Return how the command ends that is sent a signal when it imports typer."""
+    code = STARTING.replace("SIGNAL", name).replace("SETTING", setting)
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_during_imports_ends_the_command_in_one_word(name):
+    ended = started(name)
+
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "stopped\n")
+
+
+def test_ctrl_c_that_is_ignored_stays_ignored():
+    ended = started("SIGINT", setting="signal.signal(signal.SIGINT, signal.SIG_IGN)")
+
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith("stereogenbench-data ")
+
+
+def test_calling_commands_in_a_process_leaves_its_signals_alone(small_shards):
+    from typer.testing import CliRunner
+
+    from stereogenbench_data.cli.commands import app
+
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    assert CliRunner().invoke(app, ["stats", str(small_shards)]).exit_code == 0
+
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_the_module_of_the_command_has_no_other_names():
+    from stereogenbench_data.cli import main
+
+    with pytest.raises(AttributeError, match="no attribute 'apps'"):
+        main.apps  # noqa: B018

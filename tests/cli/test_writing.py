@@ -1,0 +1,178 @@
+"""What commands write: reports whole or not at all, and the place where it failed is named."""
+
+import errno
+import json
+import os
+import resource
+import signal
+import stat
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli import progress
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.cli.writing import write_report, writing
+
+COMMAND = (sys.executable, "-m", "stereogenbench_data")
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+@contextmanager
+def files_of_at_most(size):
+    """Let no file grow beyond a size, as a full disk lets none."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+
+
+def test_only_an_error_of_writing_that_names_no_file_gets_the_place():
+    with pytest.raises(OSError, match=r"report\.md"), writing(Path("report.md")):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(OSError, match=r"other\.md") as named, writing(Path("report.md")):
+        raise OSError(errno.ENOSPC, "No space left on device", "other.md")
+    with pytest.raises(OSError, match="Input/output error") as reading, writing(Path("report.md")):
+        raise OSError(errno.EIO, "Input/output error")
+
+    assert named.value.filename == "other.md"
+    assert reading.value.filename is None
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("show", "-o", "sheet.png"),
+        ("show", "-o", "clip.mp4"),
+        ("show", "-o", "clip.gif"),
+        ("stats", "-o", "stats.md"),
+        ("stats", "--plots", "plots"),
+        ("audit", "--frames", "1", "--workers", "1", "-o", "audit.md"),
+    ],
+    ids=lambda words: words[-1],
+)
+def test_a_file_that_cannot_be_written_is_named_and_not_left_half(
+    small_shards, tmp_path, monkeypatch, words
+):
+    monkeypatch.chdir(tmp_path)
+    pytest.importorskip("matplotlib.backends.backend_agg")  # its font cache is a file, too
+    with files_of_at_most(100):
+        shown = invoke(words[0], small_shards, *words[1:])
+
+    last = shown.stderr.splitlines()[-1]
+    assert shown.exit_code == 2
+    assert last.startswith(f"OSError: {words[-1]}"), last
+    assert "File too large. Choose a place that takes files of this size." in last
+    assert [path.name for path in tmp_path.iterdir() if path.suffix != ".journal"] in (
+        [],
+        ["plots"],
+    )
+
+
+def test_a_report_that_cannot_be_written_leaves_the_one_before(tmp_path):
+    report = tmp_path / "new" / "report.md"
+    write_report(report, "first")
+    with files_of_at_most(2), pytest.raises(OSError, match=r"report\.md"):
+        write_report(report, "second")
+
+    assert report.read_text() == "first"
+    assert list(report.parent.iterdir()) == [report]
+
+
+def test_a_report_may_go_through_a_link_or_a_pipe(tmp_path):
+    link, target, pipe = tmp_path / "link.md", tmp_path / "target.md", tmp_path / "pipe"
+    target.write_text("before")
+    link.symlink_to(target)
+    os.mkfifo(pipe)
+    reading = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+
+    write_report(link, "PSNR\u2191")
+    write_report(pipe, "through")
+
+    assert link.is_symlink()
+    assert target.read_text(encoding="utf-8") == "PSNR\u2191"
+    assert os.read(reading, 100) == b"through"
+    os.close(reading)
+
+
+def test_an_index_does_not_replace_a_device_or_a_pipe(small_release, tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    shown = invoke("index", small_release, "-o", pipe)
+
+    assert shown.exit_code == 2
+    assert "is no regular file" in " ".join(shown.stderr.replace("│", " ").split())
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_what_the_terminal_lacks_is_printed_as_a_question_mark(small_shards, tmp_path):
+    ended = subprocess.run(
+        [*COMMAND, "show", str(small_shards), "-o", "\u0105.png"], cwd=tmp_path, check=False,
+        capture_output=True, env=os.environ | {"PYTHONIOENCODING": "latin-1"},
+    )  # fmt: skip
+
+    assert (ended.returncode, ended.stderr) == (0, b"")
+    assert ended.stdout.startswith(b"?.png: ")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
+def test_the_exit_status_is_right_where_nothing_can_be_said():
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run([*COMMAND, "stats", "nowhere"], stderr=full, check=False)
+
+    assert ended.returncode == 2
+
+
+def test_a_command_whose_stdout_was_closed_does_its_work(small_shards):
+    words = ["sh", "-c", '"$@" >&-', "sh", *COMMAND, "stats", str(small_shards)]
+    ended = subprocess.run(words, stderr=subprocess.PIPE, text=True, check=False)
+
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_a_descriptor_is_told_as_json(small_shards, tmp_path):
+    shown = invoke("croissant", small_shards, "-o", tmp_path / "c.json", "--json")
+
+    assert shown.exit_code == 0
+    assert json.loads(shown.stdout) == {
+        "descriptor": str(tmp_path / "c.json"),
+        "distribution": len(json.loads((tmp_path / "c.json").read_text())["distribution"]),
+        "record_sets": len(json.loads((tmp_path / "c.json").read_text())["recordSet"]),
+    }
+
+
+def shown_progress(monkeypatch, *, width, every_s):
+    """Return what is printed of three steps where stderr is no terminal."""
+    console = Console(width=width, force_terminal=False, color_system=None)
+    monkeypatch.setattr(progress, "Console", lambda **_: console)
+    monkeypatch.setattr(progress, "_LOGGED_EVERY_S", every_s)
+    with console.capture() as captured, progress.progress_bar("packing", unit="MB") as report:
+        for done in (1, 2, 3):
+            report(done, 3)
+    return captured.get().splitlines()
+
+
+def test_a_log_gets_progress_line_by_line_as_time_passes(monkeypatch):
+    often = shown_progress(monkeypatch, width=80, every_s=0)
+    seldom = shown_progress(monkeypatch, width=80, every_s=60)
+
+    assert [line.split("MB")[0].split()[-1] for line in often] == ["1/3", "2/3", "3/3", "3/3"]
+    assert len(seldom) == 1
+
+
+def test_a_narrow_terminal_has_no_room_for_a_bar(monkeypatch):
+    (narrow,) = shown_progress(monkeypatch, width=40, every_s=60)
+
+    assert narrow.startswith("packing 3/3 MB")
