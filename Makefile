@@ -24,13 +24,12 @@ lint: $(READY)
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-# Draws its scenes first (20 minutes or so, kept in build/bench), then measures for as long. Let
-# nothing else run.
+# Draws its scenes first (20 minutes or so, kept in build/bench), then measures for 45. Let nothing
+# else run.
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--constraint constraints/cpu.txt --editable ".[bench]"
 	$(BIN)/stereogenbench bench
-	$(BIN)/python -m benchmarks.evaluation --out docs/performance/evaluation.json
 
 # The scenes in shards/: videos are not drawn to the same bytes everywhere, packing is the same.
 sample: $(READY)

@@ -4,13 +4,16 @@ import argparse
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from benchmarks.accuracy import CASES, measure_accuracy
+from benchmarks.clock import MeasurementError, in_a_fork
 from benchmarks.equality import differences
+from benchmarks.evaluation import measure_evaluation
 from benchmarks.ffmpeg_links import link_libraries
 from benchmarks.machine import machine
 from benchmarks.material import Material, facts, prepared
@@ -20,10 +23,11 @@ from benchmarks.race import Plan, run_races
 from benchmarks.results import Results
 from benchmarks.start import measure_memory, measure_start
 from benchmarks.tables import tables
-from benchmarks.workloads import WORKLOADS, Workload
+from benchmarks.tried import measure_tried
+from benchmarks.workloads import RATES, WORKLOADS, Workload
 
 ROOT: Final = Path(__file__).parents[1]
-OTHERS: Final = ("accuracy", "profile", "start", "memory")
+OTHERS: Final = ("accuracy", "profile", "start", "memory", "tried", "evaluation")
 """What is measured beside the races; `--only` takes these names too."""
 
 QUICK: Final = ("first", "all-frames", "random", "accuracy", "profile")
@@ -31,7 +35,7 @@ QUICK: Final = ("first", "all-frames", "random", "accuracy", "profile")
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command line."""
-    known = [workload.name for workload in WORKLOADS] + list(OTHERS)
+    known = [workload.name for workload in WORKLOADS] + ["rates", *OTHERS]
     parser = argparse.ArgumentParser(prog="stereogenbench bench", description=__doc__)
     parser.add_argument(
         "--only", action="append", choices=known, help="measure this; may be given again"
@@ -40,7 +44,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--rounds", type=int, default=5, help="rounds of every race [5]")
     parser.add_argument("--workers", help="worker processes of every race, such as 2,0,1,4")
     parser.add_argument("--whole", action="store_true", help="all frames, not a window of them")
-    parser.add_argument("--batches", type=int, default=400, help="batches of the memory run [400]")
+    parser.add_argument("--batches", type=int, default=2000, help="of the memory run [2000]")
     parser.add_argument("--resume", action="store_true", help="keep the rounds that are there")
     parser.add_argument("--draw", action="store_true", help="only draw and pack the data")
     parser.add_argument(
@@ -58,6 +62,8 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 def chosen(options: argparse.Namespace) -> tuple[list[Workload], list[str]]:
     """Return the workloads to race over, and the names of what else is to be measured."""
     names = options.only or (QUICK if options.quick else [w.name for w in WORKLOADS] + [*OTHERS])
+    if "rates" in names:
+        names = [*names, *(workload.name for workload in RATES)]
     workloads = [workload for workload in WORKLOADS if workload.name in names]
     if options.whole:
         workloads = [replace(workload, window=workload.frames) for workload in workloads]
@@ -69,29 +75,30 @@ def chosen(options: argparse.Namespace) -> tuple[list[Workload], list[str]]:
     return workloads, [name for name in OTHERS if name in names]
 
 
-def measure(options: argparse.Namespace, *, say: Callable[[str], None]) -> None:
-    """Measure what is asked for, and write results, tables and plots."""
+def measure(options: argparse.Namespace, *, say: Callable[[str], None]) -> list[str]:
+    """Measure what is asked for, and write results, tables and plots; return what failed."""
     material = Material(
         options.data, size_px=options.size, frames=options.frames, scale=options.scale
     )
     results = Results(options.out / "results.json")
+    failed: list[str] = []
     if not options.tables:
         prepared(material, say=say)
         if options.draw:
-            return
+            return failed
         if options.check:
             print(json.dumps(differences(material), indent=1))  # noqa: T201
-            return
+            return failed
         results.put("machine", machine())
         results.put("data", facts(material))
         rounds = 1 if options.quick else options.rounds
         workloads, others = chosen(options)
-        if others:
-            _measure_others(others, material, results, options=options, say=say)
         plan = Plan(rounds=rounds, resume=options.resume)
-        run_races(workloads, material, results, plan=plan, say=say)
+        failed += run_races(workloads, material, results, plan=plan, say=say)
+        failed += _measure_others(others, material, results, options=options, say=say)
     write_pages(results, options.out)
     say(f"results are in {options.out}")
+    return failed
 
 
 def _measure_others(
@@ -101,18 +108,28 @@ def _measure_others(
     *,
     options: argparse.Namespace,
     say: Callable[[str], None],
-) -> None:
+) -> list[str]:
     rounds = 1 if options.quick else options.rounds
     work = {
         "accuracy": lambda: measure_accuracy(material, rounds=rounds, cases=CASES, say=say),
         "profile": lambda: measure_profile(material, rounds=min(rounds, 3), say=say),
         "start": lambda: measure_start(material, rounds=rounds, say=say),
         "memory": lambda: measure_memory(material, batches=options.batches, say=say),
+        "tried": lambda: measure_tried(material, rounds=min(rounds, 3), say=say),
+        "evaluation": lambda: measure_evaluation(rounds=min(rounds, 3), say=say),
     }
+    failed = []
     for name in names:
         if options.resume and name in results.sections:
             continue
-        results.put(name, work[name]())
+        began = time.perf_counter()
+        try:
+            results.put(name, in_a_fork(work[name]))
+        except MeasurementError as error:
+            failed.append(f"{name}: {error}")
+            say(f"{name} failed: {error}")
+        say(f"{name} took {time.perf_counter() - began:.0f} s")
+    return failed
 
 
 def write_pages(results: Results, out: Path) -> None:
@@ -137,10 +154,11 @@ def main() -> None:
     options = parse(sys.argv[1:])
     require_libraries(options.data)
     try:
-        measure(options, say=lambda text: print(text, file=sys.stderr, flush=True))  # noqa: T201
+        failed = measure(options, say=lambda text: print(text, file=sys.stderr, flush=True))  # noqa: T201
     except KeyboardInterrupt:
         print("stopped; run the same command with --resume to go on", file=sys.stderr)  # noqa: T201
         sys.exit(130)
+    sys.exit(1 if failed else 0)
 
 
 if __name__ == "__main__":

@@ -1,27 +1,23 @@
 """Speed against error: nanoseconds a pixel of every way, and how far it is from the truth."""
 
-import math
-import mmap
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-import av
 import numpy as np
 
+from benchmarks.calls import beside, time_calls
+from benchmarks.kernels import decoded, measure_kernels
 from benchmarks.material import Material
-from benchmarks.results import Spread
 from benchmarks.ways import (
     WAYS,
     Pair,
-    Sight,
-    in_blocks,
     interpolated,
+    sight_of,
     visible_by_both,
     visible_by_left,
 )
-from stereogenbench_data.geometry.disparity import disparity_error_px, disparity_from_units
+from stereogenbench_data.geometry.disparity import disparity_error_px
 from stereogenbench_data.samples.load import resized_nearest
 from stereogenbench_data.storage.index import SceneIndex
 
@@ -30,13 +26,6 @@ PIXELS: Final = (8, 256)
 SCREEN_PX: Final = 1280.0
 """Beyond this disparity a point is outside any picture of the release."""
 CONVERSION: Final = "uint16 to float32"
-CONVERSION_HERE: Final = "uint16 to float32, into the same array"
-DEFAULT_HERE: Final = "the default, into the same array"
-
-CONVERSION_FRESH: Final = "uint16 to float32, into memory fresh from the system"
-DEFAULT_FRESH: Final = "the default, into memory fresh from the system"
-_LIKE: Final = {DEFAULT_HERE: CONVERSION_HERE, DEFAULT_FRESH: CONVERSION_FRESH}
-"""With which conversion a call is compared, if not with the plain one."""
 
 INVENTED_PX: Final = 1.0
 """A disparity so far from every surface at its pixel is of no surface: it was averaged."""
@@ -73,7 +62,8 @@ def hard_pairs(count: int = CASES) -> Iterator[tuple[Pair, np.ndarray]]:
 def measure_accuracy(material: Material, *, rounds: int, cases: int, say: Say) -> dict[str, Any]:
     """Return the section of the results: every way's error and speed."""
     say("speed against error")
-    pair, left, right = rendered_pair(material)
+    pair, paths = rendered_pair(material)
+    left, right = next(decoded(paths))
     ways = [
         {"name": way.name, "offered": way.offered, "kind": "disparity"} | _errors(way.run, cases)
         for way in WAYS
@@ -81,69 +71,24 @@ def measure_accuracy(material: Material, *, rounds: int, cases: int, say: Say) -
     calls: dict[str, Callable[[], Any]] = {
         way.name: (lambda run=way.run: run(left, pair)) for way in WAYS
     }
-    room = np.empty(left.shape, dtype=np.float32)
-    calls |= {
-        CONVERSION: lambda: left.astype(np.float32),
-        CONVERSION_HERE: lambda: np.copyto(room, left),
-        DEFAULT_HERE: lambda: in_blocks(left, pair, room),
-        CONVERSION_FRESH: lambda: np.copyto(_fresh(left.shape), left),
-        DEFAULT_FRESH: lambda: in_blocks(left, pair, _fresh(left.shape)),
-    }
+    calls[CONVERSION] = lambda: left.astype(np.float32)
     resized, resizing = _resized(material.size_px)
     sights, seeing = _visibility(pair, left, right)
     calls |= resizing | seeing
-    spent = time_calls(calls, pixels=left.size, rounds=rounds)
+    spent = beside(time_calls(calls, pixels=left.size, rounds=rounds), base=CONVERSION)
     for way in (*ways, *resized, *sights):
         way["ns_a_pixel"] = spent[way["name"]]
     return {
         "pixels": left.size,
         "cases": cases * PIXELS[0] * PIXELS[1],
         "conversion_ns": spent[CONVERSION],
-        "conversion_here_ns": spent[CONVERSION_HERE],
-        "default_here_ns": spent[DEFAULT_HERE],
-        "conversion_fresh_ns": spent[CONVERSION_FRESH],
-        "default_fresh_ns": spent[DEFAULT_FRESH],
         "ways": ways,
         "resized": resized,
         "visibility": sights,
+        "kernels": measure_kernels(pair, paths, rounds=rounds),
         "justified": justified(ways),
         "rounds": rounds,
     }
-
-
-def _fresh(shape: tuple[int, ...]) -> np.ndarray:
-    """Return an array whose memory the system has yet to give, as that of a worker's batch."""
-    return np.frombuffer(mmap.mmap(-1, 4 * math.prod(shape)), np.float32).reshape(shape)
-
-
-def time_calls(
-    calls: dict[str, Callable[[], Any]], *, pixels: int, rounds: int
-) -> dict[str, dict[str, float]]:
-    """Return nanoseconds a pixel of each call by processor time, alternating them round by round.
-
-    Beside the spread of the times stands that of the ratio to the conversion in the same round:
-    into a new array, the same one or fresh memory, as the call does it.
-    """
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for number in range(rounds + 1):
-        for name in list(calls)[:: 1 if number % 2 else -1]:
-            begin, done = time.process_time(), 0
-            while done < 2 or time.process_time() - begin < 0.02:
-                calls[name]()
-                done += 1
-            if number:
-                times[name].append((time.process_time() - begin) / done / pixels * 1e9)
-    found = {}
-    for name, values in times.items():
-        plain = times[_LIKE.get(name, CONVERSION)]
-        spread = Spread.of(values)
-        ratio = Spread.of(value / base for value, base in zip(values, plain, strict=True))
-        found[name] = {
-            "median": spread.median, "low": spread.low, "high": spread.high,
-            "conversions": ratio.median, "conversions_low": ratio.low,
-            "conversions_high": ratio.high,
-        }  # fmt: skip
-    return found
 
 
 def _errors(run: Callable[[np.ndarray, Pair], np.ndarray], cases: int) -> dict[str, Any]:
@@ -186,27 +131,18 @@ def justified(ways: list[dict[str, Any]]) -> str:
     return str(min(fit, key=lambda way: way["ns_a_pixel"]["median"])["name"])
 
 
-def rendered_pair(material: Material) -> tuple[Pair, np.ndarray, np.ndarray]:
-    """Return the primary pair of a drawn scene: its numbers, and a frame of both stored depths."""
+def rendered_pair(material: Material) -> tuple[Pair, list[Path]]:
+    """Return the primary pair of a drawn scene, and the files of both stored depths."""
     index = SceneIndex.open(material.eight)
     scene = index.scene(0)
-    left, right = scene.rig.primary_pair
-    maps = [
-        _stored(Path(index.root) / scene.members[f"cam_{camera:02d}_depth.mkv"].path)
-        for camera in (left, right)
-    ]
+    cameras = scene.rig.primary_pair
     pair = Pair(
         focal_px=scene.rig.focal_mm / scene.rig.sensor_width_mm * scene.rig.image_width_px,
-        baseline_m=scene.rig.baseline_cm(left, right) / 100,
-        unit_m=scene.depth_unit_m[left],
+        baseline_m=scene.rig.baseline_cm(*cameras) / 100,
+        unit_m=scene.depth_unit_m[cameras[0]],
     )
-    return pair, *maps
-
-
-def _stored(path: Path) -> np.ndarray:
-    with av.open(str(path)) as container:
-        frame = next(container.decode(video=0))
-        return np.ascontiguousarray(frame.to_ndarray())
+    members = [scene.members[f"cam_{camera:02d}_depth.mkv"] for camera in cameras]
+    return pair, [Path(index.root) / member.path for member in members]
 
 
 def two_planes(
@@ -272,13 +208,15 @@ def _visibility(
     pair: Pair, left: np.ndarray, right: np.ndarray
 ) -> tuple[list[dict[str, Any]], dict[str, Callable[[], Any]]]:
     """Return how often each way decides otherwise than float64 by both depths, and its call."""
-    single, double = (_sight(pair, left, right, dtype=dtype) for dtype in (np.float32, np.float64))
+    single, double = (
+        sight_of(pair, left, right, dtype=dtype) for dtype in (np.float32, np.float64)
+    )
     truth = visible_by_both(double)
     ways: dict[str, tuple[str, Callable[[], Any]]] = {
         "visible, float64": ("not taken", lambda: visible_by_both(double)),
         "visible, float32": ("default", lambda: visible_by_both(single)),
         "visible, float32, from stored units on": (
-            "default", lambda: visible_by_both(_sight(pair, left, right, dtype=np.float32)),
+            "default", lambda: visible_by_both(sight_of(pair, left, right, dtype=np.float32)),
         ),
         "visible_from_left, float32": ("offered", lambda: visible_by_left(single)),
     }  # fmt: skip
@@ -292,19 +230,3 @@ def _visibility(
         for name, (offered, run) in ways.items()
     ]
     return found, {name: run for name, (_, run) in ways.items()}
-
-
-def _sight(pair: Pair, left: np.ndarray, right: np.ndarray, *, dtype: Any) -> Sight:
-    measured = [(units != 0) & (units != 65535) for units in (left, right)]
-    left_m, right_m = (
-        np.multiply(units, pair.unit_m, dtype=np.float64).astype(dtype) * there
-        for units, there in zip((left, right), measured, strict=True)
-    )
-    if dtype == np.float32:
-        disparity_px = measured[0] * disparity_from_units(
-            left, focal_px=pair.focal_px, baseline_m=pair.baseline_m, unit_m=pair.unit_m
-        )
-    else:
-        with np.errstate(divide="ignore"):
-            disparity_px = np.where(measured[0], pair.focal_px * pair.baseline_m / left_m, 0.0)
-    return Sight(left_m, right_m, *measured, disparity_px, pair.unit_m)

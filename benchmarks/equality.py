@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.clock import in_a_fork
 from benchmarks.contestants import limit
-from benchmarks.field import CONTESTANTS, LIMIT, entrants, why_not
+from benchmarks.field import CONTESTANTS, LIMIT, NO_DEPTH, entrants, why_not
 from benchmarks.material import Material
 from benchmarks.race import addressed
 from benchmarks.server import serving
@@ -32,6 +32,8 @@ def differences(material: Material, *, only: Collection[str] = ()) -> dict[str, 
         for workload in (tiny(each) for each in WORKLOADS if not only or each.name in only):
             found[workload.name] = {}
             for name, _ in entrants(workload):
+                if name == NO_DEPTH:
+                    continue
                 reason = why_not(name)
                 if reason is None:
                     reading = CONTESTANTS[name].reading if name in CONTESTANTS else "forwards"
@@ -64,7 +66,7 @@ def samples_of(name: str, job: Job) -> list[tuple[Key, dict[str, np.ndarray]]]:
                 (wanted.scene, wanted.left, wanted.right, wanted.frames[0]),
                 {field: np.array(array) for field, array in sample.items()},
             )
-            for sample in limit.samples(job, list(job.of_scene))
+            for sample in limit.samples(job, job.of_scene)
             for wanted in [sample.pop("wanted")]
         ]
     found = []

@@ -12,6 +12,7 @@ from benchmarks.material import can_pack_blosc2
 from benchmarks.workloads import Job, Reading, Workload
 
 LIMIT: Final = "limit"
+NO_DEPTH: Final = "limit-no-depth"
 NAIVE: Final = "naive"
 OURS: Final = "ours"
 
@@ -46,6 +47,7 @@ def _forwards(dataset: Callable[[Job], Any]) -> Callable[..., DataLoader[Any]]:
 
 _TITLES: Final = {
     LIMIT: "limit: bare PyAV loop",
+    NO_DEPTH: "the limit with depth for nothing",
     NAIVE: "naive: the paper's snippet",
     "webdataset": "webdataset + decode step",
     "datasets": "HF datasets streaming + decode step",
@@ -90,11 +92,11 @@ _CONTESTANTS: Final = (
     ),
     Contestant(
         "ours-shards", _TITLES["ours-shards"], "forwards",
-        lambda job, **o: ours.mapped(job, job.material.shards, **o),
+        lambda job, **o: ours.mapped(job, job.data.shards, **o),
     ),
     Contestant(
         "ours-blosc2", _TITLES["ours-blosc2"], "forwards",
-        lambda job, **o: ours.mapped(job, job.material.blosc2, **o), "blosc2",
+        lambda job, **o: ours.mapped(job, job.data.blosc2, **o), "blosc2",
     ),
     Contestant(
         "ours-web", _TITLES["ours-web"], "forwards",
@@ -124,7 +126,7 @@ def title(name: str) -> str:
 def why_not(name: str) -> str | None:
     """Return why a contestant cannot race here, None where it can."""
     if "blosc2" in name and not can_pack_blosc2():
-        return "this version does not pack depth as blosc2 frames"
+        return "blosc2 is not installed"
     contestant = CONTESTANTS.get(name)
     if contestant is None or contestant.module is None:
         return None
@@ -139,19 +141,11 @@ def entrants(workload: Workload) -> list[tuple[str, int]]:
     """Return who races over a workload: names, each with a number of worker processes.
 
     The first number of workers is the headline: everybody races under it. Under the others the
-    limit and ours race; on the main workload the naive loader too.
+    limit and ours race.
     """
-    headline = workload.workers[0]
-    if workload.source == "web":
-        names = ["limit", "ours", "ours-web", "ours-web-blosc2", "webdataset-web", "datasets-web"]
-        return [(name, headline) for name in names]
-    names = [
+    names = workload.field or (
         LIMIT, OURS, "ours-stream", NAIVE, "webdataset", "datasets", "torchcodec", "decord",
         *workload.more,
-    ]  # fmt: skip
-    found = [(name, headline) for name in names]
-    for workers in workload.workers[1:]:
-        found += [(name, workers) for name in (LIMIT, OURS)]
-        if workload.name == "all-frames":
-            found.append((NAIVE, workers))
-    return found
+    )  # fmt: skip
+    others = [(name, count) for count in workload.workers[1:] for name in (LIMIT, OURS)]
+    return [(name, workload.workers[0]) for name in names] + others

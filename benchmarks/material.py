@@ -4,19 +4,20 @@ Four scenes of two families are drawn. The trees `many` and `eight` hold hard li
 under other keys: as many scenes open at a time as in a real epoch, without drawing for hours.
 """
 
-import inspect
 import json
 import os
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
+from benchmarks.reencoded import DRAWN_CRF, OTHER_CRFS, reencode_tree
 from stereogenbench_data.schema.records import Member, Scene, SceneId
-from stereogenbench_data.schema.release import IMAGE_SIZE_PX, SEEN_MAP_FOLDER
+from stereogenbench_data.schema.release import FRAME_RATE_HZ, IMAGE_SIZE_PX, SEEN_MAP_FOLDER
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
+from stereogenbench_data.storage.pack import pack
+from stereogenbench_data.storage.shard_plan import DepthCodec
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 
 Say = Callable[[str], None]
@@ -26,6 +27,7 @@ FAMILIES: Final = (("IPD_Gaussian", 11), ("Uniform", 12))
 
 MANY: Final = 64
 EIGHT: Final = 8
+FOUR: Final = 4
 
 _RELEASED: Final = (
     ("train", None, "IPD_Gaussian", 3289),
@@ -80,6 +82,10 @@ class Material:
         """The eight scenes in shards with depth as blosc2 frames; absent if that cannot be made."""
         return self.root / "blosc2"
 
+    def at_rate(self, crf: int) -> "Material":
+        """Return the same pictures at another constant rate factor: four scenes, not eight."""
+        return self if crf == DRAWN_CRF else replace(self, root=self.root / f"crf{crf}")
+
     @property
     def full_index(self) -> Path:
         """An index with as many scenes as the release has."""
@@ -87,22 +93,27 @@ class Material:
 
 
 def can_pack_blosc2() -> bool:
-    """Return whether this version packs depth as blosc2 frames."""
-    from stereogenbench_data.cli.pack import pack
-
-    return "depth_codec" in inspect.signature(pack).parameters
+    """Return whether depth can be packed as blosc2 frames here."""
+    return find_spec("blosc2") is not None
 
 
-def prepared(material: Material, *, say: Say, workers: int | None = None) -> Material:
+def prepared(
+    material: Material,
+    *,
+    say: Say,
+    workers: int | None = None,
+    crfs: tuple[int, ...] = OTHER_CRFS,
+) -> Material:
     """Draw, link, index and pack what is not there yet.
 
     Args:
         material: What is wanted, and where.
         say: Is told what is being done.
         workers: Processes that draw; None is one a core.
+        crfs: Constant rate factors at which the pictures are wanted too.
 
     Raises:
-        RuntimeError: If the folder holds data of another size, or packing failed.
+        RuntimeError: If the folder holds data of another size.
     """
     wanted = {"size_px": material.size_px, "frames": material.frames, "families": FAMILIES}
     note, text = material.root / "material.json", json.dumps(wanted)
@@ -111,16 +122,17 @@ def prepared(material: Material, *, say: Say, workers: int | None = None) -> Mat
             f"{material.root}: holds other data ({note.read_text()}) than asked for ({text}): "
             "remove it, or choose another folder with --data."
         )
-    _draw(material, say=say, workers=workers or os.cpu_count() or 1)
+    workers = workers or os.cpu_count() or 1
+    _draw(material, say=say, workers=workers)
     _link(material.release, material.many, scenes=max(EIGHT, round(MANY * material.scale)))
+    _index(material.many, say=say)
     _link(material.release, material.eight, scenes=EIGHT)
-    for tree in (material.many, material.eight):
-        if not (tree / INDEX_NAME).exists():
-            say(f"indexing {tree}")
-            SceneIndex.open(tree).write(tree / INDEX_NAME)
-    _pack(material.eight, material.shards, say=say)
-    if can_pack_blosc2():
-        _pack(material.eight, material.blosc2, say=say, options=("--depth-codec", "blosc2"))
+    _index_and_pack(material, say=say, workers=workers)
+    for crf in crfs:
+        other = material.at_rate(crf)
+        reencode_tree(material.release, other.release, crf=crf, workers=workers, say=say)
+        _link(other.release, other.eight, scenes=FOUR)
+        _index_and_pack(other, say=say, workers=workers)
     if not material.full_index.exists():
         say("writing an index of as many scenes as the release has")
         _write_full_index(material)
@@ -156,7 +168,23 @@ def _link(release: Path, tree: Path, *, scenes: int) -> None:
                 os.link(file, linked / file.name)
 
 
-def _pack(tree: Path, out: Path, *, say: Say, options: tuple[str, ...] = ()) -> None:
+def _index(tree: Path, *, say: Say) -> None:
+    if not (tree / INDEX_NAME).exists():
+        say(f"indexing {tree}")
+        SceneIndex.open(tree).write(tree / INDEX_NAME)
+
+
+def _index_and_pack(material: Material, *, say: Say, workers: int) -> None:
+    _index(material.eight, say=say)
+    _pack(material.eight, material.shards, say=say, workers=workers)
+    if can_pack_blosc2():
+        _pack(material.eight, material.blosc2, say=say, workers=workers, depth_codec="blosc2")
+
+
+def _pack(
+    tree: Path, out: Path, *, say: Say, workers: int, depth_codec: DepthCodec = "released"
+) -> None:
+    """Pack a tree, one scene a shard."""
     if (out / INDEX_NAME).exists():
         return
     say(f"packing {out}")
@@ -164,16 +192,8 @@ def _pack(tree: Path, out: Path, *, say: Say, options: tuple[str, ...] = ()) -> 
         sum(file.stat().st_size for file in scene.parent.iterdir())
         for scene in tree.rglob("baseline.json")
     ]
-    size = f"{max(sizes) * 101 // 100_000_000 + 1}MB"
-    command = [sys.executable, "-m", "stereogenbench_data.cli.main", "pack"]
-    done = subprocess.run(
-        [*command, str(tree), str(out), "--shard-size", size, *options],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise RuntimeError(f"packing {out} failed: {done.stderr[-1000:]}")
+    target_bytes = (max(sizes) * 101 // 100_000_000 + 1) * 1_000_000
+    pack(tree, out, target_bytes=target_bytes, depth_codec=depth_codec, workers=workers)
 
 
 def _write_full_index(material: Material) -> None:
@@ -208,20 +228,27 @@ def _moved(scene: Scene, name: SceneId, *, number: int) -> Scene:
 
 
 def facts(material: Material) -> dict[str, Any]:
-    """Return what the results say of the data: sizes and bit rates."""
-    seconds = material.frames / 15
-    scenes = sorted(path.parent for path in material.release.rglob("baseline.json"))
-    megabytes: dict[str, float] = {}
-    for label, pattern in (("rgb", "*_rgb.mp4"), ("depth", "*_depth.mkv")):
-        sizes = [file.stat().st_size for scene in scenes for file in scene.glob(pattern)]
-        megabytes[f"{label}_mb_a_frame"] = sum(sizes) / len(sizes) / material.frames / 1e6
-        megabytes[f"{label}_mbit_s"] = sum(sizes) / len(sizes) / seconds * 8 / 1e6
-    packed = {
-        f"{label}_mb_a_scene": sum(file.stat().st_size for file in folder.glob("*.tar"))
-        / EIGHT
-        / 1e6
-        for label, folder in (("shards", material.shards), ("blosc2", material.blosc2))
-        if folder.exists()
+    """Return what the results say of the data: sizes and bit rates, and those of other rates."""
+    sizes = {"size_px": material.size_px, "frames": material.frames, "scenes": 2 * len(FAMILIES)}
+    others = {
+        str(crf): _rates(material.at_rate(crf), scenes=FOUR)
+        for crf in OTHER_CRFS
+        if material.at_rate(crf).release.exists()
     }
-    sizes = {"size_px": material.size_px, "frames": material.frames, "scenes": len(scenes)}
-    return sizes | megabytes | packed
+    return sizes | _rates(material, scenes=EIGHT) | {"other_rates": others}
+
+
+def _rates(material: Material, *, scenes: int) -> dict[str, float]:
+    """Return megabytes a frame, megabits a second of a camera, and megabytes a packed scene."""
+    seconds = material.frames / FRAME_RATE_HZ
+    found: dict[str, float] = {}
+    for label, name in (("rgb", "*_rgb.mp4"), ("depth", "*_depth.mkv")):
+        sizes = [file.stat().st_size for file in material.release.rglob(name)]
+        mean = sum(sizes) / len(sizes)
+        found[f"{label}_mb_a_frame"] = mean / material.frames / 1e6
+        found[f"{label}_mbit_s"] = mean / seconds * 8 / 1e6
+    for label, folder in (("shards", material.shards), ("blosc2", material.blosc2)):
+        if folder.exists():
+            packed = sum(file.stat().st_size for file in folder.glob("*.tar"))
+            found[f"{label}_mb_a_scene"] = packed / scenes / 1e6
+    return found

@@ -5,9 +5,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, OURS, title
-from benchmarks.results import Spread, entry, rates, ratios
-from benchmarks.workloads import WORKLOADS, Workload
+from benchmarks.field import CONTESTANTS, LIMIT, NO_DEPTH, OURS, title
+from benchmarks.race_tables import rgb_mbit_s
+from benchmarks.reencoded import DRAWN_CRF, OTHER_CRFS
+from benchmarks.results import Spread, entry, rates, ratios, shares
+from benchmarks.workloads import RATED, RATES, WORKLOADS, Workload
 
 _INK: Final = "#222222"
 _OURS: Final = "#0b6e99"
@@ -32,12 +34,13 @@ def plot_all(sections: dict[str, Any], folder: Path) -> list[Path]:
         }
     )  # fmt: skip
     races = sections.get("races", {})
-    local = [w for w in WORKLOADS if w.name in races and w.source == "local"]
+    local = [w for w in WORKLOADS if w.name in races and w.source == "local" and w not in RATES]
     web = [w for w in WORKLOADS if w.name in races and w.source == "web"]
     made = []
     for name, wanted, make in (
         ("contestants", local, lambda: _contestants(races, local)),
         ("workers", "all-frames" in races, lambda: _workers(races["all-frames"])),
+        ("rates", any(w.name in races for w in RATES), lambda: _by_rate(sections)),
         ("web", web, lambda: _web(races, web)),
         ("accuracy", "accuracy" in sections, lambda: _accuracy(sections["accuracy"])),
         ("profile", "profile" in sections, lambda: _profile(sections["profile"])),
@@ -112,7 +115,7 @@ def _workers(race: dict[str, Any]) -> Any:
 
     figure, axes = plt.subplots(figsize=(6.5, 4))
     workers = sorted({int(name.split("/")[1]) for found in race["rounds"] for name in found})
-    for name, colour, marker in ((LIMIT, _INK, "s"), (OURS, _OURS, "o"), (NAIVE, "#888888", "v")):
+    for name, colour, marker in ((LIMIT, _INK, "s"), (OURS, _OURS, "o")):
         spreads = {count: rates(race["rounds"], entry(name, count)) for count in workers}
         shown = {count: spread for count, spread in spreads.items() if spread is not None}
         if not shown:
@@ -131,6 +134,64 @@ def _workers(race: dict[str, Any]) -> Any:
     axes.set_ylim(bottom=0)
     axes.set_title(race["settings"]["title"])
     axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _to_limit(race: dict[str, Any], name: str) -> Spread | None:
+    """Return the ratios of a contestant to the limit under the race's first number of workers."""
+    workers = race["settings"]["workers"][0]
+    return ratios(race["rounds"], entry(name, workers), to=entry(LIMIT, workers))
+
+
+def _by_rate(sections: dict[str, Any]) -> Any:
+    """Draw what depth's codec gives against the pictures' rate, and what it could give."""
+    import matplotlib.pyplot as plt
+
+    lines = (
+        ("ours-blosc2", "ours, blosc2 shards", _OURS, "o"),
+        ("ours-shards", "ours, released shards", "#7fb8d1", "s"),
+        (NO_DEPTH, title(NO_DEPTH), _INK, "^"),
+    )
+    figure, grid = plt.subplots(1, len(RATED), figsize=(13, 4), sharey=True)
+    for axes, name in zip(grid, RATED, strict=True):
+        found = {
+            rgb_mbit_s(sections, crf): sections["races"][race]
+            for crf in (DRAWN_CRF, *OTHER_CRFS)
+            if (race := name if crf == DRAWN_CRF else f"{name}-crf{crf}") in sections["races"]
+        }
+        for entrant, label, colour, marker in lines:
+            spreads = {mbit_s: _to_limit(race, entrant) for mbit_s, race in found.items()}
+            shown = {mbit_s: each for mbit_s, each in spreads.items() if each is not None}
+            middle = np.array([each.median for each in shown.values()])
+            low = middle - [each.low for each in shown.values()]
+            high = np.array([each.high for each in shown.values()]) - middle
+            axes.errorbar(
+                list(shown), middle, yerr=[low, high], color=colour, marker=marker, capsize=3,
+                label=label,
+            )  # fmt: skip
+        for mbit_s, race in found.items():
+            workers = race["settings"]["workers"][0]
+            limit, free = entry(LIMIT, workers), entry(NO_DEPTH, workers)
+            share = shares(race["rounds"], limit, without=free)
+            if share is not None:
+                axes.annotate(
+                    f"{share.median * 100:.0f} %", (mbit_s, 0), xytext=(0, 4), ha="center",
+                    textcoords="offset points", fontsize=8, color=_TARGET,
+                )  # fmt: skip
+        workload = next(workload for workload in WORKLOADS if workload.name == name)
+        axes.axhline(1, color=_INK, linewidth=1)
+        axes.set_title(workload.title, fontsize=9)
+        axes.set_xlabel("Mbit/s a camera")
+        axes.margins(x=0.1)
+        axes.set_xlim(left=0)
+    grid[0].set_ylim(bottom=0)
+    grid[0].set_ylabel("speed, in the bare loop's")
+    grid[0].legend(frameon=False, fontsize=8)
+    figure.suptitle(
+        "What the codec of depth gives depends on what the pictures cost "
+        "(red: depth decoding's share of the bare loop's time)", x=0.01, ha="left", fontsize=10,
+    )  # fmt: skip
+    figure.tight_layout(rect=(0, 0, 1, 0.96))
     return figure
 
 

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
 
-from benchmarks.clock import Measured, MeasurementError, measured
+from benchmarks.clock import MeasurementError, measured
 from benchmarks.field import CONTESTANTS, entrants, why_not
 from benchmarks.material import Material
 from benchmarks.results import Results, entry
@@ -61,8 +61,12 @@ class Clock:
 
 def run_races(
     workloads: list[Workload], material: Material, results: Results, *, plan: Plan, say: Say
-) -> None:
-    """Run the races of some workloads; results are written after every round."""
+) -> list[str]:
+    """Run the races of some workloads; results are written after every round.
+
+    Returns:
+        What failed in them.
+    """
     clock = Clock(results, workloads, rounds=plan.rounds)
     with ExitStack() as stack:
         server = None
@@ -70,7 +74,14 @@ def run_races(
             home = material.root / "server"
             server = stack.enter_context(serving(material.root, home=home))
         for workload in workloads:
-            _race(workload, material, results, plan=plan, say=say, clock=clock, server=server)
+            serves = server if workload.source == "web" else None
+            _race(workload, material, results, plan=plan, say=say, clock=clock, server=serves)
+    return [
+        f"{workload.name}: {name}: {why}"
+        for workload in workloads
+        for name, why in results.race(workload.name)["failed"].items()
+        if "/" in name  # others could not race here at all
+    ]
 
 
 def _race(  # noqa: PLR0913 - one race's surroundings
@@ -86,46 +97,57 @@ def _race(  # noqa: PLR0913 - one race's surroundings
     job = Job(workload, material, url=server.url if server else None)
     settings = {
         "title": workload.title, "scenes": workload.scenes, "batch": workload.batch,
-        "few": workload.few, "workers": list(workload.workers), "samples": len(job.wanted),
-        "server": server.kind if server and workload.source == "web" else None,
+        "few": workload.few, "window": str(workload.window), "workers": list(workload.workers),
+        "samples": len(job.wanted), "server": server.kind if server else None,
     }  # fmt: skip
     section: dict[str, Any] = results.race(workload.name)
     if not plan.resume or section["settings"] != settings:
         section = {"settings": settings, "rounds": [], "failed": {}}
-    jobs = {"forwards": job, "anywhere": replace(job, reading="anywhere")}
-    field = []
-    for name, workers in entrants(workload):
-        reason = why_not(name)
-        if reason is None:
-            field.append((name, workers))
-        else:
-            section["failed"][name] = reason
+    reasons = {name: why_not(name) for name, _ in entrants(workload)}
+    section["failed"] = {
+        **{name: why for name, why in section["failed"].items() if "/" in name},
+        **{name: why for name, why in reasons.items() if why is not None},
+    }
+    field = [(name, workers) for name, workers in entrants(workload) if reasons[name] is None]
     for number in range(plan.rounds):
-        turn = number % max(1, len(field))
-        in_turn = field[turn:] + field[:turn]
         if number < len(section["rounds"]):
             for entrant in field:
                 clock.skip(f"{workload.name} {entry(*entrant)}")
             continue
         say(f"{workload.name}: round {number + 1} of {plan.rounds}, about {clock.left()} left")
+        turn = number % max(1, len(field))
+        in_turn = field[turn:] + field[:turn]
         found = {}
         for name, workers in in_turn if number % 2 == 0 else in_turn[::-1]:
-            reading = CONTESTANTS[name].reading if name in CONTESTANTS else "forwards"
             began = time.perf_counter()
-            sent = server.sent_bytes() if server else 0
             try:
-                took = measured(name, addressed(jobs[reading], name), workers=workers)
+                found[entry(name, workers)] = _measured(name, job, workers=workers, server=server)
             except MeasurementError as error:
                 section["failed"][entry(name, workers)] = str(error)[-500:]
                 say(f"{workload.name}: {name} failed: {str(error)[-300:]}")
-                continue
             finally:
                 clock.spent(f"{workload.name} {entry(name, workers)}", time.perf_counter() - began)
-            found[entry(name, workers)] = _noted(took)
-            if server and name.endswith(("-web", "-web-blosc2")):
-                found[entry(name, workers)]["bytes"] = server.sent_bytes() - sent
         section["rounds"].append(found)
         results.put_race(workload.name, section)
+
+
+def _measured(name: str, job: Job, *, workers: int, server: WebServer | None) -> dict[str, float]:
+    """Return what is noted of one contestant's turn.
+
+    Raises:
+        MeasurementError: If it failed.
+    """
+    reading = CONTESTANTS[name].reading if name in CONTESTANTS else "forwards"
+    sent = server.sent_bytes() if server else 0
+    took = measured(name, addressed(replace(job, reading=reading), name), workers=workers)
+    noted = {
+        "samples": took.samples,
+        "seconds": round(took.seconds, 4),
+        "cpu_s": round(took.cpu_s, 3),
+    }
+    if server and name.endswith(("-web", "-web-blosc2")):
+        noted["bytes"] = server.sent_bytes() - sent
+    return noted
 
 
 def addressed(job: Job, name: str) -> Job:
@@ -133,11 +155,3 @@ def addressed(job: Job, name: str) -> Job:
     if name.startswith("ours"):
         return job
     return replace(job, url=f"{job.url}/shards" if name.endswith("-web") else None)
-
-
-def _noted(took: Measured) -> dict[str, float]:
-    return {
-        "samples": took.samples,
-        "seconds": round(took.seconds, 4),
-        "cpu_s": round(took.cpu_s, 3),
-    }

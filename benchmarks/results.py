@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 
 Round = dict[str, dict[str, float]]
 """Of one round: what each entrant measured, by its name and workers as in "ours/2"."""
@@ -89,6 +89,16 @@ def ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
         / (found[to]["samples"] / found[to]["seconds"])
         for found in rounds
         if entrant in found and to in found
+    )  # fmt: skip
+
+
+def shares(rounds: list[Round], entrant: str, *, without: str) -> Spread | None:
+    """Return the share of an entrant's time that another saves, which leaves out a part of it."""
+    return Spread.of(
+        1 - (found[entrant]["samples"] / found[entrant]["seconds"])
+        / (found[without]["samples"] / found[without]["seconds"])
+        for found in rounds
+        if entrant in found and without in found
     )  # fmt: skip
 
 

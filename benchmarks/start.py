@@ -11,9 +11,10 @@ from typing import Any, Final
 import numpy as np
 
 from benchmarks.clock import in_a_fork
+from benchmarks.contestants import limit
 from benchmarks.material import Material
 from benchmarks.results import Spread
-from benchmarks.workloads import WORKLOADS, Job
+from benchmarks.workloads import WORKLOADS, Job, Wanted
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.storage.index import SceneIndex
 
@@ -86,11 +87,11 @@ def measure_start(material: Material, *, rounds: int, say: Say) -> dict[str, Any
         "first_batch_ratio": _spread(
             theirs / own for own, theirs in zip(first["ours"], first["naive"], strict=True)
         ),
-        "start_s": _spread(found["start_s"] for found in resumed),
-        "resume_s": _spread(found["resume_s"] for found in resumed),
-        "seek_s": _spread(found["seek_s"] for found in resumed),
-        "epoch_from_start_s": _spread(found["rest_from_start_s"] for found in resumed),
-        "epoch_from_half_s": _spread(found["rest_from_half_s"] for found in resumed),
+        "resuming": {name: _spread(found[name] for found in resumed) for name in resumed[0]},
+        "resuming_to_bare": {
+            name: _spread(found[name] / found[f"bare_{name}"] for found in resumed)
+            for name in ("start_s", "resume_s")
+        },
         "rounds": rounds,
     }
 
@@ -166,13 +167,14 @@ def _resume(material: Material) -> dict[str, float]:
 
     Of an epoch of eight scenes' primary pairs. ``seek_s`` is what loading the state took by itself.
     ``rest_from_start_s`` and ``rest_from_half_s`` are the time that a batch takes on average over
-    the 16 batches from there on: resuming costs what it adds to these.
+    17 batches from there on. ``bare_start_s`` and ``bare_resume_s`` are what a bare loop takes that
+    opens the same videos and decodes once to the frames of the same first batch.
     """
     workload = next(workload for workload in WORKLOADS if workload.name == "all-frames")
     job = Job(workload, material)
     chosen = job.selection | {"frames": "all"}
 
-    def timed(state: dict[str, Any] | None) -> tuple[float, float, float]:
+    def timed(state: dict[str, Any] | None) -> dict[str, float]:
         pairs = StereoPairs(job.tree, **chosen)
         loader = pairs.loader(workload.batch, seed=0)
         began = time.perf_counter()
@@ -180,23 +182,49 @@ def _resume(material: Material) -> dict[str, float]:
             loader.load_state_dict(state)
         loaded = time.perf_counter()
         batches = iter(loader)
-        next(batches)
+        batch = next(batches)
         first = time.perf_counter()
-        count = sum(1 for _, _ in zip(range(16), batches, strict=False))
+        count = 1 + sum(1 for _, _ in zip(range(16), batches, strict=False))
         ended = time.perf_counter()
         pairs.close()
-        return loaded - began, first - began, (ended - began) / (count + 1)
+        return {
+            "load": loaded - began, "first": first - began, "mean": (ended - began) / count,
+            "bare": _bare_s(job, _samples(batch)),
+        }  # fmt: skip
 
     pairs = StereoPairs(job.tree, **chosen)
     loader = pairs.loader(workload.batch, seed=0)
     half = loader.batches.state_at(0, len(loader) // 2)
-    timed(None)  # whatever is done once a process
-    _, start_s, rest_from_start_s = timed(None)
-    seek_s, resume_s, rest_from_half_s = timed(half)
+    next(iter(loader))  # whatever is done once a process
+    pairs.close()
+    start, resumed = timed(None), timed(half)
     return {
-        "start_s": start_s, "resume_s": resume_s, "seek_s": seek_s,
-        "rest_from_start_s": rest_from_start_s, "rest_from_half_s": rest_from_half_s,
+        "seek_s": resumed["load"],
+        "start_s": start["first"], "bare_start_s": start["bare"],
+        "resume_s": resumed["first"], "bare_resume_s": resumed["bare"],
+        "rest_from_start_s": start["mean"], "rest_from_half_s": resumed["mean"],
     }  # fmt: skip
+
+
+def _samples(batch: dict[str, Any]) -> list[Wanted]:
+    """Return what was loaded in a batch."""
+    return [
+        Wanted(scene, int(left), int(right), (int(frame),))
+        for scene, (left, right), frame in zip(
+            batch["scene"], batch["pair"].tolist(), batch["frame_index"].tolist(), strict=True
+        )
+    ]
+
+
+def _bare_s(job: Job, wanted: list[Wanted]) -> float:
+    """Return how long a bare loop takes that decodes each stream once, as far as is wanted."""
+    scenes: dict[str, list[Wanted]] = {}
+    for sample in sorted(wanted, key=lambda sample: sample.frames):
+        scenes.setdefault(sample.scene, []).append(sample)
+    began = time.perf_counter()
+    for _ in limit.samples(job, scenes):
+        pass
+    return time.perf_counter() - began
 
 
 def measure_memory(material: Material, *, batches: int, say: Say) -> dict[str, Any]:

@@ -1,15 +1,11 @@
 """The Markdown of the results: everything in it is worked out from the JSON file."""
 
-from collections.abc import Iterable
 from typing import Any
 
-from benchmarks.field import LIMIT, NAIVE, OURS, title
-from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios
-from benchmarks.ways import DEFAULT
-from benchmarks.workloads import WORKLOADS, Workload
+from benchmarks.markdown import table
+from benchmarks.race_tables import by_rate, headlines, race_table
+from benchmarks.workloads import RATES, WORKLOADS
 from stereogenbench_data.schema.problems import counted
-
-Rows = list[list[str]]
 
 
 def tables(sections: dict[str, Any]) -> str:
@@ -17,32 +13,18 @@ def tables(sections: dict[str, Any]) -> str:
     parts = ["# Measured\n", _how(sections)]
     races = sections.get("races", {})
     if races:
-        parts += [_headlines(races)]
-        parts += [_race(workload, races[workload.name]) for workload in WORKLOADS
-                  if workload.name in races]  # fmt: skip
+        parts += [headlines(races)]
+        parts += [race_table(workload, races[workload.name]) for workload in WORKLOADS
+                  if workload.name in races and workload not in RATES]  # fmt: skip
+        if any(workload.name in races for workload in RATES):
+            parts.append(by_rate(sections))
     for name, make in (
         ("start", _start), ("memory", _memory), ("accuracy", _accuracy), ("profile", _profile),
+        ("tried", _tried), ("evaluation", _evaluation),
     ):  # fmt: skip
         if name in sections:
             parts.append(make(sections[name]))
     return "\n".join(parts)
-
-
-def _table(head: Iterable[str], rows: Rows) -> str:
-    titles = list(head)
-    lines = [titles, ["---"] + ["---:"] * (len(titles) - 1), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
-def _spread(spread: Spread | None, form: str = ".2f") -> str:
-    """Return median (low to high quartile)."""
-    if spread is None:
-        return ""
-    return f"{spread.median:{form}} ({spread.low:{form}} to {spread.high:{form}})"
-
-
-def _rate(spread: Spread | None) -> str:
-    return "" if spread is None else f"{spread.median:.3g}"
 
 
 def _how(sections: dict[str, Any]) -> str:
@@ -73,76 +55,6 @@ def _how(sections: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _verdict(spread: Spread | None, wanted: float | None) -> str:
-    if spread is None or wanted is None:
-        return ""
-    return f"{wanted:g} {'reached' if spread.median >= wanted else '**missed**'}"
-
-
-def _headlines(races: dict[str, Any]) -> str:
-    rows = []
-    for workload in WORKLOADS:
-        if workload.name not in races or workload.target is None:
-            continue
-        rounds, workers = races[workload.name]["rounds"], workload.workers[0]
-        own = entry(OURS, workers)
-        limit = ratios(rounds, own, to=entry(LIMIT, workers))
-        naive = ratios(rounds, own, to=entry(NAIVE, workers))
-        blosc2 = ratios(rounds, entry("ours-blosc2", workers), to=entry(LIMIT, workers))
-        rows.append(
-            [
-                workload.title, _spread(limit), _verdict(limit, workload.target.limit),
-                _spread(naive, ".1f"), _verdict(naive, workload.target.naive),
-                _spread(blosc2), _verdict(blosc2, workload.blosc2),
-            ]
-        )  # fmt: skip
-    head = (
-        "ours, 2 workers", "to the limit", "target", "to naive", "target",
-        "blosc2 shards to the released codecs' limit", "target",
-    )  # fmt: skip
-    return "## Headlines\n\n" + _table(head, rows)
-
-
-def _race(workload: Workload, race: dict[str, Any]) -> str:
-    rounds = race["rounds"]
-    names = {name for found in rounds for name in found}
-    rows = []
-    for workers in sorted(workload.workers):
-        limit, naive = entry(LIMIT, workers), entry(NAIVE, workers)
-        for name in (LIMIT, OURS, *(n for n in _order(names) if n not in (LIMIT, OURS))):
-            entrant = entry(name, workers)
-            if entrant not in names:
-                continue
-            sent = Spread.of(
-                found[entrant]["bytes"] / found[entrant]["samples"] / 1e6
-                for found in rounds
-                if "bytes" in found.get(entrant, {})
-            )
-            rows.append(
-                [
-                    title(name), str(workers), _rate(rates(rounds, entrant)),
-                    _spread(ratios(rounds, entrant, to=limit)) if name != LIMIT else "",
-                    _spread(ratios(rounds, entrant, to=naive), ".1f") if name != NAIVE else "",
-                    _spread(cpu_ratios(rounds, entrant, to=limit)) if name != LIMIT else "",
-                    *([_rate(sent)] if workload.source == "web" else []),
-                ]
-            )  # fmt: skip
-    head = [
-        "", "workers", "samples/s", "to the limit", "to naive", "to the limit, by processor time",
-        *(["MB a sample"] if workload.source == "web" else []),
-    ]  # fmt: skip
-    failed = [f"- {title(name.split('/')[0])}: {why}" for name, why in race["failed"].items()]
-    text = f"## {workload.title}\n\n{counted(len(rounds), 'round')}.\n\n" + _table(head, rows)
-    return text + ("\nDid not race:\n" + "\n".join(failed) + "\n" if failed else "")
-
-
-def _order(names: set[str]) -> list[str]:
-    from benchmarks.field import CONTESTANTS
-
-    found = {name.split("/")[0] for name in names}
-    return [name for name in CONTESTANTS if name in found]
-
-
 def _ms(value: dict[str, float]) -> str:
     return f"{value['median'] * 1e3:.0f} ({value['low'] * 1e3:.0f} to {value['high'] * 1e3:.0f})"
 
@@ -160,15 +72,32 @@ def _start(start: dict[str, Any]) -> str:
         ["first batch of a fresh process, no file cached: ours",
          _ms(start["first_batch_s"]["ours"]), ""],
         ["the same: naive", _ms(start["first_batch_s"]["naive"]), ""],
-        ["first batch at the start of an epoch", _ms(start["start_s"]), ""],
-        ["first batch, resumed at half an epoch", _ms(start["resume_s"]), ""],
-        ["loading the state alone", _ms(start["seek_s"]), ""],
-        ["a batch on average, over the first 17", _ms(start["epoch_from_start_s"]), ""],
-        ["a batch on average, over 17 from the middle", _ms(start["epoch_from_half_s"]), ""],
+        ["loading a state of half an epoch", _ms(start["resuming"]["seek_s"]), ""],
     ]  # fmt: skip
     torch = "imports torch" if start["imports_torch"] else "does not import torch"
-    text = f"## Start\n\n`import stereogenbench_data` {torch}. {start['rounds']} rounds.\n\n"
-    return text + _table(("", "ms", "target"), rows)
+    rounds = counted(start["rounds"], "round")
+    text = f"## Start\n\n`import stereogenbench_data` {torch}. {rounds}.\n\n"
+    return text + table(("", "ms", "target"), rows) + "\n" + _resuming(start)
+
+
+def _resuming(start: dict[str, Any]) -> str:
+    """Return the table of starting and resuming beside what a bare loop has to decode anyway."""
+    titles = {
+        "start_s": "first batch at the start of an epoch",
+        "resume_s": "first batch, resumed at half an epoch",
+        "rest_from_start_s": "a batch on average, over the first 17",
+        "rest_from_half_s": "a batch on average, over 17 from the middle",
+    }
+    rows = []
+    for name, what in titles.items():
+        times, to_bare = start["resuming"], start["resuming_to_bare"].get(name)
+        beside = ["", ""]
+        if to_bare is not None:
+            spread = f"{to_bare['median']:.2f} ({to_bare['low']:.2f} to {to_bare['high']:.2f})"
+            beside = [_ms(times[f"bare_{name}"]), spread]
+        rows.append([what, _ms(times[name]), *beside])
+    head = ("", "ours, ms", "a bare loop to the same frames, ms", "ours to the loop, times")
+    return table(head, rows)
 
 
 def _below(value: dict[str, float], wanted_s: float) -> str:
@@ -191,7 +120,7 @@ def _memory(memory: dict[str, Any]) -> str:
         f"{memory['scenes']} scenes, {memory['workers']} workers, batches of {memory['batch']}, "
         f"{memory['batches']} batches.\n\n"
     )
-    return text + _table(("", "", "target"), rows)
+    return text + table(("", "", "target"), rows)
 
 
 def _accuracy(found: dict[str, Any]) -> str:
@@ -222,7 +151,7 @@ def _accuracy(found: dict[str, Any]) -> str:
         f"## Speed against error\n\n{found['cases']:,} hard pixels; speed on "
         f"{found['pixels']:,} pixels of a rendered frame, {found['rounds']} rounds, by processor "
         f"time. One conversion of the map from uint16 to float32 takes {conversion:.2f} ns a "
-        "pixel.\n\n" + _table(head, rows)
+        "pixel.\n\n" + table(head, rows)
     )
     text += (
         f"\nThe cheapest whose error stays within the depth quantum's own bound and 1 ulp of "
@@ -238,34 +167,77 @@ def _accuracy(found: dict[str, Any]) -> str:
         "resized to 832x480", "in the package", "ns a source pixel", "conversions", "99 % px",
         "99.9 % px", "worst px", "mean px", "of no surface, % of pixels",
     )  # fmt: skip
-    text += _table(head, rows) + "\n"
+    text += table(head, rows) + "\n"
     rows = [
         [way["name"], offered[way["offered"]], *speed(way), f"{way['other_share'] * 100:.4f}"]
         for way in found["visibility"]
     ]
     head = ("visibility", "in the package", "ns a pixel", "conversions", "decided otherwise, %")
-    return text + _table(head, rows) + "\n" + _kernels(found)
-
-
-def kernel_ratios(found: dict[str, Any]) -> dict[str, tuple[dict[str, float], float]]:
-    """Return the conversions that disparity and visibility take, with what they may take."""
-    spent = {way["name"]: way["ns_a_pixel"] for way in (*found["ways"], *found["visibility"])}
-    return {
-        "disparity, into a new array": (spent[DEFAULT], 1 / 0.7),
-        "disparity, into the same array": (found["default_here_ns"], 1 / 0.7),
-        "disparity, into memory fresh from the system": (found["default_fresh_ns"], 1 / 0.7),
-        "visibility": (spent["visible, float32"], 12.0),
-    }
+    return text + table(head, rows) + "\n" + _kernels(found)
 
 
 def _kernels(found: dict[str, Any]) -> str:
+    rows = []
+    for kernel in found["kernels"]:
+        ns, most = kernel["ns_a_pixel"], kernel["most"]
+        rows.append(
+            [
+                kernel["kernel"], kernel["memory"], f"{kernel['conversion_ns']:.2f}",
+                f"{ns['median']:.2f}",
+                f"{ns['conversions']:.2f} ({ns['conversions_low']:.2f} to "
+                f"{ns['conversions_high']:.2f})",
+                f"{most:.2f} {'reached' if ns['conversions'] <= most else '**missed**'}",
+            ]
+        )  # fmt: skip
+    head = (
+        "kernel", "written into", "plain conversion, ns a pixel", "kernel, ns a pixel",
+        "conversions", "at most",
+    )  # fmt: skip
+    return table(head, rows)
+
+
+def _tried(found: dict[str, Any]) -> str:
+    text = (
+        "## Ways to decode and to convert\n\nOne process, "
+        f"{counted(found['rounds'], 'round')}; the package's own way is the first of each table. "
+        '"Equal" means bit for bit.\n'
+    )
+    for group, ways in found["groups"].items():
+        rows = []
+        for way in ways:
+            times, alike = way["times"], "not compared"
+            if "psnr_db" in way:
+                alike = "equal" if way["psnr_db"] is None else f"{way['psnr_db']:.0f} dB"
+            spread = f"{times['median']:.2f} ({times['low']:.2f} to {times['high']:.2f})"
+            ms = (f"{way['cpu_ms']:.2f}", f"{way['wall_ms']:.2f}")
+            rows.append([way["name"], *ms, "" if way is ways[0] else spread, alike])
+        head = (
+            group,
+            "ms of processor a picture",
+            "ms",
+            "processor time, in the first's",
+            "result",
+        )
+        text += "\n" + table(head, rows)
+    return text
+
+
+def _evaluation(found: dict[str, Any]) -> str:
+    beside, most = found["beside_matchers_over_decoding"], found["limit"]
     rows = [
-        [name, f"{ns['conversions']:.2f} ({ns['conversions_low']:.2f} to "
-         f"{ns['conversions_high']:.2f})",
-         f"{most:.2f} {'reached' if ns['conversions'] <= most else '**missed**'}"]
-        for name, (ns, most) in kernel_ratios(found).items()
+        ["decoding and resizing what is scored, s", f"{found['decoding_and_resizing_s']:.2f}", ""],
+        ["scoring, s", f"{found['scoring_s']:.2f}", ""],
+        ["of it the matchers, s", f"{found['matchers_s']:.2f}", ""],
+        ["scoring beside the matchers, in decodings",
+         f"{beside['median']:.2f} ({beside['low']:.2f} to {beside['high']:.2f})",
+         f"{most:g} {'reached' if beside['median'] <= most else '**missed**'}"],
     ]  # fmt: skip
-    return _table(("kernel", "conversions of the same map", "at most"), rows)
+    text = (
+        f"## Scoring\n\nOne scene of {found['frames']} frames of {found['stored_px']} px, scored "
+        f"at {found['scored_at']} by the offline metrics; processor time, "
+        f"{counted(found['rounds'], 'round')}.\n\n"
+    )
+    return text + table(("", "", "at most"), rows)
 
 
 def _profile(profile: dict[str, Any]) -> str:
@@ -280,4 +252,4 @@ def _profile(profile: dict[str, Any]) -> str:
         rows.append([label, *cells])
     rows.append(["all", *(f"{sum(profile[n]['ms_a_sample'].values()):.2f}" for n in names)])
     head = ("ms a sample, one worker", *names)
-    return "## Where the time goes\n\n" + _table(head, rows)
+    return "## Where the time goes\n\n" + table(head, rows)

@@ -91,10 +91,12 @@ def _all_measured(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def closed_form(units: np.ndarray, pair: Pair) -> np.ndarray:
-    """The same over the whole map at once, as a function."""
-    return disparity_from_units(
-        units, focal_px=pair.focal_px, baseline_m=pair.baseline_m, unit_m=pair.unit_m
-    )
+    """The same over the whole map at once, which is the package's way with torch's tensors."""
+    disparity_px = disparity_from_units(
+        torch.from_numpy(units),
+        focal_px=pair.focal_px, baseline_m=pair.baseline_m, unit_m=pair.unit_m,
+    )  # fmt: skip
+    return np.asarray(disparity_px)
 
 
 def float32_depth(units: np.ndarray, pair: Pair) -> np.ndarray:
@@ -113,7 +115,7 @@ def plain_divide(units: np.ndarray, pair: Pair) -> np.ndarray:
 def half_disparity(units: np.ndarray, pair: Pair) -> np.ndarray:
     """The default, stored in half precision."""
     with np.errstate(over="ignore"):
-        return closed_form(units, pair).astype(np.float16)
+        return in_blocks(units, pair).astype(np.float16)
 
 
 def half_depth(units: np.ndarray, pair: Pair) -> np.ndarray:
@@ -188,7 +190,7 @@ DEFAULT: Final = "float32 closed form from stored units, in blocks"
 WAYS: Final = (
     Way("float64 reference", float64_reference, "offered"),
     Way(DEFAULT, in_blocks, "default"),
-    Way("float32 closed form, the whole map at once", closed_form, "offered"),
+    Way("float32 closed form, the whole map at once (torch)", closed_form, "offered"),
     Way("float32 depth map, then its disparity", float32_depth, "offered"),
     Way("one float32 division", plain_divide, "not taken"),
     Way("look-up table of stored units", table_look_up, "not taken"),
@@ -219,6 +221,23 @@ class Sight:
     right_measured: np.ndarray
     disparity_px: np.ndarray
     quantum_m: float
+
+
+def sight_of(pair: Pair, left: np.ndarray, right: np.ndarray, *, dtype: Any) -> Sight:
+    """Return what visibility is decided from, made of the stored depth of both views."""
+    measured = [(units != 0) & (units != 65535) for units in (left, right)]
+    left_m, right_m = (
+        np.multiply(units, pair.unit_m, dtype=np.float64).astype(dtype) * there
+        for units, there in zip((left, right), measured, strict=True)
+    )
+    if dtype == np.float32:
+        disparity_px = measured[0] * disparity_from_units(
+            left, focal_px=pair.focal_px, baseline_m=pair.baseline_m, unit_m=pair.unit_m
+        )
+    else:
+        with np.errstate(divide="ignore"):
+            disparity_px = np.where(measured[0], pair.focal_px * pair.baseline_m / left_m, 0.0)
+    return Sight(left_m, right_m, *measured, disparity_px, pair.unit_m)
 
 
 def visible_by_both(sight: Sight) -> Any:

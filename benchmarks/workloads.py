@@ -2,8 +2,8 @@
 
 Whoever reads videos forwards (ours, the limit, scene-wise decoders) costs the same for every
 frame, so a slice is the first ``window`` frames of each scene. Whoever starts anew for every sample
-costs more the later a frame comes, so a slice is a random choice among *all* samples of the
-workload. Both are samples of the same workload.
+costs more the later a frame comes, so a slice is chosen from *all* samples of the workload, spread
+evenly over the places in a video. Both are samples of the same workload.
 """
 
 from dataclasses import dataclass, replace
@@ -13,7 +13,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from benchmarks.material import Material
+from benchmarks.material import EIGHT, Material
+from benchmarks.reencoded import DRAWN_CRF, OTHER_CRFS
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.storage.index import SceneIndex
 
@@ -59,7 +60,9 @@ class Workload:
         target: The ratios to reach, if any are stated.
         blosc2: The ratio to reach from blosc2 shards, if one is stated.
         more: Contestants that race over this workload beside the usual ones.
+        field: Contestants that race over it instead of the usual ones.
         source: "local" files, or shards through the "web".
+        crf: The constant rate factor of the pictures.
     """
 
     name: str
@@ -71,12 +74,14 @@ class Workload:
     size: tuple[int, int] | None = None
     both_ways: bool = False
     batch: int = 2
-    few: int = 8
-    workers: tuple[int, ...] = (2, 0)
+    few: int = 4
+    workers: tuple[int, ...] = (2,)
     target: Target | None = None
     blosc2: float | None = None
     more: tuple[str, ...] = ()
+    field: tuple[str, ...] = ()
     source: Literal["local", "web"] = "local"
+    crf: int = DRAWN_CRF
 
     @property
     def is_clip(self) -> bool:
@@ -90,46 +95,68 @@ class Workload:
         return ("left", "right", *maps, "baseline_m", "frame_index", "pair", "scene")
 
 
-WORKLOADS: Final = (
+_WEB: Final = ("ours", "ours-web", "ours-web-blosc2", "webdataset-web", "datasets-web")
+_CODECS: Final = ("limit-no-depth", "ours-shards", "ours-blosc2")
+
+_AT_DRAWN_RATE: Final = (
     Workload(
-        "first", "primary pair, first frame, 1280", 48, "first", "first", few=16,
+        "first", "primary pair, first frame, 1280", 24, "first", "first", few=8,
         target=Target(0.85, 1.2),
     ),
     Workload(
-        "all-frames", "primary pair, all frames shuffled, 1280", 8, "all", range(24), few=8,
-        workers=(2, 0, 1, 4), target=Target(0.85, 15), blosc2=2.5,
-        more=("ours-shards", "ours-blosc2"),
+        "all-frames", "primary pair, all frames shuffled, 1280", 8, "all", range(12),
+        workers=(2, 0, 1, 4), target=Target(0.85, 15), blosc2=2.5, more=_CODECS,
     ),
     Workload(
-        "all-pairs", "all 15 pairs, all frames, both disparities, 1280", 4, "all", range(6),
-        pairs="all", both_ways=True, few=6, target=Target(0.75, 60),
+        "all-pairs", "all 15 pairs, all frames, both disparities, 1280", 4, "all", range(4),
+        pairs="all", both_ways=True, target=Target(0.75, 60),
     ),
     Workload(
-        "all-pairs-832", "all 15 pairs, all frames, both disparities, 832x480", 4, "all", range(8),
-        pairs="all", both_ways=True, size=(480, 832), few=6, target=Target(0.85, 60), blosc2=2.5,
-        more=("ours-blosc2",),
+        "all-pairs-832", "all 15 pairs, all frames, both disparities, 832x480", 4, "all", range(4),
+        pairs="all", both_ways=True, size=(480, 832), target=Target(0.85, 60), blosc2=2.5,
+        more=_CODECS,
     ),
     Workload(
-        "clips", "16-frame clips, primary pair, 1280", 2, ("clips", 16, 1, 16),
-        ("clips", 16, 1, 16), batch=1, few=4, target=Target(0.85, 3),
+        "clips", "16-frame clips, primary pair, 1280", 6, ("clips", 16, 1, 16),
+        ("clips", 16, 1, 16), batch=1, target=Target(0.85, 3),
     ),
     Workload(
-        "random", "random single frames, 8 a scene, 1280", 4, ("random", 8), ("random", 8), few=8,
-        workers=(2,), target=Target(0.7, 3), blosc2=3.0, more=("ours-blosc2",),
+        "random", "random single frames, 8 a scene, 1280", 4, ("random", 8), ("random", 8),
+        target=Target(0.7, 3), blosc2=3.0, more=_CODECS,
     ),
     Workload(
         "web-first", "by HTTP: primary pair, first frame, 1280", 8, "first", "first",
-        workers=(2,), source="web",
+        field=_WEB, source="web",
     ),
     Workload(
         "web-all-frames", "by HTTP: primary pair, all frames shuffled, 1280", 2, "all", "all",
-        batch=1, workers=(2,), source="web",
+        batch=1, field=_WEB, source="web",
     ),
     Workload(
         "web-random", "by HTTP: random single frames, 8 a scene, 1280", 4, ("random", 8),
-        ("random", 8), workers=(2,), source="web",
+        ("random", 8), field=_WEB, source="web",
     ),
 )  # fmt: skip
+
+RATED: Final = ("all-frames", "random", "all-pairs-832")
+"""The workloads that are raced over at other bit rates too, by four scenes each."""
+
+
+def _at_rate(workload: Workload, crf: int) -> Workload:
+    return replace(
+        workload, name=f"{workload.name}-crf{crf}", title=f"{workload.title}, rate factor {crf}",
+        scenes=4, workers=workload.workers[:1], target=None, blosc2=None, crf=crf, more=(),
+        field=("limit", *_CODECS),
+    )  # fmt: skip
+
+
+RATES: Final = tuple(
+    _at_rate(workload, crf)
+    for crf in OTHER_CRFS
+    for workload in _AT_DRAWN_RATE
+    if workload.name in RATED
+)
+WORKLOADS: Final = (*_AT_DRAWN_RATE, *RATES)
 
 
 def tiny(workload: Workload) -> Workload:
@@ -160,10 +187,15 @@ class Job:
     reading: Reading = "forwards"
     url: str | None = None
 
+    @property
+    def data(self) -> Material:
+        """Where the data lie at the workload's bit rate."""
+        return self.material.at_rate(self.workload.crf)
+
     @cached_property
     def tree(self) -> Path:
         """The released folder that this workload reads."""
-        return self.material.many if self.workload.scenes > 8 else self.material.eight
+        return self.data.many if self.workload.scenes > EIGHT else self.data.eight
 
     @cached_property
     def keys(self) -> list[str]:
@@ -189,17 +221,29 @@ class Job:
 
     @cached_property
     def numbers(self) -> list[int]:
-        """The numbers of the slice's samples: in order for forward readers, else drawn from all."""
-        count = len(StereoPairs(self.tree, **self.selection))
+        """The numbers of the slice's samples: in order for forward readers, else from all.
+
+        The latter are one of each of ``few`` equal shares of the samples by their last frame, so
+        that their mean place in a video is that of all. Early and late ones alternate in such an
+        order that two workers, who take turns, get as much to do.
+        """
+        pairs = self._pairs
+        count = len(pairs)
         if self.reading == "forwards":
             return list(range(count))
-        drawn = np.random.default_rng(SEED).permutation(count)[: self.workload.few]
-        return [int(number) for number in drawn]
+        drawn = np.random.default_rng(SEED).permutation(count)
+        last = [pairs.plan.locate(int(number), epoch=0).frames[-1] for number in drawn]
+        by_place = drawn[np.argsort(last, kind="stable")]
+        few = min(self.workload.few, count)
+        shares = [int((share + 0.5) * count / few) for share in range(few)]
+        turns = [shares[place : place + 2] for place in range(0, few, 2)]
+        turns[1::2] = [two[::-1] for two in turns[1::2]]
+        return [int(by_place[share]) for two in turns for share in two]
 
     @cached_property
     def wanted(self) -> list[Wanted]:
         """The samples of the slice."""
-        pairs = StereoPairs(self.tree, **self.selection)
+        pairs = self._pairs
         keys = pairs.index.column("key")
         found = []
         for number in self.numbers:
@@ -207,6 +251,10 @@ class Job:
             (right,) = address.targets
             found.append(Wanted(str(keys[address.row]), address.source, right, address.frames))
         return found
+
+    @property
+    def _pairs(self) -> StereoPairs:
+        return StereoPairs(self.tree, **self.selection)
 
     @cached_property
     def of_scene(self) -> dict[str, list[Wanted]]:

@@ -3,12 +3,15 @@
 Nothing else is done: no checks, no masks, no batches, no queues. Arrays are written into buffers
 that are used again and again, so that not even memory is asked for. With N processes, N of these
 loops run over scenes of their own.
+
+With depth for nothing, no depth file is opened and every map is of the same numbers: how much
+faster the loop then is bounds what any other codec for depth can give.
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import av
 import numpy as np
@@ -18,6 +21,8 @@ from benchmarks.contestants.rig import camera_files, nearest_places, pair_number
 from benchmarks.workloads import Job, Wanted
 
 _RED_GREEN_BLUE: Final = (2, 0, 1)
+
+Depth = Literal["decoded", "given"]
 
 
 class Stream:
@@ -49,12 +54,16 @@ class Stream:
     def units(self, index: int) -> np.ndarray:
         """Return the stored depth of a frame."""
         if index != self._at:
-            stored = _plane(self._frame(index), 0, "<u2")
-            if stored.shape != self._size:
-                rows, columns = nearest_places(stored.shape, self._size)
-                stored = stored[rows].take(columns, axis=1)
-            self._kept = stored
+            self._kept = _resized(_plane(self._frame(index), 0, "<u2"), self._size)
         return self._kept
+
+    def unit_m(self) -> float:
+        """Return the metres in a stored unit."""
+        return unit_m_of(self.container)
+
+    def close(self) -> None:
+        """Close the video."""
+        self.container.close()
 
     def _frame(self, index: int) -> Any:
         if index < self._at:
@@ -65,17 +74,50 @@ class Stream:
         return frame
 
 
+class GivenDepth:
+    """Depth that costs nothing to decode: the same stored numbers for every frame."""
+
+    def __init__(self, stored: np.ndarray, size: tuple[int, int]) -> None:
+        """Take numbers as stored, wanted at (height, width)."""
+        self._stored = stored
+        self._size = size
+        self._at = -1
+        self._kept: Any = None
+
+    def units(self, index: int) -> np.ndarray:
+        """Return the stored depth of a frame."""
+        if index != self._at:
+            self._at, self._kept = index, _resized(self._stored, self._size)
+        return self._kept
+
+    def unit_m(self) -> float:
+        """Return the metres in a stored unit."""
+        return 0.001
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def _resized(stored: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    if stored.shape == size:
+        return stored
+    rows, columns = nearest_places(stored.shape, size)
+    return stored[rows].take(columns, axis=1)
+
+
 def _plane(frame: Any, number: int, dtype: str) -> np.ndarray:
     """Return a plane of a frame as an array, without copying."""
     held = frame.planes[number]
     return np.frombuffer(held, dtype).reshape(held.height, -1)[:, : held.width]
 
 
-def samples(job: Job, scenes: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the samples of some scenes; the arrays are overwritten by the next one."""
+def samples(
+    job: Job, scenes: Mapping[str, Sequence[Wanted]], *, depth: Depth = "decoded"
+) -> Iterator[dict[str, Any]]:
+    """Yield samples by scene, each scene's by frame; the next one overwrites the arrays."""
     workload = job.workload
     height, width = size = workload.size or (job.material.size_px, job.material.size_px)
-    frames = len(job.wanted[0].frames)
+    frames = len(next(iter(scenes.values()))[0].frames)
     arrays = {
         name: np.empty((frames, 3, height, width), np.uint8)
         if name in ("left", "right")
@@ -83,24 +125,25 @@ def samples(job: Job, scenes: Sequence[str]) -> Iterator[dict[str, Any]]:
         for name in ("left", "right", "disparity", "disparity_right")
         if name in workload.fields
     }
+    stored = np.full((job.material.size_px, job.material.size_px), 5000, dtype=np.uint16)
     cut = slice(None) if workload.is_clip else 0
     shown = {name: array[cut] for name, array in arrays.items()}
-    for key in scenes:
-        wanted = job.of_scene[key]
+    for key, wanted in scenes.items():
         folder = job.tree / key
         document = json.loads((folder / "baseline.json").read_text())
         streams = {
-            name: Stream(folder / name, size)
+            name: GivenDepth(stored, size)
+            if depth == "given" and name.endswith(".mkv")
+            else Stream(folder / name, size)
             for name in camera_files(wanted, both_ways=workload.both_ways)
         }
-        depth = streams[f"cam_{wanted[0].left:02d}_depth.mkv"]
-        unit_m = unit_m_of(depth.container)
+        unit_m = streams[f"cam_{wanted[0].left:02d}_depth.mkv"].unit_m()
         for sample in wanted:
             pair = pair_numbers(document, left=sample.left, right=sample.right, width_px=width)
             _fill(arrays, sample, streams, np.float32(pair.fx_px * pair.baseline_m / unit_m))
             yield shown | {"wanted": sample}
         for stream in streams.values():
-            stream.container.close()
+            stream.close()
 
 
 def _fill(

@@ -16,6 +16,6 @@ def mapped(job: Job, data: str | Path, **options: Any) -> DataLoader[Any]:
 
 
 def streamed(job: Job, data: str | Path, **options: Any) -> DataLoader[Any]:
-    """Return torch's `DataLoader` of a `StereoPairStream`, its options the defaults."""
+    """Return torch's `DataLoader` of a `StereoPairStream` with the stream's own ``collate``."""
     stream = StereoPairStream(data, job.workload.batch, tail="uneven", **job.selection)
-    return DataLoader(stream, batch_size=job.workload.batch, **options)
+    return DataLoader(stream, batch_size=job.workload.batch, collate_fn=stream.collate, **options)

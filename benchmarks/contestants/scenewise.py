@@ -30,13 +30,13 @@ def urls(job: Job) -> list[str]:
 
     A workload of more scenes than are packed is read in part: each scene costs the same here.
     """
-    index = SceneIndex.open(job.material.shards)
+    index = SceneIndex.open(job.data.shards)
     shards = {
         str(index.column("key")[row]): index.scene(row).members["baseline.json"].path
         for row in range(len(index))
     }
     names = list(dict.fromkeys(shards[key] for key in job.keys if key in shards))
-    folder = job.url or str(job.material.shards)
+    folder = job.url or str(job.data.shards)
     return [f"{folder}/{name}" for name in names]
 
 

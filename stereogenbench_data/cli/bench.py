@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.errors import StorageError
 
 
@@ -24,7 +25,7 @@ def bench(  # noqa: PLR0913 - one parameter an option
     whole: Annotated[
         bool, typer.Option("--whole", help="Races over all frames, not a window of them.")
     ] = False,
-    batches: Annotated[int, typer.Option(min=2, help="Batches of the memory run.")] = 400,
+    batches: Annotated[int, typer.Option(min=2, help="Batches of the memory run.")] = 2000,
     resume: Annotated[
         bool, typer.Option("--resume", help="Keep rounds and sections that are there.")
     ] = False,
@@ -66,7 +67,7 @@ def bench(  # noqa: PLR0913 - one parameter an option
     try:
         done = subprocess.run(command, cwd=checkout, check=False)
     except KeyboardInterrupt:
-        raise typer.Exit(130) from None
+        raise typer.Exit(STOPPED) from None
     raise typer.Exit(done.returncode)
 
 

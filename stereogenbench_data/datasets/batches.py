@@ -12,6 +12,7 @@ from torch.utils.data import Sampler
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.selection.order import (
     LANES,
+    LANES_OF_LARGE,
     OPEN_SCENES,
     ORDER_VERSION,
     EpochOrder,
@@ -46,14 +47,15 @@ class EpochOptions(TypedDict, total=False):
             left out; samples from the epoch's start fill up, marked in the field ``is_padding``
             (batch,) bool. "uneven": every sample exactly once; the last batch may be short, and
             ranks may differ by one batch. Validate with "uneven" (or "wrap", less its padding).
-        lanes: Into how many lanes the scenes are parted, 4 if left out; batch n belongs to lane
-            n mod lanes. Each video is decoded by one process, once an epoch, if
-            world_size * num_workers divides ``lanes``; make it a multiple of (or equal to) that
-            product. Selections too small for so many lanes have fewer.
+        lanes: Into how many lanes the scenes are parted; batch n belongs to lane n mod lanes. If
+            left out 4, but 2 where scenes are so large that a lane has fewer than 16 open. Each
+            video is decoded by one process, once an epoch, if world_size * num_workers divides
+            ``lanes``; make it a multiple of (or equal to) that product. Selections too small for so
+            many lanes have fewer.
         open_scenes: How many scenes each lane interleaves; if left out 16, or the batch size where
             that is more, but of large pictures no more than about 0.9 GB of decoders hold: of
             1280x1280 pixels 16 with one pair a scene, and 4 with all pairs. Fewer take less memory
-            and shuffle less well.
+            and shuffle less well. A process has so many of each lane that it reads.
         order: "shuffled" (the default) or "sequential".
     """
 
@@ -125,13 +127,14 @@ class EpochBatches(Sampler[list[int]]):
                 f"{', '.join(EpochOptions.__annotations__)}."
             )
         self.dataset = dataset
+        at_once = dataset.scenes_at_once
         rule = OrderRule(
             batch_size=batch_size,
             seed=options.get("seed", dataset.plan.seed),
-            lanes=options.get("lanes", LANES),
+            lanes=options.get("lanes", LANES if at_once >= OPEN_SCENES else LANES_OF_LARGE),
             kind=options.get("order", "shuffled"),
         )
-        most_open = min(max(OPEN_SCENES, rule.batch_size), dataset.scenes_at_once)
+        most_open = min(max(OPEN_SCENES, rule.batch_size), at_once)
         self.rule = replace(rule, open_scenes=options.get("open_scenes", most_open))
         self.tail = options.get("tail", "drop")
         self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))

@@ -139,6 +139,10 @@ class _MappedScenes(Dataset[Sample]):
             loaded[place] = room.as_tensors(place, sample)
         return [loaded[place] for place in range(len(numbers))]
 
+    def into(self, room: BatchRoom, place: int, number: int) -> Sample:
+        """Return a sample as ``dataset[number]`` does, a slice of a batch's room."""
+        return room.as_tensors(place, self._sample(number, room=room.at(place)))
+
     def _sample(self, number: int, room: Room = fresh_room) -> Sample:
         """Return a sample of arrays, written where the room says."""
         number = operator.index(number)

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -10,6 +11,7 @@ from stereogenbench_data.datasets.batches import EpochBatches
 from stereogenbench_data.samples.fields import Stream
 from stereogenbench_data.samples.streams import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.selection.order import Numbers
 from stereogenbench_data.selection.plan import Plan
 from stereogenbench_data.storage.index import SceneIndex
 
@@ -32,16 +34,22 @@ class OpenVideosWarning(UserWarning):
     """More videos would be open at a time than the process may have: some are opened again."""
 
 
+class SharedLanesWarning(UserWarning):
+    """Several processes read the same lane, so each of them decodes its videos."""
+
+
 def videos_to_keep(
     plan: Plan, batches: EpochBatches, *, streams: frozenset[Stream], processes: int
 ) -> int:
     """Return how many videos one of so many processes keeps open for its share of an epoch.
 
     It reads every lane of which it gets batches, each with its open scenes. As many files are
-    asked for as the process may open; if that is too few, a warning says what to do.
+    asked for as the process may open; if that is too few, or if other processes decode the same
+    videos though more lanes would spare that, a warning says what to do.
     """
     lengths = np.diff(plan.first_sample)
     lanes = batches.rule.lanes_of(lengths)
+    _warn_of_shared_lanes(batches, lengths=lengths, processes=processes)
     scenes = lanes // math.gcd(lanes, processes) * batches.rule.most_open(lengths)
     wanted = max(OPEN_STREAMS, scenes * videos_per_scene(plan, streams))
     allowed = max(OPEN_STREAMS, _most_files() - SPARE_FILES)
@@ -55,6 +63,20 @@ def videos_to_keep(
             stacklevel=5,
         )
     return min(wanted, allowed)
+
+
+def _warn_of_shared_lanes(batches: EpochBatches, *, lengths: Numbers, processes: int) -> None:
+    rule = batches.rule
+    together = processes // math.gcd(rule.lanes, processes)
+    spared = replace(rule, lanes=math.lcm(rule.lanes, processes)).lanes_of(lengths)
+    if together > 1 and lengths.max() > 1 and spared % processes == 0:
+        warnings.warn(
+            f"every video is decoded by {together} processes, as {processes} (ranks times workers) "
+            f"read {rule.lanes} lanes: give lanes={processes}, or a multiple of it. This is "
+            "another order of the epoch; each lane has its own open scenes.",
+            SharedLanesWarning,
+            stacklevel=6,
+        )
 
 
 def scenes_at_once(index: SceneIndex, plan: Plan) -> int:

@@ -53,11 +53,20 @@ class Parcel(NamedTuple):
 
 
 class Shelf:
-    """The slots of a loader's workers, of which each process uses its own end."""
+    """The slots of a loader's workers, of which each process uses its own end.
 
-    def __init__(self, workers: int) -> None:
-        """Begin with slots that take memory when they are first used."""
-        self._used = shared_full((workers, SLOTS), 0)
+    Attributes:
+        used: int64 (workers, slots) that all processes share: what each slot is.
+    """
+
+    def __init__(self, workers: int, *, used: torch.Tensor | None = None) -> None:
+        """Begin with slots that take memory when they are first used.
+
+        Args:
+            workers: How many workers there are.
+            used: What another process's end of the same slots has as ``used``.
+        """
+        self.used = shared_full((workers, SLOTS), 0) if used is None else used
         self._memory: dict[tuple[int, int], torch.Tensor] = {}
         self._layout: dict[str, Laid] = {}
         self._slot: int | None = None
@@ -84,8 +93,8 @@ class Shelf:
             self._layout = self._layout or _laid_out(batch)
             return batch
         key = (_worker(), self._slot)
-        memory = self._memory[key] if self._used[key] == _NEW else None
-        self._used[key] = _SENT
+        memory = self._memory[key] if self.used[key] == _NEW else None
+        self.used[key] = _SENT
         return Parcel(*key, memory, {name: self._layout.get(name, batch[name]) for name in batch})
 
     def opened(self, parcel: Parcel) -> dict[str, Any]:
@@ -95,7 +104,7 @@ class Shelf:
             self._memory[key] = parcel.memory
         # The array lives as long as any tensor over it does, however it was sliced.
         array = self._memory[key].numpy()
-        weakref.finalize(array, self._used.__setitem__, key, _FREE).atexit = False
+        weakref.finalize(array, self.used.__setitem__, key, _FREE).atexit = False
         whole = torch.from_numpy(array)
         return {
             name: whole[laid.start : laid.stop].view(laid.dtype).view(laid.shape)
@@ -111,10 +120,10 @@ class Shelf:
             if key not in self._memory:
                 size_bytes = max(laid.stop for laid in self._layout.values())
                 self._memory[key] = shared_bytes(size_bytes)
-                self._used[key] = _NEW
+                self.used[key] = _NEW
                 return slot
-            if self._used[key] == _FREE:
-                self._used[key] = _SENT
+            if self.used[key] == _FREE:
+                self.used[key] = _SENT
                 return slot
         return None
 

@@ -1,6 +1,6 @@
 """An iterable dataset with the order of the map-style ones, for trainers that want one."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Unpack
 
 import torch
@@ -15,6 +15,8 @@ from stereogenbench_data.datasets.batches import (
 )
 from stereogenbench_data.datasets.loader import split_options
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.datasets.post import Post
+from stereogenbench_data.datasets.room import BatchRoom
 from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.load import Sample, Transform
@@ -39,9 +41,10 @@ class StreamOptions(Selection, EpochOptions, total=False):
 class StereoPairStream(IterableDataset[Sample]):
     """The samples of `StereoPairs` one after another, in the order of its batches.
 
-    ``DataLoader(stream, batch_size=B, num_workers=W)``, with the batch size of the stream, gives
-    the batches that ``StereoPairs(...).loader(B, num_workers=W)`` gives: each rank and worker
-    yields its own, without duplicates or holes, also where there are more workers than scenes. With
+    ``DataLoader(stream, batch_size=B, num_workers=W, collate_fn=stream.collate)``, with the batch
+    size of the stream, gives the batches that ``StereoPairs(...).loader(B, num_workers=W)`` gives:
+    each rank and worker yields its own, without duplicates or holes, also where there are more
+    workers than scenes. torch's own ``collate_fn`` gives the same, and copies more. With
     ``tail="wrap"`` a sample has the field ``is_padding``, a bool. A stream holds one position: make
     one for each `DataLoader` that is used side by side with others.
 
@@ -74,6 +77,19 @@ class StereoPairStream(IterableDataset[Sample]):
         # Which worker has begun since a state was loaded: workers may be new copies every epoch.
         self._begun = shared_full((MOST_WORKERS,), 0)
         self._latest: SamplePass | None = None
+        self.post = Post()
+
+    def collate(self, samples: Sequence[Sample]) -> Any:
+        """Make a batch of samples: `DataLoader`'s ``collate_fn``, where speed matters.
+
+        Worker processes then write samples where their batch will be, in shared memory that is
+        used again once the training loop has let go of it. A worker must not keep samples for
+        itself. Any other ``collate_fn`` does too, and costs the copies that torch makes.
+
+        Raises:
+            FieldError: If a field has another shape in one sample than in the first.
+        """
+        return self.post.collated(samples)
 
     @property
     def epoch(self) -> int:
@@ -164,17 +180,15 @@ class SamplePass(Iterator[Sample]):
         self._left: Iterator[int] = iter(())
         self._batch: list[int] = []
         self._padding: list[bool] = []
+        self._room: BatchRoom | None = None
         self._at = 0
         self._go_to(epoch, start, given=0)
 
     def __next__(self) -> Sample:
         """Return the next sample."""
-        batches = self._stream.batches
         if self._at == len(self._batch):
             self._next_batch()
-        sample = self._stream.pairs[self._batch[self._at]]
-        if batches.tail == "wrap":
-            sample["is_padding"] = torch.tensor(self._padding[self._at])
+        sample = self._loaded()
         self._at += 1
         self._given += 1
         return sample
@@ -234,3 +248,16 @@ class SamplePass(Iterator[Sample]):
         batches, number = self._stream.batches, next(self._left)
         self._batch, self._at = batches.batch(number, epoch=self._epoch), 0
         self._padding = batches.is_padding(number).tolist()
+        self._room = self._stream.post.room(len(self._batch))
+
+    def _loaded(self) -> Sample:
+        """Return the sample that is due, in its batch's room where there is one."""
+        pairs, number = self._stream.pairs, self._batch[self._at]
+        is_padding = {}
+        if self._stream.batches.tail == "wrap":
+            is_padding = {"is_padding": torch.tensor(self._padding[self._at])}
+        if self._room is None:
+            return pairs[number] | is_padding
+        return pairs.into(self._room, self._at, number) | {
+            name: self._room.put(self._at, name, value) for name, value in is_padding.items()
+        }

@@ -20,10 +20,13 @@ from jaxtyping import Float64, Int64, UInt64
 
 from stereogenbench_data.errors import SelectionError
 
-ORDER_VERSION: Final = 1
+ORDER_VERSION: Final = 2
 """Changes whenever the same arguments give another order; a saved state names it."""
 
 LANES: Final = 4
+LANES_OF_LARGE: Final = 2
+"""Where scenes are so large that memory limits how many are open: two workers have a lane each."""
+
 OPEN_SCENES: Final = 16
 """Fewer open scenes than this make batches of small size too much alike."""
 
@@ -46,8 +49,9 @@ class OrderRule:
         seed: The seed of the order.
         lanes: Into how many lanes the scenes are parted; fewer where a lane would have fewer scenes
             than a batch can show.
-        open_scenes: How many scenes a lane interleaves; up to twice as many where it has fewer
-            than twice as many, so that all of them last to its end.
+        open_scenes: How many scenes a lane interleaves. Fewer than `OPEN_SCENES` are never
+            exceeded. From there on there may be more, up to twice as many where a lane has fewer
+            than twice as many, so that its tracks are equally long and batches equally mixed.
         kind: "shuffled", or "sequential": by the samples' numbers.
     """
 
@@ -89,7 +93,8 @@ class OrderRule:
         """
         if self.kind == "sequential":
             return OrderRule(self.batch_size, lanes=1, open_scenes=1, kind="sequential")
-        all_are_open = len(lengths) < 2 * self.open_scenes
+        most = self._most_scenes(lengths)
+        all_are_open = self.tracks_of(most) == most
         return replace(
             self,
             lanes=self.lanes_of(lengths),
@@ -97,17 +102,27 @@ class OrderRule:
         )
 
     def tracks_of(self, scenes: int) -> int:
-        """Return how many of a lane's scenes are open at a time: equally long tracks of them."""
+        """Return how many of a lane's scenes are open at a time."""
+        if self.open_scenes < OPEN_SCENES:
+            return min(scenes, self.open_scenes)
         return -(-scenes // max(1, scenes // self.open_scenes))
 
     def most_open(self, lengths: Numbers) -> int:
         """Return a bound on the scenes that one lane of a selection has open at a time."""
+        most = self._most_scenes(lengths)
+        if self.open_scenes < OPEN_SCENES:
+            return self.tracks_of(most)
+        in_turn = max(1, most // self.open_scenes // 2)
+        return min(most, self.open_scenes + self.open_scenes // in_turn)
+
+    def _most_scenes(self, lengths: Numbers) -> int:
+        """Return a bound on the scenes of a lane: the shortest ones, and parts of two others."""
         samples = int(lengths.sum())
-        turns = -(-samples // self.batch_size // self.lanes_of(lengths))
+        batches_of_all = -(-samples // self.batch_size)
+        turns = -(-batches_of_all // self.lanes_of(lengths))
         longest_lane = min(samples, turns * self.batch_size)
-        scenes = -(-longest_lane * len(lengths) // samples)
-        in_turn = max(1, scenes // self.open_scenes // 2)
-        return min(scenes, self.open_scenes + self.open_scenes // in_turn) + 1
+        whole = int((np.cumsum(np.sort(lengths)) <= longest_lane - 2).sum())
+        return min(len(lengths), whole + 2)
 
 
 class EpochOrder:

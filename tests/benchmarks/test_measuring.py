@@ -4,14 +4,16 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmarks import accuracy, clock, profile, race, start, tables
+from benchmarks import __main__, accuracy, clock, evaluation, profile, race, start, tables, tried
 from benchmarks.__main__ import chosen, parse
+from benchmarks.material import facts
 from benchmarks.plots import plot_all
-from benchmarks.results import Results, Spread, ratios
+from benchmarks.results import Results, Spread, ratios, shares
 from benchmarks.ways import WAYS
 from benchmarks.workloads import WORKLOADS, Job, tiny
 
@@ -22,10 +24,13 @@ TINY = {workload.name: tiny(workload) for workload in WORKLOADS}
 def results(material, tmp_path_factory):
     """Return results of one round of a race, and of all else that is measured in this process."""
     found = Results(tmp_path_factory.mktemp("out") / "results.json")
+    found.put("data", facts(material))
     found.put("machine", {"cores": 2, "cpu": "a processor", "versions": {"av": "18.1"}})
     found.put("accuracy", accuracy.measure_accuracy(material, rounds=1, cases=6, say=str))
     plan = race.Plan(rounds=1)
-    workloads = [TINY["all-frames"]]
+    found.put("tried", tried.measure_tried(material, rounds=1, say=str))
+    found.put("evaluation", evaluation.measure(frames=1, size_px=64, workers=1))
+    workloads = [TINY["all-frames"], TINY["all-frames-crf26"]]
     race.run_races(workloads, material, found, plan=plan, say=str)
     return found
 
@@ -124,7 +129,12 @@ def test_the_tables_and_the_plots_are_made_of_the_results(results, tmp_path):
 
     assert "primary pair, all frames shuffled" in text
     assert "float32 closed form" in text
-    assert {path.name for path in made} == {"contestants.png", "workers.png", "accuracy.png"}
+    assert "each camera decoded once for all its pairs" in text
+    assert "## Scoring" in text
+    assert "| primary pair, all frames shuffled, 1280 | 26 |" in text
+    assert {path.name for path in made} == {
+        "contestants.png", "workers.png", "accuracy.png", "rates.png",
+    }  # fmt: skip
     assert all(path.stat().st_size > 10_000 for path in made)
 
 
@@ -132,6 +142,15 @@ def test_results_outlive_the_process(results):
     again = Results(results.path)
 
     assert again.sections == json.loads(json.dumps(results.sections))
+
+
+def test_threads_and_planes_make_the_same_pictures(results):
+    groups = results.sections["tried"]["groups"]
+    decoding = groups["decoding colour, one picture after another"]
+    stored = groups["colour conversion, stored size"]
+
+    assert [way["psnr_db"] for way in decoding[:3]] == [None, None, None]
+    assert [way["psnr_db"] for way in stored[:4]] == [None, None, None, None]
 
 
 def test_a_ratio_is_taken_within_each_round():
@@ -142,6 +161,60 @@ def test_a_ratio_is_taken_within_each_round():
     ]
 
     assert ratios(rounds, "a/2", to="b/2") == Spread(3.0, 2.5, 3.5, 2)
+
+
+def test_a_share_is_what_leaving_out_a_part_saves():
+    rounds = [{"a/2": {"samples": 10, "seconds": 4}, "b/2": {"samples": 10, "seconds": 1}}]
+
+    assert shares(rounds, "a/2", without="b/2") == Spread(0.75, 0.75, 0.75, 1)
+
+
+def test_pictures_at_another_rate_are_smaller_and_their_depth_the_same(material):
+    other = material.at_rate(26)
+    sizes = {
+        kind: [
+            sum(file.stat().st_size for file in made.release.rglob(f"cam_*_{kind}"))
+            for made in (material, other)
+        ]
+        for kind in ("rgb.mp4", "depth.mkv")
+    }
+
+    assert sizes["rgb.mp4"][1] < sizes["rgb.mp4"][0]
+    assert sizes["depth.mkv"][1] == sizes["depth.mkv"][0] > 0
+    assert material.at_rate(18) == material
+
+
+def test_the_slice_of_those_that_start_anew_is_spread_over_the_places_in_a_video(material):
+    workload = replace(TINY["all-frames"], few=4)
+
+    job = Job(workload, material, reading="anywhere")
+
+    assert sorted(wanted.frames[0] for wanted in job.wanted) == [0, 1, 2, 3]
+    assert [wanted.frames[0] for wanted in job.wanted] == [0, 1, 3, 2]
+
+
+def test_a_step_that_fails_is_told_and_the_others_are_measured(material, tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise ValueError("no such thing")
+
+    monkeypatch.setattr(__main__, "measure_memory", fail)
+    monkeypatch.setattr(__main__, "measure_profile", lambda *_, **__: {"all": 1})
+    results, told = Results(tmp_path / "results.json"), []
+
+    failed = __main__._measure_others(
+        ["memory", "profile"], material, results, options=parse(["--rounds", "1"]), say=told.append
+    )
+
+    assert failed == ["memory: ValueError: no such thing"]
+    assert Results(results.path).sections["profile"] == {"all": 1}
+
+
+def test_rates_stand_for_all_their_races():
+    workloads, others = chosen(parse(["--only", "rates"]))
+
+    assert {workload.crf for workload in workloads} == {26, 34}
+    assert len(workloads) == 6
+    assert others == []
 
 
 def test_options_choose_workloads_and_workers():

@@ -18,9 +18,14 @@ from stereogenbench_data import (
     StateError,
     StereoPairs,
 )
-from stereogenbench_data.datasets.open_videos import OpenVideosWarning, videos_per_scene
+from stereogenbench_data.datasets.open_videos import (
+    OpenVideosWarning,
+    SharedLanesWarning,
+    videos_per_scene,
+)
 from stereogenbench_data.samples import streams
 from stereogenbench_data.samples.fields import streams_of
+from stereogenbench_data.selection.order import OrderRule
 from tests.datasets.conftest import flat, in_turn, keys_of
 
 # More workers than this machine has cores are no matter here.
@@ -374,19 +379,61 @@ def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):
     assert loader.dataset._loader._streams._limit == 32
 
 
+def _of_many_scenes(index):
+    scene = index.scene(0)
+    numbered = [
+        replace(scene, id=replace(scene.id, key=f"{scene.id.key}{number}")) for number in range(16)
+    ]
+    return SceneIndex.from_scenes(numbered, index.root)
+
+
 @pytest.mark.parametrize(
-    ("side_px", "selection", "expected"),
+    ("workers", "options", "said"),
     [
-        (1280, {}, 16),
-        (1280, {"pairs": "all"}, 4),
-        (1280, {"pairs": "sweep"}, 5),
-        (480, {"pairs": "all"}, 16),
-        (8192, {"pairs": "all"}, 2),
+        (8, {}, r"decoded by 2 processes, as 8 \(ranks times workers\) read 4 lanes: .*lanes=8"),
+        (3, {}, r"decoded by 3 processes, as 3 .* read 4 lanes: .*lanes=3"),
+        (2, {"world_size": 2, "rank": 1, "lanes": 2}, "by 2 processes, as 4 .*lanes=4"),
+    ],
+)
+def test_workers_that_decode_the_same_videos_are_warned_of(small_index, workers, options, said):
+    pairs = StereoPairs(_of_many_scenes(small_index), frames=range(2), fields=("left",))
+
+    with pytest.warns(SharedLanesWarning, match=said):
+        pairs.loader(1, num_workers=workers, **options)
+
+
+@pytest.mark.parametrize(
+    ("frames", "workers", "options"),
+    [
+        (range(2), 4, {}),
+        (range(2), 8, {"lanes": 8}),
+        (range(2), 32, {}),
+        ("first", 8, {}),
+        (range(2), 8, {"order": "sequential"}),
+    ],
+    ids=["a lane each", "lanes asked for", "too few scenes", "one sample a scene", "sequential"],
+)
+def test_workers_are_not_warned_of_where_more_lanes_would_not_help(
+    small_index, frames, workers, options
+):
+    pairs = StereoPairs(_of_many_scenes(small_index), frames=frames, fields=("left",))
+
+    assert pairs.loader(1, num_workers=workers, **options).num_workers == workers
+
+
+@pytest.mark.parametrize(
+    ("side_px", "selection", "expected", "lanes"),
+    [
+        (1280, {}, 16, 4),
+        (1280, {"pairs": "all"}, 4, 2),
+        (1280, {"pairs": "sweep"}, 5, 2),
+        (480, {"pairs": "all"}, 16, 4),
+        (8192, {"pairs": "all"}, 2, 2),
     ],
     ids=str,
 )
 def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
-    small_index, side_px, selection, expected
+    small_index, side_px, selection, expected, lanes
 ):
     scenes = [
         replace(scene, rig=replace(scene.rig, image_width_px=side_px, image_height_px=side_px))
@@ -397,8 +444,11 @@ def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
     pairs = StereoPairs(index, **options)
 
     assert pairs.loader(4).batches.rule.open_scenes == expected
-    assert pairs.loader(4, num_workers=3).batches.rule.open_scenes == expected
+    assert pairs.loader(4).batches.rule.lanes == lanes
+    assert pairs.loader(4, num_workers=3).batches.rule == pairs.loader(4).batches.rule
     assert StereoPairs(index, **(options | {"fields": ("depth",)})).scenes_at_once == (
         pairs.scenes_at_once
     )
-    assert pairs.loader(4, open_scenes=7).batches.rule.open_scenes == 7
+    assert pairs.loader(4, open_scenes=7, lanes=6).batches.rule == OrderRule(
+        4, lanes=6, open_scenes=7
+    )

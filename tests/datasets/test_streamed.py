@@ -1,5 +1,6 @@
 """The stream: the loader's batches, sample by sample."""
 
+import copy
 import itertools
 import json
 
@@ -50,6 +51,52 @@ def test_its_batches_are_those_of_the_loader(keyed, stream_of, world, workers, t
         if tail == "wrap":
             for one, other in zip(found, expected, strict=True):
                 assert torch.equal(one["is_padding"], other["is_padding"])
+
+
+@pytest.mark.parametrize("loader", [DataLoader, StatefulDataLoader])
+@pytest.mark.parametrize("context", ["fork", "spawn"])
+def test_batches_made_in_place_are_those_of_the_loader_and_stay_while_held(
+    small_index, loader, context
+):
+    options = {"pairs": "adjacent", "frames": range(3), "tail": "wrap"}
+    stream = StereoPairStream(small_index, 4, **options)
+    del options["tail"]
+    expected = list(StereoPairs(small_index, **options).loader(4, tail="wrap"))
+    held = {}
+    found = loader(
+        stream, batch_size=4, num_workers=2, collate_fn=stream.collate,
+        multiprocessing_context=context,
+    )  # fmt: skip
+    for number, batch in enumerate(found):
+        assert batch.keys() == expected[number].keys()
+        assert same(batch, expected[number])
+        if number in (3, 4, 8):
+            held[number] = batch
+
+    assert number == len(expected) - 1
+    assert len(stream.post._of_workers) == 2
+    assert all(same(batch, expected[number]) for number, batch in held.items())
+
+
+def test_streams_used_side_by_side_and_their_copies_send_their_own_batches(small_index):
+    options = {"pairs": "adjacent", "frames": range(3), "tail": "uneven"}
+    stream = StereoPairStream(small_index, 4, **options)
+    streams = [stream, copy.deepcopy(stream), StereoPairStream(small_index, 4, seed=1, **options)]
+    loaders = [loaded(each, 1, collate_fn=each.collate) for each in streams]
+    expected = [list(loaded(each)) for each in streams]
+    for each in streams:
+        each.load_state_dict(each.batches.state_at(0, 0))
+
+    for numbers, *batches in zip(itertools.count(), *loaders, strict=False):
+        assert all(same(batch, own[numbers]) for batch, own in zip(batches, expected, strict=True))
+    assert numbers == len(expected[0]) - 1
+
+
+def same(one, other):
+    return all(
+        torch.equal(one[name], other[name]) if torch.is_tensor(one[name]) else one[name] == value
+        for name, value in other.items()
+    )
 
 
 def test_more_workers_than_batches_or_scenes_lose_and_repeat_nothing(small_index):

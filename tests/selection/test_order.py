@@ -98,6 +98,19 @@ def test_no_more_scenes_are_open_in_a_lane_than_announced(lengths, rule):
             assert sum(first[scene] <= place < last[scene] for scene in first) <= most
 
 
+@pytest.mark.parametrize("scenes", [3, 10, 13, 64, 2123])
+@pytest.mark.parametrize("open_scenes", [1, 2, 4, 5, 15])
+def test_a_small_number_of_open_scenes_is_reached_and_never_exceeded(scenes, open_scenes):
+    order = order_of([7] * scenes, batch_size=1, lanes=1, open_scenes=open_scenes)
+    found = order.scenes_of(order.lane(0))
+    first = np.array([np.flatnonzero(found == scene)[0] for scene in range(scenes)])
+    last = np.array([np.flatnonzero(found == scene)[-1] for scene in range(scenes)])
+    opened = np.searchsorted(np.sort(first), np.arange(len(found)), side="right")
+    closed = np.searchsorted(np.sort(last), np.arange(len(found)))
+
+    assert (opened - closed).max() == min(scenes, open_scenes)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("batch_size", [1, 3, 8])
 @pytest.mark.parametrize("epoch", [0, 1, 5])
@@ -185,7 +198,7 @@ def test_two_seeds_and_two_epochs_differ_from_the_first_epoch_on():
     assert len(set(orders.values())) == 16
 
 
-def test_the_order_of_version_1_never_changes():
+def test_the_order_of_version_2_never_changes():
     """If this fails, orders that users have saved positions in have changed: see ORDER_VERSION."""
     order = order_of(
         [3, 4, 5, 4, 3, 4, 5, 4], batch_size=4, lanes=2, open_scenes=2, seed=7, epoch=3
@@ -200,13 +213,13 @@ def test_the_order_of_version_1_never_changes():
 
 PINNED_SHA256 = "61ce2c7cdae1609b7d9ed3fd51348f400b52d1f6b56ee0b0c34bf63713661be3"
 PINNED = [
-    [12, 3, 0, 4],
+    [0, 28, 1, 29],
     [16, 20, 17, 21],
-    [1, 13, 2, 5],
+    [2, 30, 3, 31],
     [18, 22, 7, 23],
-    [28, 14, 6, 29],
+    [4, 12, 5, 13],
     [8, 24, 9, 25],
-    [15, 30, 19, 31],
+    [6, 14, 19, 15],
     [10, 26, 11, 27],
 ]
 
