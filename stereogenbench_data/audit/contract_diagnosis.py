@@ -11,6 +11,8 @@ from stereogenbench_data.audit.contract_statistics import Evidence
 
 LEAST_LOG_SCALE: Final = 0.01
 """A unit that is off by less is not called wrong."""
+BIAS_PX: Final = 0.1
+"""By how much disparity may be off however many pixels agree: interpolation on small pictures."""
 LEAST_OFFSET_PX: Final = 0.3
 _NOTHING: Final = Evidence(math.nan, math.inf)
 
@@ -56,6 +58,7 @@ class SceneDiagnosis:
         rivals: The other answers.
         equals: Contracts with as few changes that are not clearly worse, in words.
         disparity_px: Root mean square of the disparities found.
+        spread_px: Root mean square of the same, less the mean of each view.
         depth_step: How far apart neighbouring stored depths lie, as a share.
         problem: Why nothing could be told; empty where something could.
     """
@@ -82,6 +85,7 @@ class SceneDiagnosis:
     rivals: tuple[Rival, ...] = ()
     equals: tuple[tuple[Structure, Free, float], ...] = ()
     disparity_px: float = math.inf
+    spread_px: float = math.inf
     depth_step: float = 0.0
     problem: str = ""
 

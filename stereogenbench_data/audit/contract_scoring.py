@@ -9,7 +9,12 @@ from jaxtyping import Float32, Float64
 
 from stereogenbench_data.audit.contract_hypotheses import Structure
 from stereogenbench_data.audit.contract_matching import Luma
-from stereogenbench_data.audit.contract_statistics import Evidence, t_975
+from stereogenbench_data.audit.contract_statistics import (
+    LEAST_DB,
+    LEAST_DB_ELSEWHERE,
+    Evidence,
+    t_975,
+)
 from stereogenbench_data.audit.contract_views import SIDE_CELLS, Points, SceneViews, Shot
 
 _FEWEST_POINTS = 40
@@ -138,7 +143,8 @@ def evidence(shots: Sequence[Shot], better: Scored, worse: Scored) -> Evidence:
     if views >= 2:
         each = _mean_db(ours[None, :, 0], theirs[None, :, 0])
         errors.append(float(each.std(ddof=1)) / math.sqrt(views) * t_975(views - 1) / t_975(99))
-    return Evidence(float(_mean_db(ours, theirs)[0]), min(errors))
+    least_db = LEAST_DB if same_places else LEAST_DB_ELSEWHERE
+    return Evidence(float(_mean_db(ours, theirs)[0]), min(errors), least_db=least_db)
 
 
 def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:

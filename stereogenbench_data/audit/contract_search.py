@@ -5,9 +5,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-import numpy as np
-
 from stereogenbench_data.audit.contract_diagnosis import (
+    BIAS_PX,
     LEAST_LOG_SCALE,
     LEAST_OFFSET_PX,
     Rival,
@@ -17,10 +16,15 @@ from stereogenbench_data.audit.contract_diagnosis import (
 from stereogenbench_data.audit.contract_fit import Free, fitted
 from stereogenbench_data.audit.contract_hypotheses import QUESTIONS, Structure
 from stereogenbench_data.audit.contract_ray import RayPower, ray_power
-from stereogenbench_data.audit.contract_scoring import Pair, Scored, agreement, evidence, scored
+from stereogenbench_data.audit.contract_rig import crossed_pair, focal_ratios
+from stereogenbench_data.audit.contract_scoring import Scored, agreement, evidence, scored
 from stereogenbench_data.audit.contract_statistics import LEAST_ERRORS, Evidence
-from stereogenbench_data.audit.contract_views import SceneViews, Shot
-from stereogenbench_data.schema.records import Rig, Scene
+from stereogenbench_data.audit.contract_views import (
+    SceneViews,
+    Shot,
+    disparity_px,
+    spread_px,
+)
 
 _COARSEST_STEP: Final = 0.5
 """With depths further apart, as a share, nothing is told."""
@@ -29,6 +33,8 @@ _SCALE_ERRORS: Final = 1.5
 """Less is asked of the score of a scale, which has an error of its own to be judged by."""
 _MOST_CHANGES: Final = 4
 FEWEST_MATCHES: Final = 200
+_LEAST_PARALLAX_PX: Final = 0.3
+"""Smaller disparities (root mean square) are those of noise."""
 
 _LENGTHS: Final[dict[Free, tuple[str, ...]]] = {
     "nothing": (), "scale": ("scale",), "offset": ("offset",), "both": ("scale", "offset"),
@@ -57,6 +63,8 @@ class Search:
         self._views = views
         self._least_log_scale = least_log_scale
         self._shots = shots
+        self._bias = BIAS_PX / max(disparity_px(shots), 1e-6)
+        self._bias_beside_offset = BIAS_PX / max(spread_px(shots), 1e-6)
         self._fitted: dict[tuple[Structure, Free], _Candidate] = {}
         self._powers: dict[tuple[Structure, Free], RayPower] = {}
         self.declared = self.candidate(Structure.declared(views.encoding), free="nothing")
@@ -90,6 +98,10 @@ class Search:
         (other,) = current.structure.alternatives("kind")
         free = _freed(current.free, "scale")
         mine, theirs = (self.candidate(each, free=free) for each in (current.structure, other))
+        # What is further off than a ray is longer than its depth has another scale altogether.
+        most = math.log(float(self._views.ray_per_planar.max())) + self._least_log_scale
+        if abs(math.log(mine.score.scale / current.score.scale)) > most:
+            return current
         return self._pruned(theirs) if self.gain(theirs, mine).by_shape else current
 
     def _one_change(self, current: _Candidate) -> Iterator[_Candidate]:
@@ -201,7 +213,11 @@ class Search:
             ("nothing", "scale"), ("offset", "both"),
         ):  # fmt: skip
             off = abs(math.log(other.score.scale))
-            sure = off > self._least_log_scale + LEAST_ERRORS * min(other.score.scale_error, 1e3)
+            least = max(self._least_log_scale, self._bias)
+            if current.free == "offset":
+                # Two things wrong at once take more to be believed.
+                least = max(2 * self._least_log_scale, self._bias_beside_offset)
+            sure = off > least + LEAST_ERRORS * min(other.score.scale_error, 1e3)
             return sure and gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
         if other.free in ("offset", "both") and current.free in ("nothing", "scale"):
             largest_px = max(map(abs, other.score.offsets_px.values()), default=0.0)
@@ -220,28 +236,6 @@ def _freed(free: Free, length: str) -> Free:
     if free in ("nothing", length):
         return "scale" if length == "scale" else "offset"
     return "both"
-
-
-def focal_ratios(rig: Rig) -> dict[str, float]:
-    """Return other readings of a rig's focal length, each over f / sensor width * width."""
-    by_pixels = rig.image_height_px / rig.image_width_px
-    by_sensor = rig.sensor_width_mm / rig.sensor_height_mm
-    readings = {
-        "f / sensor height * picture height": by_pixels * by_sensor,
-        "f / sensor height * picture width": by_sensor,
-        "f / sensor width * picture height": by_pixels,
-    }
-    told: dict[str, float] = {}
-    for words, ratio in readings.items():
-        if all(abs(math.log(ratio / other)) > LEAST_LOG_SCALE for other in (1.0, *told.values())):
-            told[words] = ratio
-    return told
-
-
-def crossed_pair(scene: Scene) -> Pair | None:
-    """Return the recorded primary pair if its cameras stand in the other order by the poses."""
-    left, right = scene.rig.primary_pair
-    return (left, right) if scene.lateral_m[left] > scene.lateral_m[right] else None
 
 
 def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
@@ -277,9 +271,14 @@ def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
             **basics, best=declared,
             problem=f"stored depth is too coarse: its steps are {basics['depth_step']:.0%} of it",
         )  # fmt: skip
+    basics["spread_px"] = spread_px(shots)
     least_log_scale = allowed_log_scale(basics["depth_step"])
-    found_px = np.concatenate([shot.matched_px for shot in shots])
-    basics["disparity_px"] = float(np.sqrt((found_px**2).mean()))
+    basics["disparity_px"] = disparity_px(shots)
+    if basics["disparity_px"] < _LEAST_PARALLAX_PX:
+        return SceneDiagnosis(
+            **basics, best=declared,
+            problem=f"too little parallax: disparities are of {basics['disparity_px']:.2f} px",
+        )  # fmt: skip
     search = Search(views, shots, least_log_scale=least_log_scale)
     best = search.best()
     share_told = agreement(views, shots, best.score)
@@ -288,7 +287,8 @@ def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
         problem = (
             "no depth: none of the pixels that were found in both pictures has any"
             if math.isnan(share_told)
-            else "too little parallax: no disparity at all explains the pictures as well"
+            else f"nothing fits: of disparities of {basics['disparity_px']:.1f} px the best "
+            f"contract explains {share_told:.0%} to a pixel, and pictures no better than none does"
         )
         return SceneDiagnosis(**basics, best=declared, parallax=parallax, problem=problem)
     (other_kind,) = best.structure.alternatives("kind")

@@ -9,6 +9,9 @@ import numpy as np
 
 LEAST_DB: Final = 0.15
 """A smaller mean difference is not believed, however sure: interpolation and codecs make such."""
+LEAST_DB_ELSEWHERE: Final = 0.4
+"""The same between contracts that take depth from other places (lag, order, flip) or another form:
+where disparity is of few pixels, interpolation alone makes 0.3 dB between neighbouring lags."""
 LEAST_ERRORS: Final = 3.0
 _NORMAL_975: Final = 1.96
 _T_975: Final = (
@@ -24,18 +27,20 @@ class Evidence:
     """By how many dB one contract is better than another in one scene, and its standard error.
 
     ``by_shape`` is whether it is the better one by the shape of disparity over the picture, which
-    then decides; None where that does not tell.
+    then decides; None where that does not tell. Less than ``least_db`` is not believed.
     """
 
     mean_db: float
     error_db: float
     by_shape: bool | None = None
+    least_db: float = LEAST_DB
 
-    def is_clear(self, *, least_db: float = LEAST_DB, errors: float = LEAST_ERRORS) -> bool:
+    def is_clear(self, *, least_db: float | None = None, errors: float = LEAST_ERRORS) -> bool:
         """Tell whether the difference is large and sure enough to be believed."""
         if self.by_shape is not None:
             return self.by_shape
-        return self.mean_db >= max(least_db, errors * self.error_db)
+        least = self.least_db if least_db is None else least_db
+        return self.mean_db >= max(least, errors * self.error_db)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +98,7 @@ def pooled(scenes: Sequence[Evidence]) -> Gain:
     mean, low, high = interval([scene.mean_db for scene in told])
     against = (replace(scene, mean_db=-scene.mean_db) for scene in told if scene.by_shape is None)
     opposed = any(scene.is_clear() for scene in against)
-    clear = (mean >= LEAST_DB and low > 0) or (
+    clear = (mean >= max(scene.least_db for scene in told) and low > 0) or (
         not opposed and any(scene.is_clear() for scene in told)
     )
     return Gain(mean, low, high, "scenes", len(told), clear, by_shape)

@@ -10,11 +10,7 @@ import numpy as np
 from stereogenbench_data.audit.contract_answers import (
     TOPICS,
     Answer,
-    Unit,
     changes,
-    common_unit,
-    kind_explains_scale,
-    length_answers,
     offset_answer,
     offset_words,
     said,
@@ -26,6 +22,12 @@ from stereogenbench_data.audit.contract_diagnosis import (
     allowed_log_scale,
 )
 from stereogenbench_data.audit.contract_hypotheses import QUESTIONS, Structure
+from stereogenbench_data.audit.contract_lengths import (
+    Unit,
+    common_unit,
+    kind_explains_scale,
+    length_answers,
+)
 from stereogenbench_data.audit.contract_statistics import LEAST_ERRORS, Gain, pooled
 from stereogenbench_data.schema.records import DepthEncoding
 
@@ -112,7 +114,8 @@ def _beside(scenes: Sequence[SceneDiagnosis], unit: Unit, answers: Sequence[Answ
     lines = []
     if first.best.flip != "none":
         lines.append(f"Depth is flipped ({first.best.flip}ly turned over): store it anew.")
-    if first.best.order != first.declared.order:
+    order_told = any(a.topic == TOPICS["order"] and a.status == "wrong" for a in answers)
+    if first.best.order != first.declared.order and order_told:
         lines.append(f"Cameras: {first.best.order}. Rename the files, or correct the metadata.")
     if first.recorded_pair is not None and not first.problem:
         lines.append("baseline.json names the primary pair's cameras the wrong way round.")
@@ -121,11 +124,10 @@ def _beside(scenes: Sequence[SceneDiagnosis], unit: Unit, answers: Sequence[Answ
             f"Constant disparity: {offset_words(first.offsets_px)}. Shift the pictures, or record "
             "each camera's principal point."
         )
-    if any(answer.topic == "focal length" and answer.status == "wrong" for answer in answers):
-        lines.append(
-            "Correct the sensor's size or the focal length in baseline.json; until then "
-            f"DepthEncoding(unit_m={unit.rounded_m:g}) gives right disparity, but wrong metres."
-        )
+    lines += [
+        _focal_line(answer, first, unit) for answer in answers
+        if answer.topic == "focal length" and answer.status in ("wrong", "one is wrong")
+    ]  # fmt: skip
     if not first.problem and allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE:
         lines.append(
             f"Stored depth is coarse: its steps are {first.depth_step:.1%} of it or more in a "
@@ -144,6 +146,21 @@ def _beside(scenes: Sequence[SceneDiagnosis], unit: Unit, answers: Sequence[Answ
             "else that is not asked here may be wrong."
         )
     return lines
+
+
+def _focal_line(answer: Answer, first: SceneDiagnosis, unit: Unit) -> str:
+    """Return what to do about a focal length that is wrong, or may be."""
+    cure = "correct the sensor's size or the focal length in baseline.json"
+    if answer.status == "wrong":
+        return (
+            f"{cure.capitalize()}; until then DepthEncoding(unit_m={unit.rounded_m:g}) gives right "
+            "disparity, but wrong metres."
+        )
+    return (
+        f"Unit or focal length: if the unit is wrong, DepthEncoding(unit_m={unit.rounded_m:g}); if "
+        f"the focal length is {answer.found}, DepthEncoding(unit_m={first.unit_m:g}), and {cure}. "
+        "Disparity is the same, metres are not."
+    )
 
 
 def _contract_words(structure: Structure, first: SceneDiagnosis, *, free: str, scale: float) -> str:

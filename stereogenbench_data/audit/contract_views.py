@@ -220,6 +220,17 @@ class SceneViews:
         return -baseline_m if structure.order == "mirrored" else baseline_m
 
 
+def disparity_px(shots: Sequence[Shot]) -> float:
+    """Return the root mean square of found disparities."""
+    return float(np.sqrt((np.concatenate([shot.matched_px for shot in shots]) ** 2).mean()))
+
+
+def spread_px(shots: Sequence[Shot]) -> float:
+    """Return the root mean square of found disparities about the mean of each shot."""
+    spreads = [shot.matched_px - shot.matched_px.mean() for shot in shots if len(shot.rows)]
+    return float(np.sqrt((np.concatenate(spreads) ** 2).mean())) if spreads else 0.0
+
+
 def chosen_frames(available: int, *, count: int) -> list[int]:
     """Return frames spread over a scene, where it is long enough with room for every lag."""
     margin = min(max(LAGS), max(0, (available - 1) // 2))

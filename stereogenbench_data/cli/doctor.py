@@ -24,6 +24,8 @@ from stereogenbench_data.cli.options import (
 )
 from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.writing import writing
+from stereogenbench_data.schema.problems import counted
 
 if TYPE_CHECKING:
     from stereogenbench_data.audit.contract import DoctorReport
@@ -98,7 +100,8 @@ def doctor(  # noqa: PLR0913 - one parameter an option
             filters=filters,
         )
     if out is not None:
-        draw_report(out, report, index)
+        with writing(out):
+            draw_report(out, report, index)
     typer.echo(_json(report) if as_json else "\n".join(_lines(report)))
     if out is not None and not as_json:
         typer.echo(f"\npicture: {out}")
@@ -110,8 +113,8 @@ def _lines(report: "DoctorReport") -> list[str]:
     matches = sum(scene.matches for scene in report.scenes)
     views = sum(scene.views for scene in report.scenes)
     lines = [
-        f"{report.data}: {len(report.scenes)} scenes, {views} views, {matches:,} pixels found in "
-        f"both pictures"
+        f"{report.data}: {counted(len(report.scenes), 'scene')}, {counted(views, 'view')}, "
+        f"{matches:,} pixels found in both pictures"
     ]
     for key, reason in report.left_out.items():
         lines.append(f"left out: {key}: {reason}")
@@ -130,7 +133,7 @@ def _lines(report: "DoctorReport") -> list[str]:
 def _verdict_lines(verdict: "Verdict", report: "DoctorReport") -> list[str]:
     lines = []
     if len(report.verdicts) > 1:
-        lines.append(f"{len(verdict.scenes)} scenes: {', '.join(verdict.scenes)}")
+        lines.append(f"{counted(len(verdict.scenes), 'scene')}: {', '.join(verdict.scenes)}")
     rows = [_row(answer) for answer in verdict.answers]
     rows.insert(0, ("question", "declared", "pictures say", "", "next best"))
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
@@ -157,10 +160,10 @@ def _row(answer: "Answer") -> tuple[str, str, str, str, str]:
     last = answer.note
     if answer.behind is not None and math.isfinite(answer.behind.mean_db):
         gain = _gain_words(answer.behind)
-        said = f"declared is {gain} worse" if answer.status == "wrong" else f"{gain} worse"
+        said = f"declared is {gain} worse" if "wrong" in answer.status else f"{gain} worse"
         last = f"{said}; {answer.note}" if answer.note else said
     return answer.topic, answer.declared, answer.found or "?", answer.status.upper() if (
-        answer.status == "wrong"
+        "wrong" in answer.status
     ) else answer.status, last  # fmt: skip
 
 

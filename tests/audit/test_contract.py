@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.audit.contract import diagnose
-from stereogenbench_data.audit.contract_answers import Unit, offset_words
+from stereogenbench_data.audit.contract_answers import TOPICS, offset_words
 from stereogenbench_data.audit.contract_diagnosis import Rival, SceneDiagnosis
-from stereogenbench_data.audit.contract_hypotheses import Structure
+from stereogenbench_data.audit.contract_hypotheses import LAGS, Structure
+from stereogenbench_data.audit.contract_lengths import Unit
 from stereogenbench_data.audit.contract_matching import match_rows
 from stereogenbench_data.audit.contract_ray import RayPower
 from stereogenbench_data.audit.contract_statistics import Evidence, interval, pooled
@@ -17,7 +18,7 @@ from stereogenbench_data.audit.contract_verdict import judge
 from stereogenbench_data.audit.contract_views import relative_step
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis import ExportContract, SynthRequest, synthesise
 from tests.audit.corruption import (
     as_inverse,
     as_ray,
@@ -124,14 +125,26 @@ def test_ray_depth_behind_a_long_lens_is_told_from_a_unit_that_is_a_little_off(l
     assert unit.unit_m == pytest.approx(UNIT_M, rel=0.005)
 
 
-def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
+def diagnosed(**said):
+    """A scene's diagnosis: the declared contract holds, and no other answer was tested."""
     planar = Structure()
-    scene = SceneDiagnosis(
-        key="scene", views=1, pairs=((0, 1),), matches=999, textured=999, unit_m=UNIT_M,
-        unit_source="tag", focal_ratios={}, recorded_pair=None, declared=planar, best=planar,
-        changed="scale", scale=1.02, scale_error=0.001, other_kind_scale=1.001,
-        agreement=0.9, offsets_px={(0, 1): 0.0},
-        gain=Evidence(0.3, 0.05), rivals=(Rival("kind", "ray", Evidence(0.01, 0.02)),),
+    basics = {
+        "key": "scene", "views": 1, "pairs": ((0, 1),), "matches": 999, "textured": 999,
+        "unit_m": UNIT_M, "unit_source": "tag", "focal_ratios": {}, "recorded_pair": None,
+        "declared": planar, "best": planar, "scale_error": 0.001, "agreement": 0.9,
+        "offsets_px": {(0, 1): 0.0},
+    }  # fmt: skip
+    return SceneDiagnosis(**(basics | said))
+
+
+def judged(**said):
+    return judge([diagnosed(**said)], declared=DepthEncoding())
+
+
+def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
+    scene = diagnosed(
+        changed="scale", scale=1.02, other_kind_scale=1.001, gain=Evidence(0.3, 0.05),
+        rivals=(Rival("kind", "ray", Evidence(0.01, 0.02)),),
     )  # fmt: skip
 
     verdict = judge([scene], declared=DepthEncoding())
@@ -144,6 +157,157 @@ def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
     assert answer(verdict, "metres a unit").status == "cannot tell"
     assert "depth along the ray, the unit as declared" in " ".join(verdict.beside)
     assert wrong_topics(told) == {"metres a unit"}
+
+
+@pytest.mark.parametrize("question", TOPICS)
+@pytest.mark.parametrize("behind_db", [math.nan, 0.01, 9.0])
+def test_an_answer_is_confirmed_only_where_all_others_were_tested_and_lost(question, behind_db):
+    others = [getattr(each, question) for each in Structure().alternatives(question)]
+    lost, last = Evidence(9.0, 0.1), Evidence(behind_db, 0.1)
+    # Of lags, the next one.
+    different = others.index(1) if question == "frame_lag" else len(others) - 1
+    rivals = [Rival(question, other, last if number == different else lost)
+              for number, other in enumerate(others)]  # fmt: skip
+
+    found = answer(judged(rivals=tuple(rivals)), TOPICS[question])
+
+    assert found.status == ("confirmed" if behind_db == 9.0 else "cannot tell")
+    assert ("not tested" in found.note) == math.isnan(behind_db)
+
+
+@pytest.mark.parametrize(
+    ("best", "tested", "status", "found"),
+    [
+        (0, (), "cannot tell", ""),
+        (0, (1,), "cannot tell", ""),
+        (0, (-1, 1), "confirmed", "0"),
+        (1, (-1, 0), "wrong", "1 or 2"),
+        (1, (-1, 0, 2), "wrong", "1"),
+        (3, (-1, 0, 1), "wrong", "3 or 2"),
+        (-3, (-2, -1, 0, 1, 2, 3), "wrong", "-3"),
+    ],
+)
+def test_a_lag_whose_neighbours_no_frame_could_test_is_left_open(best, tested, status, found):
+    rivals = tuple(
+        Rival("frame_lag", lag, Evidence(9.0 if lag in tested else math.nan, 0.1))
+        for lag in LAGS
+        if lag != best
+    )
+
+    lag = answer(judged(best=Structure(frame_lag=best), rivals=rivals), "frame lag")
+
+    assert (lag.status, lag.found) == (status, found)
+    assert ("not tested" in lag.note) == (len(tested) < len(LAGS) - 1)
+    assert ("beyond" in lag.note) == (abs(best) == 3)
+
+
+def test_a_scene_of_one_frame_does_not_tell_the_lag(tmp_path):
+    synthesise(tmp_path, SynthRequest(family="Uniform", size_px=96, frames=1, seed=3, focal_mm=35))
+
+    (verdict,) = diagnose(tmp_path, workers=1).verdicts
+
+    assert not verdict.is_wrong
+    assert answer(verdict, "frame lag").status == "cannot tell"
+    assert answer(verdict, "frame lag").note.startswith("not tested, for want of frames: -3, -2")
+    assert answer(verdict, "depth along").status == "confirmed"
+
+
+@pytest.mark.parametrize(
+    ("scale", "error", "source", "status"),
+    [
+        (0.980, 0.001, "tag", ("one is wrong", "one is wrong")),
+        (0.984, 0.001, "default", ("one is wrong", "one is wrong")),
+        (0.970, 0.001, "tag", ("wrong", "confirmed")),
+        (0.950, 0.015, "tag", ("one is wrong", "one is wrong")),
+        (1.499, 0.001, "tag", ("cannot tell", "wrong")),
+        (1.499, 0.001, "default", ("one is wrong", "one is wrong")),
+        (1.530, 0.010, "user", ("one is wrong", "one is wrong")),
+        (2.000, 0.001, "tag", ("one is wrong", "one is wrong")),
+        (10.00, 0.001, "tag", ("wrong", "confirmed")),
+    ],
+)
+def test_unit_or_focal_length_is_blamed_only_where_the_other_is_far_fetched(
+    scale, error, source, status
+):
+    verdict = judged(
+        changed="scale", scale=scale, scale_error=error, unit_source=source,
+        gain=Evidence(3.0, 0.05), focal_ratios={"near": 0.984, "far": 1.5, "double": 2.0},
+        rivals=(Rival("kind", "ray", Evidence(9.0, 0.1)),),
+    )  # fmt: skip
+
+    assert verdict.is_wrong
+    assert (answer(verdict, "metres a unit").status, answer(verdict, "focal length").status) == (
+        status
+    )
+
+
+@pytest.mark.parametrize(
+    ("scale", "error", "status"),
+    [
+        (1.001, 0.001, ("confirmed", "confirmed")),
+        (1.008, 0.001, ("cannot tell", "cannot tell")),
+        (1.001, 0.006, ("confirmed", "cannot tell")),
+        (1.013, 0.006, ("cannot tell", "cannot tell")),
+        (1.001, 0.020, ("cannot tell", "cannot tell")),
+    ],
+)
+def test_unit_and_focal_length_are_confirmed_as_far_as_they_are_known(scale, error, status):
+    verdict = judged(scale=scale, scale_error=error, focal_ratios={"near": 0.984})
+
+    assert not verdict.is_wrong
+    assert (answer(verdict, "metres a unit").status, answer(verdict, "focal length").status) == (
+        status
+    )
+
+
+@pytest.mark.parametrize(("offset_px", "status"), [(0.1, "confirmed"), (0.8, "cannot tell")])
+def test_an_offset_that_fits_and_is_not_clearly_better_is_left_open(offset_px, status):
+    verdict = judged(offsets_px={(0, 1): offset_px, (1, 2): 0.0})
+
+    assert answer(verdict, "disparity offset").status == status
+
+
+def test_a_shifted_picture_is_not_told_from_depth_of_the_other_camera():
+    swapped = "depth of the primary pair swapped"
+    rivals = tuple(
+        Rival("order", each.order, Evidence(9.0, 0.1))
+        for each in Structure(order=swapped).alternatives("order")
+    )
+    said = {"best": Structure(order=swapped), "rivals": rivals, "gain": Evidence(9.0, 0.1)}
+
+    alone = judged(**said)
+    shifted = judged(**said, changed="offset", offsets_px={(0, 1): -3.0, (1, 2): 0.0})
+
+    assert wrong_topics(alone) == {"left and right"}
+    assert any(swapped in line for line in alone.beside)
+    assert wrong_topics(shifted) == {"disparity offset"}
+    assert answer(shifted, "left and right").status == "cannot tell"
+    assert not any(swapped in line for line in shifted.beside)
+
+
+def test_a_unit_that_pixels_not_quite_square_explain_is_not_blamed_on_the_focal_length(tmp_path):
+    contract = ExportContract(sensor_mm=(36, 24))
+    request = SynthRequest(
+        family="Uniform", size_px=128, height_px=84, frames=1, seed=141, contract=contract
+    )
+    (key,) = synthesise(tmp_path / "right", request)
+    folder = copied(tmp_path / "right" / key, tmp_path / "wrong")
+    rewrite_depth(folder, lambda units: units, unit_factor=0.98)
+
+    (right,) = diagnose(tmp_path / "right", workers=1).verdicts
+    (verdict,) = diagnose(tmp_path / "wrong", workers=1).verdicts
+
+    assert not right.is_wrong
+    assert answer(right, "focal length").status == "confirmed"
+    assert verdict.is_wrong
+    assert {found.topic for found in verdict.answers if found.status == "one is wrong"} == {
+        "metres a unit", "focal length",
+    }  # fmt: skip
+    assert wrong_topics(verdict) == set()
+    (line,) = (line for line in verdict.beside if line.startswith("Unit or focal length"))
+    assert "if the unit is wrong, DepthEncoding(unit_m=0.001)" in line
+    assert "DepthEncoding(unit_m=0.00098), and correct" in line
+    assert "f / sensor height * picture height" in line
 
 
 @pytest.mark.parametrize(
@@ -291,6 +455,69 @@ def test_six_equal_views_decide_nothing(verdict_on):
 
     assert not verdict.is_wrong
     assert "too little parallax" in verdict.answers[0].note
+
+
+@pytest.fixture(scope="module")
+def small_parallax(tmp_path_factory):
+    """A function to a scene of two-pixel disparities, whose errors look like other mistakes."""
+
+    def small_parallax(**changes):
+        root = tmp_path_factory.mktemp("small_parallax")
+        request = SynthRequest(
+            family="IPD_Gaussian", frames=11, seed=905311003, focal_mm=79.7,
+            contract=ExportContract(depth_unit_m=0.0005, **changes.pop("contract", {})), **changes,
+        )  # fmt: skip
+        (key,) = synthesise(root, request)
+        return root, root / key
+
+    return small_parallax
+
+
+def test_a_shift_where_little_is_seen_does_not_make_the_unit_wrong_too(small_parallax):
+    root, folder = small_parallax(size_px=130, height_px=98)
+    rewrite_rgb(folder, 1, lambda pictures: np.roll(pictures, 2, axis=2))
+
+    (verdict,) = diagnose(root, workers=1).verdicts
+
+    assert wrong_topics(verdict) == {"disparity offset"}
+    assert answer(verdict, "disparity offset").found.startswith("camera 1's picture is +2.0")
+
+
+def test_a_unit_where_little_is_seen_is_not_taken_for_a_lag(small_parallax):
+    contract = {"sensor_mm": (36, 24)}
+    root, folder = small_parallax(size_px=128, height_px=84, contract=contract)
+    rewrite_depth(folder, lambda units: units, unit_factor=0.976)
+
+    (verdict,) = diagnose(root, workers=1).verdicts
+
+    assert answer(verdict, "frame lag").status == "cannot tell"
+    assert verdict.encoding.frame_lag == 0
+
+
+def test_ray_depth_is_not_taken_for_what_explains_few_of_the_matches(tmp_path):
+    request = SynthRequest(
+        family="Uniform", size_px=170, height_px=128, frames=1, seed=905311007, focal_mm=92.2,
+        contract=ExportContract(depth_unit_m=0.0005, sensor_mm=(36, 24)),
+    )  # fmt: skip
+    (key,) = synthesise(tmp_path, request)
+    rewrite_depth(tmp_path / key, lambda units: np.flip(units, 1))
+
+    (verdict,) = diagnose(tmp_path, workers=1).verdicts
+
+    assert wrong_topics(verdict) == set()
+    assert answer(verdict, "flip of depth").status == "cannot tell"
+    assert "nothing fits" in verdict.answers[0].note
+
+
+def test_equal_views_of_which_noise_alone_makes_disparity_decide_nothing(tmp_path):
+    request = SynthRequest(family="Uniform", size_px=174, frames=7, seed=3001, focal_mm=48)
+    (key,) = synthesise(tmp_path, request)
+    exchange(tmp_path / key, dict.fromkeys(range(6), 2))
+
+    (verdict,) = diagnose(tmp_path, frames=1, workers=1).verdicts
+
+    assert not verdict.is_wrong
+    assert "too little parallax: disparities are of 0.0" in verdict.answers[0].note
 
 
 def test_a_scene_in_which_nothing_moves_does_not_tell_the_lag(verdict_on):

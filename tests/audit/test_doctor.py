@@ -6,8 +6,8 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.cli.doctor import encoding_line
-from stereogenbench_data.cli.main import app
 from stereogenbench_data.schema.records import DepthEncoding
 
 
