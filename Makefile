@@ -24,7 +24,7 @@ lint: $(READY)
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
-# Draws its scenes first (20 minutes or so, kept in build/bench), then measures for 45. Let nothing
+# Draws its scenes first (20 minutes or so, kept in build/bench), then measures for 50. Let nothing
 # else run.
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \

@@ -34,7 +34,7 @@ def plot_all(sections: dict[str, Any], folder: Path) -> list[Path]:
         }
     )  # fmt: skip
     races = sections.get("races", {})
-    local = [w for w in WORKLOADS if w.name in races and w.source == "local" and w not in RATES]
+    local = [w for w in WORKLOADS if w.name in races and w.source == "local" and not w.field]
     web = [w for w in WORKLOADS if w.name in races and w.source == "web"]
     made = []
     for name, wanted, make in (

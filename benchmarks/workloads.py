@@ -121,6 +121,10 @@ _AT_DRAWN_RATE: Final = (
         ("clips", 16, 1, 16), batch=1, target=Target(0.85, 3),
     ),
     Workload(
+        "clips-longer", "16-frame clips, primary pair, 1280, of more scenes", 16,
+        ("clips", 16, 1, 16), ("clips", 16, 1, 16), batch=1, field=("limit", "ours"),
+    ),
+    Workload(
         "random", "random single frames, 8 a scene, 1280", 4, ("random", 8), ("random", 8),
         target=Target(0.7, 3), blosc2=3.0, more=_CODECS,
     ),
