@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -60,7 +60,7 @@ def download(  # noqa: PLR0913 - one parameter an option
 
     numbers = _cameras(cameras)
     index = SceneIndex.open(data)
-    filters = scene_filters(
+    filters: Any = scene_filters(
         split=split,
         subset=subset,
         family=family,
@@ -69,7 +69,7 @@ def download(  # noqa: PLR0913 - one parameter an option
         focal_mm=focal_mm,
         caption=caption,
     )
-    rows = filter_scenes(index, filters)  # type: ignore[arg-type]  # its keys are those of SceneFilters
+    rows = filter_scenes(index, filters)
     kinds = ("rgb", "depth") if streams == "both" else (streams,)
     wanted = plan_download(index, rows.tolist(), cameras=numbers, streams=kinds)
     size = wanted.size_bytes / _MEGABYTE

@@ -14,7 +14,7 @@ from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
-from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.selection.filters import filter_scenes
 from stereogenbench_data.selection.pairs import PairList, baselines_cm, choose_pairs
 from stereogenbench_data.storage.index import SceneIndex
 
@@ -187,9 +187,10 @@ class Catalogue:
         )
 
     def _choose(self, choice: Choice) -> Chosen:
+        filters: Any = choice.filters()
         empty = choose_pairs(self.index, np.zeros(0, dtype=np.int64), pairs="all")
         try:
-            rows = filter_scenes(self.index, SceneFilters(**choice.filters()))  # type: ignore[typeddict-item]  # names are those of the filters
+            rows = filter_scenes(self.index, filters)
             pairs = choose_pairs(
                 self.index,
                 rows,
