@@ -9,6 +9,8 @@ StereoGenBenchError
 ├── SelectionError (LookupError)  a filter, a pair or a window that no sample can satisfy
 ├── FieldError     (ValueError)   fields or transforms that cannot be had together
 ├── StateError     (ValueError)   a saved position of other samples or of another order
+├── PassError      (RuntimeError) a pass over a loader that cannot go on as it is used
+│   └── WorkerError               a worker process died in the middle of a pass
 ├── SynthesisError (ValueError)   a scene that cannot be drawn as asked
 ├── DescriptorError (ValueError)  a Croissant descriptor or dataset card that does not fit its data
 ├── EvaluationError (ValueError)  predictions, metrics or a protocol that cannot be scored
@@ -52,6 +54,14 @@ class FieldError(StereoGenBenchError, ValueError):
 
 class StateError(StereoGenBenchError, ValueError):
     """A saved position that belongs to other samples, or to another order of them."""
+
+
+class PassError(StereoGenBenchError, RuntimeError):
+    """A pass over a loader or a stream that would give wrong batches the way it is used."""
+
+
+class WorkerError(PassError):
+    """A worker process died in the middle of a pass."""
 
 
 class SynthesisError(StereoGenBenchError, ValueError):

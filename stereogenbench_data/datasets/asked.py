@@ -5,6 +5,7 @@ from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
+from stereogenbench_data.datasets.batch_buffers import Buffers
 from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS, require_fields
 from stereogenbench_data.samples.request import Request, Transform
@@ -85,6 +86,19 @@ def require_check(check: Any) -> Check:
         if check == each:
             return each
     raise SelectionError(f"check must be one of {', '.join(map(repr, known))}, got {check!r}.")
+
+
+def require_buffers(buffers: Any) -> Buffers:
+    """Return whether the memory of batches is reused.
+
+    Raises:
+        SelectionError: If it is something else.
+    """
+    known: tuple[Buffers, ...] = get_args(Buffers)
+    for each in known:
+        if buffers == each:
+            return each
+    raise SelectionError(f"buffers must be one of {', '.join(map(repr, known))}, got {buffers!r}.")
 
 
 def require_depth(depth: Any) -> DepthEncoding | None:

@@ -1,6 +1,6 @@
 """The batches of an epoch as one rank gets them, and positions in them that can be saved."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import Any, Final, Protocol, TypedDict, Unpack, runtime_checkable
@@ -9,6 +9,7 @@ import numpy as np
 import torch.distributed
 from torch.utils.data import Sampler
 
+from stereogenbench_data.datasets.frameworks import require_shared_once
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.selection.order import (
     LANES,
@@ -80,8 +81,17 @@ class Numbered(Protocol):
         """The current epoch."""
         ...
 
+    @property
+    def epoch_version(self) -> tuple[int, ...]:
+        """What differs after each `set_epoch`, whatever epoch it sets."""
+        ...
+
     def set_epoch(self, epoch: int) -> None:
         """Go to another epoch."""
+        ...
+
+    def advance_epoch(self, epoch: int) -> None:
+        """Go to another epoch because a pass is over, not because the user says so."""
         ...
 
     @property
@@ -90,14 +100,41 @@ class Numbered(Protocol):
         ...
 
 
+class EpochBatch(list[int]):
+    """The numbers of a batch's samples, with the epoch that they are drawn for.
+
+    Attributes:
+        epoch: The epoch: of random frames and transforms, too, whatever epoch the dataset is at.
+        is_padding: For each sample whether it fills up after the epoch's end; None where no sample
+            ever does (all tails but "wrap").
+    """
+
+    def __init__(
+        self, numbers: Iterable[int], *, epoch: int, is_padding: list[bool] | None = None
+    ) -> None:
+        """Hold the numbers."""
+        super().__init__(numbers)
+        self.epoch = epoch
+        self.is_padding = is_padding
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what a worker process makes the same batch from."""
+        return _epoch_batch, (list(self), self.epoch, self.is_padding)
+
+
+def _epoch_batch(numbers: list[int], epoch: int, is_padding: list[bool] | None) -> EpochBatch:
+    return EpochBatch(numbers, epoch=epoch, is_padding=is_padding)
+
+
 class EpochBatches(Sampler[list[int]]):
     """A batch sampler: the samples of each batch of an epoch, for one rank.
 
-    The order depends on the selection, the seed, the epoch, the batch size, the lanes and the open
-    scenes, and on nothing else: global batch n goes to rank n mod world_size, whoever asks. It
-    offers its position as torchdata's ``StatefulDataLoader`` asks for it; with torch's own
-    `DataLoader`, which reads ahead, use the dataset's ``loader(...)``, which counts what the
-    training loop has taken.
+    Its passes are of the same epoch until `set_epoch` is called, as with torch's samplers; a
+    ``loader(...)`` goes to the next epoch by itself. The order depends on the selection, the seed,
+    the epoch, the batch size, the lanes and the open scenes, and on nothing else: global batch n
+    goes to rank n mod world_size, whoever asks. It offers its position as torchdata's
+    ``StatefulDataLoader`` asks for it; with torch's own `DataLoader`, which reads ahead, use the
+    dataset's ``loader(...)``, which counts what the training loop has taken.
 
     >>> from stereogenbench_data import EpochBatches, StereoPairs
     >>> pairs = StereoPairs(getfixture("small_release"), frames="all")
@@ -159,7 +196,12 @@ class EpochBatches(Sampler[list[int]]):
         return len(self.share(0))
 
     def __iter__(self) -> "BatchPass":
-        """Return this rank's batches of the current epoch, or what a loaded state left of it."""
+        """Return this rank's batches of the current epoch, or what a loaded state left of it.
+
+        Raises:
+            SelectionError: If Accelerate would share these batches among ranks a second time.
+        """
+        require_shared_once(self, type(self).__name__, rank=self.rank, world_size=self.world_size)
         epoch, start = self.next_position()
         return BatchPass(self, epoch=epoch, start=start)
 
@@ -179,17 +221,21 @@ class EpochBatches(Sampler[list[int]]):
         Raises:
             StateError: If it belongs to other samples or another order, naming what differs.
         """
-        self._resumed = self.position_in(state)
+        self.go_to(*self.position_in(state))
+
+    def go_to(self, epoch: int, start: int) -> None:
+        """Begin the next pass at a global batch of an epoch."""
+        self.dataset.set_epoch(epoch)
+        self._resumed = (epoch, start)
         self._latest = None
-        self.dataset.set_epoch(self._resumed[0])
 
     def next_position(self) -> tuple[int, int]:
         """Return the epoch and the global batch at which the next pass begins."""
         epoch, start = self._resumed
         return (epoch, start) if epoch == self.dataset.epoch else (self.dataset.epoch, 0)
 
-    def begun(self, latest: "BatchPass") -> None:
-        """Note that a pass has begun: the next one starts its epoch from the beginning."""
+    def begin(self, latest: "BatchPass | None" = None) -> None:
+        """Take note that a pass has begun: the next one starts its epoch from the beginning."""
         self._resumed = (0, 0)
         self._latest = latest
 
@@ -209,20 +255,34 @@ class EpochBatches(Sampler[list[int]]):
         Raises:
             SelectionError: If torch.distributed was initialised after these batches were made.
         """
-        if self._follows_the_group and _group() not in (None, (self.rank, self.world_size)):
-            raise SelectionError(
-                f"these batches were made for rank {self.rank} of {self.world_size}, and "
-                f"torch.distributed now says (rank, world size) is {_group()}. Make them after "
-                "init_process_group, or give rank= and world_size=."
-            )
+        group = _group()
+        if group is not None:
+            self.require_group(*group)
         return rank_share(start, self.end(start), rank=self.rank, world_size=self.world_size)
 
-    def batch(self, number: int, *, epoch: int) -> list[int]:
+    def require_group(self, rank: int, world_size: int) -> None:
+        """Require that the batches were made for a rank of so many, unless the user chose another.
+
+        Raises:
+            SelectionError: If they were made for another one before the processes were known.
+        """
+        if self._follows_the_group and (rank, world_size) != (self.rank, self.world_size):
+            raise SelectionError(
+                f"these batches were made for rank {self.rank} of {self.world_size}, and this "
+                f"process is rank {rank} of {world_size} now. Make them after init_process_group "
+                "(or Accelerator()), or give rank= and world_size=."
+            )
+
+    def batch(self, number: int, *, epoch: int) -> EpochBatch:
         """Return the samples of a global batch."""
         order = self.order(epoch)
-        found = order.full_batch(number) if self.tail == "wrap" else order.batch(number)
-        samples: list[int] = found.tolist()
-        return samples
+        if self.tail != "wrap":
+            return EpochBatch(order.batch(number).tolist(), epoch=epoch)
+        return EpochBatch(
+            order.full_batch(number).tolist(),
+            epoch=epoch,
+            is_padding=self.is_padding(number).tolist(),
+        )
 
     def is_padding(self, number: int) -> np.ndarray:
         """Return, for each sample of a global batch, whether it fills up after the epoch's end."""
@@ -307,9 +367,9 @@ class BatchPass(Iterator[list[int]]):
         self._batches = batches
         self._go_to(epoch, start)
 
-    def __next__(self) -> list[int]:
+    def __next__(self) -> EpochBatch:
         """Return the next batch: the numbers of its samples."""
-        self._batches.begun(self)
+        self._batches.begin(self)
         number = next(self._left)
         self._given += 1
         return self._batches.batch(number, epoch=self._epoch)
@@ -323,7 +383,7 @@ class BatchPass(Iterator[list[int]]):
         """Go to a saved position."""
         epoch, start = self._batches.position_in(state)
         self._batches.dataset.set_epoch(epoch)
-        self._batches.begun(self)
+        self._batches.begin(self)
         self._go_to(epoch, start)
 
     def _go_to(self, epoch: int, start: int) -> None:

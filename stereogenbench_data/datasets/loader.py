@@ -1,15 +1,30 @@
 """A torch `DataLoader` over the batches of an epoch that knows what its loop has consumed."""
 
+import os
+import sys
 from collections.abc import Iterator, Mapping
 from typing import Any, Final, Protocol, runtime_checkable
+from weakref import WeakSet
 
 import torch
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Sampler
 
-from stereogenbench_data.datasets.batches import EpochBatches, EpochOptions, Numbered, State
-from stereogenbench_data.datasets.parcels import Parcel, Shelf
-from stereogenbench_data.datasets.tensors import collate
-from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.datasets.batch_buffers import BatchBuffers, forget_slots
+from stereogenbench_data.datasets.batches import (
+    EpochBatch,
+    EpochBatches,
+    EpochOptions,
+    Numbered,
+    State,
+)
+from stereogenbench_data.datasets.frameworks import AcceleratedLoader, ShareSampler
+from stereogenbench_data.datasets.workers import WorkerContext
+from stereogenbench_data.errors import (
+    PassError,
+    SelectionError,
+    StereoGenBenchError,
+    WorkerError,
+)
 
 _ORDERED: Final = "or torch's own DataLoader over the dataset"
 _INSTEAD: Final = {
@@ -38,6 +53,8 @@ class LoaderOptions(EpochOptions, total=False):
 class Keeping(Numbered, Protocol):
     """A numbered dataset that is told how many scenes are read at a time."""
 
+    buffers: BatchBuffers
+
     def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Keep videos open for the scenes that one of so many processes reads at a time."""
         ...
@@ -46,34 +63,34 @@ class Keeping(Numbered, Protocol):
         """Close the videos that are open in this process."""
         ...
 
-    @property
-    def shelf(self) -> Shelf | None:
-        """Where workers write their batches, None for memory of each batch's own."""
-        ...
 
-    @shelf.setter
-    def shelf(self, shelf: Shelf | None) -> None: ...
-
-
-class PairsLoader(DataLoader[Any]):
+class PairsLoader(AcceleratedLoader, DataLoader[Any]):
     """The batches of an epoch, loaded: what ``loader(...)`` of a dataset returns.
 
     It is a torch `DataLoader`. `state_dict` counts the batches that the loop has taken, not those
     that workers have read ahead, so that it can be saved after any batch and loaded under other
-    numbers of ranks and workers. Where a rank's worker dies, the loop ends with torch's own error.
+    numbers of ranks and workers. A pass that gave its last batch is followed by one of the next
+    epoch, unless an epoch was set since: training loops need not call `set_epoch`, and a pass to
+    be repeated, as for validation on random frames, is asked for by ``set_epoch(0)`` before it.
 
-    Its epoch is its own from the first `set_epoch` or `load_state_dict` on, and until then that of
-    the dataset that it was made from; its open videos are its own. So loaders of one dataset, one
-    to train and one to validate, leave each other alone.
+    A pass owns its workers and their memory: the loader can be iterated while another iteration of
+    it goes on. Workers that persist serve one pass at a time: a new one ends the one before, which
+    then raises `PassError`. Where a worker dies, the loop ends with `WorkerError`.
+
+    Its epoch is its own from the first `set_epoch` or `load_state_dict` on, and until then goes
+    with the dataset that it was made from; its open videos are its own. So loaders of one dataset,
+    one to train and one to validate, leave each other alone.
+
+    ``accelerator.prepare(loader)`` of Accelerate returns the loader itself, as it shares batches
+    among ranks already; from then on batches come on the accelerator's device, and
+    ``save_state`` and ``load_state`` keep its position.
     """
 
     def __init__(
         self, dataset: Keeping, batches: EpochBatches, *, num_workers: int, **options: Any
     ) -> None:
         """Load batches of a dataset; ``options`` are those of `DataLoader`."""
-        options.setdefault("collate_fn", collate)
-        self._keeping = dataset
-        self._shelf = Shelf(0)
+        options.setdefault("collate_fn", dataset.buffers.collate)
         super().__init__(
             dataset,  # type: ignore[arg-type]  # a protocol: torch asks for len and [] alone
             batch_sampler=batches,
@@ -81,61 +98,43 @@ class PairsLoader(DataLoader[Any]):
             **options,
         )
         self.batches = batches
+        self._keeping = dataset
         self._position = batches.next_position()
+        self._completed: tuple[int, tuple[int, ...]] | None = None
+        self._unfinished: WeakSet[LoaderPass] = WeakSet()
+        self._clock = 0
+        self._persistent: _Workers | None = None
+        # Past torch's guard against another sampler: it says that the batches are a rank's share.
+        object.__setattr__(self, "sampler", ShareSampler(batches))
         dataset.keep_open(batches, processes=batches.world_size * max(1, num_workers))
 
     @property
     def epoch(self) -> int:
-        """The current epoch, from 0."""
+        """The current epoch, from 0: until the next pass begins, that of the last one."""
         return self.batches.dataset.epoch
 
     def set_epoch(self, epoch: int) -> None:
-        """Go to another epoch: another order, other random frames and transforms.
+        """Go to an epoch: another order, other random frames and transforms.
 
-        Call it before each epoch. With the epoch of a state just loaded it changes nothing, so
-        that a training loop begins as ``for epoch in range(loader.epoch, epochs)``.
+        Without it each pass is followed by one of the next epoch. With the epoch of a state just
+        loaded it changes nothing, so that a training loop may begin as
+        ``for epoch in range(loader.epoch, epochs)``.
 
         Raises:
             SelectionError: If it is negative.
         """
         self.batches.set_epoch(epoch)
 
-    def __iter__(self) -> Iterator[Any]:  # type: ignore[override]  # torch names a private class
-        """Yield the batches of the current epoch, or what a loaded state left of it."""
-        batches = self.batches
-        epoch, start = self._position = batches.next_position()
-        end, consumed = batches.end(start), start
-        for number, batch in zip(batches.share(start), self._loaded(), strict=True):
-            consumed += batches.world_size
-            self._position = epoch, min(consumed, end)
-            if batches.tail == "wrap":
-                batch["is_padding"] = torch.from_numpy(batches.is_padding(number))
-            yield batch
+    def __iter__(self) -> "LoaderPass":  # type: ignore[override]  # torch names a private class
+        """Begin a pass over the current epoch, or over what a loaded state left of it.
 
-    def _loaded(self) -> Iterator[Any]:
-        """Yield batches as torch loads them; name a worker that died, however torch noticed."""
-        try:
-            for batch in self._begun():
-                yield self._shelf.opened(batch) if isinstance(batch, Parcel) else batch
-        except (ConnectionError, EOFError) as error:
-            raise RuntimeError(
-                f"a DataLoader worker died ({type(error).__name__}: {error}): it was killed, "
-                "perhaps for want of memory. Load the last state, and use fewer workers or open "
-                "scenes."
-            ) from error
-
-    def _begun(self) -> Iterator[Any]:
-        """Begin to load; workers that start now share a shelf with this process."""
-        keep_workers = self._iterator is not None
-        if self.num_workers == 0 or self.pin_memory or self.collate_fn is not collate:
-            return super().__iter__()
-        if not keep_workers:
-            self._shelf = Shelf(self.num_workers)
-        self._keeping.shelf, self.collate_fn = self._shelf, self._shelf.packed
-        try:
-            return super().__iter__()
-        finally:
-            self._keeping.shelf, self.collate_fn = None, collate
+        After a whole pass it is the next epoch, unless an epoch was set since.
+        """
+        epoch, start = self.batches.next_position()
+        if start == 0 and self._completed == (epoch, self._keeping.epoch_version):
+            epoch += 1
+            self._keeping.advance_epoch(epoch)
+        return LoaderPass(self, epoch=epoch, start=start)
 
     def state_dict(self) -> State:
         """Return the position after the last batch that the loop has taken."""
@@ -145,15 +144,241 @@ class PairsLoader(DataLoader[Any]):
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go to a saved position; nothing is replayed, and later epochs are whole again.
 
+        A position behind the last batch of an epoch is the beginning of the next one.
+
         Raises:
             StateError: If it belongs to other samples or another order, naming what differs.
         """
-        self.batches.load_state_dict(state)
-        self._position = self.batches.next_position()
+        epoch, start = self.batches.position_in(state)
+        if start > 0 and start >= self.batches.end(start):
+            epoch, start = epoch + 1, 0
+        self.batches.go_to(epoch, start)
+        self._position = epoch, start
+        self._unfinished.clear()
 
     def close(self) -> None:
-        """Close the videos that this loader holds open in this process; it can be used again."""
+        """End workers that persist, and close this process's videos; it can be used again."""
+        if self._persistent is not None:
+            self._forget(self._persistent)
         self._keeping.close()
+
+    def _forget(self, workers: "_Workers") -> None:
+        """End workers; the next pass starts others."""
+        if workers is self._persistent:
+            self._persistent = None
+        workers.end()
+
+    def _begun(self, begun: "LoaderPass") -> None:
+        """Take note that a pass is about to give its first batch."""
+        self.batches.begin()
+        self._unfinished.add(begun)
+        self._enter_pass()
+
+    def _taken(self, by: "LoaderPass") -> None:
+        """Take note that a pass gives a batch."""
+        self.end_of_dataloader = by.is_complete
+        if by not in self._unfinished:
+            return
+        self._position = by.position
+        self._clock += 1
+        by.last_taken = self._clock
+        if by.is_complete:
+            self._completed = (by.epoch, self._keeping.epoch_version)
+            self._unfinished.discard(by)
+
+    def _ended(self, ended: "LoaderPass") -> None:
+        """Take note that a pass is over: if it was left within another one, that one counts."""
+        self._leave_pass()
+        if ended in self._unfinished:
+            self._unfinished.discard(ended)
+            if self._unfinished and self._position == ended.position:
+                latest = max(self._unfinished, key=lambda each: each.last_taken)
+                self._position = latest.position
+
+
+class LoaderPass(Iterator[Any]):
+    """One pass over the batches of a loader: what ``iter(loader)`` returns.
+
+    Attributes:
+        epoch: The epoch of its batches.
+        position: The epoch, and the number of global batches that are consumed.
+        taken: How many batches it has given.
+    """
+
+    def __init__(self, loader: PairsLoader, *, epoch: int, start: int) -> None:
+        """Begin at a global batch of an epoch: workers start to load."""
+        self._workers: _Workers | None = None
+        batches = loader.batches
+        self._loader = loader
+        self.epoch = epoch
+        self.position = epoch, start
+        self.taken = 0
+        self.last_taken = 0
+        self._end = batches.end(start)
+        self._share = batches.share(start)
+        self._pid = os.getpid()
+        self._over: str | None = None
+        numbers = (batches.batch(number, epoch=epoch) for number in self._share)
+        if loader.persistent_workers:
+            loader._persistent = loader._persistent or _Workers(loader)
+            self._workers = loader._persistent
+        else:
+            self._workers = _Workers(loader)
+        self._loaded = self._workers.begin(numbers)
+        self._number = self._workers.passes
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether its last batch was given."""
+        return self.taken >= len(self._share)
+
+    def __len__(self) -> int:
+        """Return how many batches it has in all."""
+        return len(self._share)
+
+    def __next__(self) -> Any:
+        """Return the next batch.
+
+        Raises:
+            PassError: If persistent workers serve a later pass, another process began this one, or
+                an error ended it.
+            WorkerError: If a worker process died.
+        """
+        workers = self._workers
+        if workers is None:
+            if self._over is None:
+                raise StopIteration
+            raise PassError(self._over)
+        self._require_current(workers)
+        self._over = (
+            f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} batches "
+            "with an error: begin another one, or load a state."
+        )
+        batch = None
+        try:
+            batch = next(self._loaded)
+        except StopIteration:
+            self._over = None
+            raise
+        except (RuntimeError, OSError, EOFError) as error:
+            death = None if isinstance(error, StereoGenBenchError) else workers.death(error)
+            if death is None:
+                raise
+            self._loader._forget(workers)
+            raise death from error
+        finally:
+            if batch is None:
+                self.close()
+        self._over = None
+        if self.taken == 0:
+            self._loader._begun(self)
+        self.taken += 1
+        consumed = self.position[1] + self._loader.batches.world_size
+        self.position = self.epoch, min(consumed, self._end)
+        self._loader._taken(self)
+        return self._loader._on_device(batch)
+
+    def close(self) -> None:
+        """End the pass; its workers end, too, unless they persist."""
+        workers, self._workers = self._workers, None
+        if workers is None:
+            return
+        self._loaded = iter(())
+        self._loader._ended(self)
+        if workers is not self._loader._persistent:
+            workers.end()
+
+    def __del__(self) -> None:
+        """End the pass when nobody can go on with it."""
+        self.close()
+
+    def _require_current(self, workers: "_Workers") -> None:
+        if os.getpid() != self._pid:
+            raise PassError(
+                f"process {self._pid} began this pass, and its fork {os.getpid()} uses it: both "
+                "would take batches from the same workers. Call iter(loader) in the process that "
+                "uses it."
+            )
+        if workers.passes != self._number:
+            raise PassError(
+                f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
+                "batches, as another one was begun: workers that persist serve one pass at a time. "
+                "Use a loader for each, or persistent_workers=False."
+            )
+
+
+class _Workers:
+    """The workers of one pass, or of several one after another where they persist."""
+
+    def __init__(self, loader: PairsLoader) -> None:
+        self._torch: DataLoader[Any] | None = None
+        self._batches: Iterator[Any] = iter(())
+        self.passes = 0
+        self._numbers = _Numbers()
+        self._context = None
+        if loader.num_workers > 0:
+            self._context = WorkerContext(loader.multiprocessing_context)
+        self._torch = DataLoader(
+            loader.dataset,
+            batch_sampler=self._numbers,
+            num_workers=loader.num_workers,
+            collate_fn=loader.collate_fn,
+            pin_memory=loader.pin_memory,
+            timeout=loader.timeout,
+            worker_init_fn=loader.worker_init_fn,
+            multiprocessing_context=self._context and self._context.context,
+            generator=loader.generator,
+            prefetch_factor=loader.prefetch_factor,
+            persistent_workers=loader.persistent_workers,
+        )
+
+    def begin(self, numbers: Iterator[EpochBatch]) -> Iterator[Any]:
+        """Return the batches of a pass; the pass that these workers served before has ended."""
+        if self._torch is None:
+            raise PassError("these workers have ended: call iter(loader) again.")
+        self.passes += 1
+        self._numbers.due = numbers
+        self._batches = iter(self._torch)
+        if self._context is not None and self.passes == 1:
+            self._context.watch()
+        return self._batches
+
+    def death(self, noticed: Exception) -> WorkerError | None:
+        """Return an error that names a worker that died; None if none did."""
+        return None if self._context is None else self._context.error(noticed)
+
+    def __del__(self) -> None:
+        """End the workers when nobody can use them."""
+        self.end()
+
+    def end(self) -> None:
+        """End the workers, and let go of the memory that came from them."""
+        batches, self._batches = self._batches, iter(())
+        loader, self._torch = self._torch, None
+        if loader is None or self._context is None or sys.is_finalizing():
+            return
+        if not self._context.is_of_this_process:
+            _inherited.append((loader, batches))
+            return
+        self._context.stop()
+        # Now, and not when the last traceback is gone that knows the iterator.
+        batches._shutdown_workers()  # type: ignore[attr-defined]  # Lightning ends workers so, too
+        forget_slots(self._context.pids)
+
+
+class _Numbers(Sampler[list[int]]):
+    """The batch sampler of workers: the numbers of the samples that are due."""
+
+    def __init__(self) -> None:
+        self.due: Iterator[EpochBatch] = iter(())
+
+    def __iter__(self) -> Iterator[EpochBatch]:
+        return self.due
+
+
+_inherited: Final[list[object]] = []
+"""Passes that came over a fork. Their workers are the parent's: ending them here would end its
+pass. The operating system takes back what they hold when this process ends."""
 
 
 def require_options(options: Mapping[str, Any]) -> None:

@@ -8,16 +8,19 @@ from pathlib import Path
 from typing import Any, Final, Literal, Self, Unpack
 
 import numpy as np
-from torch.utils.data import Dataset, get_worker_info
+import torch
+from torch.utils.data import Dataset
 
 from stereogenbench_data.datasets.asked import (
     Check,
     requested,
+    require_buffers,
     require_cameras,
     require_check,
     require_seed,
 )
-from stereogenbench_data.datasets.batches import EpochBatches
+from stereogenbench_data.datasets.batch_buffers import BatchArrays, BatchBuffers, Buffers
+from stereogenbench_data.datasets.batches import EpochBatch, EpochBatches
 from stereogenbench_data.datasets.loader import (
     LoaderOptions,
     PairsLoader,
@@ -25,8 +28,6 @@ from stereogenbench_data.datasets.loader import (
     split_options,
 )
 from stereogenbench_data.datasets.open_videos import scenes_at_once, videos_to_keep
-from stereogenbench_data.datasets.parcels import Shelf
-from stereogenbench_data.datasets.room import BatchRoom, Memory
 from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import FieldError, SelectionError
@@ -67,6 +68,7 @@ class _MappedScenes(Dataset[Sample]):
         *,
         cache: ShardCache | None,
         check: Check,
+        buffers: Buffers,
     ) -> None:
         require_videos(index, plan, request)
         require_whole_depth(index, plan, request)
@@ -81,19 +83,26 @@ class _MappedScenes(Dataset[Sample]):
             check="opened" if opened else "metadata",
             frames="shared" if (np.diff(plan.first_pair) > 1).any() else "used once",
         )
-        self._memory = Memory()
-        # Set by a loader for its own workers.
-        self.shelf: Shelf | None = None
+        self.buffers = BatchBuffers(require_buffers(buffers))
         self._streams = request.streams
         self._access: Literal["random", "in order"] = "random"
-        # Shared memory, because workers that persist over epochs hold copies of the dataset.
-        self._epoch = self._followed = shared_full((), 0)
+        # The epoch, and how often it was set. Shared memory, because workers that persist over
+        # epochs hold copies of the dataset.
+        self._epoch = self._followed = shared_full((2,), 0)
+        self._advanced_from: int | None = None
 
     @property
     def epoch(self) -> int:
         """The epoch that random frames and transforms are drawn for."""
-        own = int(self._epoch)
-        return int(self._followed) if own == _FOLLOWS else own
+        own, followed = int(self._epoch[0]), int(self._followed[0])
+        if own == _FOLLOWS or self._advanced_from not in (None, int(self._followed[1])):
+            return followed
+        return own
+
+    @property
+    def epoch_version(self) -> tuple[int, int]:
+        """What differs after each `set_epoch`, whatever epoch it sets."""
+        return int(self._epoch[1]), int(self._followed[1])
 
     def set_epoch(self, epoch: int) -> None:
         """Draw random frames and transforms anew, in this process and in running workers.
@@ -108,7 +117,14 @@ class _MappedScenes(Dataset[Sample]):
         """
         if not isinstance(epoch, int | np.integer) or not 0 <= epoch < 2**63:
             raise SelectionError(f"an epoch is a whole number from 0, got {epoch!r}.")
-        self._epoch.fill_(int(epoch))
+        self._epoch[0] = int(epoch)
+        self._epoch[1] += 1
+        self._advanced_from = None
+
+    def advance_epoch(self, epoch: int) -> None:
+        """Go to another epoch until `set_epoch` is called, here or on the dataset followed."""
+        self._epoch[0] = epoch
+        self._advanced_from = int(self._followed[1])
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -122,35 +138,48 @@ class _MappedScenes(Dataset[Sample]):
             StorageError: If a file is missing or altered.
             MediaError: If a video does not decode to what the index says.
         """
-        return to_tensors(self._sample(number))
+        return to_tensors(self._sample(number, self.epoch))
 
     def __getitems__(self, numbers: Sequence[int]) -> list[Sample]:
         """Return several samples in the order asked, each stream read forwards on the way.
 
-        Samples of one shape lie side by side in memory, so that `collate` need not copy them.
+        Samples of one shape lie side by side in memory, so that `collate` need not copy them. What
+        `EpochBatches` gives is drawn for its own epoch, and has the field ``is_padding`` where its
+        tail is "wrap".
         """
-        if self.shelf is None or get_worker_info() is None:
-            room = BatchRoom(len(numbers), self._memory.take)
-        else:
-            room = self.shelf.room(len(numbers), self._memory)
+        arrays = self.buffers.allocate(len(numbers))
+        batch = (
+            numbers if isinstance(numbers, EpochBatch) else EpochBatch(numbers, epoch=self.epoch)
+        )
         loaded: dict[int, Sample] = {}
         for place, number in sorted(enumerate(numbers), key=operator.itemgetter(1)):
-            sample = self._sample(number, room=room.at(place))
-            loaded[place] = room.as_tensors(place, sample)
+            loaded[place] = self.load_into(arrays, place, number, batch=batch)
         return [loaded[place] for place in range(len(numbers))]
 
-    def into(self, room: BatchRoom, place: int, number: int) -> Sample:
-        """Return a sample as ``dataset[number]`` does, a slice of a batch's room."""
-        return room.as_tensors(place, self._sample(number, room=room.at(place)))
+    def load_into(
+        self, arrays: BatchArrays | None, place: int, number: int, *, batch: EpochBatch
+    ) -> Sample:
+        """Return a sample of a batch, as slices of the batch's arrays if they are given."""
+        if arrays is None:
+            sample = to_tensors(self._sample(number, batch.epoch))
+        else:
+            allocate = arrays.of_sample(place)
+            sample = arrays.as_tensors(place, self._sample(number, batch.epoch, allocate))
+        if batch.is_padding is not None:
+            is_padding = torch.tensor(batch.is_padding[place])
+            if arrays is not None:
+                is_padding = arrays.put(place, "is_padding", is_padding)
+            sample["is_padding"] = is_padding
+        return sample
 
-    def _sample(self, number: int, room: Room = fresh_room) -> Sample:
+    def _sample(self, number: int, epoch: int, room: Room = fresh_room) -> Sample:
         """Return a sample of arrays, written where the room says."""
         number = operator.index(number)
         if not -len(self) <= number < len(self):
             raise IndexError(f"no sample {number}: there are {len(self)}")
         number %= len(self)
-        address = self.plan.locate(number, epoch=self.epoch)
-        seeds = np.random.SeedSequence((self.plan.seed, self.epoch, number))
+        address = self.plan.locate(number, epoch=epoch)
+        seeds = np.random.SeedSequence((self.plan.seed, epoch, number))
         sample = self._loader.load(
             address,
             clip="clip" if self.plan.windows.is_clip else "frame",
@@ -189,8 +218,9 @@ class _MappedScenes(Dataset[Sample]):
     def _apart(self) -> Self:
         """Return the same samples, to be loaded side by side with these."""
         apart = copy.copy(self)
-        apart._loader, apart._memory = self._loader.apart(), Memory()
-        apart._epoch, apart._followed = shared_full((), _FOLLOWS), self._epoch
+        apart._loader, apart.buffers = self._loader.apart(), BatchBuffers(self.buffers.kind)
+        apart._epoch, apart._followed = shared_full((2,), 0), self._epoch
+        apart._epoch[0], apart._advanced_from = _FOLLOWS, None
         return apart
 
     @property
@@ -278,6 +308,7 @@ class StereoPairs(_MappedScenes):
         seed: int = 0,
         cache: ShardCache | None = None,
         check: Check = "read",
+        buffers: Buffers = "reused",
         **selection: Unpack[Selection],
     ) -> None:
         """Select the samples; no video is opened before the first sample is asked for.
@@ -299,6 +330,8 @@ class StereoPairs(_MappedScenes):
                 "metadata" none. Those in shards on disk and in the cache are compared before a
                 frame is given, those from a URL when their last byte has come. Metadata files are
                 always compared; the files of a released folder have no checksums.
+            buffers: "reused": the memory of a batch is used for a later one once nobody holds any
+                part of it. "fresh": each batch has memory of its own, which costs speed.
             **selection: Filters on scenes (`SceneFilters`), pairs, direction, baseline_cm,
                 balance and limit (`PairOptions`), and frames (`parse_frames`).
 
@@ -320,7 +353,7 @@ class StereoPairs(_MappedScenes):
             depth=depth,
             transform=transform,
         )
-        super().__init__(index, plan, request, cache=cache, check=check)
+        super().__init__(index, plan, request, cache=cache, check=check, buffers=buffers)
 
 
 class SceneViews(_MappedScenes):
@@ -345,6 +378,7 @@ class SceneViews(_MappedScenes):
         seed: int = 0,
         cache: ShardCache | None = None,
         check: Check = "read",
+        buffers: Buffers = "reused",
         **filters: Unpack[SceneFilters],
     ) -> None:
         """Select the samples; no video is opened before the first sample is asked for.
@@ -360,6 +394,7 @@ class SceneViews(_MappedScenes):
             seed: Seed of random frames and transforms.
             cache: As for `StereoPairs`.
             check: As for `StereoPairs`.
+            buffers: As for `StereoPairs`.
             **filters: Filters on scenes (`SceneFilters`).
 
         Raises:
@@ -386,7 +421,7 @@ class SceneViews(_MappedScenes):
             seed=require_seed(seed),
             filters=filters,
         )
-        super().__init__(index, plan, request, cache=cache, check=check)
+        super().__init__(index, plan, request, cache=cache, check=check, buffers=buffers)
 
 
 def _opens_checked(check: Check, plan: Plan) -> bool:

@@ -3,20 +3,20 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Unpack
 
-import torch
 from torch.utils.data import IterableDataset, get_worker_info
 
 from stereogenbench_data.datasets.asked import Check
+from stereogenbench_data.datasets.batch_buffers import BatchArrays, Buffers
 from stereogenbench_data.datasets.batches import (
+    EpochBatch,
     EpochBatches,
     EpochOptions,
     State,
     require_count,
 )
+from stereogenbench_data.datasets.frameworks import require_shared_once
 from stereogenbench_data.datasets.loader import split_options
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.datasets.post import Post
-from stereogenbench_data.datasets.room import BatchRoom
 from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.load import Sample, Transform
@@ -36,6 +36,7 @@ class StreamOptions(Selection, EpochOptions, total=False):
     depth: DepthEncoding | None
     cache: ShardCache | None
     check: Check
+    buffers: Buffers
 
 
 class StereoPairStream(IterableDataset[Sample]):
@@ -77,7 +78,6 @@ class StereoPairStream(IterableDataset[Sample]):
         # Which worker has begun since a state was loaded: workers may be new copies every epoch.
         self._begun = shared_full((MOST_WORKERS,), 0)
         self._latest: SamplePass | None = None
-        self.post = Post()
 
     def collate(self, samples: Sequence[Sample]) -> Any:
         """Make a batch of samples: `DataLoader`'s ``collate_fn``, where speed matters.
@@ -89,7 +89,7 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             FieldError: If a field has another shape in one sample than in the first.
         """
-        return self.post.collated(samples)
+        return self.pairs.buffers.collate(samples)
 
     @property
     def epoch(self) -> int:
@@ -113,7 +113,12 @@ class StereoPairStream(IterableDataset[Sample]):
         return len(share) * size - (size - short if has_short else 0)
 
     def __iter__(self) -> "SamplePass":
-        """Return this rank's and this worker's samples of the current epoch."""
+        """Return this rank's and this worker's samples of the current epoch.
+
+        Raises:
+            SelectionError: If Accelerate would share these samples among ranks a second time.
+        """
+        self._require_shared_once()
         info = get_worker_info()
         worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
         epoch, start = self.batches.next_position()
@@ -163,8 +168,15 @@ class StereoPairStream(IterableDataset[Sample]):
         """Close the videos that this process holds open; the stream can be used again."""
         self.pairs.close()
 
+    def _require_shared_once(self) -> None:
+        batches = self.batches
+        require_shared_once(
+            self, type(self).__name__, rank=batches.rank, world_size=batches.world_size
+        )
+
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
+        self._require_shared_once()
         return self.__dict__ | {"_latest": None}
 
 
@@ -178,9 +190,8 @@ class SamplePass(Iterator[Sample]):
         self._stream = stream
         self._place = {"worker": worker, "workers": workers}
         self._left: Iterator[int] = iter(())
-        self._batch: list[int] = []
-        self._padding: list[bool] = []
-        self._room: BatchRoom | None = None
+        self._batch = EpochBatch((), epoch=epoch)
+        self._arrays: BatchArrays | None = None
         self._at = 0
         self._go_to(epoch, start, given=0)
 
@@ -188,7 +199,9 @@ class SamplePass(Iterator[Sample]):
         """Return the next sample."""
         if self._at == len(self._batch):
             self._next_batch()
-        sample = self._loaded()
+        sample = self._stream.pairs.load_into(
+            self._arrays, self._at, self._batch[self._at], batch=self._batch
+        )
         self._at += 1
         self._given += 1
         return sample
@@ -239,25 +252,13 @@ class SamplePass(Iterator[Sample]):
         share = batches.share(start)[self._place["worker"] :: self._place["workers"]]
         whole, part = divmod(given, batches.rule.batch_size)
         self._left = iter(share[whole:])
-        self._batch, self._at = [], 0
+        self._batch, self._at = EpochBatch((), epoch=epoch), 0
         if part > 0:
             self._next_batch()
             self._at = part
 
     def _next_batch(self) -> None:
-        batches, number = self._stream.batches, next(self._left)
-        self._batch, self._at = batches.batch(number, epoch=self._epoch), 0
-        self._padding = batches.is_padding(number).tolist()
-        self._room = self._stream.post.room(len(self._batch))
-
-    def _loaded(self) -> Sample:
-        """Return the sample that is due, in its batch's room where there is one."""
-        pairs, number = self._stream.pairs, self._batch[self._at]
-        is_padding = {}
-        if self._stream.batches.tail == "wrap":
-            is_padding = {"is_padding": torch.tensor(self._padding[self._at])}
-        if self._room is None:
-            return pairs[number] | is_padding
-        return pairs.into(self._room, self._at, number) | {
-            name: self._room.put(self._at, name, value) for name, value in is_padding.items()
-        }
+        self._batch = self._stream.batches.batch(next(self._left), epoch=self._epoch)
+        self._at = 0
+        buffers = self._stream.pairs.buffers
+        self._arrays = buffers.allocate(len(self._batch)) if buffers.makes_batches else None

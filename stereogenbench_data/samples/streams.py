@@ -30,9 +30,6 @@ from stereogenbench_data.storage.source import MemberSource
 OPEN_STREAMS: Final = 24
 """How many videos a process keeps open: two scenes with all their cameras' colour and depth."""
 
-_KNOWN_HERE: Final = 3
-"""How many references to a picture there are while `_unused` looks at it and nobody else has it."""
-
 _inherited: Final[list[object]] = []
 """Readers that came over a fork. They share file offsets with the parent, so they are neither read
 nor closed here: the operating system takes them back when the process ends."""
@@ -191,12 +188,31 @@ def _unused(last: dict[Any, Any], *, height_width: tuple[int, int] | None) -> An
 
     Memory that is new costs more than what is written into it: the system clears it first.
     """
-    for (_, size), picture in last.items():
-        # Known here by the dict, by the name and by the call.
-        if size == height_width and sys.getrefcount(picture) == _KNOWN_HERE:
+    for key in last:
+        picture = last[key]
+        if (
+            key[1] == height_width
+            and picture.base is None
+            and sys.getrefcount(picture) == _REFERENCES_HERE
+        ):
             picture.flags.writeable = True
             return picture
     return None
+
+
+def _references_here() -> int:
+    """Return how many references `_unused` sees to a picture that nobody else has.
+
+    Interpreters differ: some count the one that a function borrows, some do not.
+    """
+    last = {(0, None): np.empty(1)}
+    for key in last:
+        picture = last[key]
+        return sys.getrefcount(picture)
+    return 0
+
+
+_REFERENCES_HERE: Final = _references_here()
 
 
 @contextmanager

@@ -18,6 +18,7 @@ def main() -> None:
     loader = pairs.loader(9, num_workers=1, tail="uneven")
     loader.set_epoch(1)
     whole = [batch["__key__"] for batch in loader]
+    loader.set_epoch(1)
     taken = [batch["__key__"] for batch in itertools.islice(loader, 3)]
     state = loader.state_dict()
     states = [None] * torch.distributed.get_world_size()

@@ -80,6 +80,7 @@ def test_loaders_of_one_dataset_leave_each_other_alone(keyed, workers):
     options = {"num_workers": workers, "persistent_workers": workers > 0, "tail": "uneven"}
     training, validating = keyed.loader(9, **options), keyed.loader(9, **options)
     first = keys_of(validating)
+    validating.set_epoch(0)
     training.set_epoch(3)
     begun = iter(training)
     taken = [next(begun)["__key__"]]
@@ -165,12 +166,71 @@ def test_every_batch_is_a_place_to_stop(keyed):
     states = [loader.state_dict(), *(loader.state_dict() for _ in loader)]
 
     assert [state["batches_consumed"] for state in states] == list(range(17))
-    for taken, state in enumerate(states):
+    for taken, state in enumerate(states[:-1]):
         resumed = keyed.loader(9, tail="uneven")
         resumed.load_state_dict(state)
         assert resumed.state_dict() == state
         assert keys_of(resumed) == unbroken[taken:]
         assert resumed.state_dict()["batches_consumed"] == 16
+
+
+def test_behind_an_epochs_last_batch_the_next_one_begins(keyed):
+    loader = keyed.loader(9, num_workers=1)
+    loader.set_epoch(2)
+    assert len(list(loader)) == 15
+    keyed.set_epoch(3)
+    third = keys_of(keyed.loader(9))
+    resumed = keyed.loader(9)
+    resumed.load_state_dict(loader.state_dict())
+
+    assert resumed.epoch == 3
+    assert resumed.state_dict()["batches_consumed"] == 0
+    assert keys_of(resumed) == third
+
+
+def test_each_whole_pass_is_followed_by_the_next_epoch(keyed):
+    told, by_itself = keyed.loader(9), keyed.loader(9, num_workers=1)
+    expected = []
+    for epoch in range(3):
+        told.set_epoch(epoch)
+        expected.append(keys_of(told))
+    assert [keys_of(by_itself) for _ in range(3)] == expected
+    assert by_itself.epoch == 2
+
+    assert [by_itself.set_epoch(1) or keys_of(by_itself) for _ in range(2)] == [expected[1]] * 2
+    assert keys_of(by_itself) == expected[2]
+
+
+def test_a_loop_that_stops_at_the_length_has_made_a_whole_pass(keyed):
+    """Trainers that know how many batches there are do not ask for one more."""
+    loader = keyed.loader(9)
+    passes = []
+    for _ in range(3):
+        batches = iter(loader)
+        passes.append([next(batches)["__key__"] for _ in range(len(loader))])
+
+    assert passes == [keyed.set_epoch(epoch) or keys_of(keyed.loader(9)) for epoch in range(3)]
+
+
+def test_a_pass_broken_off_is_followed_by_its_epoch_anew(keyed):
+    loader = keyed.loader(9, num_workers=1)
+    first = keys_of(keyed.loader(9))
+    for _ in range(2):
+        assert keys_of(itertools.islice(loader, 14)) == first[:14]
+
+    assert keys_of(loader) == first
+
+
+def test_a_loader_that_advances_goes_with_its_dataset_again_when_that_is_told_an_epoch(keyed):
+    loader = keyed.loader(9)
+    list(loader)
+    list(loader)
+    assert loader.epoch == 1
+    keyed.set_epoch(7)
+
+    assert loader.epoch == 7
+    assert keys_of(loader) == keys_of(keyed.loader(9))
+    assert keyed.epoch == 7
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -188,9 +248,9 @@ def test_the_epochs_after_a_resumed_one_are_whole(keyed, workers, persistent):
     loader.set_epoch(loader.epoch)
 
     assert keys_of(loader) == first[6:]
-    assert keys_of(loader) == first
-    loader.set_epoch(1)
     assert keys_of(loader) == second
+    loader.set_epoch(0)
+    assert keys_of(loader) == first
 
 
 def test_going_to_another_epoch_leaves_a_loaded_position_behind(keyed):

@@ -74,7 +74,6 @@ def test_batches_made_in_place_are_those_of_the_loader_and_stay_while_held(
             held[number] = batch
 
     assert number == len(expected) - 1
-    assert len(stream.post._of_workers) == 2
     assert all(same(batch, expected[number]) for number, batch in held.items())
 
 

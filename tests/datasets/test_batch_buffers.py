@@ -1,12 +1,13 @@
 """Memory of batches: written once, not copied, and used again only when nobody holds any of it."""
 
+import itertools
+
 import pytest
 import torch
 from torch.utils.data import DataLoader, default_collate
 
-from stereogenbench_data import PAIR_FIELDS, StereoPairs, collate
-from stereogenbench_data.datasets.parcels import SLOTS
-from stereogenbench_data.datasets.room import KEPT_BUFFERS
+from stereogenbench_data import PAIR_FIELDS, SelectionError, StereoPairs, collate
+from stereogenbench_data.datasets.batch_buffers import KEPT_BUFFERS, SLOTS
 
 FIELDS = ("left", "disparity", "valid", "baseline_m", "frame_index", "__key__")
 
@@ -111,37 +112,94 @@ def test_a_loop_that_lets_its_batches_go_uses_the_same_memory_again(pairs, worke
     loader.close()
 
 
-def test_workers_send_parcels(pairs):
+def places(loader):
+    """Return where in memory the batches of a loop that lets them go come to lie."""
+    found = []
+    for batch in loader:
+        found.append(batch["left"].data_ptr())
+        del batch
+    return found
+
+
+def test_batches_of_workers_are_those_of_one_process(pairs):
     expected = list(pairs.loader(9))
     loader = pairs.loader(9, num_workers=1)
-    count = 0
-    for one, other in zip(expected, loader, strict=True):
-        assert same(one, other)
-        count += 1
-        del other
 
-    assert len(loader._shelf._memory) == SLOTS
-    assert count == 15
+    assert all(same(one, other) for one, other in zip(expected, loader, strict=True))
 
 
-def test_workers_that_persist_go_on_with_their_slots(pairs):
+def test_workers_that_persist_go_on_with_their_memory(pairs):
     loader = pairs.loader(9, num_workers=1, persistent_workers=True)
     for epoch in range(2):
         loader.set_epoch(epoch)
         alone = pairs.loader(9)
         alone.set_epoch(epoch)
         assert all(same(one, other) for one, other in zip(loader, alone, strict=True))
-        for _ in zip(range(2), loader, strict=False):
-            pass
 
-    assert len(loader._shelf._memory) == SLOTS
+    assert len(set(places(loader))) <= SLOTS
+    loader.close()
+
+
+@pytest.mark.parametrize("taken", [0, 1, 3])
+def test_passes_broken_off_cost_workers_that_persist_no_memory(pairs, taken):
+    loader = pairs.loader(9, num_workers=2, persistent_workers=True)
+    for _ in range(6):
+        for _, batch in zip(range(taken), loader, strict=False):
+            del batch
+
+    assert len(places(loader)) == 15
+    assert len(set(places(loader))) <= 2 * SLOTS
+    loader.close()
+
+
+def test_an_error_in_a_worker_that_persists_costs_no_memory(small_index):
+    refuse = RefuseFrame(3)
+    pairs = StereoPairs(
+        small_index, fields=FIELDS, pairs="adjacent", frames="all", transform=refuse
+    )
+    loader = pairs.loader(9, num_workers=1, persistent_workers=True, order="sequential")
+    for _ in range(5):
+        with pytest.raises(ArithmeticError, match="frame 3"):
+            list(loader)
+    assert len(set(places(itertools.islice(loader, 1)))) == 1
+    loader.close()
+
+
+class RefuseFrame:
+    swaps_views = False
+
+    def __init__(self, number):
+        self.number = number
+
+    def __call__(self, views, generator):
+        if self.number in views.frames:
+            raise ArithmeticError(f"frame {self.number}")
+        return views
 
 
 def test_a_collate_function_of_ones_own_gets_plain_samples(pairs):
     loader = pairs.loader(9, num_workers=1, collate_fn=default_collate)
 
     assert all(same(one, other) for one, other in zip(loader, pairs.loader(9), strict=True))
-    assert loader._shelf._memory == {}
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_fresh_buffers_give_each_batch_memory_of_its_own(small_index, workers):
+    """While a batch is held its memory is not another's; so hold one and look at the others."""
+    pairs = StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all", buffers="fresh")
+    held = list(pairs.loader(9, num_workers=workers, tail="uneven"))
+    expected = StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
+    starts = [batch["left"].untyped_storage().data_ptr() for batch in held]
+
+    assert len(set(starts)) == len(held) == 16
+    assert all(
+        same(one, other) for one, other in zip(held, expected.loader(9, tail="uneven"), strict=True)
+    )
+
+
+def test_buffers_are_reused_or_fresh(small_index):
+    with pytest.raises(SelectionError, match="buffers must be one of 'reused', 'fresh', got 'no'"):
+        StereoPairs(small_index, buffers="no")
 
 
 def test_the_loaders_parts_serve_another_loader(pairs):

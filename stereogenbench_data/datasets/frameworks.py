@@ -1,0 +1,152 @@
+"""What training frameworks ask of a loader that shares its batches among ranks by itself.
+
+Accelerate and Lightning give each rank its share of a torch `DataLoader`. Our loaders have done
+that, so that sharing once more would lose samples without a word. Lightning leaves a loader alone
+whose sampler is torch's `DistributedSampler`; Accelerate one that says that it was prepared.
+Batches and streams that are shared twice all the same are refused.
+"""
+
+import sys
+from collections.abc import Iterator, Sized
+from typing import TYPE_CHECKING, Any, Final
+
+import torch
+from torch.utils.data import DistributedSampler
+
+from stereogenbench_data.errors import SelectionError
+
+if TYPE_CHECKING:
+    from stereogenbench_data.datasets.batches import EpochBatches
+
+_SHARED_TWICE: Final = (
+    "Accelerate shares these batches among {processes} processes, and this {name} gives rank "
+    "{rank} of {world_size} its share already: samples would be lost. Prepare pairs.loader(...) "
+    "instead, which shares once and keeps its position, or do not prepare this loader."
+)
+
+
+class ShareSampler(DistributedSampler[Any]):
+    """The samples of one rank, as the sampler that tells frameworks that they are shared out."""
+
+    def __init__(self, batches: "EpochBatches") -> None:
+        """Stand for the samples of these batches."""
+        super().__init__(
+            batches.dataset,  # type: ignore[arg-type]  # a protocol: only its length is asked for
+            num_replicas=batches.world_size,
+            rank=batches.rank,
+        )
+        self._batches = batches
+
+    def __iter__(self) -> Iterator[int]:
+        """Yield the numbers of the samples of this rank's batches."""
+        for batch in self._batches:
+            yield from batch
+
+    def __len__(self) -> int:
+        """The number of samples in this rank's full batches."""
+        return len(self._batches) * self._batches.rule.batch_size
+
+    def set_epoch(self, epoch: int) -> None:
+        """Set the epoch of the batches: Lightning does before each epoch."""
+        self._batches.set_epoch(epoch)
+
+
+class AcceleratedLoader:
+    """The part of a loader that Accelerate talks to.
+
+    Attributes:
+        use_stateful_dataloader: That Accelerate's ``save_state`` keeps the loader's ``state_dict``.
+        end_of_dataloader: Whether the batch given last is the last of its pass.
+        remainder: How many samples that are no padding all ranks' last batches hold together; 0
+            where all are none.
+    """
+
+    batches: "EpochBatches"
+    use_stateful_dataloader: Final = True
+    end_of_dataloader = False
+    remainder = 0
+    _device: torch.device | None = None
+    _gradient_state: Any = None
+
+    @property
+    def total_batch_size(self) -> int:
+        """How many samples the batches of all ranks hold together."""
+        return self.batches.rule.batch_size * self.batches.world_size
+
+    @property
+    def total_dataset_length(self) -> int:
+        """How many samples an epoch has."""
+        return len(self.batches.dataset.plan)
+
+    @property
+    def _is_accelerate_prepared(self) -> bool:
+        """That Accelerate need not share the batches, which is asked by ``accelerator.prepare``.
+
+        Raises:
+            SelectionError: If the batches are shared out otherwise than Accelerate's processes are.
+        """
+        states = sys.modules.get("accelerate.state")
+        if states is None:
+            return False
+        state = states.PartialState()
+        self.batches.require_group(state.process_index, state.num_processes)
+        self._device = state.device
+        self._gradient_state = states.GradientState()
+        return True
+
+    @_is_accelerate_prepared.setter
+    def _is_accelerate_prepared(self, value: bool) -> None:
+        """Take note of nothing: Accelerate sets what it has asked for before."""
+
+    def _enter_pass(self) -> None:
+        self.end_of_dataloader = False
+        if self._gradient_state is not None:
+            self.remainder = 0
+            if self.batches.tail != "drop":
+                self.remainder = self.total_dataset_length % self.total_batch_size
+            self._gradient_state._add_dataloader(self)
+
+    def _leave_pass(self) -> None:
+        if self._gradient_state is not None:
+            self._gradient_state._remove_dataloader(self)
+
+    def _on_device(self, batch: Any) -> Any:
+        if self._device is None:
+            return batch
+        from accelerate.utils import send_to_device
+
+        pinned = isinstance(batch, dict) and any(
+            isinstance(value, torch.Tensor) and value.is_pinned() for value in batch.values()
+        )
+        return send_to_device(batch, self._device, non_blocking=pinned)
+
+
+def require_shared_once(data: Sized | object, name: str, *, rank: int, world_size: int) -> None:
+    """Refuse what Accelerate is about to share among processes though it is a share already.
+
+    Args:
+        data: A batch sampler or an iterable dataset.
+        name: What to call it.
+        rank: Whose share it is.
+        world_size: Of how many.
+
+    Raises:
+        SelectionError: If it would be shared twice.
+    """
+    states = sys.modules.get("accelerate.state")
+    if world_size == 1 or states is None:
+        return
+    active = states.GradientState().active_dataloader
+    if active is None or isinstance(active, AcceleratedLoader):
+        return
+    dataset = getattr(active, "dataset", None)
+    sampler = getattr(active, "batch_sampler", None)
+    wrapped = [getattr(dataset, "dataset", None), getattr(sampler, "batch_sampler", None)]
+    if hasattr(active, "slice_fn"):
+        # Process 0 alone reads for all.
+        wrapped += [dataset, sampler]
+    if any(each is data for each in wrapped):
+        processes = states.PartialState().num_processes
+        raise SelectionError(
+            _SHARED_TWICE.format(processes=processes, name=name, rank=rank, world_size=world_size)
+        )

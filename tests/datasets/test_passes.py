@@ -1,0 +1,283 @@
+"""A pass over a loader owns its state: within another pass, in a fork, and broken off."""
+
+import gc
+import itertools
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from stereogenbench_data import PassError, StereoPairs, StereoPairStream, WorkerError
+from tests.datasets.conftest import keys_of
+
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
+
+OPEN_FILES = Path("/proc/self/fd")
+FIELDS = ("left", "frame_index", "__key__")
+
+
+@pytest.fixture
+def pairs(small_index):
+    return StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
+
+
+@pytest.fixture(scope="module")
+def truth(small_index):
+    """Each sample's picture by its key, read one by one."""
+    pairs = StereoPairs(small_index, fields=FIELDS, pairs="adjacent", frames="all")
+    return {sample["__key__"]: sample["left"] for sample in pairs}
+
+
+def wrong(batch, truth):
+    """Return how many pictures of a batch are not those of their keys."""
+    samples = zip(batch["__key__"], batch["left"], strict=True)
+    return sum(not torch.equal(left, truth[key]) for key, left in samples)
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2])
+@pytest.mark.parametrize("inner", ["six batches", "one batch", "all"])
+def test_a_pass_within_a_pass_takes_nothing_from_it(pairs, truth, workers, inner):
+    loader = pairs.loader(9, num_workers=workers)
+    expected = keys_of(pairs.loader(9))
+    outer, held = [], []
+    for number, batch in enumerate(loader):
+        outer.append(batch["__key__"])
+        held.append(batch)
+        if number in (0, 4, 14):
+            count = {"six batches": 6, "one batch": 1, "all": 15}[inner]
+            held += itertools.islice(loader, count)
+        if inner != "all":
+            assert loader.state_dict()["batches_consumed"] in (number + 1, count)
+
+    assert outer == expected
+    assert sum(wrong(batch, truth) for batch in held) == 0
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_two_passes_by_turns_are_each_whole(pairs, truth, workers):
+    loader = pairs.loader(9, num_workers=workers)
+    expected = keys_of(pairs.loader(9))
+    found = [], []
+    for batches in zip(loader, loader, strict=True):
+        for own, batch in zip(found, batches, strict=True):
+            own.append(batch["__key__"])
+            assert wrong(batch, truth) == 0
+
+    assert list(found) == [expected, expected]
+
+
+def test_a_look_at_one_batch_does_not_move_the_position_of_the_loop(pairs):
+    loader = pairs.loader(9, num_workers=1)
+    for number, _ in enumerate(loader):
+        next(iter(loader))
+        if number < 14:
+            assert loader.state_dict()["batches_consumed"] == number + 1
+
+
+def test_workers_that_persist_tell_the_older_of_two_passes_that_it_is_over(pairs):
+    loader = pairs.loader(9, num_workers=1, persistent_workers=True)
+    older = iter(loader)
+    next(older)
+    newer = iter(loader)
+    whole = keys_of(newer)
+
+    assert whole == keys_of(pairs.loader(9))
+    with pytest.raises(PassError, match=r"epoch 0 ended after 1 of 15 batches, as another one was"):
+        next(older)
+    loader.close()
+    assert len(list(loader)) == 15
+    loader.close()
+
+
+def test_epochs_set_during_a_pass_are_those_of_the_next_one(small_index):
+    """Frames are drawn for the epoch of the pass, also in workers that read ahead."""
+    pairs = StereoPairs(small_index, fields=("__key__",), frames=("random", 3))
+    expected = [pairs.set_epoch(epoch) or keys_of(pairs.loader(2)) for epoch in (0, 5)]
+    pairs.set_epoch(0)
+    for workers in (0, 1):
+        loader = pairs.loader(2, num_workers=workers)
+        loader.set_epoch(0)
+        found = []
+        for batch in loader:
+            found.append(batch["__key__"])
+            loader.set_epoch(5)
+
+        assert found == expected[0]
+        assert keys_of(loader) == expected[1]
+
+
+def fork_and(act):
+    """Run a function in a fork of this process, which then ends; return its exit status."""
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            act()
+            status = 0
+        finally:
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+@pytest.mark.parametrize("kind", ["loader", "persistent loader", "stream"])
+def test_a_fork_that_lets_go_of_a_batch_leaves_it_to_its_parent(pairs, small_index, truth, kind):
+    if kind == "stream":
+        stream = StereoPairStream(small_index, 9, fields=FIELDS, pairs="adjacent", frames="all")
+        loader = DataLoader(stream, batch_size=9, num_workers=1, collate_fn=stream.collate)
+    else:
+        loader = pairs.loader(9, num_workers=1, persistent_workers=kind.startswith("persistent"))
+    held = []
+    for number, batch in enumerate(loader):
+        held.append(batch)
+        del batch
+        if number in (3, 6):
+            assert fork_and(held.clear) == 0
+            assert fork_and(lambda: [held.clear(), gc.collect()]) == 0
+
+    assert len(held) == 15
+    assert sum(wrong(batch, truth) for batch in held) == 0
+
+
+def test_a_fork_keeps_its_batches_while_the_parent_goes_on(pairs, truth):
+    """A process that saves pictures, say, may be slower than training."""
+    loader = pairs.loader(9, num_workers=1)
+    batches = iter(loader)
+    for _ in range(4):
+        next(batches)
+    batch = next(batches)
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.read(reader, 1)
+        os._exit(wrong(batch, truth))
+    del batch
+    for after in batches:
+        del after
+    os.write(writer, b"x")
+    os.close(writer)
+    os.close(reader)
+
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+def test_batches_in_cycles_and_workers_forked_in_mid_epoch_change_no_batch(pairs, truth):
+    validation = pairs.loader(9, num_workers=2)
+    held = []
+    for number, batch in enumerate(pairs.loader(9, num_workers=1)):
+        cycle = {"batch": batch}
+        cycle["itself"] = cycle
+        held.append(batch)
+        if number % 5 == 2:
+            assert sum(wrong(other, truth) for other in validation) == 0
+        if number % 4 == 3:
+            assert sum(wrong(each, truth) for each in held) == 0
+            held.clear()
+
+    assert sum(wrong(each, truth) for each in held) == 0
+
+
+def test_a_pass_is_refused_in_a_fork_of_its_process(pairs):
+    batches = iter(pairs.loader(9, num_workers=1))
+    next(batches)
+
+    def take():
+        with pytest.raises(PassError, match=r"process \d+ began this pass, and its fork \d+ uses"):
+            next(batches)
+
+    assert fork_and(take) == 0
+    assert len(list(batches)) == 14
+
+
+def test_a_fork_that_lets_go_of_a_pass_does_not_end_its_workers(pairs):
+    kept = [iter(pairs.loader(9, num_workers=2))]
+    next(kept[0])
+
+    assert fork_and(lambda: [kept.clear(), gc.collect(), time.sleep(0.2)]) == 0
+    assert len(list(kept[0])) == 14
+
+
+def test_nothing_outlives_a_pass_that_is_broken_off(pairs):
+    loader = pairs.loader(9, num_workers=2)
+    next(iter(loader))
+    files, threads = len(list(OPEN_FILES.iterdir())), threading.active_count()
+    for _ in range(3):
+        next(iter(loader))
+
+    assert len(list(OPEN_FILES.iterdir())) <= files
+    assert threading.active_count() <= threads
+
+
+class DieAt:
+    """A transform that kills its worker at a frame, holding what a worker may hold then."""
+
+    swaps_views = False
+
+    def __init__(self, how):
+        self.how = how
+
+    def __call__(self, views, generator):
+        if 3 in views.frames and self.how is not None:
+            frame = sys._getframe()
+            while "data_queue" not in frame.f_locals:
+                frame = frame.f_back
+            queue = frame.f_locals["data_queue"]
+            if self.how == "queue's lock":
+                queue._wlock.acquire()
+            if self.how == "half a message":
+                queue._wlock.acquire()
+                os.write(queue._writer.fileno(), b"\x00\x00\x10\x00half")
+            if self.how == "index queue's lock":
+                frame.f_locals["index_queue"]._rlock.acquire()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return views
+
+
+@pytest.mark.parametrize("pin_memory", [False, True])
+@pytest.mark.parametrize("persistent", [False, True])
+@pytest.mark.parametrize("how", ["nothing", "queue's lock", "half a message", "index queue's lock"])
+@pytest.mark.filterwarnings("ignore:'pin_memory' argument is set as true but no accelerator")
+def test_a_worker_that_dies_ends_the_pass_whatever_it_held(
+    small_index, how, persistent, pin_memory
+):
+    pairs = StereoPairs(small_index, fields=FIELDS, frames="all", transform=DieAt(how))
+    loader = pairs.loader(
+        2,
+        num_workers=2,
+        order="sequential",
+        persistent_workers=persistent,
+        pin_memory=pin_memory,
+        multiprocessing_context="fork",
+    )
+    with pytest.raises(WorkerError, match=r"worker \(pid \d+\) was killed by SIGKILL in"):
+        list(loader)
+    loader.close()
+    loader.dataset._loader._request.transform.how = None
+
+    assert len(list(loader)) == 14
+    loader.close()
+
+
+def test_an_error_ends_its_pass_and_says_so_to_who_asks_on(small_index):
+    pairs = StereoPairs(small_index, fields=FIELDS, frames="all", transform=Refuse())
+    batches = iter(pairs.loader(2, num_workers=1, order="sequential"))
+    next(batches)
+    with pytest.raises(ArithmeticError, match="frame 3"):
+        list(batches)
+
+    with pytest.raises(PassError, match="epoch 0 ended after 1 of 14 batches with an error"):
+        next(batches)
+
+
+class Refuse:
+    swaps_views = False
+
+    def __call__(self, views, generator):
+        if 3 in views.frames:
+            raise ArithmeticError("frame 3")
+        return views
