@@ -121,6 +121,20 @@ class AcceleratedLoader:
         return send_to_device(batch, self._device, non_blocking=pinned)
 
 
+def accelerates_epoch(dataset: object) -> int | None:
+    """Return the epoch of the pass that Accelerate begins over a map-style dataset, None if none.
+
+    Accelerate counts its passes, and calls ``set_epoch`` of a dataset in some of its loops only:
+    neither where it shares batches among processes nor where it goes on in mid-epoch.
+    """
+    states = sys.modules.get("accelerate.state")
+    active = None if states is None else states.GradientState().active_dataloader
+    if active is None or getattr(active, "dataset", None) is not dataset:
+        return None
+    iteration = getattr(active, "iteration", None)
+    return iteration if isinstance(iteration, int) else None
+
+
 def require_shared_once(data: Sized | object, name: str, *, rank: int, world_size: int) -> None:
     """Refuse what Accelerate is about to share among processes though it is a share already.
 

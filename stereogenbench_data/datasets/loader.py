@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any, Final, Protocol, runtime_checkable
 from weakref import WeakSet
 
@@ -126,15 +127,12 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         self.batches.set_epoch(epoch)
 
     def __iter__(self) -> "LoaderPass":  # type: ignore[override]  # torch names a private class
-        """Begin a pass over the current epoch, or over what a loaded state left of it.
+        """Return a pass over the current epoch, or over what a loaded state left of it.
 
-        After a whole pass it is the next epoch, unless an epoch was set since.
+        After a whole pass it is the next epoch, unless an epoch was set since. It begins when its
+        first batch is asked for: trainers set the epoch in between.
         """
-        epoch, start = self.batches.next_position()
-        if start == 0 and self._completed == (epoch, self._keeping.epoch_version):
-            epoch += 1
-            self._keeping.advance_epoch(epoch)
-        return LoaderPass(self, epoch=epoch, start=start)
+        return LoaderPass(self)
 
     def state_dict(self) -> State:
         """Return the position after the last batch that the loop has taken."""
@@ -168,11 +166,16 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             self._persistent = None
         workers.end()
 
-    def _begun(self, begun: "LoaderPass") -> None:
-        """Take note that a pass is about to give its first batch."""
+    def _begin(self, begun: "LoaderPass") -> tuple[int, int]:
+        """Return the epoch and the global batch at which a pass begins now."""
+        epoch, start = self.batches.next_position()
+        if start == 0 and self._completed == (epoch, self._keeping.epoch_version):
+            epoch += 1
+            self._keeping.advance_epoch(epoch)
         self.batches.begin()
         self._unfinished.add(begun)
         self._enter_pass()
+        return epoch, start
 
     def _taken(self, by: "LoaderPass") -> None:
         """Take note that a pass gives a batch."""
@@ -205,20 +208,26 @@ class LoaderPass(Iterator[Any]):
         taken: How many batches it has given.
     """
 
-    def __init__(self, loader: PairsLoader, *, epoch: int, start: int) -> None:
-        """Begin at a global batch of an epoch: workers start to load."""
+    def __init__(self, loader: PairsLoader) -> None:
+        """Stand for the next pass of a loader; workers start when the first batch is asked for."""
         self._workers: _Workers | None = None
-        batches = loader.batches
         self._loader = loader
-        self.epoch = epoch
-        self.position = epoch, start
+        self.epoch = loader.epoch
+        self.position = self.epoch, 0
         self.taken = 0
         self.last_taken = 0
-        self._end = batches.end(start)
-        self._share = batches.share(start)
+        self._share: range | None = None
         self._pid = os.getpid()
         self._over: str | None = None
-        numbers = (batches.batch(number, epoch=epoch) for number in self._share)
+
+    def _begin(self) -> None:
+        """Begin at the position that the loader is at now."""
+        loader, batches = self._loader, self._loader.batches
+        self.epoch, start = self.position = loader._begin(self)
+        self._end = batches.end(start)
+        self._share = batches.share(start)
+        # No reference to this pass in it: without a cycle, a pass that is left ends at once.
+        numbers = map(partial(batches.batch, epoch=self.epoch), self._share)
         if loader.persistent_workers:
             loader._persistent = loader._persistent or _Workers(loader)
             self._workers = loader._persistent
@@ -230,10 +239,12 @@ class LoaderPass(Iterator[Any]):
     @property
     def is_complete(self) -> bool:
         """Whether its last batch was given."""
-        return self.taken >= len(self._share)
+        return self._share is not None and self.taken >= len(self._share)
 
     def __len__(self) -> int:
         """Return how many batches it has in all."""
+        if self._share is None:
+            return len(self._loader.batches.share(self._loader.batches.next_position()[1]))
         return len(self._share)
 
     def __next__(self) -> Any:
@@ -244,11 +255,14 @@ class LoaderPass(Iterator[Any]):
                 an error ended it.
             WorkerError: If a worker process died.
         """
+        if self._over is not None:
+            raise PassError(self._over)
+        self._require_own_process()
+        if self._share is None:
+            self._begin()
         workers = self._workers
         if workers is None:
-            if self._over is None:
-                raise StopIteration
-            raise PassError(self._over)
+            raise StopIteration
         self._require_current(workers)
         self._over = (
             f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} batches "
@@ -270,8 +284,6 @@ class LoaderPass(Iterator[Any]):
             if batch is None:
                 self.close()
         self._over = None
-        if self.taken == 0:
-            self._loader._begun(self)
         self.taken += 1
         consumed = self.position[1] + self._loader.batches.world_size
         self.position = self.epoch, min(consumed, self._end)
@@ -279,8 +291,9 @@ class LoaderPass(Iterator[Any]):
         return self._loader._on_device(batch)
 
     def close(self) -> None:
-        """End the pass; its workers end, too, unless they persist."""
+        """End the pass, begun or not; its workers end, too, unless they persist."""
         workers, self._workers = self._workers, None
+        self._share = range(0) if self._share is None else self._share
         if workers is None:
             return
         self._loaded = iter(())
@@ -292,13 +305,15 @@ class LoaderPass(Iterator[Any]):
         """End the pass when nobody can go on with it."""
         self.close()
 
-    def _require_current(self, workers: "_Workers") -> None:
+    def _require_own_process(self) -> None:
         if os.getpid() != self._pid:
             raise PassError(
                 f"process {self._pid} began this pass, and its fork {os.getpid()} uses it: both "
                 "would take batches from the same workers. Call iter(loader) in the process that "
                 "uses it."
             )
+
+    def _require_current(self, workers: "_Workers") -> None:
         if workers.passes != self._number:
             raise PassError(
                 f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
@@ -313,6 +328,7 @@ class _Workers:
     def __init__(self, loader: PairsLoader) -> None:
         self._torch: DataLoader[Any] | None = None
         self._batches: Iterator[Any] = iter(())
+        _running.add(self)
         self.passes = 0
         self._numbers = _Numbers()
         self._context = None
@@ -376,9 +392,21 @@ class _Numbers(Sampler[list[int]]):
         return self.due
 
 
+_running: Final[WeakSet[_Workers]] = WeakSet()
+"""The workers of the passes of this process."""
+
 _inherited: Final[list[object]] = []
-"""Passes that came over a fork. Their workers are the parent's: ending them here would end its
-pass. The operating system takes back what they hold when this process ends."""
+"""What came over a fork. These workers are the parent's: if the last reference to torch's iterator
+went here, torch would end them. The operating system takes it all back when this process ends."""
+
+
+def _keep_inherited() -> None:
+    _inherited.extend(_running)
+    _running.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_keep_inherited)
 
 
 def require_options(options: Mapping[str, Any]) -> None:

@@ -21,6 +21,7 @@ from stereogenbench_data.datasets.asked import (
 )
 from stereogenbench_data.datasets.batch_buffers import BatchArrays, BatchBuffers, Buffers
 from stereogenbench_data.datasets.batches import EpochBatch, EpochBatches
+from stereogenbench_data.datasets.frameworks import accelerates_epoch
 from stereogenbench_data.datasets.loader import (
     LoaderOptions,
     PairsLoader,
@@ -128,6 +129,10 @@ class _MappedScenes(Dataset[Sample]):
 
     def __len__(self) -> int:
         """Return the number of samples."""
+        # Samplers ask for it when a pass begins.
+        epoch = accelerates_epoch(self)
+        if epoch is not None and epoch != self.epoch:
+            self.set_epoch(epoch)
         return len(self.plan)
 
     def __getitem__(self, number: int) -> Sample:
@@ -175,9 +180,10 @@ class _MappedScenes(Dataset[Sample]):
     def _sample(self, number: int, epoch: int, room: Room = fresh_room) -> Sample:
         """Return a sample of arrays, written where the room says."""
         number = operator.index(number)
-        if not -len(self) <= number < len(self):
-            raise IndexError(f"no sample {number}: there are {len(self)}")
-        number %= len(self)
+        count = len(self.plan)
+        if not -count <= number < count:
+            raise IndexError(f"no sample {number}: there are {count}")
+        number %= count
         address = self.plan.locate(number, epoch=epoch)
         seeds = np.random.SeedSequence((self.plan.seed, epoch, number))
         sample = self._loader.load(

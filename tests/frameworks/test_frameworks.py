@@ -1,0 +1,119 @@
+"""Accelerate, Lightning and Hugging Face's Trainer as they are used: no epoch set by hand.
+
+Each sample comes once an epoch, epochs differ, and a run that goes on equals the unbroken one.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.datasets.conftest import flat
+from tests.frameworks import runs
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::UserWarning:lightning"),
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),
+    pytest.mark.filterwarnings("ignore::FutureWarning"),
+]
+PAIRS = 20
+"""The adjacent pairs of the scenes: each comes with three frames."""
+
+
+@pytest.fixture(scope="module")
+def ranks(small_release, tmp_path_factory):
+    """What two real processes found, by rank."""
+    out = tmp_path_factory.mktemp("ranks")
+    script = "import runpy; runpy.run_module('tests.frameworks.ranks', run_name='__main__')"
+    (out / "run.py").write_text(script)
+    ended = subprocess.run(
+        [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
+         out / "run.py", small_release, out],
+        capture_output=True, text=True, timeout=240, check=False,
+        env={**__import__("os").environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    return [json.loads((out / f"rank{rank}.json").read_text()) for rank in range(2)]
+
+
+def of_epochs(steps, *, epochs):
+    """Return the keys of each epoch of a run."""
+    size = len(steps) // epochs
+    return [flat(steps[epoch * size : (epoch + 1) * size]) for epoch in range(epochs)]
+
+
+@pytest.mark.parametrize("name", ["accelerate", "hugging face loader", "lightning"])
+def test_two_ranks_get_each_sample_once_and_other_frames_each_epoch(ranks, name):
+    epochs = 2 if name == "accelerate" else runs.EPOCHS
+    shares = [of_epochs(rank[name][0], epochs=epochs) for rank in ranks]
+    together = [flat(of_ranks) for of_ranks in zip(*shares, strict=True)]
+
+    for keys in together:
+        assert len(keys) == len(set(keys)) == 56
+    assert len({tuple(sorted(keys)) for keys in together}) == epochs
+    assert not set(shares[0][0]) & set(shares[1][0])
+
+
+def test_two_ranks_get_other_frames_each_epoch_where_the_trainer_makes_the_loader(ranks):
+    shares = [of_epochs(rank["hugging face dataset"][0], epochs=runs.EPOCHS) for rank in ranks]
+    together = [frozenset(flat(of_ranks)) for of_ranks in zip(*shares, strict=True)]
+
+    # The trainer fills up the last batches.
+    assert [len(keys) for keys in together] == [60] * 3
+    assert len(set(together)) == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "stop"),
+    [("accelerate", 9), ("hugging face loader", 10), ("hugging face dataset", 10),
+     ("lightning", 7)],
+)  # fmt: skip
+def test_a_run_of_two_ranks_that_goes_on_equals_the_unbroken_one(ranks, name, stop):
+    for rank in ranks:
+        whole, before, after = rank[name]
+
+        assert len(before) == stop
+        assert before + after == whole
+
+
+def test_shares_are_not_shared_again(ranks):
+    for number, rank in enumerate(ranks):
+        batches, stream = rank["refused"]
+        assert f"2 processes, and this EpochBatches gives rank {number} of 2 its share" in batches
+        assert "this StereoPairStream gives rank" in stream
+        assert "Prepare pairs.loader(...) instead" in stream
+
+
+@pytest.mark.parametrize("stop", [4, 15, 22], ids=["mid-epoch", "last batch", "second epoch"])
+def test_lightning_goes_on_as_if_it_had_not_stopped(small_release, tmp_path, stop):
+    def loader():
+        return runs.random_frames(small_release).loader(4, num_workers=1)
+
+    whole = runs.lightning(loader(), tmp_path)
+    before = runs.lightning(loader(), tmp_path, stop_at=stop)
+    after = runs.lightning(loader(), tmp_path, resume=True)
+
+    assert len({tuple(sorted(keys)) for keys in of_epochs(whole, epochs=3)}) == 3
+    assert len(before) == stop
+    assert before + after == whole
+
+
+@pytest.mark.parametrize("stop", [15, 22], ids=["last batch", "second epoch"])
+@pytest.mark.parametrize("given", ["loader", "dataset"])
+def test_hugging_faces_trainer_goes_on_as_if_it_had_not_stopped(
+    small_release, tmp_path, stop, given
+):
+    def run(**options):
+        pairs = runs.random_frames(small_release)
+        loader = pairs.loader(4, num_workers=1) if given == "loader" else None
+        return runs.hugging_face(pairs, tmp_path / "run", loader=loader, **options)
+
+    whole = run()
+    before = run(stop_at=stop)
+    after = run(resume=True)
+
+    assert len({tuple(sorted(keys)) for keys in of_epochs(whole, epochs=3)}) == 3
+    assert len(before) == stop
+    assert before + after == whole
