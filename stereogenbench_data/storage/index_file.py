@@ -17,7 +17,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.storage.location import is_remote, local_path, shown
+from stereogenbench_data.storage.location import (
+    is_remote,
+    local_path,
+    shown,
+    why_not_from_a_file,
+)
 from stereogenbench_data.storage.rows import SCHEMA
 from stereogenbench_data.storage.source import UNSAFE_PATH
 
@@ -28,6 +33,8 @@ _OF_SHARDS: Final = (
 )
 
 _FORMAT: Final = 1
+_LONGEST_ROOT: Final = 300
+_LARGEST: Final = 2**63
 _UNSAFE: Final = re.compile(UNSAFE_PATH)
 _METADATA_KEY: Final = b"stereogenbench_data.index"
 
@@ -104,21 +111,58 @@ def root_told(root: str, *, beside: Path) -> str:
 
 
 def root_of(path: Path, head: Mapping[str, Any], table: pa.Table) -> str | Path:
-    """Return the data's root: the index's own folder if the data are there, else the recorded."""
-    beside, recorded = path.parent, Path(head["root"])
-    if is_remote(head["root"]):
-        return str(head["root"])
-    if head["root"] == "." or not table.num_rows:
+    """Return the data's root: the index's own folder if the data are there, else the recorded.
+
+    The file may be another's, so what it records is opened only where that can do no harm: below
+    the index's own folder, or at a URL of which `why_not_from_a_file` has nothing to say.
+
+    Raises:
+        StorageError: If the recorded root needs the user's word, or is no folder.
+    """
+    beside, recorded = path.parent, str(head["root"])
+    if recorded == "." or not table.num_rows or _are_beside(table, beside):
         return beside
-    first = table.column("members")[0].as_py()[0]["path"]
-    if (beside / first).exists():
-        return beside
-    if not recorded.is_dir():
+    if is_remote(recorded):
+        reason = why_not_from_a_file(recorded)
+        if reason:
+            raise _needs_word(path, recorded, reason)
+        return recorded
+    folder = _folder_told(recorded, beside)
+    if folder is None or not folder.is_relative_to(beside.resolve()):
+        raise _needs_word(path, recorded, "it is outside the index's own folder")
+    if not folder.is_dir():
         raise StorageError(
-            f"{path}: its data were at {recorded}, which is no folder now. Move the index into "
+            f"{path}: its data were at {folder}, which is no folder now. Move the index into "
             f"the data's root, or run `stereogenbench index` again."
         )
-    return recorded
+    return folder
+
+
+def _are_beside(table: pa.Table, folder: Path) -> bool:
+    """Return whether a file of the first scene lies below a folder."""
+    members = table.column("members")[0].as_py()
+    return any((folder / member["path"]).exists() for member in members)
+
+
+def _folder_told(recorded: str, beside: Path) -> Path | None:
+    """Return the folder that a recorded path means, links followed; None if there is none."""
+    try:
+        told = local_path(recorded) if recorded[:5].lower() == "file:" else Path(recorded)
+        return (beside / told).resolve()
+    except (OSError, ValueError, RuntimeError):
+        return None
+
+
+def _needs_word(path: Path, recorded: str, reason: str) -> StorageError:
+    told = shown(recorded)
+    is_plain = told.isprintable() and len(told) <= _LONGEST_ROOT
+    place = told if is_plain else repr(told[:_LONGEST_ROOT])
+    return StorageError(
+        f"{path}: its data are not beside it, and it records their root as {place}. A file may not "
+        f"choose such a place ({reason}). If you trust it, name the root yourself: "
+        f"SceneIndex.open({str(path)!r}, root=...), or --root with a command. Or move the index "
+        f"into that root."
+    )
 
 
 def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
@@ -137,9 +181,10 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
             f"{where}: is an index of format {head.get('format')!r}, and this version of the "
             f"package reads format {_FORMAT}. {made_again(where)}"
         )
-    tables = [head.get("incomplete"), head.get("broken"), head.get("shards")]
+    reasons = [head.get("incomplete"), head.get("broken")]
     if (
-        not all(isinstance(each, dict) for each in tables)
+        not all(map(_are_texts, reasons))
+        or not isinstance(head.get("shards"), dict)
         or not isinstance(head.get("root"), str)
         or not all(map(_are_shard_facts, head["shards"].values()))
         or any(map(_UNSAFE.search, head["shards"]))
@@ -148,9 +193,18 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
     return head
 
 
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
+
+
 def _are_shard_facts(value: Any) -> bool:
     kinds = {"size": int, "sha256": str, "members": int}
-    return isinstance(value, dict) and {name: type(each) for name, each in value.items()} == kinds
+    return (
+        isinstance(value, dict)
+        and {name: type(each) for name, each in value.items()} == kinds
+        and 0 <= value["size"] < _LARGEST
+        and 0 <= value["members"] < _LARGEST
+    )
 
 
 def require_sound(table: pa.Table, *, where: str) -> None:
