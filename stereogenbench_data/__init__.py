@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from stereogenbench_data.selection.quality import order_quality
     from stereogenbench_data.storage.cache import ShardCache
     from stereogenbench_data.storage.index import SceneIndex
+    from stereogenbench_data.storage.retry import Patience
 
 _HOMES = {
     "datasets.adapters": ("to_raft_stereo", "to_torchvision"),
@@ -98,6 +99,7 @@ _HOMES = {
     "selection.quality": ("order_quality",),
     "storage.cache": ("ShardCache",),
     "storage.index": ("SceneIndex",),
+    "storage.retry": ("Patience",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -120,6 +122,7 @@ __all__ = [
     "Letterbox",
     "MediaError",
     "PairsLoader",
+    "Patience",
     "RandomCrop",
     "RandomScale",
     "Resize",

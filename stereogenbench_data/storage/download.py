@@ -209,7 +209,7 @@ def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> No
 
 def _chunks(index: SceneIndex, member: Member) -> Iterator[bytes]:
     if is_remote(index.root):
-        remote = RemoteObject(joined(index.root, member.path))
+        remote = RemoteObject(joined(index.root, member.path), patience=index.patience)
         yield from remote.chunks(member.offset, member.offset + member.size)
         return
     opened = open_local(index.root, member, shard=index.shards.get(member.path))

@@ -143,6 +143,7 @@ class SceneIndex:
         root: str | Path,
         *,
         shards: Mapping[str, ShardFacts] | None = None,
+        patience: Patience | None = None,
     ) -> "SceneIndex":
         """Return the index of some scenes, in whatever order they come.
 
@@ -150,6 +151,7 @@ class SceneIndex:
             scenes: The scenes, with the places of their members.
             root: The folder to which these places are relative.
             shards: What is known of each shard, where the members lie in shards.
+            patience: As for `open`.
 
         Raises:
             StorageError: If two scenes have one key, or a path leaves the root.
@@ -163,7 +165,7 @@ class SceneIndex:
             ) from error
         require_sound(table, where=shown(str(root)))
         index = cls(table, root=root, head={})
-        index.shards = dict(shards or {})
+        index.shards, index.patience = dict(shards or {}), patience
         return index
 
     @classmethod

@@ -6,8 +6,10 @@ out of the data's root, are refused.
 
 import itertools
 import json
+import math
 import os
 import re
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +19,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import StorageError
+from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.storage.location import (
     is_remote,
     local_path,
@@ -238,11 +241,76 @@ def require_sound(table: pa.Table, *, where: str) -> None:
                 f"{where}: {unsafe[0].as_py()!r} is no path inside the data's root. The index "
                 f"was altered. {made_again(where)}"
             )
-    for name, numbers, least in (
-        ("frames", table.column("frames"), 1),
-        ("size", pc.struct_field(members, "size"), 0),
-        ("offset", pc.struct_field(members, "offset"), 0),
+    _require_texts(table, where=where)
+    _require_numbers(table, members, where=where)
+
+
+def _require_texts(table: pa.Table, *, where: str) -> None:
+    for name, known in _KNOWN.items():
+        texts = table.column(name) if name in _PLAIN_TEXTS else pc.list_flatten(table.column(name))
+        odd = texts.filter(pc.invert(pc.is_in(texts, value_set=pa.array(known, pa.string()))))
+        if len(odd):
+            options = ", ".join(str(each) for each in known)
+            raise _odd(where, name, odd, f"none of {options}")
+    for name in ("family", "map_name"):
+        texts = table.column(name)
+        odd = texts.filter(pc.match_substring_regex(texts, r"^$|[/\\\x00-\x1f]"))
+        if len(odd):
+            raise _odd(where, name, odd, "no name of a folder")
+
+
+def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
+    sound_units = pc.not_equal(pc.list_flatten(table.column("depth_unit_source")), "unreadable")
+    for name, numbers, (least, most) in (
+        ("offset", pc.struct_field(members, "offset"), _OF_BYTES),
+        ("size", pc.struct_field(members, "size"), _OF_BYTES),
+        ("depth_unit_m", pc.list_flatten(table.column("depth_unit_m")).filter(sound_units), _ABOVE),
+        *((name, table.column(name), bounds) for name, bounds in _BOUNDS.items()),
     ):
-        lowest = pc.min(numbers).as_py()
-        if lowest is not None and lowest < least:
-            raise StorageError(f"{where}: {name} is {lowest}, below {least}. {made_again(where)}")
+        flat = pc.list_flatten(numbers) if name in ("baselines_cm", "lateral_m") else numbers
+        within = pc.and_(pc.greater_equal(flat, least), pc.less_equal(flat, most))
+        odd = flat.filter(pc.invert(within))
+        if len(odd):
+            raise _odd(where, name, odd, f"not {least:g} to {most:g}")
+    if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
+        raise StorageError(f"{where}: a primary pair has one camera twice. {made_again(where)}")
+    halves = [pc.is_null(table.column(f"principal_{axis}_px")) for axis in "xy"]
+    if pc.any(pc.not_equal(*halves)).as_py():
+        raise StorageError(f"{where}: a principal point has one number. {made_again(where)}")
+
+
+def _odd(where: str, name: str, found: Any, why: str) -> StorageError:
+    return StorageError(
+        f"{where}: {name} is {found[0].as_py()!r}, {why}. The index was altered. "
+        f"{made_again(where)}"
+    )
+
+
+_PLAIN_TEXTS: Final = ("split", "subset", "image_size_source")
+_KNOWN: Final = {
+    "split": ("train", "eval"),
+    "subset": ("seen_map", "unseen_map", None),
+    "image_size_source": ("recorded", "default"),
+    "depth_unit_source": ("tag", "default", "unreadable"),
+}
+_OF_BYTES: Final = (0, 2**61)
+_ABOVE: Final = (sys.float_info.min, sys.float_info.max)
+_FINITE: Final = (-sys.float_info.max, sys.float_info.max)
+_BOUNDS: Final = {
+    "focal_mm": _ABOVE,
+    "sensor_width_mm": _ABOVE,
+    "sensor_height_mm": _ABOVE,
+    "image_width_px": (1, 2**16),
+    "image_height_px": (1, 2**16),
+    "baselines_cm": _ABOVE,
+    "primary_left": (0, CAMERA_COUNT - 1),
+    "primary_right": (0, CAMERA_COUNT - 1),
+    "frames": (1, 2**31),
+    "frame_rate_hz": (0, sys.float_info.max),
+    "lateral_m": _FINITE,
+    "rig_residual_px": (0, math.inf),
+    "principal_x_px": _FINITE,
+    "principal_y_px": _FINITE,
+    "valid_depth_ratio": (0, 1),
+}
+"""The least and the greatest number of a column; nan is not between, what is unknown is null."""
