@@ -24,6 +24,9 @@ from typing import Final
 _CHAIN: Final = re.compile(r"::(?=(?:[\w+.-]+::)*[A-Za-z][\w+.-]*://|/|data:|[\w+.-]*$)", re.ASCII)
 """Where a chain of file systems goes on; the colons of an IPv6 address or a password are none."""
 _IN_TEXT: Final = re.compile(r"[A-Za-z][\w+.-]*(?:::[\w+.-]+)*://[^\s'\"<>]+", re.ASCII)
+_AS_PATH: Final = re.compile(r"(\b[a-z][a-z0-9+.-]+:/)[^/\s'\"]*@")
+"""The login of a URL that was taken for a path, which has one slash."""
+_LOGIN_IN_PATH: Final = re.compile(r"(?<=/)[^/@:]*:[^/@]*@")
 _AUTHORITY_END: Final = re.compile(r"[/\\?#]")
 _PORT: Final = re.compile(r"[^:]*(?::[0-9]*)?|\[.*", re.ASCII)
 
@@ -41,7 +44,8 @@ def url_without_secrets(url: str) -> str:
 
 def text_without_secrets(text: str) -> str:
     """Return a text in which each URL is without login, query and fragment."""
-    return _IN_TEXT.sub(lambda found: url_without_secrets(found[0]), text)
+    whole = _IN_TEXT.sub(lambda found: url_without_secrets(found[0]), text)
+    return _AS_PATH.sub(r"\1", whole)
 
 
 def _link_without_secrets(link: str) -> str:
@@ -59,7 +63,7 @@ def _link_without_secrets(link: str) -> str:
     if scheme.lower() == "hf" and ":" not in login:
         host = authority  # of the Hub, what follows the @ is a revision
     path = re.split(r"[?#]", rest[len(authority) :], maxsplit=1)[0]
-    return f"{scheme}://{host}{path}"
+    return f"{scheme}://{host}{_LOGIN_IN_PATH.sub('', path)}"
 
 
 class StereoGenBenchError(Exception):

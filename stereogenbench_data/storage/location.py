@@ -53,11 +53,13 @@ def split_url(url: str) -> SplitResult:
     """Return the parts of a URL.
 
     Raises:
-        StorageError: If it is none, as with half an IPv6 address or a port that is no number.
+        StorageError: If it is none, as with half an IPv6 address or, of a web server, a port that
+            is no number.
     """
     try:
         parts = urlsplit(url)
-        _ = parts.port, parts.hostname
+        if is_web(url):
+            _ = parts.port
     except ValueError:
         raise StorageError(f"{shown(url)}: is no URL: correct it.") from None
     return parts

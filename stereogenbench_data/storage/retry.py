@@ -99,7 +99,7 @@ class Patience:
     def bounds(self) -> str:
         """What a server must keep to, in words."""
         return (
-            f"least_rate_bytes_s={self.least_rate_bytes_s:g} over window_s={self.window_s:g}, "
+            f"least_rate_bytes_s={self.least_rate_bytes_s:.10g} over window_s={self.window_s:g}, "
             f"timeout_s={self.timeout_s:g}, longest_read_s={self.longest_read_s:g}"
         )
 
@@ -153,7 +153,7 @@ class Pace:
             return TooSlow(f"a read may take {self._patience.longest_read_s:g} s")
         if self._in_body:
             return TooSlow(
-                f"fewer than {self._patience.least_rate_bytes_s:g} bytes a second over "
+                f"fewer than {self._patience.least_rate_bytes_s:.10g} bytes a second over "
                 f"{self._patience.window_s:g} s"
             )
         return TooSlow(f"no answer within {self._patience.timeout_s:g} s")

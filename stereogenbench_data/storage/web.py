@@ -156,7 +156,8 @@ class WebTransport:
         except TooSlow as error:
             raise Fault(str(error)) from None
         except (LocationValueError, UnicodeError):
-            raise StorageError(f"{self._where}: is no URL: correct it.") from None
+            sent = "" if url == self._url else f"is redirected to {shown(url)[:200]}, which "
+            raise StorageError(f"{self._where}: {sent}is no URL: correct it.") from None
         except HTTPError as error:
             raise Fault(_reason(error)) from None
         finally:
@@ -243,7 +244,7 @@ class WebTransport:
                 f"honours ranges, as nginx does, {_FETCH}."
             )
         first, last, size = self._content_range(response)
-        if not first:
+        if not first or response.status == 416:
             raise StorageError(
                 f"{self._where}: has {size} bytes, and byte {stop - 1} is asked for. It was cut "
                 f"short or replaced: use the index that was made with it."
