@@ -108,16 +108,16 @@ def why_not_from_a_file(url: str) -> str:
     server that is neither this machine nor one of its own network.
     """
     scheme = url.partition("://")[0].lower()
+    try:
+        host = split_url(url).hostname or "" if is_web(url) else ""
+    except StorageError:
+        return "it is no URL"
     if "::" in (_IPV6_HOST.sub("", url) if is_web(url) else url):
         return "it is a chain of file systems"
     if scheme not in FILE_SCHEMES:
         return f"it is none of {', '.join(f'{each}://' for each in FILE_SCHEMES)}"
     if shown(url) != url or _ODD.search(url):
         return "it holds a login, a query, or signs that no address has"
-    try:
-        host = split_url(url).hostname or ""
-    except StorageError:
-        return "it is no URL"
     return "it is on this machine or in its own network" if is_web(url) and is_inside(host) else ""
 
 
