@@ -363,8 +363,8 @@ def test_an_index_elsewhere_opens_once_the_user_says_where_its_data_are(scenes, 
     with pytest.raises(
         StorageError,
         match=rf"{kept}: its data are not beside it, and it records their root as {tmp_path}/data. "
-        r"A file may not choose such a place \(it is outside the index's own folder\). If you trust "
-        rf"it, name the root yourself: SceneIndex.open\('{kept}', root=...\), or --root with a command",
+        r"A file may not choose such a place \(it is outside the index's own folder\). If you "
+        rf"trust it, name the root yourself: SceneIndex.open\('{kept}', root=...\), or --root",
     ):
         SceneIndex.open(kept)
     for root in (tmp_path / "data", str(tmp_path / "data"), (tmp_path / "data").as_uri()):
