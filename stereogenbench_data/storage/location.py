@@ -72,8 +72,13 @@ def joined(root: str, path: str) -> str:
     archive that a chain of file systems opens (``zip://folder::s3://bucket/all.zip``).
 
     Raises:
-        StorageError: If the root is no URL.
+        StorageError: If the root is no URL, or the path would make it a chain of file systems.
     """
+    if "::" in path:
+        raise StorageError(
+            f"{shown(root)}: holds {path!r}, and a name with '::' in it would open another file "
+            f"system. Rename it."
+        )
     if is_web(root):
         parts = split_url(root)
         return urlunsplit(parts._replace(path=f"{parts.path.rstrip('/')}/{quote(path)}"))

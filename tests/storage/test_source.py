@@ -212,6 +212,11 @@ def test_a_path_is_joined_to_a_root(root, expected):
     assert joined(root, "b c/x.tar") == expected
 
 
+def test_a_name_cannot_make_a_chain_of_a_root():
+    with pytest.raises(StorageError, match=r"s3://b: holds 'a::local:', and a name with '::' in"):
+        joined("s3://b", "a::local:")
+
+
 def test_what_is_secret_in_a_url_is_not_shown():
     assert shown("https://me:word@h:1/a/x.tar?key=1#2") == "https://h:1/a/x.tar"
     assert shown("hf://datasets/org/name@main/x.tar") == "hf://datasets/org/name@main/x.tar"
