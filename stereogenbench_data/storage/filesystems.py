@@ -214,7 +214,13 @@ def _pinned(files: Any, path: str) -> str:
     revision = getattr(found, "revision", None)
     if revision is None or _COMMIT.fullmatch(revision):
         return path
-    key = (os.getpid(), files.endpoint, found.repo_type, found.repo_id, revision)
+    key = (
+        os.getpid(),
+        str(getattr(files, "endpoint", "")),
+        found.repo_type,
+        found.repo_id,
+        revision,
+    )
     if key not in _commits:
         told = files._api.repo_info(found.repo_id, repo_type=found.repo_type, revision=revision)
         _commits[key] = told.sha

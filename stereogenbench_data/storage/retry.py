@@ -57,13 +57,13 @@ class Patience:
     """
 
     attempts: int = 6
-    first_wait_s: float = 0.5
-    longest_wait_s: float = 30.0
-    longest_asked_s: float = 300.0
-    timeout_s: float = 30.0
-    least_rate_bytes_s: float = 4096.0
-    window_s: float = 10.0
-    longest_read_s: float = 600.0
+    first_wait_s: float | int = 0.5
+    longest_wait_s: float | int = 30.0
+    longest_asked_s: float | int = 300.0
+    timeout_s: float | int = 30.0
+    least_rate_bytes_s: float | int = 4096.0
+    window_s: float | int = 10.0
+    longest_read_s: float | int = 600.0
     sleep: Callable[[float], None] = time.sleep
     chance: Callable[[], float] = _chance
     clock: Callable[[], float] = time.monotonic
