@@ -24,8 +24,10 @@ from typing import Final
 _CHAIN: Final = re.compile(r"::(?=(?:[\w+.-]+::)*[A-Za-z][\w+.-]*://|/|data:|[\w+.-]*$)", re.ASCII)
 """Where a chain of file systems goes on; the colons of an IPv6 address or a password are none."""
 _IN_TEXT: Final = re.compile(r"[A-Za-z][\w+.-]*(?:::[\w+.-]+)*://[^\s'\"<>]+", re.ASCII)
-_AS_PATH: Final = re.compile(r"(\b[a-z][a-z0-9+.-]+:/)[^/\s'\"]*@")
-"""The login of a URL that was taken for a path, which has one slash."""
+_AS_PATH: Final = re.compile(
+    r"\b(https?|s3a?|hf|ftps?|sftp|ssh|smb|gs|gcs|az|abfss?|webhdfs):/(?!/)([^\s'\"]+)"
+)
+"""A URL that was taken for a path, which has one slash."""
 _LOGIN_IN_PATH: Final = re.compile(r"(?<=/)[^/@:]*:[^/@]*@")
 _AUTHORITY_END: Final = re.compile(r"[/\\?#]")
 _PORT: Final = re.compile(r"[^:]*(?::[0-9]*)?|\[.*", re.ASCII)
@@ -45,7 +47,11 @@ def url_without_secrets(url: str) -> str:
 def text_without_secrets(text: str) -> str:
     """Return a text in which each URL is without login, query and fragment."""
     whole = _IN_TEXT.sub(lambda found: url_without_secrets(found[0]), text)
-    return _AS_PATH.sub(r"\1", whole)
+    return _AS_PATH.sub(_path_without_secrets, whole)
+
+
+def _path_without_secrets(found: re.Match[str]) -> str:
+    return url_without_secrets(f"{found[1]}://{found[2]}").replace("://", ":/", 1)
 
 
 def _link_without_secrets(link: str) -> str:

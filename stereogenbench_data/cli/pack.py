@@ -15,7 +15,7 @@ _MEGABYTE = 1_000_000
 
 
 def pack(  # noqa: PLR0913 - one parameter an option
-    root: Annotated[Path, typer.Argument(help="Released tree, or its index file.")],
+    root: Annotated[str, typer.Argument(help="Released tree, or its index file.")],
     out: Annotated[Path, typer.Argument(help="Folder for the shards and their index.")],
     *,
     data_root: RootOption = None,

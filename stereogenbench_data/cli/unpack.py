@@ -14,7 +14,7 @@ _MEGABYTE = 1_000_000
 
 
 def unpack(
-    shards: Annotated[Path, typer.Argument(help="Folder of shards, or its index file.")],
+    shards: Annotated[str, typer.Argument(help="Folder of shards, or its index file.")],
     out: Annotated[Path, typer.Argument(help="Folder for the scenes.")],
     *,
     data_root: RootOption = None,

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
@@ -15,7 +14,7 @@ _MEGABYTE = 1_000_000
 
 
 def verify(
-    shards: Annotated[Path, typer.Argument(help="Folder of shards, or its index file.")],
+    shards: Annotated[str, typer.Argument(help="Folder of shards, or its index file.")],
     *,
     data_root: RootOption = None,
     deep: Annotated[

@@ -446,6 +446,18 @@ def test_a_file_may_not_choose_what_is_opened(scenes, tmp_path, monkeypatch, roo
     assert SceneIndex.open(path).root == str(tmp_path / "a")
 
 
+@pytest.mark.parametrize("address", ["10.1.2.3", "127.0.0.1", "fd00::1", "::ffff:192.168.0.1"])
+def test_a_name_of_the_own_network_is_not_opened_on_a_files_word(
+    scenes, tmp_path, monkeypatch, address
+):
+    found = [(0, 0, 0, "", ("8.8.8.8", 0)), (0, 0, 0, "", (address, 0))]
+    monkeypatch.setattr("socket.getaddrinfo", lambda *asked, **how: found)
+    path = recording(scenes, tmp_path / "index.parquet", "https://files.example.org/x")
+
+    with pytest.raises(StorageError, match=r"it is on this machine or in its own network"):
+        SceneIndex.open(path)
+
+
 @pytest.mark.parametrize(
     "root",
     ["https://8.8.8.8/x", "hf://datasets/a/b@main/x", "s3://bucket/a", "https://[2606:4700::1]/x"],
