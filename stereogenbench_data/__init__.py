@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from stereogenbench_data.selection.quality import order_quality
     from stereogenbench_data.storage.cache import ShardCache
     from stereogenbench_data.storage.index import SceneIndex
+    from stereogenbench_data.storage.retry import Patience
 
 _HOMES = {
     "datasets.adapters": ("to_raft_stereo", "to_torchvision"),
@@ -103,6 +104,7 @@ _HOMES = {
     "selection.quality": ("order_quality",),
     "storage.cache": ("ShardCache",),
     "storage.index": ("SceneIndex",),
+    "storage.retry": ("Patience",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -126,6 +128,7 @@ __all__ = [
     "MediaError",
     "PairsLoader",
     "PassError",
+    "Patience",
     "RandomCrop",
     "RandomScale",
     "Resize",

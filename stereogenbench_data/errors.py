@@ -17,11 +17,69 @@ StereoGenBenchError
 └── ExtraError     (ImportError)  an optional dependency or its weights are not installed
 
 Each takes one message: so a DataLoader worker's error is rebuilt as itself in the main process.
+A message shows URLs without logins and queries, whatever it was made of.
 """
+
+import re
+from typing import Final
+
+_CHAIN: Final = re.compile(r"::(?=(?:[\w+.-]+::)*[A-Za-z][\w+.-]*://|/|data:|[\w+.-]*$)", re.ASCII)
+"""Where a chain of file systems goes on; the colons of an IPv6 address or a password are none."""
+_IN_TEXT: Final = re.compile(r"[A-Za-z][\w+.-]*(?:::[\w+.-]+)*://[^\s'\"<>]+", re.ASCII)
+_AS_PATH: Final = re.compile(
+    r"\b(https?|s3a?|hf|ftps?|sftp|ssh|smb|gs|gcs|az|abfss?|webhdfs):/(?!/)([^\s'\"]+)"
+)
+"""A URL that was taken for a path, which has one slash."""
+_LOGIN_IN_PATH: Final = re.compile(r"(?<=/)[^/@:]*:[^/@]*@")
+_AUTHORITY_END: Final = re.compile(r"[/\\?#]")
+_PORT: Final = re.compile(r"[^:]*(?::[0-9]*)?|\[.*", re.ASCII)
+
+
+def url_without_secrets(url: str) -> str:
+    """Return a URL, or a chain of them, without logins, queries and fragments.
+
+    It never fails, also where the URL is none.
+
+    >>> url_without_secrets("zip://a::https://me:word@host/all.zip?token=1")
+    'zip://a::https://host/all.zip'
+    """
+    return "::".join(map(_link_without_secrets, _CHAIN.split(url)))
+
+
+def text_without_secrets(text: str) -> str:
+    """Return a text in which each URL is without login, query and fragment."""
+    whole = _IN_TEXT.sub(lambda found: url_without_secrets(found[0]), text)
+    return _AS_PATH.sub(_path_without_secrets, whole)
+
+
+def _path_without_secrets(found: re.Match[str]) -> str:
+    return url_without_secrets(f"{found[1]}://{found[2]}").replace("://", ":/", 1)
+
+
+def _link_without_secrets(link: str) -> str:
+    scheme, separator, rest = link.partition("://")
+    if not separator:
+        return link if len(link) < 64 or not link.startswith("data:") else "data:..."
+    if scheme.lower() == "file":
+        return link
+    end = _AUTHORITY_END.search(rest)
+    authority = rest[: end.start()] if end else rest
+    login, _, host = authority.rpartition("@")
+    if not login and "@" in rest and not _PORT.fullmatch(authority):
+        # The password holds a slash, a question mark or a hash.
+        return _link_without_secrets(f"{scheme}://{rest.rpartition('@')[2]}")
+    if scheme.lower() == "hf" and ":" not in login:
+        host = authority  # of the Hub, what follows the @ is a revision
+    path = re.split(r"[?#]", rest[len(authority) :], maxsplit=1)[0]
+    return f"{scheme}://{host}{_LOGIN_IN_PATH.sub('', path)}"
 
 
 class StereoGenBenchError(Exception):
     """The base of every error that this package raises on purpose."""
+
+    def __init__(self, message: str = "") -> None:
+        """Say what is wrong, without what is secret in the URLs that are named."""
+        super().__init__(text_without_secrets(str(message)))
 
 
 class SchemaError(StereoGenBenchError, ValueError):

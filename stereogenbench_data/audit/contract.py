@@ -28,6 +28,7 @@ from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.pool import AfterBytes, run_tasks
+from stereogenbench_data.storage.retry import Patience
 from stereogenbench_data.storage.source import MemberSource
 
 MOST_RESIDUAL_PX: Final = 0.5
@@ -70,10 +71,14 @@ class SceneTask:
     revision: str
     frames: int
     encoding: DepthEncoding
+    patience: Patience | None = None
 
     def streams(self) -> Streams:
         """Return the scene's videos."""
-        return Streams(MemberSource(self.root, shards=self.shards, revision=self.revision))
+        source = MemberSource(
+            self.root, shards=self.shards, revision=self.revision, patience=self.patience
+        )
+        return Streams(source)
 
 
 def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
@@ -127,7 +132,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
             progress(len(found), len(tasks))
     found.sort(key=lambda diagnosis: diagnosis.key)
     verdicts = tuple(judge(group, declared=encoding) for group in grouped(found))
-    return DoctorReport(str(index.root), encoding, tuple(found), verdicts, left_out)
+    return DoctorReport(index.where, encoding, tuple(found), verdicts, left_out)
 
 
 def scene_task(data: SceneIndex, key: str, *, encoding: DepthEncoding) -> SceneTask:
@@ -140,7 +145,7 @@ def _task(index: SceneIndex, row: int, *, frames: int, encoding: DepthEncoding) 
     scene = index.scene(row)
     paths = {member.path for member in scene.members.values()}
     shards = {path: facts for path, facts in index.shards.items() if path in paths}
-    return SceneTask(scene, index.root, shards, index.digest, frames, encoding)
+    return SceneTask(scene, index.root, shards, index.digest, frames, encoding, index.patience)
 
 
 def _diagnoses(tasks: list[SceneTask], *, workers: int | None) -> Iterator[SceneDiagnosis]:

@@ -76,6 +76,7 @@ class AuditRequest:
 def open_for_audit(
     data: str | Path,
     *,
+    root: str | Path | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
     **filters: Unpack[SceneFilters],
@@ -84,6 +85,7 @@ def open_for_audit(
 
     Args:
         data: Whatever `SceneIndex.open` opens.
+        root: Where the data of an index file are, by the user's word.
         workers: Processes that walk a tree that has no index.
         progress: Called with the scenes walked, and all there are.
         **filters: Scenes of a tree that their paths tell to be none of these are not described.
@@ -91,7 +93,7 @@ def open_for_audit(
     Raises:
         StorageError: If there is no such data, or no such scene in it, whole or not.
     """
-    if _is_plain_tree(data):
+    if root is None and _is_plain_tree(data):
         is_concerned = _Concerned(filters)
         report = walk(
             data if is_remote(data) else local_path(data),
@@ -102,7 +104,7 @@ def open_for_audit(
         return SceneIndex.from_report(report)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", IncompleteSceneWarning)
-        return SceneIndex.open(data)
+        return SceneIndex.open(data, root=root)
 
 
 def _is_plain_tree(data: str | Path) -> bool:
@@ -164,7 +166,7 @@ def audit(
     for scene in audited:
         findings += findings_of(scene, request.limits)
     return AuditReport(
-        root=index.root,
+        root=index.where,
         scenes_there=len(index) + len(index.broken) + len(index.incomplete),
         scenes_audited=len(audited),
         frames=request.frames,
@@ -256,6 +258,7 @@ def _task(index: SceneIndex, scene: Scene, request: AuditRequest) -> SceneTask:
     places = {member.path for member in scene.members.values()}
     return SceneTask(
         root=index.root,
+        patience=index.patience,
         shards={path: index.shards[path] for path in places if path in index.shards},
         revision=index.digest,
         scene=scene,
@@ -275,7 +278,7 @@ def audit_journal(path: Path, index: SceneIndex, request: AuditRequest) -> Recor
     """
     work = {
         "audit": _FORMAT,
-        "root": index.root,
+        "root": index.where,
         "frames": request.frames,
         "depth": repr(request.depth),
     }

@@ -41,6 +41,7 @@ from stereogenbench_data.schema.release import (
     rgb_name,
 )
 from stereogenbench_data.storage.pool import AfterBytes
+from stereogenbench_data.storage.retry import Patience
 from stereogenbench_data.storage.source import MemberSource
 
 LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
@@ -60,6 +61,7 @@ class SceneTask:
         scene: The scene.
         frames: How many frames to audit, evenly spread; 0 for all.
         depth: The depth contract, None for what the files say.
+        patience: How reading deals with a slow server, None for the defaults.
     """
 
     root: str
@@ -68,6 +70,7 @@ class SceneTask:
     scene: Scene
     frames: int
     depth: DepthEncoding | None = None
+    patience: Patience | None = None
 
 
 def spread_frames(frames: int, wanted: int) -> tuple[int, ...]:
@@ -100,7 +103,9 @@ class _SceneCheck:
         self.scene = task.scene
         self.frames = spread_frames(task.scene.frames, task.frames)
         self.intrinsics = rig_intrinsics(task.scene.rig)
-        source = MemberSource(task.root, shards=task.shards, revision=task.revision)
+        source = MemberSource(
+            task.root, shards=task.shards, revision=task.revision, patience=task.patience
+        )
         self.files = SceneFiles(source, task.scene, contract=task.depth or DepthEncoding())
         self.light = [LightCheck() for _ in range(CAMERA_COUNT)]
         self.payload = [PayloadCheck() for _ in range(CAMERA_COUNT)]

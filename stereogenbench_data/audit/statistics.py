@@ -139,7 +139,7 @@ def statistics(index: SceneIndex, **filters: Unpack[SceneFilters]) -> Statistics
             chosen = of_branch[subsets == subset]
             families.append(_family(index, chosen, split=split, subset=subset, family=family))
     return Statistics(
-        root=index.root,
+        root=index.where,
         scenes=len(rows),
         families=tuple(families),
         branches=tuple(branches),

@@ -42,7 +42,7 @@ def card(index: SceneIndex, *, repository: str) -> str:
         DescriptorError: If the data are no shards.
     """
     if not index.shards:
-        raise DescriptorError(f"{index.root}: is no folder of shards: pack the data first.")
+        raise DescriptorError(f"{index.where}: is no folder of shards: pack the data first.")
     return "\n".join([_head(index), MARK, "", *_body(index, repository)]) + "\n"
 
 

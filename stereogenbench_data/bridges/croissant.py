@@ -21,6 +21,7 @@ from stereogenbench_data.bridges.croissant_tables import write_tables
 from stereogenbench_data.bridges.croissant_terms import CONTEXT, CROISSANT, RAI, Node
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.location import shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +62,16 @@ def write_descriptor(
         The descriptor as written.
 
     Raises:
-        DescriptorError: If something cannot be written, or shards lie behind a URL while no
-            ``data_url`` is given.
+        DescriptorError: If something cannot be written, shards lie behind a URL while no
+            ``data_url`` is given, or such a URL holds a login or a query.
     """
     told = publication or Publication()
+    for url in (told.data_url, told.tables_url):
+        if url is not None and shown(url) != url:
+            raise DescriptorError(
+                f"{shown(url)}: the URL has a login or a query, which no descriptor shall publish: "
+                f"give the plain URL."
+            )
     if index is not None and index.shards:
         data_url = told.data_url or _relative(index.root, to=path.parent)
         beside = path.stem if told.data_url is None else f"{told.data_url}/{path.stem}"
@@ -90,8 +97,8 @@ def write_descriptor(
 def _relative(root: str, *, to: Path) -> str:
     if "://" in root:
         raise DescriptorError(
-            f"{root}: the shards lie behind a URL: give the URL that the descriptor shall name, "
-            "pinned to a revision (--base-url)."
+            f"{shown(root)}: the shards lie behind a URL: give the URL that the descriptor shall "
+            "name, pinned to a revision (--base-url)."
         )
     return Path(os.path.relpath(root, to)).as_posix()
 

@@ -17,6 +17,8 @@ from stereogenbench_data.storage.tar import read_members
 
 _SHA256: Final = re.compile(r"[0-9a-f]{64}")
 _MOVING: Final = re.compile(r"/(?:resolve|raw|blob|tree)/(?:main|master|HEAD)(?:/|$)")
+_DATA_SUFFIXES: Final = (".tar", ".parquet", ".txt")
+_NO_PATH: Final = re.compile(r"^[/~]|\\|:|[\x00-\x1f]")
 _CHUNK_BYTES: Final = 1 << 20
 
 
@@ -49,17 +51,26 @@ class Descriptor:
         }
 
     def local(self, file: Node) -> Path | None:
-        """Return where a file is at hand, None where it lies behind a URL."""
+        """Return where a file is at hand, None where it lies behind a URL or may not be read.
+
+        A descriptor may be anybody's: a path in it leads from its own folder, and to tables and
+        shards alone. `check_files` says what is wrong with another.
+        """
         name, url = str(file.get("@id")), str(file.get("contentUrl", ""))
         if name in self.mapping:
             return self.mapping[name]
-        return None if "://" in url else self.folder / url
+        return None if "://" in url or not _is_data_path(url) else self.folder / url
 
     def members(self, name: str) -> list[str] | None:
         """Return the files in a container, None where it is not at hand or is no container."""
         if name not in self._members:
             self._members[name] = _members(self, name)
         return self._members[name]
+
+
+def _is_data_path(path: str) -> bool:
+    """Return whether a path is a relative one of a file that descriptors describe."""
+    return path.endswith(_DATA_SUFFIXES) and not _NO_PATH.search(path)
 
 
 def check_files(told: Descriptor) -> None:
@@ -79,12 +90,22 @@ def check_files(told: Descriptor) -> None:
             told.say(name, f"{file['contentUrl']} is a branch, which moves: pin a revision")
         if name.endswith(".tar") and TAR not in listed(file["encodingFormat"]):
             told.say(name, f"has the encodingFormat {file['encodingFormat']!r}, and must be {TAR}")
-        path = told.local(file)
-        if path is None or is_repository:
-            continue
-        if not path.is_file():
-            told.say(name, f"{path} does not exist: write the descriptor where its files are")
-            continue
+        if not is_repository:
+            _at_hand(told, name, file)
+
+
+def _at_hand(told: Descriptor, name: str, file: Node) -> None:
+    """Check a file that is at hand."""
+    path = told.local(file)
+    if path is None and "://" not in str(file["contentUrl"]):
+        told.say(
+            name,
+            f"has the contentUrl {file['contentUrl']!r}, and a path must be relative and of a file "
+            f"that ends in {', '.join(_DATA_SUFFIXES)}",
+        )
+    elif path is not None and not path.is_file():
+        told.say(name, f"{path} does not exist: write the descriptor where its files are")
+    elif path is not None:
         _content(told, name, file, path)
 
 

@@ -16,6 +16,7 @@ from stereogenbench_data.cli.options import (
     JsonOption,
     MapOption,
     OutOption,
+    RootOption,
     SceneOption,
     SplitOption,
     SubsetOption,
@@ -40,6 +41,7 @@ def _complete_limit(incomplete: str) -> list[str]:
 def audit(  # noqa: PLR0913 - one parameter an option
     data: DataArgument,
     *,
+    data_root: RootOption = None,
     scenes: Annotated[
         int | None, typer.Option("--scenes", min=1, help="Audit so many, drawn at random [all].")
     ] = None,
@@ -122,7 +124,9 @@ def audit(  # noqa: PLR0913 - one parameter an option
     )
     try:
         with progress_bar("reading the index", unit="scenes") as progress:
-            index = open_for_audit(data, workers=workers, progress=progress, **filters)
+            index = open_for_audit(
+                data, root=data_root, workers=workers, progress=progress, **filters
+            )
         notes = journal or _journal(out, data, request)
         kept = audit_journal(notes, index, request)
         with writing(notes), kept, progress_bar("auditing", unit="frames") as progress:
@@ -157,9 +161,11 @@ def _contract(unit_m: float | None, kind: Any, accept: Any) -> Any:
 
 
 def _journal(out: Path | None, data: str, request: Any) -> Path:
+    from stereogenbench_data.storage.location import is_remote, shown
+
     if out is not None:
         return out.with_name(f"{out.name}.journal")
-    place = data if "://" in data else str(Path(data).resolve())
+    place = shown(data) if is_remote(data) else str(Path(data).resolve())
     name = hashlib.sha256(
         repr((place, request.frames, request.depth)).encode(errors="replace")
     ).hexdigest()[:16]

@@ -7,13 +7,14 @@ from typing import Annotated
 import typer
 
 from stereogenbench_data.cli.opening import open_data
-from stereogenbench_data.cli.options import DataArgument, DepthUnitOption
+from stereogenbench_data.cli.options import DataArgument, DepthUnitOption, RootOption
 from stereogenbench_data.schema.problems import counted
 
 
 def browse(
     data: DataArgument,
     *,
+    data_root: RootOption = None,
     port: Annotated[
         int, typer.Option("--port", min=0, max=65535, help="Port [any that is free].")
     ] = 0,
@@ -35,7 +36,7 @@ def browse(
     from stereogenbench_data.schema.records import DepthEncoding
     from stereogenbench_data.storage.location import is_remote, shown
 
-    index = open_data(data)
+    index = open_data(data, root=data_root)
     shown_data = shown(data) if is_remote(data) else str(Path(data).expanduser().resolve())
     depth = None if depth_unit_m is None else DepthEncoding(unit_m=depth_unit_m)
     reader = SceneReader(index, depth=depth)

@@ -5,12 +5,13 @@ from typing import Annotated
 
 import typer
 
-from stereogenbench_data.cli.options import DataArgument
+from stereogenbench_data.cli.options import DataArgument, RootOption
 
 
 def card(
     data: DataArgument,
     *,
+    data_root: RootOption = None,
     repository: Annotated[str, typer.Option("--repo", help="ORG/NAME on the Hub.")],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder to write README.md into [stdout].")
@@ -21,7 +22,7 @@ def card(
     from stereogenbench_data.bridges.card import write_card
     from stereogenbench_data.storage.index import SceneIndex
 
-    index = SceneIndex.open(data)
+    index = SceneIndex.open(data, root=data_root)
     if out is None:
         typer.echo(card_text(index, repository=repository), nl=False)
         return

@@ -35,6 +35,7 @@ from stereogenbench_data.cli.options import (
     FocalOption,
     JsonOption,
     MapOption,
+    RootOption,
     SceneOption,
     SplitOption,
     SubsetOption,
@@ -49,6 +50,7 @@ from stereogenbench_data.cli.stopping import STOPPED
 def controls(  # noqa: PLR0913 - one parameter an option
     data: DataArgument,
     *,
+    data_root: RootOption = None,
     seed: Annotated[
         int, typer.Option(min=0, help="Decides whose right view stands in for whose.")
     ] = 0,
@@ -110,7 +112,7 @@ def controls(  # noqa: PLR0913 - one parameter an option
         caption=caption,
         baseline_cm=baseline_cm,
     )
-    index = open_data(data)
+    index = open_data(data, root=data_root)
     try:
         with progress_bar("scoring", unit="frames") as progress:
             results = score_controls(

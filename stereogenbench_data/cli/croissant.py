@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from stereogenbench_data.cli.options import RootOption
 from stereogenbench_data.schema.problems import counted
 
 
@@ -19,6 +20,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         ),
     ] = None,
     *,
+    data_root: RootOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Descriptor to write; tables go beside it.")
     ] = None,
@@ -67,7 +69,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.bridges.croissant import Publication, write_descriptor
     from stereogenbench_data.storage.index import SceneIndex
 
-    index = None if data is None else SceneIndex.open(data)
+    index = None if data is None else SceneIndex.open(data, root=data_root)
     publication = Publication(
         name=name or about.TITLE,
         version=release or about.VERSION,

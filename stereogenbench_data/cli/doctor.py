@@ -16,6 +16,7 @@ from stereogenbench_data.cli.options import (
     JsonOption,
     MapOption,
     OutOption,
+    RootOption,
     SceneOption,
     SplitOption,
     SubsetOption,
@@ -44,6 +45,7 @@ _DB_NOTE = (
 def doctor(  # noqa: PLR0913 - one parameter an option
     data: DataArgument,
     *,
+    data_root: RootOption = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Look at so many scenes.")] = 6,
     frames: Annotated[int, typer.Option(min=1, help="Frames of each scene.")] = 4,
     split: SplitOption = None,
@@ -88,7 +90,7 @@ def doctor(  # noqa: PLR0913 - one parameter an option
         split=split, subset=subset, family=family, map=map_name, scenes=scene,
         focal_mm=focal_mm, caption=caption,
     )  # fmt: skip
-    index = open_data(data)
+    index = open_data(data, root=data_root)
     with progress_bar("examining", unit="scenes") as progress:
         report = diagnose(
             index,

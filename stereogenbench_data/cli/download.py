@@ -13,6 +13,7 @@ from stereogenbench_data.cli.options import (
     FocalOption,
     JsonOption,
     MapOption,
+    RootOption,
     SceneOption,
     SplitOption,
     SubsetOption,
@@ -28,6 +29,7 @@ _MEGABYTE = 1_000_000
 def download(  # noqa: PLR0913 - one parameter an option
     data: DataArgument,
     *,
+    data_root: RootOption = None,
     dest: Annotated[Path, typer.Option("--dest", help="Folder to write into.")],
     cameras: Annotated[
         str, typer.Option(help="Numbers of the cameras wanted, such as 0,1.")
@@ -59,7 +61,7 @@ def download(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.storage.index import SceneIndex
 
     numbers = _cameras(cameras)
-    index = SceneIndex.open(data)
+    index = SceneIndex.open(data, root=data_root)
     filters: Any = scene_filters(
         split=split,
         subset=subset,

@@ -38,6 +38,7 @@ from stereogenbench_data.cli.options import (
     FocalOption,
     JsonOption,
     MapOption,
+    RootOption,
     SceneOption,
     SplitOption,
     SubsetOption,
@@ -54,6 +55,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
         Path, typer.Argument(help="Folder of right views: ITEM/000.png ... or ITEM.mp4.")
     ],
     *,
+    data_root: RootOption = None,
     tier: TierOption,
     name: Annotated[
         str | None, typer.Option("--name", help="What tables call the method [the folder's name].")
@@ -122,7 +124,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
         caption=caption,
         baseline_cm=baseline_cm,
     )
-    index = open_data(data)
+    index = open_data(data, root=data_root)
     try:
         with progress_bar("scoring", unit="frames") as progress:
             scores = evaluated(

@@ -24,6 +24,7 @@ from stereogenbench_data.cli.options import (
     FamilyOption,
     FocalOption,
     MapOption,
+    RootOption,
     SceneOption,
     SplitOption,
     SubsetOption,
@@ -39,6 +40,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
     data: DataArgument,
     out: Annotated[Path, typer.Argument(help="Folder to write into.")],
     *,
+    data_root: RootOption = None,
     tier: TierOption,
     split: SplitOption = None,
     subset: SubsetOption = None,
@@ -73,7 +75,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
         caption=caption,
         baseline_cm=baseline_cm,
     )
-    index = open_data(data)
+    index = open_data(data, root=data_root)
     try:
         with progress_bar("writing", unit="frames") as progress:
             items = exported(

@@ -54,8 +54,9 @@ def index(  # noqa: PLR0913 - one parameter an option
     --family or --map only such scenes are read.
     """
     from stereogenbench_data.storage.index import SceneIndex
+    from stereogenbench_data.storage.index_file import root_told
     from stereogenbench_data.storage.journal import Journal
-    from stereogenbench_data.storage.location import is_remote, shown
+    from stereogenbench_data.storage.location import is_remote, local_path, shown
     from stereogenbench_data.storage.walk import walk
 
     console = Console(stderr=True)
@@ -73,6 +74,7 @@ def index(  # noqa: PLR0913 - one parameter an option
         )
     if target.exists() and not target.is_file():
         raise typer.BadParameter(f"{target} is no regular file, which an index would replace.")
+    root_told(root, beside=target.parent)  # before hours of work, whether it may be written
     done_before = target.with_name(f"{target.name}.journal")
     try:
         with (
@@ -107,14 +109,20 @@ def index(  # noqa: PLR0913 - one parameter an option
         console.print(f"{shown(root)}: no scene is whole, so there is nothing to index")
         raise typer.Exit(1)
     typer.echo(f"{target}: {counted(len(report.scenes), 'scene')}")
+    if not is_remote(root) and target.parent.resolve() != local_path(root).resolve():
+        console.print(
+            f"its data are not beside it: open it as SceneIndex.open({str(target)!r}, "
+            f"root={_whole(root)!r}), or with --root {_whole(root)}",
+            markup=False, highlight=False, soft_wrap=True,
+        )  # fmt: skip
     if report.broken:
         raise typer.Exit(1)
 
 
 def _whole(root: str) -> str:
-    from stereogenbench_data.storage.location import is_remote, local_path
+    from stereogenbench_data.storage.location import is_remote, local_path, shown
 
-    return root if is_remote(root) else str(local_path(root).resolve())
+    return shown(root) if is_remote(root) else str(local_path(root).resolve())
 
 
 def _passing(

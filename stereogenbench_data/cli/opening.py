@@ -14,8 +14,12 @@ if TYPE_CHECKING:
     from stereogenbench_data.storage.walk import TreeReport
 
 
-def open_data(data: str) -> "SceneIndex":
+def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
     """Return the index of some data, without scenes that are broken: stderr is told of these.
+
+    Args:
+        data: What the command was given.
+        root: Where an index file's data are, by the user's word.
 
     Raises:
         StorageError: If there is no such data, or no scene of it is whole.
@@ -25,31 +29,31 @@ def open_data(data: str) -> "SceneIndex":
     from stereogenbench_data.storage.location import is_remote, local_path
     from stereogenbench_data.storage.walk import walk
 
-    if is_remote(data):
-        return _opened(data)
-    root = local_path(data)
-    if not root.is_dir() or (root / INDEX_NAME).is_file():
-        return _opened(data)
+    folder = None if is_remote(data) else local_path(data)
+    if folder is None or root is not None or not folder.is_dir():
+        return _opened(data, root)
+    if (folder / INDEX_NAME).is_file():
+        return _opened(data, root)
     with progress_bar("reading scenes", unit="scenes") as progress:
-        report = walk(root, progress=progress)
+        report = walk(folder, progress=progress)
     if not report.scenes:
         reasons = [*report.broken.values(), *report.incomplete.values()]
         more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         raise StorageError(
-            f"{root}: no scene is whole: {reasons[0]}{more}. `stereogenbench index {root}` lists "
-            f"them all."
+            f"{folder}: no scene is whole: {reasons[0]}{more}. `stereogenbench index {folder}` "
+            f"lists them all."
         )
-    _tell_left_out(root, report)
+    _tell_left_out(folder, report)
     return SceneIndex.from_report(report)
 
 
-def _opened(data: str) -> "SceneIndex":
+def _opened(data: str, root: str | None) -> "SceneIndex":
     """Return an index that exists; its warnings are said as a command says things."""
     from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
 
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", IncompleteSceneWarning)
-        index = SceneIndex.open(data)
+        index = SceneIndex.open(data, root=root)
     for warning in told:
         typer.echo(str(warning.message), err=True)
     return index

@@ -36,6 +36,14 @@ def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
 DataArgument = Annotated[
     str, typer.Argument(help="Released tree, folder of shards, index file, or the URL of either.")
 ]
+RootOption = Annotated[
+    str | None,
+    typer.Option(
+        "--root",
+        help="Root of an index file's data, on your word, where they are not beside it and it "
+        "names no plain URL.",
+    ),
+]
 SplitOption = Annotated[
     str | None,
     typer.Option("--split", help="train or eval.", autocompletion=complete_from(("train", "eval"))),

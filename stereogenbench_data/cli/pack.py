@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from stereogenbench_data.cli.options import JsonOption
+from stereogenbench_data.cli.options import JsonOption, RootOption
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.stopping import STOPPED
 
@@ -15,9 +15,10 @@ _MEGABYTE = 1_000_000
 
 
 def pack(  # noqa: PLR0913 - one parameter an option
-    root: Annotated[Path, typer.Argument(help="Released tree, or its index file.")],
+    root: Annotated[str, typer.Argument(help="Released tree, or its index file.")],
     out: Annotated[Path, typer.Argument(help="Folder for the shards and their index.")],
     *,
+    data_root: RootOption = None,
     shard_size: Annotated[
         str,
         typer.Option(
@@ -62,7 +63,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", IncompleteSceneWarning)
-            index = SceneIndex.open(root)
+            index = SceneIndex.open(root, root=data_root)
         for warning in told:
             typer.echo(str(warning.message), err=True)
         with progress_bar("packing", unit="MB") as bar:

@@ -6,7 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stereogenbench_data.cli.opening import open_data
-from stereogenbench_data.cli.options import DataArgument, DepthUnitOption, complete_scene
+from stereogenbench_data.cli.options import (
+    DataArgument,
+    DepthUnitOption,
+    RootOption,
+    complete_scene,
+)
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
 
@@ -26,6 +31,7 @@ def show(  # noqa: PLR0913 - one parameter an option
         ),
     ] = None,
     *,
+    data_root: RootOption = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -59,7 +65,7 @@ def show(  # noqa: PLR0913 - one parameter an option
     if out is not None and out.suffix.lower() not in (_CLIPS if clip else (".png",)):
         wanted = "a clip is .mp4 or .gif" if clip else "a sheet is .png"
         raise typer.BadParameter(f"{out}: {wanted}, by its ending.", param_hint="--out")
-    index = open_data(data)
+    index = open_data(data, root=data_root)
     row = 0 if scene is None else find_scene(index, scene)
     key = index.scene(row).id.key
     target = out or Path(key.replace("/", "_") + (".mp4" if clip else ".png"))

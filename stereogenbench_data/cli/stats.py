@@ -16,6 +16,7 @@ from stereogenbench_data.cli.options import (
     JsonOption,
     MapOption,
     OutOption,
+    RootOption,
     SceneOption,
     SplitOption,
     SubsetOption,
@@ -28,6 +29,7 @@ from stereogenbench_data.cli.writing import write_report, writing
 def stats(  # noqa: PLR0913 - one parameter an option
     data: DataArgument,
     *,
+    data_root: RootOption = None,
     split: SplitOption = None,
     subset: SubsetOption = None,
     family: FamilyOption = None,
@@ -57,7 +59,7 @@ def stats(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.audit.statistics import statistics
     from stereogenbench_data.audit.statistics_table import statistics_markdown
 
-    index = open_data(data)
+    index = open_data(data, root=data_root)
     filters = scene_filters(
         split=split,
         subset=subset,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from stereogenbench_data.cli.options import JsonOption, WorkersOption
+from stereogenbench_data.cli.options import JsonOption, RootOption, WorkersOption
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.stopping import STOPPED
 
@@ -14,9 +14,10 @@ _MEGABYTE = 1_000_000
 
 
 def unpack(
-    shards: Annotated[Path, typer.Argument(help="Folder of shards, or its index file.")],
+    shards: Annotated[str, typer.Argument(help="Folder of shards, or its index file.")],
     out: Annotated[Path, typer.Argument(help="Folder for the scenes.")],
     *,
+    data_root: RootOption = None,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -35,7 +36,7 @@ def unpack(
             def progress(done: int, total: int) -> None:
                 bar(-(-done // _MEGABYTE), -(-total // _MEGABYTE))
 
-            report = unpacked(shards, out, workers=workers, progress=progress)
+            report = unpacked(shards, out, root=data_root, workers=workers, progress=progress)
     except KeyboardInterrupt:
         typer.echo("stopped; run the same command again to go on from here", err=True)
         raise typer.Exit(STOPPED) from None

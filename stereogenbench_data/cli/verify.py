@@ -2,11 +2,11 @@
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
+from stereogenbench_data.cli.options import RootOption
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.stopping import STOPPED
 
@@ -14,8 +14,9 @@ _MEGABYTE = 1_000_000
 
 
 def verify(
-    shards: Annotated[Path, typer.Argument(help="Folder of shards, or its index file.")],
+    shards: Annotated[str, typer.Argument(help="Folder of shards, or its index file.")],
     *,
+    data_root: RootOption = None,
     deep: Annotated[
         bool, typer.Option("--deep", help="Decode every video too, and count its frames.")
     ] = False,
@@ -38,7 +39,7 @@ def verify(
             def progress(done: int, total: int) -> None:
                 bar(-(-done // _MEGABYTE), -(-total // _MEGABYTE))
 
-            report = verified(shards, mode=mode, workers=workers, progress=progress)
+            report = verified(shards, root=data_root, mode=mode, workers=workers, progress=progress)
     except KeyboardInterrupt:
         typer.echo("stopped", err=True)
         raise typer.Exit(STOPPED) from None

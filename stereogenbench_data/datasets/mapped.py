@@ -255,7 +255,9 @@ class _MappedScenes(Dataset[Sample]):
     def __repr__(self) -> str:
         """Say what it holds."""
         scenes = len(self.plan.scene_rows)
-        return f"<{type(self).__name__}: {len(self)} samples of {scenes} scenes, {self.index.root}>"
+        return (
+            f"<{type(self).__name__}: {len(self)} samples of {scenes} scenes, {self.index.where}>"
+        )
 
 
 class OddSceneWarning(UserWarning):
@@ -287,7 +289,7 @@ def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None
 def _warn(index: SceneIndex, rows: Any, what: str) -> None:
     if len(rows):
         keys = ", ".join(index.column("key")[rows[:3]])
-        text = f"{index.root}: {len(rows)} selected scenes {what}. The first: {keys}."
+        text = f"{index.where}: {len(rows)} selected scenes {what}. The first: {keys}."
         warnings.warn(text, OddSceneWarning, stacklevel=5)
 
 

@@ -41,7 +41,7 @@ def document(
         "format": FORMAT,
         "tier": first.tier,
         "methods": [one.name for one in results],
-        "data": {"root": first.index.root, "digest": first.index.digest},
+        "data": {"root": first.index.where, "digest": first.index.digest},
         "settings": dict(first.settings),
         "coverage": [_coverage(one) for one in results],
         "tables": [plain(table) for table in tables],

@@ -197,5 +197,8 @@ def _require_few(faults: Sequence[str], *, allowed: int) -> None:
 def _part_of(index: SceneIndex, rows: Sequence[int]) -> SceneIndex:
     """Return an index of a few rows, small enough to be sent to a process with its work."""
     return SceneIndex.from_scenes(
-        [index.scene(row) for row in rows], index.root, shards=index.shards
+        [index.scene(row) for row in rows],
+        index.root,
+        shards=index.shards,
+        patience=index.patience,
     )

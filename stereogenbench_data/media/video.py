@@ -133,6 +133,9 @@ class VideoReader:
         container = open_container(file, name=name, pixel_format="later")
         try:
             require_whole_payload(container, name=name)
+            coded = container.streams.video[0].codec_context
+            self.size_px = (coded.width, coded.height)
+            """Width and height by the header; 0 where it does not tell."""
             if container.streams.video[0].codec_context.pix_fmt is not None:
                 self._facts = stream_facts(container, name=name, frames=frames)
             steady = steady_clock(container, frames=frames)

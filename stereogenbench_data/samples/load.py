@@ -72,7 +72,12 @@ class SampleLoader:
         self._index = index
         self._request = request
         self._source = MemberSource(
-            index.root, shards=index.shards, revision=index.digest, cache=cache, check=check
+            index.root,
+            shards=index.shards,
+            revision=index.digest,
+            cache=cache,
+            check=check,
+            patience=index.patience,
         )
         self._streams = Streams(self._source)
         self._shares_frames = frames == "shared"

@@ -31,7 +31,7 @@ def require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:
         if missing:
             there = sorted({name[4:6] for name in scene.members if name.startswith("cam_")})
             raise StorageError(
-                f"{index.root}: {scene.id.key} has no {', '.join(missing)}; videos of cameras "
+                f"{index.where}: {scene.id.key} has no {', '.join(missing)}; videos of cameras "
                 f"{', '.join(there) or 'none'} were fetched. Choose pairs of these, or download "
                 "the others too."
             )

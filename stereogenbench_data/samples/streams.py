@@ -156,6 +156,7 @@ class Streams:
                     label = self._source.label(scene, name)
                     kind = open_depth if name in PACKED_DEPTH_NAMES.values() else VideoReader
                     reader = kind(file, name=label, frames=scene.frames)
+                    _require_size(reader, scene, name=label)
                 self._open[place] = _Stream(reader, file)
             self._open.move_to_end(place)
             stream = self._open[place]
@@ -176,6 +177,22 @@ class Streams:
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what another process makes a pool of its own from."""
         return partial(Streams, limit=self._limit), (self._source,)
+
+
+def _require_size(reader: Any, scene: Scene, *, name: str) -> None:
+    """Refuse a video whose pictures have not the size that the index says, if its header tells."""
+    if isinstance(reader, VideoReader):
+        found = reader.size_px
+    else:
+        found = (reader.facts.width_px, reader.facts.height_px)
+    told = (scene.rig.image_width_px, scene.rig.image_height_px)
+    if all(found) and found != told:
+        reader.close()
+        raise MediaError(
+            f"{name}: holds pictures of {found[0]}x{found[1]} pixels where the index says "
+            f"{told[0]}x{told[1]}. The video or the index was replaced or altered: fetch them "
+            f"again, or run `stereogenbench index` again."
+        )
 
 
 def _read_only(picture: Any) -> Any:

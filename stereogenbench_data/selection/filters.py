@@ -81,7 +81,7 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
         rows = rows[keep]
         applied.append(f"{name}={wanted!r}")
     if len(rows) == 0:
-        raise SelectionError(f"{index.root}: the index holds no scene at all.")
+        raise SelectionError(f"{index.where}: the index holds no scene at all.")
     return rows
 
 

@@ -207,11 +207,28 @@ def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> No
         part.unlink(missing_ok=True)
 
 
+def _require_within(root: Path, member: Member) -> None:
+    """Refuse a link that leads out of the data: what is copied is passed on.
+
+    Snapshots in the Hub's own cache are links to the blobs beside them, which are theirs.
+    """
+    folders = [root.resolve()]
+    if folders[0].parent.name == "snapshots":
+        folders.append(folders[0].parent.parent / "blobs")
+    place = (root / member.path).resolve()
+    if not any(place.is_relative_to(folder) for folder in folders):
+        raise StorageError(
+            f"{root / member.path}: is a link to {place}, outside the data, and is not copied. "
+            f"If it belongs to the data, put the file itself in the link's place."
+        )
+
+
 def _chunks(index: SceneIndex, member: Member) -> Iterator[bytes]:
     if is_remote(index.root):
-        remote = RemoteObject(joined(index.root, member.path))
+        remote = RemoteObject(joined(index.root, member.path), patience=index.patience)
         yield from remote.chunks(member.offset, member.offset + member.size)
         return
+    _require_within(local_path(index.root), member)
     opened = open_local(index.root, member, shard=index.shards.get(member.path))
     with opened.open("rb") if isinstance(opened, Path) else opened as file:
         while data := file.read(_CHUNK):

@@ -36,6 +36,7 @@ from stereogenbench_data.storage.location import (
 )
 from stereogenbench_data.storage.remote import RemoteObject
 from stereogenbench_data.storage.remote_tree import find_remote_scenes
+from stereogenbench_data.storage.retry import Patience
 from stereogenbench_data.storage.rows import SCHEMA, row_of, scene_of
 from stereogenbench_data.storage.walk import TreeReport, walk
 
@@ -57,7 +58,9 @@ class SceneIndex:
     """The scenes of one root, by row; rows are sorted by key.
 
     Attributes:
-        root: The folder or URL to which the members' paths are relative.
+        root: The folder or URL to which the members' paths are relative, with its login if it has
+            one; `where` is what may be shown.
+        patience: How reading from a URL deals with a slow or failing server; None for the defaults.
         incomplete: Key to reason, for scenes that were not finished when the index was made.
         broken: Key to what is wrong, for scenes that were left out for it.
         shards: What is known of each shard, by its path below the root; empty for folders.
@@ -66,6 +69,7 @@ class SceneIndex:
     def __init__(self, table: pa.Table, *, root: str | Path, head: Mapping[str, Any]) -> None:
         """Take a checked table; use `open` or `from_scenes` to make an index."""
         self.root = str(root)
+        self.patience: Patience | None = None
         self.incomplete: dict[str, str] = dict(head.get("incomplete", {}))
         self.broken: dict[str, str] = dict(head.get("broken", {}))
         self.shards: dict[str, ShardFacts] = {
@@ -76,8 +80,19 @@ class SceneIndex:
         self._digest = ""
 
     @classmethod
-    def open(cls, data: str | Path) -> "SceneIndex":
+    def open(
+        cls,
+        data: str | Path,
+        *,
+        root: str | Path | None = None,
+        patience: Patience | None = None,
+    ) -> "SceneIndex":
         """Return the index of some data.
+
+        Data are looked for beside the index first. An index that was written elsewhere remembers
+        where its data are, but a file may be anybody's: without ``root`` it is believed only if it
+        names a folder below its own, or a plain URL (``https://``, ``http://``, ``hf://``,
+        ``s3://``) without a login that is not of this machine's own network.
 
         Args:
             data: An index file; a folder that holds ``index.parquet``, such as one of shards; the
@@ -85,18 +100,33 @@ class SceneIndex:
                 opens), of which only the index is fetched; or a folder in the released layout,
                 which is then walked (seconds for hundreds of scenes, minutes for all:
                 ``stereogenbench index`` keeps the result).
+            root: Where the data of an index file are, on your word and whatever the file says: any
+                folder or URL.
+            patience: How often to try a server that fails, and how slow it may be.
 
         Raises:
             StorageError: If there is no such data, it holds no scene, the index is damaged or
-                was made by another version, or scenes of a tree are broken.
+                was made by another version, its data are where only your word lets them be opened,
+                or scenes of a tree are broken.
         """
+        index = cls._opened(
+            data, root=None if root is None else _root_said(root), patience=patience
+        )
+        where = shown(data) if is_remote(data) else str(local_path(data))
+        _warn_of(index.incomplete | index.broken, where=where)
+        index.patience = patience
+        return index
+
+    @classmethod
+    def _opened(
+        cls, data: str | Path, *, root: str | None, patience: Patience | None
+    ) -> "SceneIndex":
         if is_remote(data):
-            index = cls._from_url(str(data))
-            _warn_of(index.incomplete | index.broken, where=shown(str(data)))
-            return index
+            return cls._from_url(str(data), root=root, patience=patience)
         path = local_path(data)
         if path.is_dir():
             if not (path / INDEX_NAME).is_file():
+                _require_no_root(path, root)
                 return cls._from_tree(path)
             path /= INDEX_NAME
         elif not path.is_file():
@@ -104,9 +134,7 @@ class SceneIndex:
                 f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or "
                 f"a folder in the released layout."
             )
-        index = cls._from_file(path)
-        _warn_of(index.incomplete | index.broken, where=str(path))
-        return index
+        return cls._from_file(path, root=root)
 
     @classmethod
     def from_scenes(
@@ -115,6 +143,7 @@ class SceneIndex:
         root: str | Path,
         *,
         shards: Mapping[str, ShardFacts] | None = None,
+        patience: Patience | None = None,
     ) -> "SceneIndex":
         """Return the index of some scenes, in whatever order they come.
 
@@ -122,6 +151,7 @@ class SceneIndex:
             scenes: The scenes, with the places of their members.
             root: The folder to which these places are relative.
             shards: What is known of each shard, where the members lie in shards.
+            patience: As for `open`.
 
         Raises:
             StorageError: If two scenes have one key, or a path leaves the root.
@@ -135,7 +165,7 @@ class SceneIndex:
             ) from error
         require_sound(table, where=shown(str(root)))
         index = cls(table, root=root, head={})
-        index.shards = dict(shards or {})
+        index.shards, index.patience = dict(shards or {}), patience
         return index
 
     @classmethod
@@ -148,36 +178,37 @@ class SceneIndex:
     @classmethod
     def _from_tree(cls, root: str | Path) -> "SceneIndex":
         # In this process: a script without `if __name__ == "__main__"` could start no others.
-        report = walk(root, workers=1)
+        report, where = walk(root, workers=1), shown(root)
         if report.broken:
             raise StorageError(
-                f"{root}: {_listed(report.broken)}\nRepair or remove them; or leave them out on "
-                f"purpose: `stereogenbench index {root}` makes an index without them."
+                f"{where}: {_listed(report.broken)}\nRepair or remove them; or leave them out on "
+                f"purpose: `stereogenbench index {where}` makes an index without them."
             )
         if not report.scenes:
-            raise StorageError(f"{root}: no scene is finished: {_listed(report.incomplete)}")
-        _warn_of(report.incomplete, where=str(root))
+            raise StorageError(f"{where}: no scene is finished: {_listed(report.incomplete)}")
         return cls.from_report(report)
 
     @classmethod
-    def _from_file(cls, path: Path) -> "SceneIndex":
+    def _from_file(cls, path: Path, *, root: str | None) -> "SceneIndex":
         table, head = read_index_file(path, where=str(path))
-        return cls._checked(table, head, root=root_of(path, head, table), where=str(path))
+        place = root_of(path, head, table) if root is None else root
+        return cls._checked(table, head, root=place, where=str(path))
 
     @classmethod
-    def _from_url(cls, url: str) -> "SceneIndex":
-        """Fetch an index; its data lie beside it."""
-        root, name = split_name(url)
+    def _from_url(cls, url: str, *, root: str | None, patience: Patience | None) -> "SceneIndex":
+        """Fetch an index; its data lie beside it, unless the user says where."""
+        beside, name = split_name(url)
         is_folder = not name.endswith(".parquet")
         if is_folder:
-            root, url = url.rstrip("/"), joined(url.rstrip("/"), INDEX_NAME)
-        remote = RemoteObject(url)
+            beside, url = url.rstrip("/"), joined(url.rstrip("/"), INDEX_NAME)
+        remote = RemoteObject(url, patience=patience)
         try:
             size = remote.size()
         except MissingObject:
             if not is_folder:
                 raise
-            return cls._from_remote_tree(root)
+            _require_no_root(shown(beside), root)
+            return cls._from_remote_tree(beside)
         if size > MAX_INDEX_BYTES:
             raise StorageError(
                 f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
@@ -185,7 +216,7 @@ class SceneIndex:
             )
         content = pa.BufferReader(remote.read(0, size))
         table, head = read_index_file(content, where=remote.where)
-        return cls._checked(table, head, root=root, where=remote.where)
+        return cls._checked(table, head, root=root or beside, where=remote.where)
 
     @classmethod
     def _from_remote_tree(cls, root: str) -> "SceneIndex":
@@ -231,6 +262,11 @@ class SceneIndex:
         }
         write_index_file(path, self._table, description)
 
+    @property
+    def where(self) -> str:
+        """The root as messages, reports and other files show it: without login and query."""
+        return shown(self.root)
+
     def __len__(self) -> int:
         """The number of scenes."""
         return int(self._table.num_rows)
@@ -242,9 +278,7 @@ class SceneIndex:
             StorageError: If there is no such row.
         """
         if not 0 <= row < len(self):
-            raise StorageError(
-                f"{shown(self.root)}: there is no row {row}; the index has {len(self)}."
-            )
+            raise StorageError(f"{self.where}: there is no row {row}; the index has {len(self)}.")
         return scene_of(self._table.slice(int(row), 1).to_pylist()[0])
 
     def column(self, name: str) -> np.ndarray:
@@ -296,6 +330,31 @@ class SceneIndex:
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
         return self.__dict__ | {"_columns": {}}
+
+
+def _root_said(root: str | Path) -> str:
+    """Return a root that the user names: whatever URL it is, or a folder.
+
+    Raises:
+        StorageError: If it is a path, and no folder.
+    """
+    if is_remote(root):
+        return str(root)
+    folder = local_path(root)
+    if not str(root) or not folder.is_dir():
+        raise StorageError(
+            f"{str(root)!r}: is no folder, and was named as the root of an index's data. Name the "
+            f"folder, or the URL, to which the paths in the index are relative."
+        )
+    return str(folder)
+
+
+def _require_no_root(where: str | Path, root: str | None) -> None:
+    if root is not None:
+        raise StorageError(
+            f"{where}: has no {INDEX_NAME}, and a root was named for the data of one. Leave root "
+            f"out, or pass the index file."
+        )
 
 
 def _array(values: Any) -> np.ndarray:

@@ -6,8 +6,10 @@ out of the data's root, are refused.
 
 import itertools
 import json
+import math
 import os
 import re
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -17,7 +19,13 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.storage.location import is_remote, local_path, shown
+from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.storage.location import (
+    is_remote,
+    local_path,
+    shown,
+    why_not_from_a_file,
+)
 from stereogenbench_data.storage.rows import SCHEMA
 from stereogenbench_data.storage.source import UNSAFE_PATH
 
@@ -28,6 +36,8 @@ _OF_SHARDS: Final = (
 )
 
 _FORMAT: Final = 1
+_LONGEST_ROOT: Final = 300
+_LARGEST: Final = 2**63
 _UNSAFE: Final = re.compile(UNSAFE_PATH)
 _METADATA_KEY: Final = b"stereogenbench_data.index"
 
@@ -104,21 +114,58 @@ def root_told(root: str, *, beside: Path) -> str:
 
 
 def root_of(path: Path, head: Mapping[str, Any], table: pa.Table) -> str | Path:
-    """Return the data's root: the index's own folder if the data are there, else the recorded."""
-    beside, recorded = path.parent, Path(head["root"])
-    if is_remote(head["root"]):
-        return str(head["root"])
-    if head["root"] == "." or not table.num_rows:
+    """Return the data's root: the index's own folder if the data are there, else the recorded.
+
+    The file may be another's, so what it records is opened only where that can do no harm: below
+    the index's own folder, or at a URL of which `why_not_from_a_file` has nothing to say.
+
+    Raises:
+        StorageError: If the recorded root needs the user's word, or is no folder.
+    """
+    beside, recorded = path.parent, str(head["root"])
+    if recorded == "." or not table.num_rows or _are_beside(table, beside):
         return beside
-    first = table.column("members")[0].as_py()[0]["path"]
-    if (beside / first).exists():
-        return beside
-    if not recorded.is_dir():
+    if is_remote(recorded):
+        reason = why_not_from_a_file(recorded)
+        if reason:
+            raise _needs_word(path, recorded, reason)
+        return recorded
+    folder = _folder_told(recorded, beside)
+    if folder is None or not folder.is_relative_to(beside.resolve()):
+        raise _needs_word(path, recorded, "it is outside the index's own folder")
+    if not folder.is_dir():
         raise StorageError(
-            f"{path}: its data were at {recorded}, which is no folder now. Move the index into "
+            f"{path}: its data were at {folder}, which is no folder now. Move the index into "
             f"the data's root, or run `stereogenbench index` again."
         )
-    return recorded
+    return folder
+
+
+def _are_beside(table: pa.Table, folder: Path) -> bool:
+    """Return whether a file of the first scene lies below a folder."""
+    members = table.column("members")[0].as_py()
+    return any((folder / member["path"]).exists() for member in members)
+
+
+def _folder_told(recorded: str, beside: Path) -> Path | None:
+    """Return the folder that a recorded path means, links followed; None if there is none."""
+    try:
+        told = local_path(recorded) if recorded[:5].lower() == "file:" else Path(recorded)
+        return (beside / told).resolve()
+    except (OSError, ValueError, RuntimeError):
+        return None
+
+
+def _needs_word(path: Path, recorded: str, reason: str) -> StorageError:
+    told = shown(recorded)
+    is_plain = told.isprintable() and len(told) <= _LONGEST_ROOT
+    place = told if is_plain else repr(told[:_LONGEST_ROOT])
+    return StorageError(
+        f"{path}: its data are not beside it, and it records their root as {place}. A file may not "
+        f"choose such a place ({reason}). If you trust it, name the root yourself: "
+        f"SceneIndex.open({str(path)!r}, root=...), or --root with a command. Or move the index "
+        f"into that root."
+    )
 
 
 def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
@@ -137,9 +184,10 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
             f"{where}: is an index of format {head.get('format')!r}, and this version of the "
             f"package reads format {_FORMAT}. {made_again(where)}"
         )
-    tables = [head.get("incomplete"), head.get("broken"), head.get("shards")]
+    reasons = [head.get("incomplete"), head.get("broken")]
     if (
-        not all(isinstance(each, dict) for each in tables)
+        not all(map(_are_texts, reasons))
+        or not isinstance(head.get("shards"), dict)
         or not isinstance(head.get("root"), str)
         or not all(map(_are_shard_facts, head["shards"].values()))
         or any(map(_UNSAFE.search, head["shards"]))
@@ -148,9 +196,18 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
     return head
 
 
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
+
+
 def _are_shard_facts(value: Any) -> bool:
     kinds = {"size": int, "sha256": str, "members": int}
-    return isinstance(value, dict) and {name: type(each) for name, each in value.items()} == kinds
+    return (
+        isinstance(value, dict)
+        and {name: type(each) for name, each in value.items()} == kinds
+        and 0 <= value["size"] < _LARGEST
+        and 0 <= value["members"] < _LARGEST
+    )
 
 
 def require_sound(table: pa.Table, *, where: str) -> None:
@@ -184,11 +241,76 @@ def require_sound(table: pa.Table, *, where: str) -> None:
                 f"{where}: {unsafe[0].as_py()!r} is no path inside the data's root. The index "
                 f"was altered. {made_again(where)}"
             )
-    for name, numbers, least in (
-        ("frames", table.column("frames"), 1),
-        ("size", pc.struct_field(members, "size"), 0),
-        ("offset", pc.struct_field(members, "offset"), 0),
+    _require_texts(table, where=where)
+    _require_numbers(table, members, where=where)
+
+
+def _require_texts(table: pa.Table, *, where: str) -> None:
+    for name, known in _KNOWN.items():
+        texts = table.column(name) if name in _PLAIN_TEXTS else pc.list_flatten(table.column(name))
+        odd = texts.filter(pc.invert(pc.is_in(texts, value_set=pa.array(known, pa.string()))))
+        if len(odd):
+            options = ", ".join(str(each) for each in known)
+            raise _odd(where, name, odd, f"none of {options}")
+    for name in ("family", "map_name"):
+        texts = table.column(name)
+        odd = texts.filter(pc.match_substring_regex(texts, r"^$|[/\\\x00-\x1f]"))
+        if len(odd):
+            raise _odd(where, name, odd, "no name of a folder")
+
+
+def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
+    sound_units = pc.not_equal(pc.list_flatten(table.column("depth_unit_source")), "unreadable")
+    for name, numbers, (least, most) in (
+        ("offset", pc.struct_field(members, "offset"), _OF_BYTES),
+        ("size", pc.struct_field(members, "size"), _OF_BYTES),
+        ("depth_unit_m", pc.list_flatten(table.column("depth_unit_m")).filter(sound_units), _ABOVE),
+        *((name, table.column(name), bounds) for name, bounds in _BOUNDS.items()),
     ):
-        lowest = pc.min(numbers).as_py()
-        if lowest is not None and lowest < least:
-            raise StorageError(f"{where}: {name} is {lowest}, below {least}. {made_again(where)}")
+        flat = pc.list_flatten(numbers) if name in ("baselines_cm", "lateral_m") else numbers
+        within = pc.and_(pc.greater_equal(flat, least), pc.less_equal(flat, most))
+        odd = flat.filter(pc.invert(within))
+        if len(odd):
+            raise _odd(where, name, odd, f"not {least:g} to {most:g}")
+    if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
+        raise StorageError(f"{where}: a primary pair has one camera twice. {made_again(where)}")
+    halves = [pc.is_null(table.column(f"principal_{axis}_px")) for axis in "xy"]
+    if pc.any(pc.not_equal(*halves)).as_py():
+        raise StorageError(f"{where}: a principal point has one number. {made_again(where)}")
+
+
+def _odd(where: str, name: str, found: Any, why: str) -> StorageError:
+    return StorageError(
+        f"{where}: {name} is {found[0].as_py()!r}, {why}. The index was altered. "
+        f"{made_again(where)}"
+    )
+
+
+_PLAIN_TEXTS: Final = ("split", "subset", "image_size_source")
+_KNOWN: Final = {
+    "split": ("train", "eval"),
+    "subset": ("seen_map", "unseen_map", None),
+    "image_size_source": ("recorded", "default"),
+    "depth_unit_source": ("tag", "default", "unreadable"),
+}
+_OF_BYTES: Final = (0, 2**61)
+_ABOVE: Final = (sys.float_info.min, sys.float_info.max)
+_FINITE: Final = (-sys.float_info.max, sys.float_info.max)
+_BOUNDS: Final = {
+    "focal_mm": _ABOVE,
+    "sensor_width_mm": _ABOVE,
+    "sensor_height_mm": _ABOVE,
+    "image_width_px": (1, 2**16),
+    "image_height_px": (1, 2**16),
+    "baselines_cm": _ABOVE,
+    "primary_left": (0, CAMERA_COUNT - 1),
+    "primary_right": (0, CAMERA_COUNT - 1),
+    "frames": (1, 2**31),
+    "frame_rate_hz": (0, sys.float_info.max),
+    "lateral_m": _FINITE,
+    "rig_residual_px": (0, math.inf),
+    "principal_x_px": _FINITE,
+    "principal_y_px": _FINITE,
+    "valid_depth_ratio": (0, 1),
+}
+"""The least and the greatest number of a column; nan is not between, what is unknown is null."""

@@ -1,23 +1,68 @@
-"""Where data are: a path on this machine or a URL, and how a URL is joined and shown."""
+"""Where data are, a path or a URL: how it is joined and shown, and whose word it takes to open it.
 
+What a user names is opened, whatever it is. What a file names may be another's choice: see
+`why_not_from_a_file`.
+"""
+
+import ipaddress
+import re
+import socket
 from pathlib import Path
 from typing import Final
-from urllib.parse import quote, unquote, urlsplit, urlunsplit
+from urllib.parse import SplitResult, quote, unquote, urlsplit, urlunsplit
+
+from stereogenbench_data.errors import StorageError, url_without_secrets
 
 WEB_SCHEMES: Final = ("http", "https")
+FILE_SCHEMES: Final = ("https", "http", "hf", "s3")
+"""What a file may name as the place of data: stores that hold bytes, and nothing else.
+
+Other file systems of fsspec reach into this machine (``local``, ``reference``, ``ssh`` ...), or
+open what yet another part of the URL names.
+"""
+
+_ODD: Final = re.compile(r"[\x00-\x20\x7f\\]")
+_IPV6_HOST: Final = re.compile(r"(?<=://)\[[0-9A-Fa-f:.]*\]")
+_EMBEDDED: Final = ipaddress.ip_network("64:ff9b::/96")
+"""IPv6 addresses that stand for IPv4 addresses, the last 32 bits."""
 
 
 def is_remote(location: str | Path) -> bool:
     """Return whether a location is a URL of something that is not a file of this machine."""
-    return "://" in str(location) and not str(location).startswith("file://")
+    return "://" in str(location) and not _is_file_url(str(location))
+
+
+def is_web(location: str) -> bool:
+    """Return whether a location is a URL of a web server."""
+    return location.partition("://")[0].lower() in WEB_SCHEMES and "://" in location
 
 
 def local_path(location: str | Path) -> Path:
     """Return a local location as an absolute path, ``~`` expanded; a ``file://`` URL is one too."""
     text = str(location)
-    if text.startswith("file://"):
-        return Path(unquote(urlsplit(text).path))
+    if _is_file_url(text):
+        return Path(unquote(split_url(text).path))
     return Path(location).expanduser().absolute()
+
+
+def _is_file_url(location: str) -> bool:
+    return location[:7].lower() == "file://"
+
+
+def split_url(url: str) -> SplitResult:
+    """Return the parts of a URL.
+
+    Raises:
+        StorageError: If it is none, as with half an IPv6 address or, of a web server, a port that
+            is no number.
+    """
+    try:
+        parts = urlsplit(url)
+        if is_web(url):
+            _ = parts.port
+    except ValueError:
+        raise StorageError(f"{shown(url)}: is no URL: correct it.") from None
+    return parts
 
 
 def joined(root: str, path: str) -> str:
@@ -25,25 +70,83 @@ def joined(root: str, path: str) -> str:
 
     What follows the root's path stays behind the whole: a query, as of a signed URL, or the
     archive that a chain of file systems opens (``zip://folder::s3://bucket/all.zip``).
+
+    Raises:
+        StorageError: If the root is no URL, or the path would make it a chain of file systems.
     """
-    if urlsplit(root).scheme in WEB_SCHEMES:
-        parts = urlsplit(root)
+    if "::" in path:
+        raise StorageError(
+            f"{shown(root)}: holds {path!r}, and a name with '::' in it would open another file "
+            f"system. Rename it."
+        )
+    if is_web(root):
+        parts = split_url(root)
         return urlunsplit(parts._replace(path=f"{parts.path.rstrip('/')}/{quote(path)}"))
     first, chain, rest = root.partition("::")
     return f"{first.rstrip('/')}/{path}{chain}{rest}"
 
 
 def split_name(url: str) -> tuple[str, str]:
-    """Return the URL of the folder that holds a URL's last part, and this part."""
-    parts = urlsplit(url)
+    """Return the URL of the folder that holds a URL's last part, and this part.
+
+    Raises:
+        StorageError: If it is no URL.
+    """
+    parts = split_url(url)
     folder, _, name = parts.path.rpartition("/")
     return urlunsplit(parts._replace(path=folder)), unquote(name)
 
 
-def shown(location: str) -> str:
-    """Return a location as messages may show it: a URL without user, password, query, fragment."""
-    if not is_remote(location):
-        return location
-    parts = urlsplit(location)
-    host = parts.netloc.rpartition("@")[2] if parts.scheme in WEB_SCHEMES else parts.netloc
-    return f"{parts.scheme}://{host}{parts.path}"
+def shown(location: str | Path) -> str:
+    """Return a location as messages and files may show it: a URL without login, query, fragment.
+
+    So is every URL of a chain. Other logins than those in URLs are never part of a location.
+    """
+    text = str(location)
+    return url_without_secrets(text) if is_remote(text) else text
+
+
+def why_not_from_a_file(url: str) -> str:
+    """Return why a URL that a file names is not opened without the user's word, "" if it is.
+
+    It must be of `FILE_SCHEMES`, without a chain of file systems, a login or a query, and on a web
+    server that is neither this machine nor one of its own network.
+    """
+    scheme = url.partition("://")[0].lower()
+    try:
+        host = split_url(url).hostname or "" if is_web(url) else ""
+    except StorageError:
+        return "it is no URL"
+    if "::" in (_IPV6_HOST.sub("", url) if is_web(url) else url):
+        return "it is a chain of file systems"
+    if scheme not in FILE_SCHEMES:
+        return f"it is none of {', '.join(f'{each}://' for each in FILE_SCHEMES)}"
+    if shown(url) != url or _ODD.search(url):
+        return "it holds a login, a query, or signs that no address has"
+    return "it is on this machine or in its own network" if is_web(url) and is_inside(host) else ""
+
+
+def is_inside(host: str) -> bool:
+    """Return whether a host is this machine or one of a network that the world cannot reach.
+
+    Names are looked up; one that is unknown is of neither.
+    """
+    name = unquote(host).rstrip(".").lower()
+    if name in ("", "localhost") or name.endswith(".localhost"):
+        return True
+    try:
+        found = socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError, ValueError):
+        return False
+    return any(_is_inside(str(address[0])) for *_, address in found)
+
+
+def _is_inside(text: str) -> bool:
+    address: ipaddress.IPv4Address | ipaddress.IPv6Address
+    address = ipaddress.ip_address(text.partition("%")[0])
+    if isinstance(address, ipaddress.IPv6Address):
+        if address in _EMBEDDED:
+            address = ipaddress.IPv4Address(int(address) & 0xFFFFFFFF)
+        else:
+            address = address.ipv4_mapped or address.sixtofour or address
+    return not address.is_global or address.is_multicast

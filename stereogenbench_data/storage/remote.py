@@ -3,13 +3,13 @@
 How a request is made is up to a transport: `web` for http and https, `filesystems` for the rest.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Protocol, TypeVar
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.storage.filesystems import FilesystemTransport
-from stereogenbench_data.storage.location import WEB_SCHEMES, shown
-from stereogenbench_data.storage.retry import Fault, Patience
+from stereogenbench_data.storage.location import is_web, shown
+from stereogenbench_data.storage.retry import Effort, Fault, Pace, Patience
 from stereogenbench_data.storage.web import WebTransport
 
 _T = TypeVar("_T")
@@ -18,7 +18,7 @@ _T = TypeVar("_T")
 class Transport(Protocol):
     """One way to reach one remote object."""
 
-    def size(self) -> int:
+    def size(self, pace: Pace) -> int:
         """Return how many bytes it has.
 
         Raises:
@@ -27,7 +27,7 @@ class Transport(Protocol):
         """
         ...
 
-    def part(self, start: int, stop: int) -> Iterator[bytes]:
+    def part(self, start: int, stop: int, pace: Pace) -> Generator[bytes, None, None]:
         """Yield its bytes from start to stop, or the first of them.
 
         Raises:
@@ -53,15 +53,15 @@ class RemoteObject:
             url: Where it is.
             expected_size: The bytes that it must have, by an index; None if that is not known.
             patience: How often and how long to try; None for a minute or so.
+
+        Raises:
+            StorageError: If it is no URL.
         """
         self.where = shown(url)
         self._expected_size = expected_size
         self._is_checked = expected_size is None
         self._patience = patience or Patience()
-        is_web = url.partition("://")[0] in WEB_SCHEMES
-        self._transport: Transport = (WebTransport if is_web else FilesystemTransport)(
-            url, timeout_s=self._patience.timeout_s
-        )
+        self._transport: Transport = (WebTransport if is_web(url) else FilesystemTransport)(url)
 
     def size(self) -> int:
         """Return how many bytes it has.
@@ -86,13 +86,19 @@ class RemoteObject:
             StorageError: If they cannot be had.
         """
         self._require_expected_size()
-        failures = 0
+        effort = Effort(self._patience)
         while start < stop:
             begin = start
             fault = Fault("the answer ended early")
+            pieces = self._transport.part(start, stop, effort.pace())
             try:
-                for data in self._transport.part(start, stop):
+                while True:
+                    with effort.timed():
+                        data = next(pieces, None)
+                    if data is None:
+                        break
                     start += len(data)
+                    effort.gain(len(data))
                     if start > stop:
                         raise StorageError(
                             f"{self.where}: sent more than the {stop - begin} bytes asked for "
@@ -102,9 +108,10 @@ class RemoteObject:
                     yield data
             except Fault as found:
                 fault = found
+            finally:
+                pieces.close()
             if start < stop:
-                failures = 1 if start > begin else failures + 1
-                self._wait(fault, failures=failures, doing=f"at byte {start} of {stop}")
+                self._wait(effort, fault, gained=start - begin, doing=f"at byte {start} of {stop}")
 
     def entries(self) -> dict[str, int | None]:
         """Return what it holds as a folder: names, with a file's size, and None for a folder.
@@ -131,20 +138,20 @@ class RemoteObject:
             )
         self._is_checked = True
 
-    def _persist(self, ask: Callable[[], _T]) -> _T:
-        failures = 0
+    def _persist(self, ask: Callable[[Pace], _T]) -> _T:
+        effort = Effort(self._patience)
         while True:
             try:
-                return ask()
+                with effort.timed():
+                    return ask(effort.pace())
             except Fault as fault:
-                failures += 1
-                self._wait(fault, failures=failures, doing="asked for its size")
+                self._wait(effort, fault, gained=0, doing="asked for its size")
 
-    def _wait(self, fault: Fault, *, failures: int, doing: str) -> None:
-        if not self._patience.wait(fault, failures=failures):
-            asked = f", which asks to wait {fault.wait_s:.0f} s" if fault.wait_s else ""
+    def _wait(self, effort: Effort, fault: Fault, *, gained: int, doing: str) -> None:
+        if not effort.goes_on(fault, gained=gained):
             raise StorageError(
-                f"{self.where}: cannot be read, {doing} ({fault}{asked}; {failures} tries). Check "
-                f"the network and the server, then try again; or fetch the data and pass the "
-                f"folder."
+                f"{self.where}: cannot be read, {doing} ({effort.told(fault)}). Check the network "
+                f"and the server, then try again; or fetch the data and pass the folder; or allow "
+                f"for a slower one: SceneIndex.open(..., patience=Patience(...)), which has "
+                f"{self._patience.bounds} now."
             ) from fault

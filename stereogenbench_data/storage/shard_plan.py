@@ -143,15 +143,15 @@ def parse_size(text: str) -> int:
 def _require_released(index: SceneIndex) -> None:
     if index.shards:
         raise ShardError(
-            f"{index.root}: holds shards already. To pack again, run `stereogenbench unpack`, and "
+            f"{index.where}: holds shards already. To pack again, run `stereogenbench unpack`, and "
             f"pass the folder that it made."
         )
     if "://" in index.root:
-        raise ShardError(f"{index.root}: is far away. Fetch the release, and pass its folder.")
+        raise ShardError(f"{index.where}: is far away. Fetch the release, and pass its folder.")
     if index.broken:
         names = ", ".join(sorted(index.broken)[:3])
         raise ShardError(
-            f"{index.root}: its index leaves out {len(index.broken)} broken scenes ({names}). "
+            f"{index.where}: its index leaves out {len(index.broken)} broken scenes ({names}). "
             f"Repair or remove them, and run `stereogenbench index` again."
         )
 

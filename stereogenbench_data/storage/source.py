@@ -19,6 +19,7 @@ from stereogenbench_data.storage.ranged_file import (
     require_crc32,
 )
 from stereogenbench_data.storage.remote import RemoteObject
+from stereogenbench_data.storage.retry import Patience
 
 UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
 """What no member's path may hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
@@ -75,6 +76,7 @@ class MemberSource:
         revision: str = "",
         cache: ShardCache | None = None,
         check: Literal["opened", "metadata"] = "metadata",
+        patience: Patience | None = None,
     ) -> None:
         """Prepare to read; nothing is opened yet.
 
@@ -86,12 +88,14 @@ class MemberSource:
             check: What is compared with its checksum. "opened": each member of a shard or of the
                 cache when this process first opens it, and one from a URL when its last byte
                 comes. "metadata": metadata files alone.
+            patience: How often to try a server, and how slow it may be; None for the defaults.
         """
         self._root = str(root)
         self._shards = shards
         self._revision = revision
         self._cache = cache
         self._check = check
+        self._patience = patience
         self._sound: set[tuple[str, int]] = set()
         self._objects: dict[str, RemoteObject] = {}
 
@@ -187,6 +191,7 @@ class MemberSource:
             self._objects[member.path] = RemoteObject(
                 joined(self._root, member.path),
                 expected_size=member.offset + member.size if shard is None else shard.size,
+                patience=self._patience,
             )
         return self._objects[member.path]
 

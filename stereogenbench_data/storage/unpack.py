@@ -20,6 +20,7 @@ from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
 from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.location import shown
 from stereogenbench_data.storage.pool import AfterBytes, run_tasks
 from stereogenbench_data.storage.ranged_file import MemberFile
 from stereogenbench_data.storage.source import open_local
@@ -65,6 +66,7 @@ def unpack(
     data: str | Path,
     out: str | Path,
     *,
+    root: str | Path | None = None,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> UnpackReport:
@@ -75,6 +77,7 @@ def unpack(
 
     Args:
         data: The folder of the shards, or its index file.
+        root: The folder of the shards, by your word, where an index file does not lie in it.
         out: Folder for the tree; made if need be.
         workers: Processes that work at the same time; None is one a core.
         progress: Called now and then with the bytes of members done, and all there are.
@@ -85,7 +88,7 @@ def unpack(
             else, another process unpacks into this folder, or it cannot be written.
         ExtraError: If blosc2 is needed and not installed.
     """
-    index = _opened(data)
+    index = _opened(data, root)
     scenes = [index.scene(row) for row in range(len(index))]
     out = Path(out)
     if out.resolve() == Path(index.root).resolve():
@@ -133,10 +136,10 @@ def unpack(
     )
 
 
-def _opened(data: str | Path) -> SceneIndex:
+def _opened(data: str | Path, root: str | Path | None) -> SceneIndex:
     if "://" in str(data):
-        raise ShardError(f"{data}: is far away. Fetch the shards, and pass their folder.")
-    index = SceneIndex.open(data)
+        raise ShardError(f"{shown(data)}: is far away. Fetch the shards, and pass their folder.")
+    index = SceneIndex.open(data, root=root)
     if not index.shards:
         raise ShardError(f"{data}: is a released tree already, and no folder of shards.")
     return index

@@ -12,6 +12,7 @@ from stereogenbench_data.errors import ShardError
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.storage.foreign_index import foreign_indexes
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
+from stereogenbench_data.storage.location import shown
 from stereogenbench_data.storage.pool import run_tasks
 from stereogenbench_data.storage.shard_writer import UNFINISHED
 from stereogenbench_data.storage.unfinished import PARTS
@@ -49,6 +50,7 @@ class VerifyReport:
 def verify(
     data: str | Path,
     *,
+    root: str | Path | None = None,
     mode: Literal["bytes", "decode"] = "bytes",
     workers: int | None = None,
     progress: Progress | None = None,
@@ -59,6 +61,7 @@ def verify(
 
     Args:
         data: The folder of the shards, or its index file.
+        root: The folder of the shards, by your word, where an index file does not lie in it.
         mode: "bytes" reads all bytes; "decode" then decodes all frames of all videos, too.
         workers: Processes that work at the same time; None is one a core.
         progress: Called now and then with the bytes done, and all there are; with "decode" those
@@ -67,7 +70,7 @@ def verify(
     Raises:
         StorageError: If there is no index, it is not one of shards, or a worker died.
     """
-    index = _opened(data)
+    index = _opened(data, root)
     expected = _expected_of(index)
     problems = list(_folder_problems(index, expected))
     checks = [each for each in expected.values() if Path(each.root, each.shard).is_file()]
@@ -89,7 +92,7 @@ def verify(
     for found in run_tasks(decode_scene, tasks, workers=workers, after_bytes=after_bytes):
         problems += found
     return VerifyReport(
-        root=index.root,
+        root=index.where,
         shards=len(expected),
         scenes=len(index),
         members=sum(len(each.members) for each in expected.values()),
@@ -99,9 +102,9 @@ def verify(
     )
 
 
-def _opened(data: str | Path) -> SceneIndex:
+def _opened(data: str | Path, root: str | Path | None) -> SceneIndex:
     if "://" in str(data):
-        raise ShardError(f"{data}: is far away. Fetch the shards, and pass their folder.")
+        raise ShardError(f"{shown(data)}: is far away. Fetch the shards, and pass their folder.")
     path = Path(data)
     if path.is_dir() and not (path / INDEX_NAME).is_file():
         begun = (path / PARTS).is_dir()
@@ -110,7 +113,7 @@ def _opened(data: str | Path) -> SceneIndex:
             + ("Packing was not finished: run `stereogenbench pack` again." if begun else
                "Point at a folder that `stereogenbench pack` made.")
         )  # fmt: skip
-    index = SceneIndex.open(path)
+    index = SceneIndex.open(path, root=root)
     if not index.shards:
         raise ShardError(
             f"{path}: is the index of a released folder, not of shards. Pack it with "
@@ -127,7 +130,7 @@ def _expected_of(index: SceneIndex) -> dict[str, ExpectedShard]:
         for name, member in scene.members.items():
             if member.path not in expected:
                 raise ShardError(
-                    f"{index.root}: its index places {scene.id.key}.{name} in {member.path} and "
+                    f"{index.where}: its index places {scene.id.key}.{name} in {member.path} and "
                     f"knows no such shard. The index was altered: fetch it again."
                 )
             expected[member.path].members[f"{scene.id.key}.{name}"] = member

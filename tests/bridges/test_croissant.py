@@ -228,3 +228,16 @@ def test_a_descriptor_that_cannot_be_written_says_where(index, tmp_path):
 
     with pytest.raises(DescriptorError, match=r"file/data: tables cannot be written"):
         write_descriptor(index, tmp_path / "file" / "data.json", publication=DAY)
+
+
+@pytest.mark.parametrize("name", ["data_url", "tables_url"])
+def test_no_login_is_published(small_shards, tmp_path, name):
+    publication = Publication(**{name: "https://me:word@host/data?key=word"})
+
+    with pytest.raises(
+        DescriptorError, match=r"^https://host/data: the URL has a login or a query"
+    ):
+        write_descriptor(
+            SceneIndex.open(small_shards), tmp_path / "a.json", publication=publication
+        )
+    assert list(tmp_path.iterdir()) == []

@@ -205,3 +205,17 @@ def test_the_command_writes_and_checks(small_shards, tmp_path):
     assert json.loads(checked.output)["problems"] == []
     assert found.exit_code == 1
     assert "rai:dataBiases: is missing" in found.output
+
+
+@pytest.mark.parametrize(
+    "place", ["/etc/passwd", "/x.tar", "~/x.tar", "../secret", "a\\b.tar", "c:x.tar", "\0.tar"]
+)
+def test_a_path_that_is_none_of_a_data_file_is_not_read(written, place):
+    document = json.loads(written.read_text())
+    first_tar(document)["contentUrl"] = place
+    written.write_text(json.dumps(document))
+
+    (told,) = [each for each in check_descriptor(written) if "contentUrl" in each]
+
+    assert f"has the contentUrl {place!r}, and a path must be relative and of a file" in told
+    assert "sha256" not in told

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 
 import imageio_ffmpeg
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from stereogenbench_data import (
     DepthEncoding,
     MediaError,
+    SceneIndex,
     SchemaError,
     StereoGenBenchError,
     StereoPairs,
@@ -329,3 +331,18 @@ def test_data_that_are_not_there_say_where_they_were_looked_for(tmp_path):
 def test_a_folder_inside_the_tree_is_answered_with_the_right_one(scene):
     with pytest.raises(StorageError, match=str(root_of(scene))):
         StereoPairs(root_of(scene) / "train")
+
+
+@pytest.mark.parametrize("size", [None, (32, 32)])
+def test_a_video_of_another_size_than_the_index_says_is_named(scene, size):
+    index = SceneIndex.open(root_of(scene))
+    row = index.scene(0)
+    rig = replace(row.rig, image_height_px=17)
+    altered = SceneIndex.from_scenes([replace(row, rig=rig)], root_of(scene))
+
+    for fields in (("left",), ("disparity",)):
+        pairs = StereoPairs(altered, fields=fields, size=size)
+        with pytest.raises(
+            MediaError, match=r"holds pictures of 64x64 pixels where the index says 64x17. The"
+        ):
+            pairs[0]

@@ -212,15 +212,15 @@ def test_nothing_outlives_a_pass_that_is_broken_off(pairs):
 
     next(iter(loader))
     files, threads = held()
-    for _ in range(20):
+    for _ in range(8):
         next(iter(loader))
 
     # Threads of queues end a moment after their queue.
     for _ in range(100):
-        if held()[0] < files + 20 and held()[1] <= threads + 2:
+        if held()[0] < files + 8 and held()[1] <= threads + 2:
             break
         time.sleep(0.05)
-    assert held()[0] < files + 20
+    assert held()[0] < files + 8
     assert held()[1] <= threads + 2
     assert not multiprocessing.active_children()
 

@@ -277,3 +277,40 @@ def test_a_shard_that_is_damaged_itself_is_told_with_its_checksum(shards_served,
 
     with pytest.raises(ShardError, match=r"have crc32 [0-9a-f]{8}, and the index says [0-9a-f]{8}"):
         pairs[0]
+
+
+def test_patience_is_set_where_data_are_opened_and_goes_to_the_workers(shards_served):
+    patience = Patience(attempts=1, first_wait_s=0.0, least_rate_bytes_s=77.0)
+    index = SceneIndex.open(shards_served.url, patience=patience)
+    pairs = StereoPairs(index, fields=("left",), family="IPD_Gaussian")
+    shards_served.always["train-IPD_Gaussian-000000.tar"] = Answer(status=503)
+
+    with pytest.raises(StorageError, match=r"503 Service Unavailable; 1 try\).*bytes_s=77 over"):
+        pairs[0]
+    with pytest.raises(StorageError, match=r"503 Service Unavailable; 1 try\).*bytes_s=77 over"):
+        list(DataLoader(pairs, num_workers=1))
+
+
+def test_a_shard_that_is_replaced_between_two_frames_is_told(shards_served):
+    name = "train-IPD_Gaussian-000000.tar"
+    shards_served.validators = {"ETag": '"a"'}
+    pairs = StereoPairs(
+        shards_served.url, fields=("left",), family="IPD_Gaussian", frames="all", check="metadata"
+    )
+    pairs[0]
+    whole = (shards_served.folder / name).read_bytes()
+    (shards_served.folder / name).write_bytes(whole[::-1])
+    shards_served.validators = {"ETag": '"b"'}
+    pairs.close()
+
+    with pytest.raises(ShardError, match=rf'{name}: was replaced .*its ETag was "a" and is "b"'):
+        pairs[1]
+
+
+def test_no_login_is_in_what_a_dataset_shows(shards_served):
+    pairs = StereoPairs(shards_served.url.replace("http://", "http://me:word@"), fields=("left",))
+
+    assert "word" not in repr(pairs)
+    assert repr(pairs).endswith(f"{shards_served.url}>")
+    assert "authorization" in shards_served.asked[-1].headers
+    pairs.close()

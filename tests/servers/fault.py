@@ -45,7 +45,9 @@ class Answer:
 class FaultServer(ThreadingHTTPServer):
     """Serves ``folder``; ``answers`` are used up in order, one a request, then all goes well.
 
-    ``always`` is used for every request whose path it is given for.
+    ``always`` is used for every request whose path it is given for. ``validators`` are sent with
+    every file; a request whose If-Range is none of them is answered with the whole file, as long as
+    ``honours_if_range``.
     """
 
     daemon_threads = True
@@ -56,6 +58,8 @@ class FaultServer(ThreadingHTTPServer):
         self.asked: list[Asked] = []
         self.answers: list[Answer] = []
         self.always: dict[str, Answer] = {}
+        self.validators: dict[str, str] = {}
+        self.honours_if_range = True
         self.connections = 0
         self.alive: set[Any] = set()
         self.lock = threading.Lock()
@@ -116,6 +120,9 @@ class FileHandler(BaseHTTPRequestHandler):
             return
         whole = path.read_bytes()
         found = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
+        condition = self.headers.get("If-Range")
+        if condition and self.server.honours_if_range:
+            found = found if condition in self.server.validators.values() else None
         start, stop = 0, len(whole)
         if found and not answer.whole:
             start = int(found[1])
@@ -135,6 +142,8 @@ class FileHandler(BaseHTTPRequestHandler):
         if found and not answer.whole:
             told = answer.content_range or f"bytes {start}-{start + len(body) - 1}/{size}"
             self.send_header("Content-Range", told)
+        for key, value in self.server.validators.items():
+            self.send_header(key, value)
         self.send_header("Content-Length", str(len(body)))
         self.end_headers()
         self.wfile.write(cut)

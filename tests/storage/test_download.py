@@ -1,6 +1,7 @@
 """Downloading a part of a release: only what is asked for, checked, gone on with, usable."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -188,3 +189,38 @@ def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(
     assert done.exit_code == 0, done.output
     assert len(StereoPairs(dest, pairs="all")) == 4 * 15
     assert not list(dest.rglob("*.part"))
+
+
+def linked(small_release, root, target):
+    """A copy of the data of which a rig is a link to a file of equal size."""
+    shutil.copytree(small_release, root)
+    index = SceneIndex.open(root)
+    rig = root / index.scene(0).members["baseline.json"].path
+    target.parent.mkdir(parents=True, exist_ok=True)
+    rig.rename(target)
+    rig.symlink_to(target)
+    return root
+
+
+def test_a_link_out_of_the_data_is_not_copied(small_release, tmp_path):
+    root = linked(small_release, tmp_path / "data", tmp_path / "secret")
+
+    with pytest.raises(
+        StorageError, match=rf"baseline.json: is a link to {tmp_path}/secret, outside the data"
+    ):
+        fetched(root, tmp_path / "part")
+    place = SceneIndex.open(root).scene(0).members["baseline.json"].path
+    assert not (tmp_path / "part" / place).exists()
+
+
+@pytest.mark.parametrize(
+    ("root", "target"), [("data", "data/else/x"), ("a/snapshots/0123", "a/blobs/4567")]
+)
+def test_a_link_within_the_data_is_copied(small_release, tmp_path, root, target):
+    linked(small_release, tmp_path / root, tmp_path / target)
+
+    fetched(tmp_path / root, tmp_path / "part")
+
+    for path in (tmp_path / "part").rglob("baseline.json"):
+        here = path.relative_to(tmp_path / "part")
+        assert path.read_bytes() == (small_release / here).read_bytes()

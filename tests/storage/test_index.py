@@ -1,5 +1,6 @@
 """The index: the same rows in memory, on disk and in another process."""
 
+import base64
 import contextlib
 import dataclasses
 import json
@@ -8,6 +9,7 @@ import random
 import shutil
 import warnings
 
+import fsspec.core
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -18,7 +20,9 @@ from hypothesis import strategies as st
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
 from stereogenbench_data.storage import index as index_module
+from stereogenbench_data.storage.digest import table_digest
 from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
+from stereogenbench_data.storage.source import MemberSource
 
 METADATA = b"stereogenbench_data.index"
 
@@ -310,9 +314,10 @@ def test_an_index_behind_a_url_that_is_far_too_large_is_not_fetched(web, monkeyp
 
 
 def test_an_index_kept_elsewhere_remembers_a_url(scenes, tmp_path, web):
-    SceneIndex.from_scenes(scenes, web.url).write(tmp_path / "kept.parquet")
+    SceneIndex.from_scenes(scenes, "s3://bucket/data").write(tmp_path / "kept.parquet")
 
-    assert SceneIndex.open(tmp_path / "kept.parquet").root == web.url
+    assert SceneIndex.open(tmp_path / "kept.parquet").root == "s3://bucket/data"
+    assert SceneIndex.open(tmp_path / "kept.parquet", root=web.url).root == web.url
 
 
 def test_an_index_behind_a_url_cannot_send_its_readers_elsewhere(scenes, web):
@@ -322,10 +327,17 @@ def test_an_index_behind_a_url_cannot_send_its_readers_elsewhere(scenes, web):
 
 
 def test_no_secret_is_written_into_an_index(scenes, tmp_path):
-    index = SceneIndex.from_scenes(scenes, "https://me:word@host/data?key=secret")
+    for root, told in (
+        ("https://me:word@host/data?key=secret", "https://host/data"),
+        ("s3://key:word@bucket/data", "s3://bucket/data"),
+        ("zip://data::http://me:word@host/a.zip", "zip://data::http://host/a.zip"),
+    ):
+        index = SceneIndex.from_scenes(scenes, root)
 
-    with pytest.raises(StorageError, match=r"https://host/data: the URL has a login or a query"):
-        index.write(tmp_path / "kept.parquet")
+        assert index.where == told
+        with pytest.raises(StorageError, match=f"{told}: the URL has a login or a query"):
+            index.write(tmp_path / "kept.parquet")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_index_in_its_root_moves_with_it(scenes, tmp_path):
@@ -336,11 +348,203 @@ def test_an_index_in_its_root_moves_with_it(scenes, tmp_path):
     assert SceneIndex.open(tmp_path / "new").root == str(tmp_path / "new")
 
 
-def test_an_index_elsewhere_remembers_its_root(scenes, tmp_path):
+def test_an_index_above_its_data_remembers_where_they_are(scenes, tmp_path):
     (tmp_path / "data").mkdir()
-    SceneIndex.from_scenes(scenes, tmp_path / "data").write(tmp_path / "a" / "index.parquet")
+    SceneIndex.from_scenes(scenes, tmp_path / "data").write(tmp_path / "index.parquet")
 
-    assert SceneIndex.open(tmp_path / "a" / "index.parquet").root == str(tmp_path / "data")
+    assert SceneIndex.open(tmp_path / "index.parquet").root == str(tmp_path / "data")
+
+
+def test_an_index_elsewhere_opens_once_the_user_says_where_its_data_are(scenes, tmp_path):
+    (tmp_path / "data").mkdir()
+    kept = tmp_path / "a" / "index.parquet"
+    SceneIndex.from_scenes(scenes, tmp_path / "data").write(kept)
+
+    with pytest.raises(
+        StorageError,
+        match=rf"{kept}: its data are not beside it, and it records their root as {tmp_path}/data. "
+        r"A file may not choose such a place \(it is outside the index's own folder\). If you "
+        rf"trust it, name the root yourself: SceneIndex.open\('{kept}', root=...\), or --root",
+    ):
+        SceneIndex.open(kept)
+    for root in (tmp_path / "data", str(tmp_path / "data"), (tmp_path / "data").as_uri()):
+        assert SceneIndex.open(kept, root=root).root == str(tmp_path / "data")
+    kept.rename(tmp_path / "data" / "index.parquet")
+    assert SceneIndex.open(tmp_path / "data", root=tmp_path / "a").root == str(tmp_path / "a")
+
+
+def test_a_root_that_is_no_folder_is_refused(scenes, tmp_path):
+    path = written(scenes, tmp_path)
+    (tmp_path / "tree").mkdir()
+
+    for root in (tmp_path / "gone", path, ""):
+        with pytest.raises(StorageError, match=r"is no folder, and was named as the root"):
+            SceneIndex.open(path, root=root)
+    with pytest.raises(StorageError, match=r"tree: has no index.parquet, and a root was named"):
+        SceneIndex.open(tmp_path / "tree", root=tmp_path)
+
+
+def recording(scenes, path, root):
+    """Write an index that records a root, whatever it is."""
+    path.parent.mkdir(exist_ok=True)
+    SceneIndex.from_scenes(scenes, path.parent).write(path)
+    altered(path, lambda table, head: head.update(root=root))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("root", "reason"),
+    [
+        ("reference://x::data:application/json;base64,e30=", "it is a chain of file systems"),
+        ("hf://datasets/a/b::https://example.org", "it is a chain of file systems"),
+        ("hf://a[::http://127.0.0.1/x]", "it is a chain of file systems"),
+        ("simplecache::https://example.org/x", "it is a chain of file systems"),
+        ("local:///etc", "it is none of https://, http://, hf://, s3://"),
+        ("memory://x", "it is none of https://, http://, hf://, s3://"),
+        ("ssh://example.org/x", "it is none of https://, http://, hf://, s3://"),
+        ("file:///etc", "it is outside the index's own folder"),
+        ("FILE:///etc", "it is outside the index's own folder"),
+        ("/etc", "it is outside the index's own folder"),
+        ("../other", "it is outside the index's own folder"),
+        ("link", "it is outside the index's own folder"),
+        ("a\0b", "it is outside the index's own folder"),
+        ("https://me:word@example.org/x", "it holds a login, a query, or"),
+        ("s3://key:word@bucket/x", "it holds a login, a query, or"),
+        ("https://example.org/x?key=word", "it holds a login, a query, or"),
+        ("https://example.org\\@127.0.0.1/x", "it holds a login, a query, or"),
+        ("https://example.org/\x1b[31m", "it holds a login, a query, or"),
+        ("http://[::1", "it is no URL"),
+        ("http://127.0.0.1/x", "it is on this machine or in its own network"),
+        ("HTTPS://127.0.0.1/x", "it is on this machine or in its own network"),
+        ("http://localhost:8000/x", "it is on this machine or in its own network"),
+        ("http://2130706433/x", "it is on this machine or in its own network"),
+        ("http://0x7f.1/x", "it is on this machine or in its own network"),
+        ("http://127%2e0.0.1/x", "it is on this machine or in its own network"),
+        ("http://[::1]/x", "it is on this machine or in its own network"),
+        ("http://[::ffff:10.1.2.3]/x", "it is on this machine or in its own network"),
+        ("http://[64:ff9b::7f00:1]/x", "it is on this machine or in its own network"),
+        ("https://10.1.2.3/x", "it is on this machine or in its own network"),
+        ("http://169.254.169.254/latest", "it is on this machine or in its own network"),
+    ],
+)
+def test_a_file_may_not_choose_what_is_opened(scenes, tmp_path, monkeypatch, root, reason):
+    monkeypatch.setattr(fsspec.core, "url_to_fs", None)
+    (tmp_path / "other").mkdir()
+    path = recording(scenes, tmp_path / "a" / "index.parquet", root)
+    (tmp_path / "a" / "link").symlink_to(tmp_path / "other")
+
+    with pytest.raises(StorageError, match=r"A file may not choose such a place \(") as caught:
+        SceneIndex.open(path)
+    message = str(caught.value)
+    assert f"({reason}" in message
+    assert not any(secret in message for secret in ("word", "\x1b", "\0"))
+
+    # Data beside the index come first, whatever it records.
+    place = tmp_path / "a" / scenes[0].members["baseline.json"].path
+    place.parent.mkdir(parents=True)
+    place.write_bytes(b"")
+    assert SceneIndex.open(path).root == str(tmp_path / "a")
+
+
+@pytest.mark.parametrize("address", ["10.1.2.3", "127.0.0.1", "fd00::1", "::ffff:192.168.0.1"])
+def test_a_name_of_the_own_network_is_not_opened_on_a_files_word(
+    scenes, tmp_path, monkeypatch, address
+):
+    found = [(0, 0, 0, "", ("8.8.8.8", 0)), (0, 0, 0, "", (address, 0))]
+    monkeypatch.setattr("socket.getaddrinfo", lambda *asked, **how: found)
+    path = recording(scenes, tmp_path / "index.parquet", "https://files.example.org/x")
+
+    with pytest.raises(StorageError, match=r"it is on this machine or in its own network"):
+        SceneIndex.open(path)
+
+
+@pytest.mark.parametrize(
+    "root",
+    ["https://8.8.8.8/x", "hf://datasets/a/b@main/x", "s3://bucket/a", "https://[2606:4700::1]/x"],
+)
+def test_a_plain_url_of_a_store_is_opened_on_a_files_word(scenes, tmp_path, root):
+    assert SceneIndex.open(recording(scenes, tmp_path / "index.parquet", root)).root == root
+
+
+def test_a_chain_that_runs_commands_is_not_opened(scenes, tmp_path, monkeypatch):
+    template = "{{ cycler.__init__.__globals__.os.system('touch RAN') }}"
+    members = [member.path for member in scenes[0].members.values()]
+    references = {"version": 1, "templates": {"u": template}, "refs": {}}
+    references["refs"] = {path: ["{{u}}", 0, 1] for path in members}
+    coded = base64.b64encode(json.dumps(references).encode()).decode()
+    root = f"reference://x::data:application/json;base64,{coded}"
+    monkeypatch.chdir(tmp_path)
+    path = recording(scenes, tmp_path / "index.parquet", root)
+    for member in members:
+        (tmp_path / member).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / member).write_bytes(b"")
+
+    index = SceneIndex.open(path)
+    source = MemberSource(index.root, shards=index.shards)
+    with pytest.raises(StorageError, match=r"has 0 bytes, and the index says"):
+        source.open(index.scene(0), "cam_00_rgb.mp4")
+    assert not (tmp_path / "RAN").exists()
+
+
+def with_row(**values):
+    def change(rows):
+        rows[2].update(values)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (with_row(image_height_px=0), "image_height_px is 0, not 1 to 65536"),
+        (with_row(image_width_px=2**40), "image_width_px is 1099511627776, not 1 to 65536"),
+        (with_row(frames=-3), "frames is -3, not 1 to"),
+        (with_row(focal_mm=float("nan")), "focal_mm is nan, not"),
+        (with_row(sensor_width_mm=float("inf")), "sensor_width_mm is inf, not"),
+        (with_row(baselines_cm=[float("nan")] * 15), "baselines_cm is nan, not"),
+        (with_row(baselines_cm=[-1.0] * 15), "baselines_cm is -1.0, not"),
+        (with_row(lateral_m=[float("inf")] * 6), "lateral_m is inf, not"),
+        (with_row(rig_residual_px=float("nan")), "rig_residual_px is nan, not 0 to inf"),
+        (with_row(depth_unit_m=[0.0] * 6), "depth_unit_m is 0.0, not"),
+        (with_row(depth_unit_source=["guess"] * 6), "depth_unit_source is 'guess', none of tag"),
+        (with_row(primary_left=6), "primary_left is 6, not 0 to 5"),
+        (with_row(primary_left=1, primary_right=1), "a primary pair has one camera twice"),
+        (with_row(split="test"), "split is 'test', none of train, eval"),
+        (with_row(subset="some"), "subset is 'some', none of seen_map, unseen_map, None"),
+        (with_row(family="a/b"), "family is 'a/b', no name of a folder"),
+        (with_row(map_name="\x1b[31m"), r"map_name is .*, no name of a folder"),
+        (
+            with_row(principal_x_px=3.0, principal_y_px=None),
+            "a principal point has one number",
+        ),
+        (with_row(valid_depth_ratio=float("nan")), "valid_depth_ratio is nan, not 0 to 1"),
+        (lambda rows: rows[1]["members"][0].update(size=-1), "size is -1, not 0 to"),
+        (lambda rows: rows[1]["members"][0].update(offset=2**62), "offset is 4611686018427387904"),
+    ],
+)
+def test_a_value_that_no_scene_has_is_refused_though_the_digest_is_right(
+    scenes, tmp_path, change, match
+):
+    def edit(table, head):
+        rows = table.to_pylist()
+        change(rows)
+        table = pa.Table.from_pylist(rows, schema=table.schema)
+        head["digest"] = table_digest(table.replace_schema_metadata())
+        return table
+
+    path = written(scenes, tmp_path)
+    altered(path, edit)
+
+    with pytest.raises(StorageError, match=rf"index.parquet: {match}"):
+        SceneIndex.open(path)
+
+
+def test_reasons_that_are_no_texts_are_refused(scenes, tmp_path):
+    path = written(scenes, tmp_path)
+    altered(path, lambda table, head: head.update(incomplete={"a": 3}))
+
+    with pytest.raises(StorageError, match="its description of itself was altered"):
+        SceneIndex.open(path)
 
 
 def test_an_index_whose_root_is_gone_says_where_it_was(scenes, tmp_path):

@@ -7,6 +7,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.cli.index import index
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.storage import walk as walk_module
@@ -16,10 +17,10 @@ from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
 @pytest.fixture
 def run():
     """Run the command; several commands in one app, as the real one has."""
-    app = typer.Typer()
-    app.command()(index)
-    app.command("other")(lambda: None)
-    return lambda *words: CliRunner().invoke(app, ["index", *map(str, words)])
+    alone = typer.Typer()
+    alone.command()(index)
+    alone.command("other")(lambda: None)
+    return lambda *words: CliRunner().invoke(alone, ["index", *map(str, words)])
 
 
 def test_a_whole_tree_is_indexed_in_its_root(make_scene, root, run):
@@ -38,11 +39,34 @@ def test_an_index_may_lie_elsewhere(make_scene, root, run, tmp_path):
 
     result = run(root, "-o", tmp_path / "made" / "a.parquet", "--workers", "1", "--valid-depth")
 
-    opened = SceneIndex.open(tmp_path / "made" / "a.parquet")
+    opened = SceneIndex.open(tmp_path / "made" / "a.parquet", root=root)
+    assert f"root='{root}'), or with --root {root}" in result.stderr
     assert result.exit_code == 0
     assert opened.root == str(root)
     assert opened.column("valid_depth_ratio")[0] == pytest.approx(23 / 24)
     assert [path.name for path in (tmp_path / "made").iterdir()] == ["a.parquet"]
+
+
+def test_an_address_with_a_login_is_not_indexed(run, tmp_path):
+    result = run("s3://key:word@bucket/data", "-o", tmp_path / "a.parquet")
+
+    assert isinstance(result.exception, StorageError)
+    assert "s3://bucket/data: the URL has a login or a query" in str(result.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_commands_take_the_root_of_an_index_elsewhere(small_release, tmp_path):
+    kept = tmp_path / "kept.parquet"
+    SceneIndex.open(small_release).write(kept)
+    told = ["stats", str(kept), "--json"]
+
+    refused = CliRunner().invoke(app, told)
+    taken = CliRunner().invoke(app, [*told, "--root", str(small_release)])
+
+    assert refused.exit_code == 2
+    assert "or --root with a command" in refused.stderr
+    assert taken.exit_code == 0
+    assert json.loads(taken.stdout)["root"] == str(small_release)
 
 
 def test_incomplete_scenes_are_listed_and_not_fatal(make_scene, root, run):

@@ -1,19 +1,25 @@
 """Ranges from real servers of each kind: nginx, an S3 endpoint, and a Hub for its own client."""
 
+import io
 import os
 import sys
+import threading
 from pathlib import Path
+from typing import ClassVar
 
 import fsspec
 import pytest
 
 from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.storage import filesystems
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.remote import RemoteObject
 from stereogenbench_data.storage.retry import Patience
 from stereogenbench_data.storage.source import read_range, size_of
 from tests.servers.fault import Answer
-from tests.servers.hub import COMMIT, REPOSITORY
+from tests.servers.fixtures import BUCKET
+from tests.servers.hub import COMMIT, REPOSITORY, HubHandler
+from tests.servers.tools import require_module
 
 
 def shard_of(folder: Path) -> Path:
@@ -144,6 +150,79 @@ def test_a_shard_of_another_size_in_a_store_is_told(s3, small_shards):
 
     with pytest.raises(ShardError, match=r"tar: has \d+ bytes, and the index says 5. The index"):
         RemoteObject(url, expected_size=5).read(0, 3)
+
+
+def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_told(s3):
+    boto = require_module("boto3")
+    store = boto.client(
+        "s3", endpoint_url=fsspec.config.conf["s3"]["endpoint_url"], region_name="us-east-1",
+        aws_access_key_id="key", aws_secret_access_key="word",
+    )  # fmt: skip
+    store.put_object(Bucket=BUCKET, Key="shards/changing.tar", Body=b"0" * 1000)
+    remote = RemoteObject(f"{s3}/changing.tar", patience=Patience(attempts=1))
+    assert remote.read(0, 9) == b"0" * 9
+    store.put_object(Bucket=BUCKET, Key="shards/changing.tar", Body=b"1" * 1000)
+
+    with pytest.raises(ShardError, match=r"changing.tar: was replaced in its store while it was"):
+        remote.read(9, 18)
+    assert RemoteObject(f"{s3}/changing.tar").read(9, 18) == b"1" * 9
+    store.delete_object(Bucket=BUCKET, Key="shards/changing.tar")
+    store.close()
+
+
+def test_what_is_read_of_a_branch_of_the_hub_is_of_one_commit(hub, small_shards):
+    url = f"hf://datasets/{REPOSITORY}@main/{shard_of(small_shards).name}"
+    remote = RemoteObject(url)
+    paths = []
+
+    class Listening(HubHandler):
+        def parse_request(self):
+            parsed = super().parse_request()
+            paths.append(self.path)
+            return parsed
+
+    hub.RequestHandlerClass = Listening
+    filesystems._commits.clear()
+    remote.read(0, 9)
+
+    asked = [path for path in paths if "/resolve/" in path]
+    assert asked
+    assert all(f"/resolve/{COMMIT}/" in path for path in asked)
+
+
+def test_a_file_system_that_does_not_come_back_is_left(monkeypatch):
+    files = fsspec.filesystem("memory")
+    files.pipe_file("/shard.tar", b"0123456789")
+    done = threading.Event()
+    monkeypatch.setattr(files, "open", lambda *args, **how: done.wait())
+    remote = RemoteObject("memory://shard.tar", patience=Patience(longest_read_s=0.2))
+
+    with pytest.raises(StorageError, match=r"a read may take 0.2 s; 1 try\).*longest_read_s=0.2"):
+        remote.read(0, 9)
+    done.set()
+    files.rm("/shard.tar")
+
+
+def test_a_file_that_a_file_system_tells_otherwise_is_told_as_replaced(monkeypatch):
+    files = fsspec.filesystem("memory")
+    files.pipe_file("/shard.tar", b"0123456789")
+    tags = iter("aab")
+
+    class Tagged(io.BytesIO):
+        details: ClassVar = {}
+
+    def opened(path, *args, **how):
+        file = Tagged(b"0123456789")
+        file.details = {"ETag": next(tags), "size": 10}
+        return file
+
+    monkeypatch.setattr(files, "open", opened)
+    remote = RemoteObject("memory://shard.tar", patience=Patience(attempts=1))
+
+    assert remote.read(0, 3) + remote.read(3, 6) == b"012345"
+    with pytest.raises(ShardError, match=r"was replaced in its store .*: its ETag was a and is b"):
+        remote.read(6, 9)
+    files.rm("/shard.tar")
 
 
 def test_a_file_system_that_fails_is_asked_again(monkeypatch):

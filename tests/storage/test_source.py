@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from stereogenbench_data.errors import SchemaError, ShardError, StorageError
+from stereogenbench_data import errors
+from stereogenbench_data.errors import SchemaError, ShardError, StereoGenBenchError, StorageError
 from stereogenbench_data.schema.records import Member, ShardFacts
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.location import is_remote, joined, local_path, shown, split_name
@@ -211,11 +212,69 @@ def test_a_path_is_joined_to_a_root(root, expected):
     assert joined(root, "b c/x.tar") == expected
 
 
+def test_a_name_cannot_make_a_chain_of_a_root():
+    with pytest.raises(StorageError, match=r"s3://b: holds 'a::local:', and a name with '::' in"):
+        joined("s3://b", "a::local:")
+
+
 def test_what_is_secret_in_a_url_is_not_shown():
     assert shown("https://me:word@h:1/a/x.tar?key=1#2") == "https://h:1/a/x.tar"
     assert shown("hf://datasets/org/name@main/x.tar") == "hf://datasets/org/name@main/x.tar"
     assert shown("s3://bucket/a") == "s3://bucket/a"
     assert shown("a?b") == "a?b"
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("s3://K:PW@b/x", "s3://b/x"),
+        ("ftp://u:PW@h/x", "ftp://h/x"),
+        ("HTTP://u:PW@h", "HTTP://h"),
+        ("simplecache::https://u:PW@h/x?token=PW", "simplecache::https://h/x"),
+        ("zip://a::http://u:PW@h/z#PW", "zip://a::http://h/z"),
+        ("zip://a.*::simplecache::https://u:PW@h", "zip://a.*::simplecache::https://h"),
+        ("http://u:P/PW@h/x", "http://h/x"),
+        ("http://u:P?PW@h/x", "http://h/x"),
+        ("http://u:P@PW@h/x", "http://h/x"),
+        ("http://u::PW@h/x", "http://h/x"),
+        ("http://u:PW@[::1/x", "http://[::1/x"),
+        ("http://[::1]:80/x", "http://[::1]:80/x"),
+        ("http:////u:PW@h/x", "http:////h/x"),
+        ("hf://u:PW@datasets/a/b@main", "hf://datasets/a/b@main"),
+        ("https://h/x?X-Amz-Signature=PW", "https://h/x"),
+    ],
+)
+def test_no_login_and_no_query_of_any_link_of_a_chain_is_shown(url, told):
+    assert shown(url) == told
+    assert str(StorageError(f"{url}: is there; see '{url}'.")).count("PW") == 0
+
+
+def test_a_url_given_as_a_path_shows_no_login():
+    with pytest.raises(StorageError, match=r"http:/h/x does not exist") as caught:
+        SceneIndex.open(Path("http://u:PW@h/x?key=PW"))
+    assert "PW" not in str(caught.value)
+
+
+def test_every_error_is_made_of_one_text_that_shows_no_login():
+    kinds = [each for each in vars(errors).values() if isinstance(each, type)]
+    kinds = [each for each in kinds if issubclass(each, StereoGenBenchError)]
+
+    for kind in kinds:
+        error = pickle.loads(pickle.dumps(kind("s3://K:PW@b/x: is gone.")))
+        assert type(error) is kind
+        assert error.args == ("s3://b/x: is gone.",)
+    assert len(kinds) > 10
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["http://u:PW@[::1/x", "http://u:PW@h:99999/x", "http://u:PW@h:\u00b2/x", "http://u:PW@/x",
+     "http://u:PW@h..h/x"],
+)  # fmt: skip
+def test_a_url_that_is_none_is_named_without_its_login(url):
+    with pytest.raises(StorageError, match=r"is no URL: correct it") as caught:
+        SceneIndex.open(url)
+    assert "PW" not in str(caught.value)
 
 
 def test_a_file_url_is_a_path_of_this_machine(tmp_path):

@@ -429,7 +429,7 @@ def test_a_released_folder_is_not_shards(small_release, tmp_path):
     SceneIndex.open(small_release).write(tmp_path / "index.parquet")
 
     with pytest.raises(ShardError, match="is the index of a released folder, not of shards"):
-        verify(tmp_path)
+        verify(tmp_path, root=small_release)
 
 
 def test_far_shards_are_to_be_fetched(tmp_path):
