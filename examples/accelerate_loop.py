@@ -2,8 +2,8 @@
 
 accelerate launch examples/accelerate_loop.py [SHARDS]
 
-The loader shares batches among the ranks itself: prepare the network and the optimiser, not the
-loader, and move each batch to the device.
+Prepare the loader like the rest: it shares batches among the ranks by itself, gives them on the
+accelerator's device, and its position is part of the saved state.
 """
 
 import sys
@@ -11,7 +11,6 @@ from pathlib import Path
 
 import torch
 from accelerate import Accelerator
-from accelerate.utils import send_to_device
 from torch import nn
 
 from stereogenbench_data import StereoPairs
@@ -22,16 +21,12 @@ SHARDS = Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parents[1] / 
 def main() -> None:
     accelerator = Accelerator()
     pairs = StereoPairs(SHARDS, split="train", pairs="adjacent", frames=("every", 20))
-    loader = pairs.loader(
-        batch_size=4, seed=0, rank=accelerator.process_index, world_size=accelerator.num_processes
-    )
+    loader = pairs.loader(batch_size=4, seed=0)
     network = nn.Conv2d(6, 1, 5, padding=2)
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-3)
-    network, optimiser = accelerator.prepare(network, optimiser)
+    network, optimiser, loader = accelerator.prepare(network, optimiser, loader)
     for epoch in range(loader.epoch, 2):
-        loader.set_epoch(epoch)
         for batch in loader:
-            batch = send_to_device(batch, accelerator.device)
             views = torch.cat([batch["left"], batch["right"]], dim=1).float() / 255
             error = (network(views) - batch["disparity"]).abs()[batch["valid"]].mean()
             optimiser.zero_grad()

@@ -32,7 +32,6 @@ def main() -> None:
         optimiser.load_state_dict(state["optimiser"])
         loader.load_state_dict(state["loader"])
     for epoch in range(loader.epoch, 2):
-        loader.set_epoch(epoch)
         for number, batch in enumerate(loader):
             views = torch.cat([batch["left"], batch["right"]], dim=1).float() / 255
             error = (network(views) - batch["disparity"]).abs()[batch["valid"]].mean()

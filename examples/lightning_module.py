@@ -23,9 +23,7 @@ class StereoData(LightningDataModule):
         self.eval = StereoPairs(SHARDS, split="eval", frames=("every", 40))
 
     def train_dataloader(self) -> PairsLoader:
-        loader = self.train.loader(batch_size=8, seed=0)
-        loader.set_epoch(self.trainer.current_epoch)
-        return loader
+        return self.train.loader(batch_size=8, seed=0)
 
     def val_dataloader(self) -> PairsLoader:
         return self.eval.loader(batch_size=8, order="sequential", tail="uneven")
@@ -52,8 +50,8 @@ class Network(LightningModule):
 
 if __name__ == "__main__":
     trainer = Trainer(
-        max_epochs=1, reload_dataloaders_every_n_epochs=1, use_distributed_sampler=False,
-        accelerator="auto", logger=False, enable_checkpointing=False, enable_model_summary=False,
+        max_epochs=1, accelerator="auto", logger=False, enable_checkpointing=False,
+        enable_model_summary=False,
     )  # fmt: skip
     trainer.fit(Network(), datamodule=StereoData())
     print(f"error {trainer.callback_metrics['error_px']:.2f} px")
