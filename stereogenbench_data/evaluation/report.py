@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import StorageError, cure_of
 from stereogenbench_data.evaluation.aggregate import PairMeans
 from stereogenbench_data.evaluation.predictions import pair_name
 from stereogenbench_data.evaluation.reference import DISCREPANCIES, PAPER
@@ -110,8 +110,8 @@ def write_report(
             write_whole(folder / name, text.encode())
     except OSError as error:
         raise StorageError(
-            f"{folder}: the report cannot be written ({error.strerror or error}). Choose another "
-            f"folder with --out."
+            f"{folder}: the report cannot be written ({error.strerror or error}). "
+            + cure_of(error, "Choose another folder with --out.")
         ) from error
     files = [folder / name for name in written]
     if plots == "skip":

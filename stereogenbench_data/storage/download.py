@@ -13,18 +13,23 @@ from pathlib import Path
 from threading import Event
 from typing import Final
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import StorageError, cure_of
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import METADATA_FILES
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
 from stereogenbench_data.storage.location import is_remote, joined, local_path
 from stereogenbench_data.storage.remote import RemoteObject
 from stereogenbench_data.storage.source import open_local
+from stereogenbench_data.storage.unfinished import writing_whole
 
 Progress = Callable[[int, int], None]
 
 _CHUNK: Final = 1024 * 1024
 _SPARE_BYTES: Final = 16 * 1024 * 1024
+
+
+class _Stopped(Exception):
+    """Another file failed, so this one is not fetched to its end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +177,7 @@ def _require_room(dest: Path, needed: int) -> None:
         dest.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(dest).free
     except OSError as error:
-        raise StorageError(f"{dest}: cannot be written ({error.strerror}).") from error
+        raise StorageError(_why_not_written(dest, error)) from error
     if needed + _SPARE_BYTES > free:
         raise StorageError(
             f"{dest}: {needed} bytes are to come, and the disk has room for {free}. Take fewer "
@@ -180,31 +185,39 @@ def _require_room(dest: Path, needed: int) -> None:
         )
 
 
+def _why_not_written(place: Path, error: OSError) -> str:
+    cure = cure_of(error, "Choose another folder.")
+    return f"{place}: cannot be written ({error.strerror or error}). {cure}"
+
+
 def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> None:
     place = dest / wanted.key / wanted.name
-    part = place.with_name(f".{wanted.name}.part")
     member = wanted.member
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         crc32 = 0
-        with part.open("wb") as file:
-            for data in _chunks(index, member):
-                if stop.is_set():
-                    return
+        with writing_whole(place) as file:
+            for data in _until(stop, _chunks(index, member)):
                 file.write(data)
                 crc32 = zlib.crc32(data, crc32)
-        if member.crc32 not in (None, crc32):
-            raise StorageError(
-                f"{wanted.key}/{wanted.name}: came with crc32 {crc32:08x}, and the index says "
-                f"{member.crc32:08x}. The source is damaged, or not the one that was indexed."
-            )
-        part.replace(place)
+            if member.crc32 not in (None, crc32):
+                raise StorageError(
+                    f"{wanted.key}/{wanted.name}: came with crc32 {crc32:08x}, and the index says "
+                    f"{member.crc32:08x}. The source is damaged, or not the one that was indexed."
+                )
+    except _Stopped:
+        return
     except OSError as error:
         if isinstance(error, StorageError):
             raise
-        raise StorageError(f"{place}: cannot be written ({error.strerror}).") from error
-    finally:
-        part.unlink(missing_ok=True)
+        raise StorageError(_why_not_written(place, error)) from error
+
+
+def _until(stop: Event, chunks: Iterator[bytes]) -> Iterator[bytes]:
+    for data in chunks:
+        if stop.is_set():
+            raise _Stopped
+        yield data
 
 
 def _chunks(index: SceneIndex, member: Member) -> Iterator[bytes]:

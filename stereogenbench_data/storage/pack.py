@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereogenbench_data.errors import ShardError
+from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.media.depth_frame_file import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES
@@ -159,8 +159,8 @@ def prepare(
         if isinstance(error, ShardError):
             raise
         raise ShardError(
-            f"{out}: cannot be written to ({error.strerror or error}). Give write permission, or "
-            f"pack into another folder."
+            f"{out}: cannot be written to ({error.strerror or error}). "
+            + cure_of(error, "Pack into another folder.")
         ) from error
     return job
 
@@ -203,8 +203,9 @@ def finish(job: PackJob, *, packed: list[str]) -> PackReport:
             require_same_rows(task, note)
         shards = {name: found for name, found in done.items() if found is not None}
         index = packed_index(job, shards)
-        index.write(target)
+        # The index comes last: where there is one, everything is.
         write_foreign_indexes(index, out=job.out)
+        index.write(target)
     part = tuple(shard.name for shard in job.shards)
     return PackReport(part, tuple(name for name in part if name in packed), missing, target)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.errors import ShardError, StorageError, cure_of
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.storage.cache import ShardCache
@@ -38,7 +38,9 @@ def size_of(location: str | Path) -> int:
     try:
         return path.stat().st_size
     except OSError as error:
-        raise StorageError(f"{path}: cannot be read ({error.strerror}). Fetch it again.") from error
+        raise StorageError(
+            f"{path}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
+        ) from error
 
 
 def read_range(location: str | Path, start: int, stop: int) -> bytes:
@@ -56,7 +58,9 @@ def read_range(location: str | Path, start: int, stop: int) -> bytes:
     except StorageError:
         raise
     except OSError as error:
-        raise StorageError(f"{path}: cannot be read ({error.strerror}). Fetch it again.") from error
+        raise StorageError(
+            f"{path}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
+        ) from error
 
 
 class MemberSource:
@@ -216,7 +220,9 @@ def open_local(
     try:
         file = FileSlice(path, member)
     except OSError as error:
-        raise ShardError(f"{path}: cannot be read ({error.strerror}). {again}") from error
+        raise ShardError(
+            f"{path}: cannot be read ({error.strerror}). {cure_of(error, again)}"
+        ) from error
     found, end = file.status().st_size, member.offset + member.size
     if found < end or (shard is not None and found != shard.size):
         file.close()
@@ -242,7 +248,8 @@ def member_path(root: str | Path, member: Member) -> Path:
     except OSError as error:
         raise StorageError(
             f"{path}: cannot be read ({error.strerror}), and the index says that it has "
-            f"{member.size} bytes. Fetch it again, or run `stereogenbench index` again."
+            f"{member.size} bytes. "
+            + cure_of(error, "Fetch it again, or run `stereogenbench index` again.")
         ) from error
     if size_bytes != member.offset + member.size:
         raise StorageError(
@@ -275,6 +282,6 @@ def read_text_file(path: Path, *, where: str) -> bytes:
             return path.read_bytes()
     except OSError as error:
         raise StorageError(
-            f"{where}: cannot be read ({error.strerror}). Fetch it again, or give read permission."
+            f"{where}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
         ) from error
     raise StorageError(f"{where}: is no file. Put the release's own file in its place.")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.errors import MediaError, ShardError
+from stereogenbench_data.errors import MediaError, ShardError, cure_of
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.media.video import probe
@@ -145,10 +145,8 @@ def _opened(data: str | Path) -> SceneIndex:
 def _why_not_written(out: Path, error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"{out}: the disk is full. Make room, then run the same command again to go on."
-    return (
-        f"{error.filename or out}: cannot be written ({error.strerror or error}). Give write "
-        f"permission, or unpack into another folder."
-    )
+    cure = cure_of(error, "Unpack into another folder.")
+    return f"{error.filename or out}: cannot be written ({error.strerror or error}). {cure}"
 
 
 def unpack_scene(task: _Task, after_bytes: AfterBytes) -> tuple[str, Literal["unpacked", "kept"]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.errors import ShardError
+from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.storage.foreign_index import foreign_indexes
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
@@ -160,7 +160,8 @@ def _companion_problems(index: SceneIndex) -> Iterator[Problem]:
         except FileNotFoundError:
             yield Problem(name, "", "", "is missing, and pack wrote it", _WRITE_AGAIN)
         except OSError as error:
-            yield Problem(name, "", "", f"cannot be read ({error.strerror})", _WRITE_AGAIN)
+            cure = cure_of(error, _WRITE_AGAIN)
+            yield Problem(name, "", "", f"cannot be read ({error.strerror})", cure)
         else:
             if found != content:
                 yield Problem(name, "", "", "contradicts the index", _WRITE_AGAIN)
