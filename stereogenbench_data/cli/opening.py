@@ -46,9 +46,11 @@ def open_data(data: str) -> "SceneIndex":
 def _opened(data: str) -> "SceneIndex":
     """Return an index that exists; its warnings are said as a command says things."""
     from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
+    from stereogenbench_data.storage.stale_index import StaleIndexWarning
 
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", IncompleteSceneWarning)
+        warnings.simplefilter("always", StaleIndexWarning)
         index = SceneIndex.open(data)
     for warning in told:
         typer.echo(str(warning.message), err=True)

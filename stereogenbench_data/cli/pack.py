@@ -57,11 +57,13 @@ def pack(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.storage.pack import pack as pack_locally
     from stereogenbench_data.storage.ray_pack import pack_on_ray
     from stereogenbench_data.storage.shard_plan import parse_size
+    from stereogenbench_data.storage.stale_index import StaleIndexWarning
 
     target_bytes, wanted = parse_size(shard_size), _part(part)
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", IncompleteSceneWarning)
+            warnings.simplefilter("always", StaleIndexWarning)
             index = SceneIndex.open(root)
         for warning in told:
             typer.echo(str(warning.message), err=True)

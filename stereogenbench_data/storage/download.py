@@ -20,6 +20,7 @@ from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
 from stereogenbench_data.storage.location import is_remote, joined, local_path
 from stereogenbench_data.storage.remote import RemoteObject
 from stereogenbench_data.storage.source import open_local
+from stereogenbench_data.storage.stale_index import scenes_listed
 from stereogenbench_data.storage.unfinished import writing_whole
 
 Progress = Callable[[int, int], None]
@@ -155,6 +156,7 @@ def download(
         for scene in wanted.scenes
     ]
     here = SceneIndex.from_scenes(scenes, dest)
+    here.passed_over = tuple(sorted(scenes_listed(dest) - {scene.id.key for scene in scenes}))
     here.write(dest / INDEX_NAME)
     return here
 

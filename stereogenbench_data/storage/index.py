@@ -37,6 +37,11 @@ from stereogenbench_data.storage.location import (
 from stereogenbench_data.storage.remote import RemoteObject
 from stereogenbench_data.storage.remote_tree import find_remote_scenes
 from stereogenbench_data.storage.rows import SCHEMA, row_of, scene_of
+from stereogenbench_data.storage.stale_index import (
+    Indexed,
+    StaleIndexWarning,
+    stale_message,
+)
 from stereogenbench_data.storage.walk import TreeReport, walk
 
 INDEX_NAME: Final = "index.parquet"
@@ -61,6 +66,10 @@ class SceneIndex:
         incomplete: Key to reason, for scenes that were not finished when the index was made.
         broken: Key to what is wrong, for scenes that were left out for it.
         shards: What is known of each shard, by its path below the root; empty for folders.
+        is_part: Whether it was made of a part of the root on purpose.
+        passed_over: Keys of scenes that the root holds and the index leaves out on purpose.
+        stale: What the root holds that the index does not know, or lacks of it, and the cure;
+            empty where nothing of that can be seen. A URL is not looked at.
     """
 
     def __init__(self, table: pa.Table, *, root: str | Path, head: Mapping[str, Any]) -> None:
@@ -71,6 +80,10 @@ class SceneIndex:
         self.shards: dict[str, ShardFacts] = {
             path: ShardFacts(**facts) for path, facts in head.get("shards", {}).items()
         }
+        # An index of an earlier version that lies elsewhere may have been made of a part.
+        self.is_part: bool = head.get("part", head.get("root", ".") != ".") is True
+        self.passed_over: tuple[str, ...] = tuple(map(str, head.get("passed_over", ())))
+        self.stale = ""
         self._table = table
         self._columns: dict[str, np.ndarray] = {}
         self._digest = ""
@@ -106,6 +119,8 @@ class SceneIndex:
             )
         index = cls._from_file(path)
         _warn_of(index.incomplete | index.broken, where=str(path))
+        if index.stale:
+            warnings.warn(index.stale, StaleIndexWarning, stacklevel=2)
         return index
 
     @classmethod
@@ -143,6 +158,7 @@ class SceneIndex:
         """Return the index of the scenes that a walk found, with those that it left out."""
         index = cls.from_scenes(report.scenes, report.root)
         index.incomplete, index.broken = report.incomplete, report.broken
+        index.is_part = report.is_part
         return index
 
     @classmethod
@@ -162,7 +178,9 @@ class SceneIndex:
     @classmethod
     def _from_file(cls, path: Path) -> "SceneIndex":
         table, head = read_index_file(path, where=str(path))
-        return cls._checked(table, head, root=root_of(path, head, table), where=str(path))
+        index = cls._checked(table, head, root=root_of(path, head, table), where=str(path))
+        index._look_around(path)
+        return index
 
     @classmethod
     def _from_url(cls, url: str) -> "SceneIndex":
@@ -212,6 +230,19 @@ class SceneIndex:
             )
         return index
 
+    def _look_around(self, path: Path) -> None:
+        """Compare what is indexed with what its folder holds now, by names."""
+        if is_remote(self.root):
+            return
+        indexed = Indexed(
+            keys=self.column("key").tolist(),
+            passed_over={*self.incomplete, *self.broken, *self.passed_over},
+            unfinished=self.incomplete.keys(),
+            shards=self.shards.keys(),
+            is_part=self.is_part,
+        )
+        self.stale = stale_message(Path(self.root), indexed, index_file=path)
+
     def write(self, path: str | Path) -> None:
         """Write the index as one Parquet file, whole or not at all.
 
@@ -227,6 +258,8 @@ class SceneIndex:
             "digest": self.digest,
             "incomplete": self.incomplete,
             "broken": self.broken,
+            "part": self.is_part,
+            "passed_over": list(self.passed_over),
             "shards": {path: asdict(facts) for path, facts in sorted(self.shards.items())},
         }
         write_index_file(path, self._table, description)
@@ -296,6 +329,19 @@ class SceneIndex:
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
         return self.__dict__ | {"_columns": {}}
+
+
+def warn_if_stale(root: str | Path) -> None:
+    """Warn if a folder has an index that does not know what was just written into it."""
+    path = local_path(root) / INDEX_NAME
+    if not path.is_file():
+        return
+    try:
+        stale = SceneIndex._from_file(path).stale
+    except StorageError:
+        return  # an index that cannot be read says so to whoever opens it
+    if stale:
+        warnings.warn(stale, StaleIndexWarning, stacklevel=3)
 
 
 def _array(values: Any) -> np.ndarray:

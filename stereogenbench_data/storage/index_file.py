@@ -144,6 +144,7 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
         or not isinstance(head.get("root"), str)
         or not all(map(_are_shard_facts, head["shards"].values()))
         or any(map(_UNSAFE.search, head["shards"]))
+        or not isinstance(head.get("passed_over", []), list)
     ):
         raise StorageError(f"{where}: its description of itself was altered. {made_again(where)}")
     return head

@@ -14,7 +14,7 @@ from stereogenbench_data.media.depth_frame_file import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES
 from stereogenbench_data.storage.foreign_index import write_foreign_indexes
-from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
+from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex, warn_if_stale
 from stereogenbench_data.storage.pack_folder import take_folder
 from stereogenbench_data.storage.pool import run_tasks
 from stereogenbench_data.storage.repack_check import require_same_rows, require_same_sources
@@ -206,6 +206,7 @@ def finish(job: PackJob, *, packed: list[str]) -> PackReport:
         # The index comes last: where there is one, everything is.
         write_foreign_indexes(index, out=job.out)
         index.write(target)
+        warn_if_stale(job.out)
     part = tuple(shard.name for shard in job.shards)
     return PackReport(part, tuple(name for name in part if name in packed), missing, target)
 

@@ -19,7 +19,7 @@ from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
-from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.index import SceneIndex, warn_if_stale
 from stereogenbench_data.storage.pool import AfterBytes, run_tasks
 from stereogenbench_data.storage.ranged_file import MemberFile
 from stereogenbench_data.storage.source import open_local
@@ -126,6 +126,7 @@ def unpack(
         if error.errno is None:
             raise
         raise ShardError(_why_not_written(out, error)) from error
+    warn_if_stale(out)
     return UnpackReport(
         out,
         tuple(sorted(key for key, work in found.items() if work == "unpacked")),

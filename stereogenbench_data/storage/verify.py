@@ -3,6 +3,7 @@
 A shard that is wrong does not stop the rest: all that is wrong is gathered, each with its cure.
 """
 
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from stereogenbench_data.storage.foreign_index import foreign_indexes
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
 from stereogenbench_data.storage.pool import run_tasks
 from stereogenbench_data.storage.shard_writer import UNFINISHED
+from stereogenbench_data.storage.stale_index import StaleIndexWarning
 from stereogenbench_data.storage.unfinished import PARTS
 from stereogenbench_data.storage.verify_decode import (
     Problem,
@@ -110,7 +112,10 @@ def _opened(data: str | Path) -> SceneIndex:
             + ("Packing was not finished: run `stereogenbench pack` again." if begun else
                "Point at a folder that `stereogenbench pack` made.")
         )  # fmt: skip
-    index = SceneIndex.open(path)
+    with warnings.catch_warnings():
+        # What does not fit the index is a problem, told with the others.
+        warnings.simplefilter("ignore", StaleIndexWarning)
+        index = SceneIndex.open(path)
     if not index.shards:
         raise ShardError(
             f"{path}: is the index of a released folder, not of shards. Pack it with "

@@ -13,6 +13,7 @@ from typing import Final
 
 from stereogenbench_data.errors import SynthesisError, cure_of
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
+from stereogenbench_data.storage.index import warn_if_stale
 from stereogenbench_data.synthesis.crew import Job, run_jobs
 from stereogenbench_data.synthesis.export import completion_text, metadata_texts
 from stereogenbench_data.synthesis.plan import ScenePlan, plan_scene
@@ -68,6 +69,7 @@ def synthesise(
                     _finish(root, plan_scene(request, index=job.index), drawn_in=job.folder)
     finally:
         _clear(root, request, missing=missing)
+    warn_if_stale(root)
     return [request.key(index) for index in range(request.scenes)]
 
 
