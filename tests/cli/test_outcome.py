@@ -141,6 +141,7 @@ def test_debug_may_stand_after_the_command_too(tmp_path):
     assert "Traceback" in ended.stderr
 
 
+@pytest.mark.usefixtures("usual_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_browser_at_once_with_130(small_shards, number):
     with subprocess.Popen(
@@ -152,7 +153,10 @@ def test_a_signal_ends_the_browser_at_once_with_130(small_shards, number):
         line = browsing.stdout.readline()
         time.sleep(0.2)
         browsing.send_signal(number)
-        _, said = browsing.communicate(timeout=60)
+        try:
+            _, said = browsing.communicate(timeout=60)
+        finally:
+            browsing.kill()
 
     assert line.startswith("http://127.0.0.1:")
     assert "4 scenes" in line

@@ -401,7 +401,8 @@ def test_a_process_that_is_killed_while_it_fills_leaves_no_lock_and_no_half(fill
     web.answers = [Answer(stop_after=2000), Answer(delay_s=5.0)]
     killed = fillers.start(4)
     fillers.go()
-    while len(web.answers) > 0:
+    deadline = time.monotonic() + 60
+    while len(web.answers) > 0 and time.monotonic() < deadline:
         time.sleep(0.01)
     killed.send_signal(signal.SIGKILL)
     killed.wait()

@@ -187,4 +187,4 @@ def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(
         assert path.read_bytes() == (small_release / path.relative_to(dest)).read_bytes()
     assert done.exit_code == 0, done.output
     assert len(StereoPairs(dest, pairs="all")) == 4 * 15
-    assert not list(dest.rglob("*.part"))
+    assert not list(dest.rglob(".*"))

@@ -413,6 +413,7 @@ main.main()
 """
 
 
+@pytest.mark.usefixtures("usual_signals")
 def test_ctrl_c_ends_with_exit_code_130_and_leaves_no_half_shard(small_release, tmp_path):
     with subprocess.Popen(
         [sys.executable, "-c", INTERRUPTED_COMMAND, small_release, tmp_path, "--workers", "1"],
@@ -420,7 +421,10 @@ def test_ctrl_c_ends_with_exit_code_130_and_leaves_no_half_shard(small_release, 
     ) as process:  # fmt: skip
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=30)
+        try:
+            _, told = process.communicate(timeout=30)
+        finally:
+            process.kill()
 
     assert process.returncode == 130
     assert told == "stopped; run the same command again to go on from here\n"
