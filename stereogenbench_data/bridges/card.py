@@ -14,7 +14,7 @@ import numpy as np
 
 from stereogenbench_data.bridges import about
 from stereogenbench_data.errors import DescriptorError, cure_of
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.problems import counted, markdown_text
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     CAMERA_COUNT,
@@ -219,8 +219,8 @@ def _counts(index: SceneIndex) -> list[str]:
         split, subset, family = kind
         count = scenes[kind]
         lines.append(
-            f"| {split} | {subset or ''} | {family} | {count} | {count * len(CAMERA_PAIRS)} "
-            f"| {low:.2f} to {high:.2f} |"
+            f"| {split} | {subset or ''} | {markdown_text(family)} | {count} "
+            f"| {count * len(CAMERA_PAIRS)} | {low:.2f} to {high:.2f} |"
         )
     return lines
 

@@ -12,6 +12,7 @@ import typer
 
 from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.errors import StereoGenBenchError, cure_of
+from stereogenbench_data.schema.problems import plain_line
 
 FINDINGS: Final = 1
 """Exit status where something is wrong with the data."""
@@ -76,7 +77,7 @@ def _unwritten() -> OSError | None:
 def _say(message: str) -> None:
     """Write a line to stderr; where that cannot be, the exit status alone has to tell."""
     try:
-        typer.echo(message, err=True)
+        typer.echo("\n".join(map(plain_line, message.split("\n"))), err=True)
     except OSError:
         _forget(sys.stderr)
 
@@ -116,4 +117,5 @@ def _forget(stream: TextIO) -> None:
 def _warning_line(
     message: Warning | str, category: type[Warning], *_place: object, **_line: object
 ) -> str:
-    return f"{category.__name__}: {message}\n"
+    lines = f"{category.__name__}: {message}".split("\n")
+    return "\n".join(map(plain_line, lines)) + "\n"

@@ -16,7 +16,7 @@ from stereogenbench_data.evaluation.render import csv_text, latex, markdown, pla
 from stereogenbench_data.evaluation.results import CONTROL, Scores
 from stereogenbench_data.evaluation.table_rows import Table
 from stereogenbench_data.evaluation.tiers import TIERS
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.problems import counted, markdown_text
 from stereogenbench_data.storage.unfinished import write_whole
 
 Verdict = Mapping[bool | None, str]
@@ -59,17 +59,17 @@ def page(
 ) -> str:
     """Return an evaluation as a Markdown page: what was scored, the tables, every choice."""
     first = results[0]
-    names = ", ".join(one.name for one in results)
+    names = ", ".join(markdown_text(one.name) for one in results)
     tier = "" if first.tier == CONTROL else f", tier {first.tier}: {TIERS[first.tier].meaning}"
     lines = [f"# {names}{tier}", ""]
     for one in results:
         told = _coverage(one)
         lines.append(
-            f"- {one.name}: {counted(told['pairs'], 'pair')} of "
+            f"- {markdown_text(one.name)}: {counted(told['pairs'], 'pair')} of "
             f"{counted(told['scenes'], 'scene')}, {counted(told['frames'], 'frame')}"
             + (f", {counted(len(told['missing']), 'pair')} missing" if told["missing"] else "")
         )
-        lines += [f"  - missing: {each}" for each in told["missing"][:_GAPS_TOLD]]
+        lines += [f"  - missing: {markdown_text(each)}" for each in told["missing"][:_GAPS_TOLD]]
     lines += ["", *(f"{markdown(table)}" for table in tables)]
     if found:
         lines += ["### Relations between the controls", ""]

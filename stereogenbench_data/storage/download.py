@@ -19,7 +19,7 @@ from stereogenbench_data.schema.release import METADATA_FILES
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
 from stereogenbench_data.storage.location import is_remote, joined, local_path
 from stereogenbench_data.storage.remote import RemoteObject
-from stereogenbench_data.storage.source import open_local
+from stereogenbench_data.storage.source import open_local, require_own_files
 from stereogenbench_data.storage.stale_index import scenes_listed
 from stereogenbench_data.storage.unfinished import writing_whole
 
@@ -124,6 +124,8 @@ def download(
     dest = local_path(dest)
     if not is_remote(index.root) and dest == local_path(index.root):
         raise StorageError(f"{dest}: is where the data are. Name another folder.")
+    if not is_remote(index.root):
+        require_own_files(index.root, sorted({each.member.path for each in wanted.files}))
     missing = [each for each in wanted.files if not _is_whole(each, dest)]
     needed = sum(each.member.size for each in missing)
     done = wanted.size_bytes - needed

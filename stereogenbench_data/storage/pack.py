@@ -33,6 +33,7 @@ from stereogenbench_data.storage.shard_plan import (
     plan_shards,
 )
 from stereogenbench_data.storage.shard_writer import found_whole, pack_task
+from stereogenbench_data.storage.source import require_own_files
 
 Progress = Callable[[int, int], None]
 
@@ -148,6 +149,9 @@ def prepare(
     if depth_codec == "blosc2":
         blosc2_module()
     plan = plan_shards(index, target_bytes, depth_codec=depth_codec)
+    require_own_files(
+        plan.root, (member.source for shard in plan.shards for member in shard.members)
+    )
     job = PackJob(index, plan, Path(out), part)
     _require_fitting(job.plan)
     try:

@@ -1,5 +1,6 @@
 """Where a scene's bytes are, and how they are opened: files, members of shards, URLs, the cache."""
 
+import os
 import re
 import stat
 import zlib
@@ -258,6 +259,47 @@ def member_path(root: str | Path, member: Member) -> Path:
             f"fetch it again, or run `stereogenbench index` again."
         )
     return path
+
+
+def require_own_files(root: str | Path, paths: Iterable[str]) -> None:
+    """Refuse files of a folder that are to be passed on and that links lead out of it to.
+
+    Such a link in a stranger's folder would carry any file of this machine into what is published.
+    Links to other files of the folder are as good as copies; so are those of the Hub's cache, which
+    keeps the files of a snapshot in ``blobs`` beside it. Reading for oneself follows all links.
+
+    Args:
+        root: The folder, on this machine.
+        paths: Of the files, below it.
+
+    Raises:
+        StorageError: Naming the first such file, where it leads and what to do.
+    """
+    root = local_path(root)
+    real = os.path.realpath(root)
+    own = [real, *_hub_blobs(Path(real))]
+    folders: dict[str, str] = {}
+    for path in paths:
+        folder, _, name = path.rpartition("/")
+        if folder not in folders:
+            folders[folder] = os.path.realpath(root / folder)
+        place = f"{folders[folder]}/{name}"
+        place = os.path.realpath(place) if Path(place).is_symlink() else place
+        if not any(place.startswith(f"{each.rstrip('/')}/") for each in own):
+            raise StorageError(
+                f"{root / path}: leads out of {root} by a link, to {place}, and would be passed on "
+                f"with the data. Copy the file into the folder if it may be (`cp -rL` copies what "
+                f"links lead to); else remove the link."
+            )
+
+
+def _hub_blobs(real: Path) -> list[str]:
+    """Return where the Hub's cache keeps the files of the snapshot that a folder lies in."""
+    return [
+        str(each.parent.parent / "blobs")
+        for each in (real, *real.parents)
+        if each.parent.name == "snapshots" and each.parent.parent.name.startswith("datasets--")
+    ]
 
 
 def _require_safe(member: Member) -> None:

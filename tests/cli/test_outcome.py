@@ -176,3 +176,15 @@ def test_a_port_that_is_taken_is_told(small_shards):
     assert shown.exit_code == 2
     assert "Address already in use" in shown.stderr
     assert "Choose another port." in shown.stderr
+
+
+def test_what_a_name_would_do_to_the_terminal_is_spelled_out(tmp_path):
+    odd = tmp_path / "a\x1b]0;title\x07\x1b[31m"
+    shown = invoke("stats", odd)
+    odd_scene = tmp_path / "tree" / "train" / "F" / "M" / "s\x1b[2J"
+    odd_scene.mkdir(parents=True)
+    indexed = invoke("index", tmp_path / "tree")
+
+    assert shown.exit_code == 2
+    assert "\x1b" not in shown.stderr + indexed.stderr + indexed.stdout
+    assert r"a\x1b]0;title\x07\x1b[31m" in shown.stderr
