@@ -18,8 +18,12 @@ StereoGenBenchError
 
 Each takes one message: so a DataLoader worker's error is rebuilt as itself in the main process.
 A message shows URLs without logins and queries, whatever it was made of.
+
+What to do about an error of the operating system follows from its number, wherever it is met: see
+`cure_of`.
 """
 
+import errno
 import re
 from typing import Final
 
@@ -72,6 +76,35 @@ def _link_without_secrets(link: str) -> str:
         host = authority  # of the Hub, what follows the @ is a revision
     path = re.split(r"[?#]", rest[len(authority) :], maxsplit=1)[0]
     return f"{scheme}://{host}{_LOGIN_IN_PATH.sub('', path)}"
+
+
+_CURES: Final = {
+    errno.ENOSPC: "Make room, or choose another place.",
+    errno.EDQUOT: "Make room, or choose another place.",
+    errno.EFBIG: "Choose a place that takes files of this size.",
+    errno.EROFS: "Choose a place that can be written.",
+    errno.EMFILE: "Raise the limit of open files (`ulimit -n`), or use fewer workers.",
+    errno.ENFILE: "All processes of this machine have too many files open: end some of them, or "
+    "raise `fs.file-max`.",
+    errno.ENOMEM: "Memory is short: use fewer workers.",
+    errno.EACCES: "Give permission, or choose another place.",
+    errno.EPERM: "Give permission, or choose another place.",
+    errno.EIO: "Check the disk or the network drive: the system cannot read or write there.",
+    errno.ESTALE: "The network drive was mounted anew or the file replaced: run it again.",
+    errno.ELOOP: "Links lead in a circle: remove them.",
+}
+
+
+def cure_of(error: OSError, otherwise: str = "") -> str:
+    """Return what to do about an error of the operating system.
+
+    Where its number tells the cause (a full disk, too many open files, no permission), the cure
+    belongs to that; for any other number it is what the caller says.
+
+    >>> cure_of(OSError(errno.ENOENT, "No such file or directory"), "Fetch it again.")
+    'Fetch it again.'
+    """
+    return _CURES.get(error.errno or 0, otherwise)
 
 
 class StereoGenBenchError(Exception):

@@ -1,5 +1,11 @@
-"""What all tests share: the material that stands beside the project, where it is at hand."""
+"""What all tests share: the material that stands beside the project, and signals as they are usual.
 
+Where the material is missing, pytest's first and last lines say so, and under CI its tests fail.
+"""
+
+import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,11 +17,57 @@ pytest_plugins = ("tests.servers.fixtures",)
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
+MATERIAL = ("scenes", "ground_truth")
+_CURE = f"put it at {SHARED}: without it nothing is compared with data that others made"
+
+
+def _missing_material() -> list[str]:
+    return [name for name in MATERIAL if not (SHARED / name).is_dir()]
+
+
+def _is_ci() -> bool:
+    return os.environ.get("CI", "").lower() not in ("", "0", "false", "no")
+
+
+def pytest_report_header() -> str:
+    """Say at the start whether the shared material is at hand."""
+    missing = _missing_material()
+    if not missing:
+        return f"shared material: {SHARED}"
+    return f"shared material: {' and '.join(missing)} MISSING: {_CURE}"
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say at the end, too, what could not be tested for want of it."""
+    missing = _missing_material()
+    if missing:
+        terminalreporter.write_sep("!", "shared material is missing", red=True, bold=True)
+        terminalreporter.write_line(
+            f"Tests with {' and '.join(missing)} did not run: {_CURE}.", red=True
+        )
+
+
 def _shared_folder(name: str) -> Path:
     folder = SHARED / name
     if not folder.is_dir():
-        pytest.skip(f"needs {name}, which stands beside the project and is not at hand here")
+        reason = f"needs {name}, which stands beside the project and is not here: {_CURE}"
+        pytest.fail(reason) if _is_ci() else pytest.skip(reason)
     return folder
+
+
+@pytest.fixture
+def usual_signals() -> Iterator[None]:
+    """Commands that a test starts get Ctrl-C and SIGTERM as from a terminal.
+
+    A script's background jobs ignore Ctrl-C, and what they start inherits that.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

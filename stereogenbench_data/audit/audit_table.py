@@ -20,7 +20,7 @@ from stereogenbench_data.audit.audit_records import (
 from stereogenbench_data.audit.paper_figures import AUDIT, AUDIT_TABLE, FRAMES_A_SCENE
 from stereogenbench_data.audit.reprojection import TOLERANCES
 from stereogenbench_data.audit.scene_audit import LONG_PAIR
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.problems import counted, markdown_text
 from stereogenbench_data.schema.release import ADJACENT_PAIRS
 
 _LISTED: Final = 500
@@ -235,7 +235,7 @@ def audit_markdown(report: AuditReport) -> str:
     """Return a report as Markdown: the table, the definitions that it needs, and the findings."""
     frames = "all frames" if report.frames == 0 else f"up to {counted(report.frames, 'frame')}"
     lines = [
-        f"# Audit of {report.root}",
+        f"# Audit of {markdown_text(str(report.root))}",
         "",
         f"{report.scenes_audited} of {counted(report.scenes_there, 'scene')}, {frames} of "
         f"each. Under paper: {AUDIT_TABLE}.",
@@ -262,7 +262,18 @@ def _listed(title: str, texts: list[str]) -> list[str]:
     if not texts:
         return []
     more = [f"- and {len(texts) - _LISTED} more"] if len(texts) > _LISTED else []
-    return ["", f"## {title} ({len(texts)})", "", *(f"- {each}" for each in texts[:_LISTED]), *more]
+    return [
+        "",
+        f"## {title} ({len(texts)})",
+        "",
+        *(f"- {_inert(each)}" for each in texts[:_LISTED]),
+        *more,
+    ]
+
+
+def _inert(text: str) -> str:
+    """Return a sentence that holds names of the data, with our own quotation of commands."""
+    return markdown_text(text).replace(r"\`", "`")
 
 
 def _finite(values: Iterable[float]) -> list[float]:

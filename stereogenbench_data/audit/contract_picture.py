@@ -16,6 +16,7 @@ from stereogenbench_data.audit.contract_scoring import scored
 from stereogenbench_data.audit.contract_views import SceneViews, Shot
 from stereogenbench_data.errors import ExtraError, SelectionError
 from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.unfinished import writing_output
 
 _ENDINGS: Final = (".png", ".pdf", ".svg", ".jpg")
 _NOT_KNOWN: Final = 255
@@ -65,7 +66,8 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
         _draw_curves(wide, views, shots, diagnosis, units_m=np.sort([*_WIDE_M, *found_m * _NEAR]))
         _draw_curves(near, views, shots, diagnosis, units_m=found_m * _NEAR)
         _draw_rivals(others, diagnosis)
-    figure.savefig(path, dpi=90)
+    with writing_output(path) as file:
+        figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=90)
 
 
 def _figure_class() -> Any:

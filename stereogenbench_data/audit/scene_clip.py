@@ -24,6 +24,7 @@ from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.samples.load import Sample
 from stereogenbench_data.samples.picture import Picture, anaglyph
 from stereogenbench_data.schema.records import Scene
+from stereogenbench_data.storage.unfinished import writing_output
 
 CLIP_FIELDS: Final = ("left", "right", "disparity", "valid", "baseline_m")
 CLIP_SUFFIXES: Final = (".mp4", ".gif")
@@ -123,18 +124,14 @@ def write_clip(
     write = writers.get(path.suffix.lower())
     if write is None:
         raise SelectionError(f"{path}: a clip is {' or '.join(CLIP_SUFFIXES)}, by its ending.")
-    unfinished = path.with_name(f".{path.stem}.unfinished{path.suffix.lower()}")
     try:
-        with unfinished.open("wb") as file:
+        with writing_output(path) as file:
             write(file, _counted(pages, frames=frames, progress=progress), rate_hz)
-        unfinished.replace(path)
     except av.FFmpegError as error:
         # PyAV says only that writing to the file object failed; why is what it came upon.
         if isinstance(error.__context__, OSError):
             raise error.__context__ from None
         raise
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def _counted(

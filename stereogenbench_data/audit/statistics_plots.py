@@ -11,6 +11,7 @@ from stereogenbench_data.audit.statistics import ADJACENT, FOCAL_EDGES_MM, branc
 from stereogenbench_data.errors import ExtraError
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.unfinished import writing_whole
 
 _BINS: Final = 40
 _COLOURS: Final = {"IPD_Gaussian": "#4477aa", "Uniform": "#ee6677", "Pairwise_Uniform": "#228833"}
@@ -49,7 +50,7 @@ def write_plots(
         what = "all pairs" if is_pairwise else "adjacent"
         _histogram(axes, shown_cm.ravel(), bins=_BINS, colour=_COLOURS.get(family, "#777777"))
         axes.set(title=f"{title}, {what}", xlabel="baseline (cm)", ylabel="pairs")
-    figure.savefig(baselines, dpi=100)
+    _save(figure, baselines)
     figure = _figure(len(panels))
     for axes, (title, family, _, focal_mm) in zip(_axes(figure), panels, strict=False):
         outer = [focal_mm.min(), focal_mm.max()]
@@ -57,7 +58,7 @@ def write_plots(
         edges = np.union1d(FOCAL_EDGES_MM, beyond)
         _histogram(axes, focal_mm, bins=edges, colour=_COLOURS.get(family, "#777777"))
         axes.set(title=title, xlabel="focal length (mm)", ylabel="scenes")
-    figure.savefig(focals, dpi=100)
+    _save(figure, focals)
     return baselines, focals
 
 
@@ -96,3 +97,8 @@ def _figure(panels: int) -> Any:
 
 def _axes(figure: Any) -> Iterator[Any]:
     yield from figure.axes
+
+
+def _save(figure: Any, path: Path) -> None:
+    with writing_whole(path) as file:
+        figure.savefig(file, format="png", dpi=100)

@@ -11,6 +11,7 @@ from stereogenbench_data.audit.statistics import (
     Spread,
     Statistics,
 )
+from stereogenbench_data.schema.problems import markdown_text
 
 _BAR: Final = 40
 
@@ -18,7 +19,7 @@ _BAR: Final = 40
 def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
     """Return statistics as Markdown, with the paper's figures beside, where given."""
     text = [
-        f"# Statistics of {found.root}",
+        f"# Statistics of {markdown_text(str(found.root))}",
         *_section("Scenes", _count_rows(found)),
         *_section("Adjacent baselines (cm)", _spread_rows(found.branches, "adjacent")),
         *_section("Baselines of all 15 pairs (cm)", _spread_rows(found.branches, "all pairs")),
@@ -47,7 +48,7 @@ def _section(title: str, rows: Iterable[Sequence[str]]) -> list[str]:
 
 def _table(rows: Iterable[Sequence[str]]) -> Iterator[str]:
     for place, row in enumerate(rows):
-        yield f"| {' | '.join(row)} |"
+        yield f"| {' | '.join(map(markdown_text, row))} |"
         if place == 0:
             yield "|" + "---|" * len(row)
 

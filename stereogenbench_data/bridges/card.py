@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.bridges import about
-from stereogenbench_data.errors import DescriptorError
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.errors import DescriptorError, cure_of
+from stereogenbench_data.schema.problems import counted, markdown_text
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     CAMERA_COUNT,
@@ -23,6 +23,7 @@ from stereogenbench_data.schema.release import (
     METADATA_FILES,
 )
 from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.unfinished import write_whole
 
 CARD_NAME: Final = "README.md"
 MARK: Final = "<!-- made by stereogenbench card -->"
@@ -60,9 +61,12 @@ def write_card(index: SceneIndex, folder: Path, *, repository: str) -> Path:
                 f"{path}: is there and was not made by this package: move it away, or add "
                 f"{MARK!r} to it if it may be replaced."
             )
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text.encode())
     except OSError as error:
-        raise DescriptorError(f"{path}: cannot be written ({error.strerror}).") from error
+        raise DescriptorError(
+            f"{path}: cannot be written ({error.strerror or error}). "
+            + cure_of(error, "Choose another place with --out.")
+        ) from error
     return path
 
 
@@ -215,8 +219,8 @@ def _counts(index: SceneIndex) -> list[str]:
         split, subset, family = kind
         count = scenes[kind]
         lines.append(
-            f"| {split} | {subset or ''} | {family} | {count} | {count * len(CAMERA_PAIRS)} "
-            f"| {low:.2f} to {high:.2f} |"
+            f"| {split} | {subset or ''} | {markdown_text(family)} | {count} "
+            f"| {count * len(CAMERA_PAIRS)} | {low:.2f} to {high:.2f} |"
         )
     return lines
 

@@ -19,9 +19,10 @@ from stereogenbench_data.bridges.croissant_folders import folder_nodes
 from stereogenbench_data.bridges.croissant_packed import packed_nodes
 from stereogenbench_data.bridges.croissant_tables import write_tables
 from stereogenbench_data.bridges.croissant_terms import CONTEXT, CROISSANT, RAI, Node
-from stereogenbench_data.errors import DescriptorError
+from stereogenbench_data.errors import DescriptorError, cure_of
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.location import shown
+from stereogenbench_data.storage.unfinished import write_whole
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +89,12 @@ def write_descriptor(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(descriptor, indent=1, ensure_ascii=False) + "\n"
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text.encode())
     except OSError as error:
-        raise DescriptorError(f"{path}: cannot be written ({error.strerror}).") from error
+        raise DescriptorError(
+            f"{path}: cannot be written ({error.strerror or error}). "
+            + cure_of(error, "Choose another place with --out.")
+        ) from error
     return descriptor
 
 

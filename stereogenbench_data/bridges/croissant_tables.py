@@ -13,9 +13,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from stereogenbench_data.errors import DescriptorError
+from stereogenbench_data.errors import DescriptorError, cure_of
 from stereogenbench_data.schema.release import CAMERA_PAIRS, baseline_bin
 from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.unfinished import write_whole, writing_whole
 
 SCENES: Final = "scenes.parquet"
 PAIRS: Final = "pairs.parquet"
@@ -58,14 +59,16 @@ def write_tables(index: SceneIndex, folder: Path) -> list[WrittenTable]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, table in tables.items():
-            pq.write_table(table, folder / name, compression="zstd")
+            with writing_whole(folder / name) as file:
+                pq.write_table(table, file, compression="zstd")
         if len(index.shards) > MOST_SHARD_FILES:
-            (folder / SHARD_LIST).write_text("".join(f"{path}\n" for path in sorted(index.shards)))
+            listed = "".join(f"{path}\n" for path in sorted(index.shards))
+            write_whole(folder / SHARD_LIST, listed.encode())
             names.append(SHARD_LIST)
     except OSError as error:
         raise DescriptorError(
-            f"{folder}: tables cannot be written ({error.strerror or error}). Name another file, "
-            "or make room."
+            f"{folder}: tables cannot be written ({error.strerror or error}). "
+            + cure_of(error, "Name another file.")
         ) from error
     return [_written(folder / name) for name in names]
 

@@ -15,6 +15,7 @@ from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.storage.filesystems import network_errors
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
 from stereogenbench_data.storage.location import local_path
+from stereogenbench_data.storage.source import require_own_files
 
 DESCRIPTOR_NAME: Final = "croissant.json"
 _COMPANIONS: Final = (INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "croissant/*.parquet")
@@ -66,6 +67,7 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
     write_descriptor(index, folder / DESCRIPTOR_NAME)
     api = HfApi(library_name="stereogenbench-data")
     patterns = [*sorted(index.shards), *_COMPANIONS]
+    require_own_files(folder, [str(path.relative_to(folder)) for path in _found(folder, patterns)])
     refusals: tuple[type[BaseException], ...] = (HfHubHTTPError, ValueError, *network_errors())
     try:
         api.create_repo(repository, repo_type="dataset", exist_ok=True)
@@ -97,8 +99,12 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
             f"{repository}: the Hub did not take the upload ({_reason(error)}). Log in with "
             "`hf auth login` if it asks for it, and run the same command again to go on."
         ) from None
-    files = [path for pattern in patterns for path in folder.glob(pattern)]
+    files = _found(folder, patterns)
     return Uploaded(f"hf://datasets/{repository}@{revision}", revision, len(files) + 1)
+
+
+def _found(folder: Path, patterns: list[str]) -> list[Path]:
+    return [path for pattern in patterns for path in sorted(folder.glob(pattern))]
 
 
 def _require_whole(index: SceneIndex, folder: Path) -> None:

@@ -12,7 +12,7 @@ from stereogenbench_data.cli.options import FamilyOption, JsonOption, MapOption,
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.cli.writing import writing
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.problems import counted, plain_line
 
 if TYPE_CHECKING:
     from stereogenbench_data.schema.records import SceneId
@@ -106,7 +106,10 @@ def index(  # noqa: PLR0913 - one parameter an option
     _list(console, "broken, left out", report.broken)
     _list(console, "to know", {note: note for note in report.notes})
     if not report.scenes:
-        console.print(f"{shown(root)}: no scene is whole, so there is nothing to index")
+        console.print(
+            f"{plain_line(shown(root))}: no scene is whole, so there is nothing to index",
+            markup=False,
+        )
         raise typer.Exit(1)
     typer.echo(f"{target}: {counted(len(report.scenes), 'scene')}")
     if not is_remote(root) and target.parent.resolve() != local_path(root).resolve():
@@ -143,4 +146,4 @@ def _list(console: Console, title: str, reasons: Mapping[str, str]) -> None:
         console.print(f"{len(reasons)} {title}:", style="bold", highlight=False)
     for key, reason in reasons.items():
         text = reason if key in reason else f"{key}: {reason}"
-        console.print(f"  {text}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"  {plain_line(text)}", markup=False, highlight=False, soft_wrap=True)

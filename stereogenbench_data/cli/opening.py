@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.problems import counted, plain_line
 
 if TYPE_CHECKING:
     from stereogenbench_data.storage.index import SceneIndex
@@ -50,12 +50,14 @@ def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
 def _opened(data: str, root: str | None) -> "SceneIndex":
     """Return an index that exists; its warnings are said as a command says things."""
     from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
+    from stereogenbench_data.storage.stale_index import StaleIndexWarning
 
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", IncompleteSceneWarning)
+        warnings.simplefilter("always", StaleIndexWarning)
         index = SceneIndex.open(data, root=root)
     for warning in told:
-        typer.echo(str(warning.message), err=True)
+        typer.echo("\n".join(map(plain_line, str(warning.message).split("\n"))), err=True)
     return index
 
 
@@ -67,7 +69,7 @@ def _tell_left_out(root: Path, report: "TreeReport") -> None:
     said = " and ".join(f"{count} {name}" for name, count in counts.items() if count)
     found = len(report.scenes) + len(reasons)
     typer.echo(
-        f"{root}: {said} of {counted(found, 'scene')} left out: {reasons[0]}"
+        plain_line(f"{root}: {said} of {counted(found, 'scene')} left out: {reasons[0]}")
         + (f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else "")
         + f" `stereogenbench index {root}` lists them all.",
         err=True,

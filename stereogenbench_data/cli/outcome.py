@@ -11,7 +11,8 @@ from typing import Final, TextIO
 import typer
 
 from stereogenbench_data.cli.stopping import STOPPED
-from stereogenbench_data.errors import StereoGenBenchError
+from stereogenbench_data.errors import StereoGenBenchError, cure_of
+from stereogenbench_data.schema.problems import plain_line
 
 FINDINGS: Final = 1
 """Exit status where something is wrong with the data."""
@@ -21,16 +22,9 @@ PIPE_CLOSED: Final = 141
 """Exit status where whoever read the output has closed it, as ``head`` does."""
 
 _CURES: Final = {
-    errno.EACCES: "Give permission, or choose another place.",
-    errno.EPERM: "Give permission, or choose another place.",
-    errno.EROFS: "Choose a place that can be written.",
-    errno.ENOSPC: "Make room, or choose another place.",
-    errno.EDQUOT: "Make room, or choose another place.",
-    errno.EFBIG: "Choose a place that takes files of this size.",
     errno.ENOENT: "Check the path.",
     errno.ENOTDIR: "Check the path.",
     errno.EISDIR: "Name a file, not a folder.",
-    errno.EMFILE: "Raise the limit of open files (`ulimit -n`), or use fewer workers.",
     errno.EADDRINUSE: "Choose another port.",
 }
 
@@ -83,7 +77,7 @@ def _unwritten() -> OSError | None:
 def _say(message: str) -> None:
     """Write a line to stderr; where that cannot be, the exit status alone has to tell."""
     try:
-        typer.echo(message, err=True)
+        typer.echo("\n".join(map(plain_line, message.split("\n"))), err=True)
     except OSError:
         _forget(sys.stderr)
 
@@ -94,7 +88,7 @@ def _message(error: BaseException) -> str:
         return f"{type(error).__name__}: {error}"
     if isinstance(error, OSError) and error.errno is not None:
         where = f"{error.filename}: " if error.filename else ""
-        cure = _CURES.get(error.errno, "")
+        cure = cure_of(error, _CURES.get(error.errno, ""))
         return f"{type(error).__name__}: {where}{error.strerror}. {cure}".rstrip()
     if isinstance(error, MemoryError):
         return "MemoryError: memory is short. Use fewer workers or smaller pictures."
@@ -123,4 +117,5 @@ def _forget(stream: TextIO) -> None:
 def _warning_line(
     message: Warning | str, category: type[Warning], *_place: object, **_line: object
 ) -> str:
-    return f"{category.__name__}: {message}\n"
+    lines = f"{category.__name__}: {message}".split("\n")
+    return "\n".join(map(plain_line, lines)) + "\n"

@@ -53,19 +53,21 @@ def pack(  # noqa: PLR0913 - one parameter an option
     sizes and times of change and reads metadata again; `stereogenbench verify` reads every byte.
     With --part, run the same command once for each I; whichever is finished last writes the index.
     """
-    from stereogenbench_data.schema.problems import counted
+    from stereogenbench_data.schema.problems import counted, plain_line
     from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
     from stereogenbench_data.storage.pack import pack as pack_locally
     from stereogenbench_data.storage.ray_pack import pack_on_ray
     from stereogenbench_data.storage.shard_plan import parse_size
+    from stereogenbench_data.storage.stale_index import StaleIndexWarning
 
     target_bytes, wanted = parse_size(shard_size), _part(part)
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always", IncompleteSceneWarning)
+            warnings.simplefilter("always", StaleIndexWarning)
             index = SceneIndex.open(root, root=data_root)
         for warning in told:
-            typer.echo(str(warning.message), err=True)
+            typer.echo("\n".join(map(plain_line, str(warning.message).split("\n"))), err=True)
         with progress_bar("packing", unit="MB") as bar:
 
             def progress(done: int, total: int) -> None:

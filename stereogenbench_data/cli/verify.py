@@ -29,7 +29,7 @@ def verify(
 
     The exit status is 0 if nothing is wrong, 1 if something is, 2 if they cannot be verified.
     """
-    from stereogenbench_data.schema.problems import counted
+    from stereogenbench_data.schema.problems import counted, plain_line
     from stereogenbench_data.storage.verify import verify as verified
 
     mode: Literal["bytes", "decode"] = "decode" if deep else "bytes"
@@ -47,7 +47,7 @@ def verify(
         typer.echo(json.dumps(asdict(report), indent=2))
     else:
         for problem in report.problems:
-            typer.echo(str(problem))
+            typer.echo(plain_line(str(problem)))
         decoded = f", {counted(report.videos_decoded, 'video')} decoded" if deep else ""
         there = ", ".join(
             (

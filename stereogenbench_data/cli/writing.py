@@ -29,12 +29,10 @@ def write_report(path: Path, text: str) -> None:
         OSError: If it cannot be written; then the file that was there is as before, unless it is
             a device or a pipe.
     """
-    from stereogenbench_data.storage.unfinished import write_whole
+    from stereogenbench_data.storage.unfinished import writing_output
 
     content = text.encode(errors="replace")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and not path.is_file():
-            path.write_bytes(content)
-        else:
-            write_whole(path.resolve(), content)
+        with writing_output(path) as file:
+            file.write(content)

@@ -24,7 +24,7 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.errors import EvaluationError, StorageError
+from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
 from stereogenbench_data.evaluation.evaluate import selected
 from stereogenbench_data.evaluation.predictions import Wanted, frame_name, item_name
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
@@ -153,9 +153,8 @@ def _begin(root: Path, told: Mapping[str, Any]) -> None:
     except (OSError, ValueError) as error:
         if isinstance(error, EvaluationError):
             raise
-        raise StorageError(
-            f"{path}: cannot be read or written ({error}). Choose another folder."
-        ) from error
+        cure = cure_of(error, _ELSEWHERE) if isinstance(error, OSError) else _ELSEWHERE
+        raise StorageError(f"{path}: cannot be read or written ({error}). {cure}") from error
     differing = [
         name for name in told if not isinstance(there, dict) or there.get(name) != told[name]
     ]
@@ -190,8 +189,8 @@ def _write_item(work: _ItemWork, after_frames: AfterBytes) -> None:
         if isinstance(error, StorageError):
             raise
         raise StorageError(
-            f"{work.folder}: cannot be written ({error.strerror or error}). Make room, or choose "
-            f"another folder."
+            f"{work.folder}: cannot be written ({error.strerror or error}). "
+            + cure_of(error, "Choose another folder.")
         ) from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
@@ -225,6 +224,7 @@ def _npy(values: Any) -> bytes:
     return out.getvalue()
 
 
+_ELSEWHERE: Final = "Choose another folder."
 _OF_CAMERA: Final = frozenset({"baseline_m", "intrinsics"})
 _WRITERS: Final[dict[str, tuple[str, Callable[[Any], bytes]]]] = {
     "left": (".png", _png),

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from stereogenbench_data.errors import EvaluationError, StorageError
+from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
 from stereogenbench_data.evaluation.frame_scores import PairScores
 from stereogenbench_data.evaluation.frechet import Spread
 from stereogenbench_data.evaluation.predictions import Pair, pair_name
@@ -58,7 +58,7 @@ class PartialResults:
         except OSError as error:
             raise StorageError(
                 f"{folder}: partial results cannot be kept there ({error.strerror or error}). "
-                f"Choose another folder with --out."
+                + cure_of(error, "Choose another folder with --out.")
             ) from error
         if theirs is not None and theirs != ours:
             name, there, here = next(_differences(theirs, ours))
@@ -109,7 +109,7 @@ class PartialResults:
         except OSError as error:
             raise StorageError(
                 f"{path}: the scores of {scene} cannot be written ({error.strerror or error}). "
-                f"Make room, or choose another folder with --out."
+                + cure_of(error, "Choose another folder with --out.")
             ) from error
 
     def is_done(self, scene: str, *, stamps: Stamps) -> bool:

@@ -7,12 +7,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from stereogenbench_data.errors import ExtraError, StorageError
+from stereogenbench_data.errors import ExtraError, StorageError, cure_of
 from stereogenbench_data.evaluation.aggregate import PairMeans, cell, grouped
 from stereogenbench_data.evaluation.columns import COLUMNS
 from stereogenbench_data.evaluation.reference import reference_rows
 from stereogenbench_data.evaluation.results import CONTROL, Scores, require_comparable
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
+from stereogenbench_data.storage.unfinished import writing_whole
 
 _SIZE_IN: Final = (9.0, 4.2)
 _DPI: Final = 120
@@ -48,11 +49,12 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
         path = folder / f"{column}_by_baseline.png"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=_DPI)
+            with writing_whole(path) as file:
+                figure.savefig(file, format="png", dpi=_DPI)
         except OSError as error:
             raise StorageError(
-                f"{path}: the plot cannot be written ({error.strerror or error}). Choose another "
-                f"folder with --out."
+                f"{path}: the plot cannot be written ({error.strerror or error}). "
+                + cure_of(error, "Choose another folder with --out.")
             ) from error
         written.append(path)
     return written

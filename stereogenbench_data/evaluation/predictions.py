@@ -23,7 +23,7 @@ import numpy as np
 from av.video.reformatter import Interpolation, VideoReformatter
 from PIL import Image
 
-from stereogenbench_data.errors import EvaluationError, MediaError, StorageError
+from stereogenbench_data.errors import EvaluationError, MediaError, StorageError, cure_of
 from stereogenbench_data.media.planes import plane_numbers
 from stereogenbench_data.media.video import VideoReader, probe, read_rgb
 
@@ -186,6 +186,10 @@ class _PngFrames:
         except (OSError, SyntaxError, ValueError, zlib.error) as error:
             if isinstance(error, PredictionFault):
                 raise
+            if isinstance(error, OSError) and cure_of(error):
+                raise StorageError(
+                    f"{path}: cannot be read ({error.strerror}). {cure_of(error)}"
+                ) from error
             raise PredictionFault(
                 f"{_told(self._wanted)}: {path} is no picture that can be read ({error})."
             ) from error

@@ -11,6 +11,7 @@ from stereogenbench_data.evaluation.aggregate import Cell
 from stereogenbench_data.evaluation.columns import COLUMNS
 from stereogenbench_data.evaluation.frechet import FrechetDistance
 from stereogenbench_data.evaluation.table_rows import Row, Table
+from stereogenbench_data.schema.problems import markdown_text
 
 ABSENT: Final = "-"
 _HEAVY_TAILED: Final = frozenset({"sd"})
@@ -35,7 +36,7 @@ def markdown(table: Table) -> str:
     lines.append(_pipes(head))
     texts = 1 + len(table.keys)
     lines.append(_pipes(["---"] * texts + ["---:"] * (len(head) - texts)))
-    lines += [_pipes(row) for row in rows]
+    lines += [_pipes(list(map(markdown_text, row))) for row in rows]
     if table.notes:
         lines += ["", *(f"- {note}" for note in table.notes)]
     return "\n".join(lines) + "\n"

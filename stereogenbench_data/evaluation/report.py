@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import StorageError, cure_of
 from stereogenbench_data.evaluation.aggregate import PairMeans
 from stereogenbench_data.evaluation.predictions import pair_name
 from stereogenbench_data.evaluation.reference import DISCREPANCIES, PAPER
@@ -16,7 +16,7 @@ from stereogenbench_data.evaluation.render import csv_text, latex, markdown, pla
 from stereogenbench_data.evaluation.results import CONTROL, Scores
 from stereogenbench_data.evaluation.table_rows import Table
 from stereogenbench_data.evaluation.tiers import TIERS
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.problems import counted, markdown_text
 from stereogenbench_data.storage.unfinished import write_whole
 
 Verdict = Mapping[bool | None, str]
@@ -59,17 +59,17 @@ def page(
 ) -> str:
     """Return an evaluation as a Markdown page: what was scored, the tables, every choice."""
     first = results[0]
-    names = ", ".join(one.name for one in results)
+    names = ", ".join(markdown_text(one.name) for one in results)
     tier = "" if first.tier == CONTROL else f", tier {first.tier}: {TIERS[first.tier].meaning}"
     lines = [f"# {names}{tier}", ""]
     for one in results:
         told = _coverage(one)
         lines.append(
-            f"- {one.name}: {counted(told['pairs'], 'pair')} of "
+            f"- {markdown_text(one.name)}: {counted(told['pairs'], 'pair')} of "
             f"{counted(told['scenes'], 'scene')}, {counted(told['frames'], 'frame')}"
             + (f", {counted(len(told['missing']), 'pair')} missing" if told["missing"] else "")
         )
-        lines += [f"  - missing: {each}" for each in told["missing"][:_GAPS_TOLD]]
+        lines += [f"  - missing: {markdown_text(each)}" for each in told["missing"][:_GAPS_TOLD]]
     lines += ["", *(f"{markdown(table)}" for table in tables)]
     if found:
         lines += ["### Relations between the controls", ""]
@@ -110,8 +110,8 @@ def write_report(
             write_whole(folder / name, text.encode())
     except OSError as error:
         raise StorageError(
-            f"{folder}: the report cannot be written ({error.strerror or error}). Choose another "
-            f"folder with --out."
+            f"{folder}: the report cannot be written ({error.strerror or error}). "
+            + cure_of(error, "Choose another folder with --out.")
         ) from error
     files = [folder / name for name in written]
     if plots == "skip":

@@ -4,6 +4,7 @@ FFmpeg knows playlist and script formats that open further files and addresses. 
 containers of the release are let in, and a path is never read as an address.
 """
 
+import errno
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -13,7 +14,7 @@ from typing import Final, Literal, Protocol, runtime_checkable
 import av
 from av.container import InputContainer
 
-from stereogenbench_data.errors import MediaError, StorageError
+from stereogenbench_data.errors import MediaError, StorageError, cure_of
 
 
 @runtime_checkable
@@ -37,6 +38,7 @@ _UNDECODED: Final = {**_OPTIONS, "probesize": "32", "skip_frame": "all"}
 """FFmpeg decodes the first picture of H.264 only to learn its pixel format: not with these."""
 
 _MICROSECONDS: Final = 1_000_000
+_OUT_OF_FILES: Final = (errno.EMFILE, errno.ENFILE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +90,10 @@ def open_container(
     except PermissionError as error:
         raise StorageError(f"{name}: may not be read: give read permission.") from error
     except av.FFmpegError as error:
+        if isinstance(error, OSError) and error.errno in _OUT_OF_FILES:
+            raise StorageError(
+                f"{name}: cannot be opened ({error.strerror}). {cure_of(error)}"
+            ) from error
         raise MediaError(
             f"{name}: cannot be opened as MP4 or Matroska ({error.strerror}). The file is cut "
             f"short, damaged or something else: fetch it again."
@@ -118,7 +124,8 @@ def _require_file(path: Path, *, name: str) -> None:
         size = path.stat().st_size
     except OSError as error:
         raise StorageError(
-            f"{name}: cannot be read at {path} ({error.strerror}): fetch it, or correct the path."
+            f"{name}: cannot be read at {path} ({error.strerror}). "
+            + cure_of(error, "Fetch it, or correct the path.")
         ) from error
     if size == 0:
         raise MediaError(f"{name}: is empty (0 bytes at {path}): fetch it again.")

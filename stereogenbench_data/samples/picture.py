@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from stereogenbench_data.errors import FieldError
 from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.storage.unfinished import writing_output
 
 Picture = UInt8[np.ndarray, "h w 3"]
 
@@ -91,8 +92,13 @@ def _enlarged(tile: Picture) -> Picture:
 
 
 def write_png(path: Path, picture: Picture) -> None:
-    """Write an (h, w, 3) uint8 picture as PNG."""
-    Image.fromarray(picture).save(path, format="PNG")
+    """Write an (h, w, 3) uint8 picture as PNG, whole or not at all.
+
+    Raises:
+        OSError: If it cannot be written; then the file that was there is as before.
+    """
+    with writing_output(path) as file:
+        Image.fromarray(picture).save(file, format="PNG")
 
 
 def _row(sample: Sample) -> list[tuple[str, Picture]]:

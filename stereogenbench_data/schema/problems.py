@@ -82,3 +82,29 @@ def counted(count: int, noun: str) -> str:
     ('1 shard', '0 shards')
     """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def markdown_text(text: str) -> str:
+    r"""Return text that came with data as Markdown that shows it, in a table's cell too.
+
+    Nothing in it is taken for a tag, a link, a picture, code or the end of a cell.
+
+    >>> print(markdown_text("<img src=x onerror=alert(1)>|[a](b)"))
+    &lt;img src=x onerror=alert(1)&gt;\|[a]\(b)
+    """
+    escaped = text.replace("\\", "\\\\").replace("&", "&amp;")
+    escaped = escaped.replace("<", "&lt;").replace(">", "&gt;")
+    for mark, inert in (("|", r"\|"), ("`", r"\`"), ("](", r"]\(")):
+        escaped = escaped.replace(mark, inert)
+    return plain_line(escaped)
+
+
+def plain_line(text: str) -> str:
+    r"""Return text on one line, without what steers a terminal: such characters are spelled out.
+
+    >>> print(plain_line("a" + chr(27) + "[31mb" + chr(10) + "c"))
+    a\x1b[31mb\nc
+    """
+    return "".join(
+        each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
+    )

@@ -76,13 +76,18 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
             before = f" of those left by {', '.join(applied)}" if applied else ""
             raise SelectionError(
                 f"{name}={wanted!r} matches none of {counted(len(rows), 'scene')}{before}; "
-                f"{name} there is {there()}."
+                f"{name} there is {there()}.{told_stale(index)}"
             )
         rows = rows[keep]
         applied.append(f"{name}={wanted!r}")
     if len(rows) == 0:
         raise SelectionError(f"{index.where}: the index holds no scene at all.")
     return rows
+
+
+def told_stale(index: SceneIndex) -> str:
+    """Return what to add to a message about scenes that an index does not have."""
+    return f" {index.stale}" if index.stale else ""
 
 
 def _apply(
@@ -98,7 +103,7 @@ def _apply(
             raise SelectionError(
                 f"{name}={nowhere[0]!r} matches none of {counted(len(column), 'scene')} of the "
                 f"index; {name} "
-                f"there is {_listed(column, near=nowhere)}."
+                f"there is {_listed(column, near=nowhere)}.{told_stale(index)}"
             )
         return np.isin(values.astype(str), names), lambda: _listed(values, near=names)
     if name in _RANGE_COLUMNS:

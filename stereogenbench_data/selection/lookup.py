@@ -5,6 +5,7 @@ from typing import Final
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.selection.filters import told_stale
 from stereogenbench_data.storage.index import SceneIndex
 
 _SHOWN: Final = 6
@@ -42,6 +43,7 @@ def find_scene(index: SceneIndex, text: str) -> int:
     raise SelectionError(
         f"{text!r} is no key of {counted(len(keys), 'scene')}, nor a part of one. "
         + (f"Did you mean {_listed(near)}?" if near else f"There is {_listed(keys)}.")
+        + told_stale(index)
     )
 
 

@@ -4,7 +4,7 @@ An item is one member, stored whole under a name made of the dataset's revision,
 and the member's place, size and checksum. It is written beside its place and moved there, so that
 no reader meets half of one; a lock lets one process fetch it while others wait. When the limit is
 reached, items that were not used for longest go. A reader keeps what it has opened even then: its
-open file stays whole until it is closed.
+open file stays whole until it is closed. A cache that may only be read serves what it holds.
 
 A stored item bears a time of change that follows from its name. Whatever is written into it later
 changes that time: then its checksum decides whether it is still what was fetched. When it was used
@@ -23,11 +23,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.errors import ShardError, StorageError, cure_of
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.storage.locks import locked
 from stereogenbench_data.storage.ranged_file import FileSlice
 from stereogenbench_data.storage.remote import RemoteObject
+from stereogenbench_data.storage.unfinished import write_whole
 
 FOLDER_NAME: Final = "stereogenbench-members"
 _TAG: Final = "CACHEDIR.TAG"
@@ -39,6 +40,7 @@ _OWN_FILE: Final = re.compile(r"([0-9a-f]{64})\.(member|part)")
 _FULL: Final = 0.9
 """The share of the limit to which a full cache is emptied, so that not every item empties it."""
 
+_READ_ONLY: Final = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
 _FIRST_STAMP_S: Final = 1_000_000_000
 
 
@@ -97,7 +99,7 @@ class ShardCache:
     def drop_damaged(self, member: Member, *, where: str, revision: str) -> bool:
         """Drop a member whose bytes are not those that were stored; say whether it was one."""
         key = _key(member, where=where, revision=revision)
-        with _named_errors(self.folder), self._locked(key[:2]):
+        with _named_errors(self.folder), _where_writable(), self._locked(key[:2]):
             place = self._place(key)
             if member.crc32 is None or not place.is_file():
                 return False
@@ -106,6 +108,7 @@ class ShardCache:
                     return False
             self._drop(place)
             return True
+        return False
 
     def used_bytes(self) -> int:
         """Return the bytes of all members stored."""
@@ -120,16 +123,17 @@ class ShardCache:
             )
         self.folder.mkdir(parents=True, exist_ok=True)
         tag = self.folder / _TAG
-        names = sorted(each.name for each in self.folder.iterdir())
+        begun = f".{_TAG}."  # by another process, or by one that was killed
+        names = sorted(
+            each.name for each in self.folder.iterdir() if not each.name.startswith(begun)
+        )
         if names and _TAG not in names:
             raise StorageError(
                 f"{self.folder}: holds {names[0]} and is no cache of this package. Choose another "
                 f"folder, or delete it."
             )
         if not names:
-            unfinished = self.folder.with_name(f".{FOLDER_NAME}.{os.getpid()}")
-            unfinished.write_bytes(_TAG_TEXT)
-            unfinished.replace(tag)
+            write_whole(tag, _TAG_TEXT)
         if not tag.read_bytes().startswith(_SIGNATURE):
             raise StorageError(
                 f"{tag}: was not written by this package. Choose another folder, or delete it."
@@ -270,9 +274,20 @@ def _stamp_ns(key: str) -> int:
 
 def _mark_used(path: Path, key: str) -> None:
     """Set when an item was used last, and its own time of change."""
-    # Of another user's item neither can be set: it goes as if it had not been used.
-    with suppress(PermissionError):
+    # Of another user's item, or on a disk that is read-only now, neither can be set: it goes as if
+    # it had not been used.
+    with _where_writable():
         os.utime(path, ns=(time.time_ns(), _stamp_ns(key)))
+
+
+@contextmanager
+def _where_writable() -> Iterator[None]:
+    """Pass over what a cache that may only be read cannot do."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _READ_ONLY:
+            raise
 
 
 def _key(member: Member, *, where: str, revision: str) -> str:
@@ -308,7 +323,7 @@ def _named_errors(folder: Path) -> Iterator[None]:
         cure = (
             "Free space, or give the cache a smaller limit."
             if error.errno in (errno.ENOSPC, errno.EDQUOT)
-            else "Choose another folder for the cache."
+            else cure_of(error, "Choose another folder for the cache.")
         )
         raise StorageError(
             f"{folder}: the cache cannot be read or written ({error.strerror or error}). {cure}"

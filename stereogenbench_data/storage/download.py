@@ -13,18 +13,24 @@ from pathlib import Path
 from threading import Event
 from typing import Final
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import StorageError, cure_of
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import METADATA_FILES
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
 from stereogenbench_data.storage.location import is_remote, joined, local_path
 from stereogenbench_data.storage.remote import RemoteObject
-from stereogenbench_data.storage.source import open_local
+from stereogenbench_data.storage.source import open_local, require_own_files
+from stereogenbench_data.storage.stale_index import scenes_listed
+from stereogenbench_data.storage.unfinished import writing_whole
 
 Progress = Callable[[int, int], None]
 
 _CHUNK: Final = 1024 * 1024
 _SPARE_BYTES: Final = 16 * 1024 * 1024
+
+
+class _Stopped(Exception):
+    """Another file failed, so this one is not fetched to its end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +124,8 @@ def download(
     dest = local_path(dest)
     if not is_remote(index.root) and dest == local_path(index.root):
         raise StorageError(f"{dest}: is where the data are. Name another folder.")
+    if not is_remote(index.root):
+        require_own_files(index.root, sorted({each.member.path for each in wanted.files}))
     missing = [each for each in wanted.files if not _is_whole(each, dest)]
     needed = sum(each.member.size for each in missing)
     done = wanted.size_bytes - needed
@@ -150,6 +158,7 @@ def download(
         for scene in wanted.scenes
     ]
     here = SceneIndex.from_scenes(scenes, dest)
+    here.passed_over = tuple(sorted(scenes_listed(dest) - {scene.id.key for scene in scenes}))
     here.write(dest / INDEX_NAME)
     return here
 
@@ -172,7 +181,7 @@ def _require_room(dest: Path, needed: int) -> None:
         dest.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(dest).free
     except OSError as error:
-        raise StorageError(f"{dest}: cannot be written ({error.strerror}).") from error
+        raise StorageError(_why_not_written(dest, error)) from error
     if needed + _SPARE_BYTES > free:
         raise StorageError(
             f"{dest}: {needed} bytes are to come, and the disk has room for {free}. Take fewer "
@@ -180,47 +189,39 @@ def _require_room(dest: Path, needed: int) -> None:
         )
 
 
+def _why_not_written(place: Path, error: OSError) -> str:
+    cure = cure_of(error, "Choose another folder.")
+    return f"{place}: cannot be written ({error.strerror or error}). {cure}"
+
+
 def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> None:
     place = dest / wanted.key / wanted.name
-    part = place.with_name(f".{wanted.name}.part")
     member = wanted.member
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         crc32 = 0
-        with part.open("wb") as file:
-            for data in _chunks(index, member):
-                if stop.is_set():
-                    return
+        with writing_whole(place) as file:
+            for data in _until(stop, _chunks(index, member)):
                 file.write(data)
                 crc32 = zlib.crc32(data, crc32)
-        if member.crc32 not in (None, crc32):
-            raise StorageError(
-                f"{wanted.key}/{wanted.name}: came with crc32 {crc32:08x}, and the index says "
-                f"{member.crc32:08x}. The source is damaged, or not the one that was indexed."
-            )
-        part.replace(place)
+            if member.crc32 not in (None, crc32):
+                raise StorageError(
+                    f"{wanted.key}/{wanted.name}: came with crc32 {crc32:08x}, and the index says "
+                    f"{member.crc32:08x}. The source is damaged, or not the one that was indexed."
+                )
+    except _Stopped:
+        return
     except OSError as error:
         if isinstance(error, StorageError):
             raise
-        raise StorageError(f"{place}: cannot be written ({error.strerror}).") from error
-    finally:
-        part.unlink(missing_ok=True)
+        raise StorageError(_why_not_written(place, error)) from error
 
 
-def _require_within(root: Path, member: Member) -> None:
-    """Refuse a link that leads out of the data: what is copied is passed on.
-
-    Snapshots in the Hub's own cache are links to the blobs beside them, which are theirs.
-    """
-    folders = [root.resolve()]
-    if folders[0].parent.name == "snapshots":
-        folders.append(folders[0].parent.parent / "blobs")
-    place = (root / member.path).resolve()
-    if not any(place.is_relative_to(folder) for folder in folders):
-        raise StorageError(
-            f"{root / member.path}: is a link to {place}, outside the data, and is not copied. "
-            f"If it belongs to the data, put the file itself in the link's place."
-        )
+def _until(stop: Event, chunks: Iterator[bytes]) -> Iterator[bytes]:
+    for data in chunks:
+        if stop.is_set():
+            raise _Stopped
+        yield data
 
 
 def _chunks(index: SceneIndex, member: Member) -> Iterator[bytes]:
@@ -228,7 +229,6 @@ def _chunks(index: SceneIndex, member: Member) -> Iterator[bytes]:
         remote = RemoteObject(joined(index.root, member.path), patience=index.patience)
         yield from remote.chunks(member.offset, member.offset + member.size)
         return
-    _require_within(local_path(index.root), member)
     opened = open_local(index.root, member, shard=index.shards.get(member.path))
     with opened.open("rb") if isinstance(opened, Path) else opened as file:
         while data := file.read(_CHUNK):

@@ -9,7 +9,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.errors import ShardError
+from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.unfinished import write_whole
 
@@ -54,8 +54,8 @@ def write_foreign_indexes(index: SceneIndex, *, out: Path) -> None:
             write_whole(out / path, content)
     except OSError as error:
         raise ShardError(
-            f"{error.filename or out}: cannot be written ({error.strerror or error}). Make room or "
-            f"give write permission, then run the same command again."
+            f"{error.filename or out}: cannot be written ({error.strerror or error}). "
+            + cure_of(error, "Check the disk, then run the same command again.")
         ) from error
 
 

@@ -38,6 +38,11 @@ from stereogenbench_data.storage.remote import RemoteObject
 from stereogenbench_data.storage.remote_tree import find_remote_scenes
 from stereogenbench_data.storage.retry import Patience
 from stereogenbench_data.storage.rows import SCHEMA, row_of, scene_of
+from stereogenbench_data.storage.stale_index import (
+    Indexed,
+    StaleIndexWarning,
+    stale_message,
+)
 from stereogenbench_data.storage.walk import TreeReport, walk
 
 INDEX_NAME: Final = "index.parquet"
@@ -64,6 +69,10 @@ class SceneIndex:
         incomplete: Key to reason, for scenes that were not finished when the index was made.
         broken: Key to what is wrong, for scenes that were left out for it.
         shards: What is known of each shard, by its path below the root; empty for folders.
+        is_part: Whether it was made of a part of the root on purpose.
+        passed_over: Keys of scenes that the root holds and the index leaves out on purpose.
+        stale: What the root holds that the index does not know, or lacks of it, and the cure;
+            empty where nothing of that can be seen. A URL is not looked at.
     """
 
     def __init__(self, table: pa.Table, *, root: str | Path, head: Mapping[str, Any]) -> None:
@@ -75,6 +84,10 @@ class SceneIndex:
         self.shards: dict[str, ShardFacts] = {
             path: ShardFacts(**facts) for path, facts in head.get("shards", {}).items()
         }
+        # An index of an earlier version that lies elsewhere may have been made of a part.
+        self.is_part: bool = head.get("part", head.get("root", ".") != ".") is True
+        self.passed_over: tuple[str, ...] = tuple(map(str, head.get("passed_over", ())))
+        self.stale = ""
         self._table = table
         self._columns: dict[str, np.ndarray] = {}
         self._digest = ""
@@ -114,6 +127,8 @@ class SceneIndex:
         )
         where = shown(data) if is_remote(data) else str(local_path(data))
         _warn_of(index.incomplete | index.broken, where=where)
+        if index.stale:
+            warnings.warn(index.stale, StaleIndexWarning, stacklevel=2)
         index.patience = patience
         return index
 
@@ -173,6 +188,7 @@ class SceneIndex:
         """Return the index of the scenes that a walk found, with those that it left out."""
         index = cls.from_scenes(report.scenes, report.root)
         index.incomplete, index.broken = report.incomplete, report.broken
+        index.is_part = report.is_part
         return index
 
     @classmethod
@@ -192,7 +208,9 @@ class SceneIndex:
     def _from_file(cls, path: Path, *, root: str | None) -> "SceneIndex":
         table, head = read_index_file(path, where=str(path))
         place = root_of(path, head, table) if root is None else root
-        return cls._checked(table, head, root=place, where=str(path))
+        index = cls._checked(table, head, root=place, where=str(path))
+        index._look_around(path)
+        return index
 
     @classmethod
     def _from_url(cls, url: str, *, root: str | None, patience: Patience | None) -> "SceneIndex":
@@ -243,6 +261,19 @@ class SceneIndex:
             )
         return index
 
+    def _look_around(self, path: Path) -> None:
+        """Compare what is indexed with what its folder holds now, by names."""
+        if is_remote(self.root):
+            return
+        indexed = Indexed(
+            keys=self.column("key").tolist(),
+            passed_over={*self.incomplete, *self.broken, *self.passed_over},
+            unfinished=self.incomplete.keys(),
+            shards=self.shards.keys(),
+            is_part=self.is_part,
+        )
+        self.stale = stale_message(Path(self.root), indexed, index_file=path)
+
     def write(self, path: str | Path) -> None:
         """Write the index as one Parquet file, whole or not at all.
 
@@ -258,6 +289,8 @@ class SceneIndex:
             "digest": self.digest,
             "incomplete": self.incomplete,
             "broken": self.broken,
+            "part": self.is_part,
+            "passed_over": list(self.passed_over),
             "shards": {path: asdict(facts) for path, facts in sorted(self.shards.items())},
         }
         write_index_file(path, self._table, description)
@@ -355,6 +388,19 @@ def _require_no_root(where: str | Path, root: str | None) -> None:
             f"{where}: has no {INDEX_NAME}, and a root was named for the data of one. Leave root "
             f"out, or pass the index file."
         )
+
+
+def warn_if_stale(root: str | Path) -> None:
+    """Warn if a folder has an index that does not know what was just written into it."""
+    path = local_path(root) / INDEX_NAME
+    if not path.is_file():
+        return
+    try:
+        stale = SceneIndex._from_file(path, root=None).stale
+    except StorageError:
+        return  # an index that cannot be read says so to whoever opens it
+    if stale:
+        warnings.warn(stale, StaleIndexWarning, stacklevel=3)
 
 
 def _array(values: Any) -> np.ndarray:

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import StorageError, cure_of
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.storage.location import (
     is_remote,
@@ -28,6 +28,7 @@ from stereogenbench_data.storage.location import (
 )
 from stereogenbench_data.storage.rows import SCHEMA
 from stereogenbench_data.storage.source import UNSAFE_PATH
+from stereogenbench_data.storage.unfinished import writing_whole
 
 _OF_RELEASE: Final = "Run `stereogenbench index ROOT` again."
 _OF_SHARDS: Final = (
@@ -65,6 +66,10 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
     except StorageError:
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        if isinstance(error, OSError) and error.errno and cure_of(error):
+            raise StorageError(
+                f"{where}: cannot be read ({os.strerror(error.errno)}). {cure_of(error)}"
+            ) from error
         raise StorageError(
             f"{where}: is no Parquet file that can be read ({error}). It was cut short or is "
             f"something else. {made_again(where)}"
@@ -80,19 +85,15 @@ def write_index_file(path: Path, table: pa.Table, description: Mapping[str, Any]
         StorageError: If it cannot be written.
     """
     head = json.dumps({"format": _FORMAT} | dict(description))
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    described = table.replace_schema_metadata({_METADATA_KEY: head})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            described = table.replace_schema_metadata({_METADATA_KEY: head})
-            pq.write_table(described, unfinished, compression="zstd")
-            unfinished.replace(path)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        with writing_whole(path) as file:
+            pq.write_table(described, file, compression="zstd")
     except OSError as error:
         raise StorageError(
-            f"{path}: the index cannot be written ({error.strerror or error}). Choose "
-            f"another place with --out."
+            f"{path}: the index cannot be written ({error.strerror or error}). "
+            + cure_of(error, "Choose another place with --out.")
         ) from error
 
 
@@ -191,6 +192,7 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
         or not isinstance(head.get("root"), str)
         or not all(map(_are_shard_facts, head["shards"].values()))
         or any(map(_UNSAFE.search, head["shards"]))
+        or not isinstance(head.get("passed_over", []), list)
     ):
         raise StorageError(f"{where}: its description of itself was altered. {made_again(where)}")
     return head

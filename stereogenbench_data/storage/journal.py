@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, TextIO
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import StorageError, cure_of
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.storage.rows import SCHEMA, row_of, scene_of
 
@@ -43,7 +43,7 @@ class RecordJournal:
         except OSError as error:
             raise StorageError(
                 f"{path}: the journal of an earlier run cannot be read ({error.strerror}). "
-                f"Remove it, or write the result to another folder."
+                + cure_of(error, "Remove it, or write the result to another folder.")
             ) from error
         self._is_same = bool(lines) and lines[0] == self._head
         self._known = _known(lines[1:]) if self._is_same else {}
@@ -73,8 +73,8 @@ class RecordJournal:
             self._file.flush()
         except OSError as error:
             raise StorageError(
-                f"{self._path}: the journal cannot be written ({error.strerror}). Give write "
-                f"permission there, or write the result to another folder."
+                f"{self._path}: the journal cannot be written ({error.strerror}). "
+                + cure_of(error, "Write the result to another folder.")
             ) from error
 
     def delete(self) -> None:

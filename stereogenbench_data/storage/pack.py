@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereogenbench_data.errors import ShardError
+from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.media.depth_frame_file import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES
 from stereogenbench_data.storage.foreign_index import write_foreign_indexes
-from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
+from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex, warn_if_stale
 from stereogenbench_data.storage.pack_folder import take_folder
 from stereogenbench_data.storage.pool import run_tasks
 from stereogenbench_data.storage.repack_check import require_same_rows, require_same_sources
@@ -33,6 +33,7 @@ from stereogenbench_data.storage.shard_plan import (
     plan_shards,
 )
 from stereogenbench_data.storage.shard_writer import found_whole, pack_task
+from stereogenbench_data.storage.source import require_own_files
 
 Progress = Callable[[int, int], None]
 
@@ -148,6 +149,9 @@ def prepare(
     if depth_codec == "blosc2":
         blosc2_module()
     plan = plan_shards(index, target_bytes, depth_codec=depth_codec)
+    require_own_files(
+        plan.root, (member.source for shard in plan.shards for member in shard.members)
+    )
     job = PackJob(index, plan, Path(out), part)
     _require_fitting(job.plan)
     try:
@@ -159,8 +163,8 @@ def prepare(
         if isinstance(error, ShardError):
             raise
         raise ShardError(
-            f"{out}: cannot be written to ({error.strerror or error}). Give write permission, or "
-            f"pack into another folder."
+            f"{out}: cannot be written to ({error.strerror or error}). "
+            + cure_of(error, "Pack into another folder.")
         ) from error
     return job
 
@@ -203,8 +207,10 @@ def finish(job: PackJob, *, packed: list[str]) -> PackReport:
             require_same_rows(task, note)
         shards = {name: found for name, found in done.items() if found is not None}
         index = packed_index(job, shards)
-        index.write(target)
+        # The index comes last: where there is one, everything is.
         write_foreign_indexes(index, out=job.out)
+        index.write(target)
+        warn_if_stale(job.out)
     part = tuple(shard.name for shard in job.shards)
     return PackReport(part, tuple(name for name in part if name in packed), missing, target)
 

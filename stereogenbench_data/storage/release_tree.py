@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.errors import SchemaError, StorageError
+from stereogenbench_data.errors import SchemaError, StorageError, cure_of
 from stereogenbench_data.schema.labels import parse_scene_key
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
@@ -23,6 +23,7 @@ LAYOUT: Final = "train/<family>/<map>/<scene> or eval/<subset>/<family>/<map>/<s
 _SCENE_FILES: Final = frozenset({BASELINE_JSON, TRAJECTORY_JSON, COMPLETE_JSON, *VIDEO_FILES})
 _DEPTH_BELOW: Final = {"train": 4, "eval": 5}
 _DEEPEST: Final = 8
+_SEARCHABLE: Final = "Check the disk, then run it again."
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +85,7 @@ def _search(root: Path) -> Iterator[tuple[Path, str]]:
             files = {entry.name for entry in listed}
             folders = [e.name for e in listed if not e.name.startswith(".") and _is_folder(e)]
         except OSError as error:
-            yield folder, f"cannot be searched ({error.strerror}). Give read permission."
+            yield folder, f"cannot be searched ({error.strerror}). {cure_of(error, _SEARCHABLE)}"
             continue
         if files & _SCENE_FILES or (is_place_of_scene and not folders):
             yield folder, ""

@@ -9,7 +9,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.errors import MediaError, ShardError
+from stereogenbench_data.errors import MediaError, ShardError, cure_of
 from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.storage.pool import AfterBytes
 from stereogenbench_data.storage.shard_note import SeenFile
@@ -112,8 +112,8 @@ def _read(source: Path, file: FileIO, size: int) -> bytes:
 
 def _unreadable(source: Path, error: OSError) -> ShardError:
     return ShardError(
-        f"{source}: cannot be read ({error.strerror}). Fetch it again or give read permission, "
-        f"then run the same command again."
+        f"{source}: cannot be read ({error.strerror}). "
+        + cure_of(error, "Fetch it again, then run the same command again.")
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.errors import ShardError
+from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import METADATA_FILES
 from stereogenbench_data.storage.metadata_check import metadata_differences
@@ -88,7 +88,7 @@ def _seen_now(source: Path, seen: SeenFile, *, is_text: bool) -> tuple[int, int]
         return None
     except OSError as error:
         raise ShardError(
-            f"{source}: cannot be read ({error.strerror}). Give read permission, then run the "
-            f"same command again."
+            f"{source}: cannot be read ({error.strerror}). "
+            + cure_of(error, "Check the disk, then run the same command again.")
         ) from error
     return status.st_size, crc32

@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import StorageError, cure_of
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.release import METADATA_FILES, PACKED_DEPTH_NAMES, VIDEO_FILES
 from stereogenbench_data.storage.location import is_remote, joined
@@ -65,8 +65,8 @@ class LocalSceneFiles:
                 found = {entry.name: entry.stat() for entry in entries if entry.name in _WANTED}
         except OSError as error:
             raise StorageError(
-                f"{self._folder}: cannot be read ({error.strerror}). Give read permission, or "
-                f"fetch the scene again."
+                f"{self._folder}: cannot be read ({error.strerror}). "
+                + cure_of(error, "Fetch the scene again.")
             ) from error
         return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
 

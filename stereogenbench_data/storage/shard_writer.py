@@ -12,7 +12,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.errors import ShardError
+from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import METADATA_FILES
 from stereogenbench_data.storage.pool import AfterBytes
@@ -115,10 +115,8 @@ def _why_not_written(task: ShardTask, error: OSError) -> str:
             f"{task.target}: the disk is full; the shard needs {task.shard.size} bytes. What was "
             f"begun is removed: make room, then run the same command again to go on from here."
         )
-    return (
-        f"{task.target}: cannot be written ({error.strerror or error}). Give write permission "
-        f"there, or pack into another folder."
-    )
+    cure = cure_of(error, "Pack into another folder.")
+    return f"{task.target}: cannot be written ({error.strerror or error}). {cure}"
 
 
 class _Output:

@@ -1,5 +1,6 @@
 """Where a scene's bytes are, and how they are opened: files, members of shards, URLs, the cache."""
 
+import os
 import re
 import stat
 import zlib
@@ -7,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.errors import ShardError, StorageError, cure_of
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.storage.cache import ShardCache
@@ -39,7 +40,9 @@ def size_of(location: str | Path) -> int:
     try:
         return path.stat().st_size
     except OSError as error:
-        raise StorageError(f"{path}: cannot be read ({error.strerror}). Fetch it again.") from error
+        raise StorageError(
+            f"{path}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
+        ) from error
 
 
 def read_range(location: str | Path, start: int, stop: int) -> bytes:
@@ -57,7 +60,9 @@ def read_range(location: str | Path, start: int, stop: int) -> bytes:
     except StorageError:
         raise
     except OSError as error:
-        raise StorageError(f"{path}: cannot be read ({error.strerror}). Fetch it again.") from error
+        raise StorageError(
+            f"{path}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
+        ) from error
 
 
 class MemberSource:
@@ -221,7 +226,9 @@ def open_local(
     try:
         file = FileSlice(path, member)
     except OSError as error:
-        raise ShardError(f"{path}: cannot be read ({error.strerror}). {again}") from error
+        raise ShardError(
+            f"{path}: cannot be read ({error.strerror}). {cure_of(error, again)}"
+        ) from error
     found, end = file.status().st_size, member.offset + member.size
     if found < end or (shard is not None and found != shard.size):
         file.close()
@@ -247,7 +254,8 @@ def member_path(root: str | Path, member: Member) -> Path:
     except OSError as error:
         raise StorageError(
             f"{path}: cannot be read ({error.strerror}), and the index says that it has "
-            f"{member.size} bytes. Fetch it again, or run `stereogenbench index` again."
+            f"{member.size} bytes. "
+            + cure_of(error, "Fetch it again, or run `stereogenbench index` again.")
         ) from error
     if size_bytes != member.offset + member.size:
         raise StorageError(
@@ -256,6 +264,47 @@ def member_path(root: str | Path, member: Member) -> Path:
             f"fetch it again, or run `stereogenbench index` again."
         )
     return path
+
+
+def require_own_files(root: str | Path, paths: Iterable[str]) -> None:
+    """Refuse files of a folder that are to be passed on and that links lead out of it to.
+
+    Such a link in a stranger's folder would carry any file of this machine into what is published.
+    Links to other files of the folder are as good as copies; so are those of the Hub's cache, which
+    keeps the files of a snapshot in ``blobs`` beside it. Reading for oneself follows all links.
+
+    Args:
+        root: The folder, on this machine.
+        paths: Of the files, below it.
+
+    Raises:
+        StorageError: Naming the first such file, where it leads and what to do.
+    """
+    root = local_path(root)
+    real = os.path.realpath(root)
+    own = [real, *_hub_blobs(Path(real))]
+    folders: dict[str, str] = {}
+    for path in paths:
+        folder, _, name = path.rpartition("/")
+        if folder not in folders:
+            folders[folder] = os.path.realpath(root / folder)
+        place = f"{folders[folder]}/{name}"
+        place = os.path.realpath(place) if Path(place).is_symlink() else place
+        if not any(place.startswith(f"{each.rstrip('/')}/") for each in own):
+            raise StorageError(
+                f"{root / path}: leads out of {root} by a link, to {place}, and would be passed on "
+                f"with the data. Copy the file into the folder if it may be (`cp -rL` copies what "
+                f"links lead to); else remove the link."
+            )
+
+
+def _hub_blobs(real: Path) -> list[str]:
+    """Return where the Hub's cache keeps the files of the snapshot that a folder lies in."""
+    return [
+        str(each.parent.parent / "blobs")
+        for each in (real, *real.parents)
+        if each.parent.name == "snapshots" and each.parent.parent.name.startswith("datasets--")
+    ]
 
 
 def _require_safe(member: Member) -> None:
@@ -280,6 +329,6 @@ def read_text_file(path: Path, *, where: str) -> bytes:
             return path.read_bytes()
     except OSError as error:
         raise StorageError(
-            f"{where}: cannot be read ({error.strerror}). Fetch it again, or give read permission."
+            f"{where}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
         ) from error
     raise StorageError(f"{where}: is no file. Put the release's own file in its place.")

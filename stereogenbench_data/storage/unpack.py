@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.errors import MediaError, ShardError
+from stereogenbench_data.errors import MediaError, ShardError, cure_of
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
-from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.storage.index import SceneIndex, warn_if_stale
 from stereogenbench_data.storage.location import shown
 from stereogenbench_data.storage.pool import AfterBytes, run_tasks
 from stereogenbench_data.storage.ranged_file import MemberFile
@@ -129,6 +129,7 @@ def unpack(
         if error.errno is None:
             raise
         raise ShardError(_why_not_written(out, error)) from error
+    warn_if_stale(out)
     return UnpackReport(
         out,
         tuple(sorted(key for key, work in found.items() if work == "unpacked")),
@@ -148,10 +149,8 @@ def _opened(data: str | Path, root: str | Path | None) -> SceneIndex:
 def _why_not_written(out: Path, error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"{out}: the disk is full. Make room, then run the same command again to go on."
-    return (
-        f"{error.filename or out}: cannot be written ({error.strerror or error}). Give write "
-        f"permission, or unpack into another folder."
-    )
+    cure = cure_of(error, "Unpack into another folder.")
+    return f"{error.filename or out}: cannot be written ({error.strerror or error}). {cure}"
 
 
 def unpack_scene(task: _Task, after_bytes: AfterBytes) -> tuple[str, Literal["unpacked", "kept"]]:

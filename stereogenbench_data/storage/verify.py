@@ -3,18 +3,20 @@
 A shard that is wrong does not stop the rest: all that is wrong is gathered, each with its cure.
 """
 
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.errors import ShardError
+from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.storage.foreign_index import foreign_indexes
 from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
 from stereogenbench_data.storage.location import shown
 from stereogenbench_data.storage.pool import run_tasks
 from stereogenbench_data.storage.shard_writer import UNFINISHED
+from stereogenbench_data.storage.stale_index import StaleIndexWarning
 from stereogenbench_data.storage.unfinished import PARTS
 from stereogenbench_data.storage.verify_decode import (
     Problem,
@@ -113,7 +115,10 @@ def _opened(data: str | Path, root: str | Path | None) -> SceneIndex:
             + ("Packing was not finished: run `stereogenbench pack` again." if begun else
                "Point at a folder that `stereogenbench pack` made.")
         )  # fmt: skip
-    index = SceneIndex.open(path, root=root)
+    with warnings.catch_warnings():
+        # What does not fit the index is a problem, told with the others.
+        warnings.simplefilter("ignore", StaleIndexWarning)
+        index = SceneIndex.open(path, root=root)
     if not index.shards:
         raise ShardError(
             f"{path}: is the index of a released folder, not of shards. Pack it with "
@@ -163,7 +168,8 @@ def _companion_problems(index: SceneIndex) -> Iterator[Problem]:
         except FileNotFoundError:
             yield Problem(name, "", "", "is missing, and pack wrote it", _WRITE_AGAIN)
         except OSError as error:
-            yield Problem(name, "", "", f"cannot be read ({error.strerror})", _WRITE_AGAIN)
+            cure = cure_of(error, _WRITE_AGAIN)
+            yield Problem(name, "", "", f"cannot be read ({error.strerror})", cure)
         else:
             if found != content:
                 yield Problem(name, "", "", "contradicts the index", _WRITE_AGAIN)

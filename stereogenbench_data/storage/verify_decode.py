@@ -4,7 +4,7 @@ import io
 from dataclasses import dataclass
 from pathlib import Path
 
-from stereogenbench_data.errors import MediaError
+from stereogenbench_data.errors import MediaError, cure_of
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import require_depth_stream, resolve_encoding
 from stereogenbench_data.media.depth_frames import DepthFrames
@@ -64,6 +64,8 @@ def decode_scene(task: DecodeTask, after_bytes: AfterBytes) -> list[Problem]:
         except (MediaError, OSError) as error:
             told = str(error).removeprefix(f"{name}: ").rstrip(".")
             cure = "Pack the scene again from a video that is whole."
+            if isinstance(error, OSError):
+                cure = cure_of(error, cure)
             problems.append(Problem(member.path, task.scene.id.key, name, told, cure))
         after_bytes(member.size)
     return problems

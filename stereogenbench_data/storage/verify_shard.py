@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.errors import ShardError
+from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import METADATA_FILES
@@ -53,7 +53,8 @@ def check_shard(expected: ExpectedShard, after_bytes: AfterBytes) -> CheckedShar
         with path.open("rb", buffering=0) as file:
             return _checked(expected, file, path.stat().st_size, after_bytes)
     except OSError as error:
-        return CheckedShard([expected.problem("", f"cannot be read ({error.strerror or error})")])
+        told = f"cannot be read ({error.strerror or error})"
+        return CheckedShard([expected.problem("", told, cure_of(error, FETCH))])
 
 
 def _checked(

@@ -40,6 +40,7 @@ class TreeReport:
         incomplete: Key to reason, for scenes without their mark or without any video.
         broken: Key (or path below the root) to what is wrong and what to do.
         notes: What was decided where the tree does not say.
+        is_part: Whether only scenes that were asked for were described.
     """
 
     root: str
@@ -47,6 +48,7 @@ class TreeReport:
     incomplete: dict[str, str]
     broken: dict[str, str]
     notes: tuple[str, ...]
+    is_part: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +104,8 @@ def walk(
             journal.add(outcome.scene, stamp=outcome.stamp)
         if progress is not None:
             progress(len(outcomes), total)
-    return _report(root, folders, [outcomes[key] for key in folders.keys])
+    report = _report(root, folders, [outcomes[key] for key in folders.keys])
+    return replace(report, is_part=wanted is not None)
 
 
 def _chosen(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from stereogenbench_data.errors import StorageError, SynthesisError
+from stereogenbench_data.errors import StorageError, SynthesisError, cure_of
 from stereogenbench_data.storage.pool import run_tasks
 from stereogenbench_data.synthesis.filming import film_camera
 from stereogenbench_data.synthesis.plan import plan_scene
@@ -35,8 +35,8 @@ class Job:
         except OSError as error:
             raise SynthesisError(
                 f"{plan.key}: camera {self.camera} could not be written to {self.folder}: {error}. "
-                f"See that the disk has room and may be written to, then run again: finished "
-                f"scenes are kept."
+                + cure_of(error, "See that the disk has room and may be written to.")
+                + " Then run again: finished scenes are kept."
             ) from error
 
 

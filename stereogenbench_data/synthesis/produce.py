@@ -11,8 +11,9 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.errors import SynthesisError, cure_of
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
+from stereogenbench_data.storage.index import warn_if_stale
 from stereogenbench_data.synthesis.crew import Job, run_jobs
 from stereogenbench_data.synthesis.export import completion_text, metadata_texts
 from stereogenbench_data.synthesis.plan import ScenePlan, plan_scene
@@ -21,6 +22,7 @@ from stereogenbench_data.synthesis.request import SynthRequest
 Progress = Callable[[int, int], None]
 
 _UNFINISHED: Final = ".unfinished"
+_LOOK: Final = "See that the disk has room and may be written to."
 
 
 def synthesise(
@@ -67,6 +69,7 @@ def synthesise(
                     _finish(root, plan_scene(request, index=job.index), drawn_in=job.folder)
     finally:
         _clear(root, request, missing=missing)
+    warn_if_stale(root)
     return [request.key(index) for index in range(request.scenes)]
 
 
@@ -98,7 +101,8 @@ def _jobs(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[J
             folder.mkdir(parents=True)
         except OSError as error:
             raise SynthesisError(
-                f"{out}: no folder could be made in it ({error}). Choose one that you may write to."
+                f"{out}: no folder could be made in it ({error}). "
+                + cure_of(error, "Choose one that you may write to.")
             ) from error
         for camera in range(CAMERA_COUNT):
             yield Job(request=request, index=index, camera=camera, folder=folder)
@@ -114,8 +118,8 @@ def _finish(out: Path, plan: ScenePlan, *, drawn_in: Path) -> None:
         drawn_in.rename(folder)
     except OSError as error:
         raise SynthesisError(
-            f"{plan.key}: could not be finished in {out}: {error}. See that the disk has room and "
-            f"may be written to, then run again: finished scenes are kept."
+            f"{plan.key}: could not be finished in {out}: {error}. {cure_of(error, _LOOK)} Then "
+            f"run again: finished scenes are kept."
         ) from error
 
 

@@ -6,6 +6,7 @@ import re
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from importlib import resources
 from urllib.parse import urlencode
 
@@ -259,3 +260,38 @@ def test_a_malformed_request_is_refused_and_the_server_goes_on(server):
 
     assert b"Bad request version" in answer
     assert ask(server, "/api/about")[0] == 200
+
+
+@pytest.mark.parametrize("sent", [b"", b"GET /api/about HTTP/1.1\r\nHost: 127"])
+def test_it_can_be_reached_beside_hundreds_of_half_open_connections(server, sent):
+    silent = [socket.create_connection(server.server_address, timeout=30) for _ in range(300)]
+    try:
+        for each in silent:
+            with suppress(OSError):  # it was ended already, to make room
+                each.sendall(sent)
+
+        answers = [ask(server, "/api/about")[0] for _ in range(5)]
+
+        assert answers == [200] * 5
+        assert threading.active_count() < 100
+    finally:
+        for each in silent:
+            each.close()
+
+
+def test_a_connection_that_is_answered_is_not_ended_for_others(server):
+    kept = http.client.HTTPConnection(*server.server_address, timeout=30)
+    kept.request("GET", "/api/about")
+    assert kept.getresponse().read()
+    kept.request("GET", "/api/about")
+
+    silent = [socket.create_connection(server.server_address, timeout=30) for _ in range(80)]
+    try:
+        answer = kept.getresponse()
+
+        assert answer.status == 200
+        assert json.loads(answer.read())
+    finally:
+        kept.close()
+        for each in silent:
+            each.close()

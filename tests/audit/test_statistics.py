@@ -244,3 +244,18 @@ def test_the_command_writes_json_plots_and_files(small_shards, run, tmp_path):
     assert sorted(path.name for path in (tmp_path / "plots").iterdir()) == [
         "baselines.png", "focal_lengths.png",
     ]  # fmt: skip
+
+
+def test_names_of_the_data_are_no_markup_in_the_table(small_release):
+    scene = SceneIndex.open(small_release).scene(0)
+    name = "<img src=x onerror=alert(1)>|[a](b)`"
+    named = dataclasses.replace(
+        scene, id=dataclasses.replace(scene.id, family=name, map_name=name, key=f"train/{name}")
+    )
+    index = SceneIndex.from_scenes([dataclasses.replace(named, members={})], small_release)
+
+    text = statistics_markdown(statistics(index))
+
+    assert "<img" not in text
+    assert "](b)" not in text
+    assert r"| &lt;img src=x onerror=alert(1)&gt;\|[a]\(b)\` | 1 |" in text

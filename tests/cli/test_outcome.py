@@ -141,6 +141,7 @@ def test_debug_may_stand_after_the_command_too(tmp_path):
     assert "Traceback" in ended.stderr
 
 
+@pytest.mark.usefixtures("usual_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_browser_at_once_with_130(small_shards, number):
     with subprocess.Popen(
@@ -152,7 +153,10 @@ def test_a_signal_ends_the_browser_at_once_with_130(small_shards, number):
         line = browsing.stdout.readline()
         time.sleep(0.2)
         browsing.send_signal(number)
-        _, said = browsing.communicate(timeout=60)
+        try:
+            _, said = browsing.communicate(timeout=60)
+        finally:
+            browsing.kill()
 
     assert line.startswith("http://127.0.0.1:")
     assert "4 scenes" in line
@@ -172,3 +176,15 @@ def test_a_port_that_is_taken_is_told(small_shards):
     assert shown.exit_code == 2
     assert "Address already in use" in shown.stderr
     assert "Choose another port." in shown.stderr
+
+
+def test_what_a_name_would_do_to_the_terminal_is_spelled_out(tmp_path):
+    odd = tmp_path / "a\x1b]0;title\x07\x1b[31m"
+    shown = invoke("stats", odd)
+    odd_scene = tmp_path / "tree" / "train" / "F" / "M" / "s\x1b[2J"
+    odd_scene.mkdir(parents=True)
+    indexed = invoke("index", tmp_path / "tree")
+
+    assert shown.exit_code == 2
+    assert "\x1b" not in shown.stderr + indexed.stderr + indexed.stdout
+    assert r"a\x1b]0;title\x07\x1b[31m" in shown.stderr

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("usual_signals")
+
 STARTING = """
 import os, signal, sys
 

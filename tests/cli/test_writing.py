@@ -8,7 +8,7 @@ import signal
 import stat
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -75,10 +75,32 @@ def test_a_file_that_cannot_be_written_is_named_and_not_left_half(
     assert shown.exit_code == 2
     assert last.startswith(f"OSError: {words[-1]}"), last
     assert "File too large. Choose a place that takes files of this size." in last
-    assert [path.name for path in tmp_path.iterdir() if path.suffix != ".journal"] in (
-        [],
-        ["plots"],
-    )
+    left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
+    assert [name for name in left if not name.endswith(".journal")] == []
+
+
+def test_a_full_disk_leaves_no_empty_picture_and_keeps_the_one_before(small_shards, tmp_path):
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", tmp_path],
+        check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    if mounted.returncode:
+        reason = f"a small disk cannot be mounted: {mounted.stderr.strip()}"
+        pytest.fail(reason) if os.environ.get("CI") else pytest.skip(reason)
+    try:
+        before = tmp_path / "before.png"
+        before.write_bytes(b"a picture")
+        with suppress(OSError), (tmp_path / "full").open("wb", buffering=0) as filling:
+            filling.write(bytes(16 * 1024))
+        new = invoke("show", small_shards, "-o", tmp_path / "sheet.png")
+        again = invoke("show", small_shards, "-o", before)
+
+        assert {path.name for path in tmp_path.iterdir()} == {"before.png", "full"}
+        assert before.read_bytes() == b"a picture"
+    finally:
+        subprocess.run(["umount", tmp_path], check=True)
+    assert [new.exit_code, again.exit_code] == [2, 2]
+    assert "No space left on device. Make room, or choose another place." in new.stderr
 
 
 def test_a_report_that_cannot_be_written_leaves_the_one_before(tmp_path):

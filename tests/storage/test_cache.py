@@ -401,7 +401,8 @@ def test_a_process_that_is_killed_while_it_fills_leaves_no_lock_and_no_half(fill
     web.answers = [Answer(stop_after=2000), Answer(delay_s=5.0)]
     killed = fillers.start(4)
     fillers.go()
-    while len(web.answers) > 0:
+    deadline = time.monotonic() + 60
+    while len(web.answers) > 0 and time.monotonic() < deadline:
         time.sleep(0.01)
     killed.send_signal(signal.SIGKILL)
     killed.wait()
@@ -413,3 +414,41 @@ def test_a_process_that_is_killed_while_it_fills_leaves_no_lock_and_no_half(fill
 
     assert fillers.end() == ["done\n"]
     assert web.asked[-1].start == 4000
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A small disk that can be made read-only."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1M", "tmpfs", place],
+        check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    if mounted.returncode:
+        reason = f"a disk cannot be mounted: {mounted.stderr.strip()}"
+        pytest.fail(reason) if os.environ.get("CI") else pytest.skip(reason)
+    yield place
+    subprocess.run(["umount", place], check=True)
+
+
+def test_a_cache_that_may_only_be_read_serves_what_it_holds(disk, shelf):
+    wanted = member(1000, 2000)
+    read(ShardCache(disk, limit_bytes=10_000), wanted, shelf)
+    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+
+    cache = ShardCache(disk, limit_bytes=10_000)
+
+    assert read(cache, wanted, shelf) == DATA[1000:3000]
+    assert not cache.drop_damaged(wanted, where="https://h/x.tar", revision="1")
+    assert shelf.fetched == [(1000, 3000)]
+    with pytest.raises(StorageError, match=r"Read-only file system\). Choose a place that can be"):
+        read(cache, member(0, 1000), shelf)
+
+
+def test_a_cache_that_another_process_is_making_is_used(tmp_path, shelf):
+    (tmp_path / FOLDER_NAME).mkdir()
+    (tmp_path / FOLDER_NAME / ".CACHEDIR.TAG.unfinished").write_bytes(b"Signat")
+
+    assert read(ShardCache(tmp_path, limit_bytes=10_000), member(0, 10), shelf) == DATA[:10]
+    assert not (tmp_path / FOLDER_NAME / ".CACHEDIR.TAG.unfinished").exists()

@@ -413,6 +413,7 @@ main.main()
 """
 
 
+@pytest.mark.usefixtures("usual_signals")
 def test_ctrl_c_ends_with_exit_code_130_and_leaves_no_half_shard(small_release, tmp_path):
     with subprocess.Popen(
         [sys.executable, "-c", INTERRUPTED_COMMAND, small_release, tmp_path, "--workers", "1"],
@@ -420,7 +421,10 @@ def test_ctrl_c_ends_with_exit_code_130_and_leaves_no_half_shard(small_release, 
     ) as process:  # fmt: skip
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=30)
+        try:
+            _, told = process.communicate(timeout=30)
+        finally:
+            process.kill()
 
     assert process.returncode == 130
     assert told == "stopped; run the same command again to go on from here\n"
@@ -836,3 +840,43 @@ def test_help_imports_nothing_heavy():
     assert "pack" in shown.stdout
     assert "verify" in shown.stdout
     assert {word for word in ("torch", "pyarrow", "av", "ray") if word in shown.stderr} == set()
+
+
+KILLED_PACK = """
+import os, signal, sys
+from stereogenbench_data.storage.pack import pack
+
+left = int(sys.argv[3])
+
+def after_event(event, arguments):
+    global left
+    mode = arguments[1] if event == "open" else None
+    writes = isinstance(mode, str) and mode[:1] in "wxa" and sys.argv[2] in str(arguments[0])
+    if writes or event in ("os.rename", "os.remove"):
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+sys.addaudithook(after_event)
+pack(sys.argv[1], sys.argv[2], target_bytes=int(sys.argv[4]), workers=1)
+"""
+
+
+@pytest.mark.parametrize("moment", [1, 3, 5, 8, 13, 26, 28, 30, 32, 34, 36, 38])
+def test_a_pack_killed_at_any_moment_leaves_nothing_behind_once_it_was_resumed(
+    moment, small_release, packed, tmp_path
+):
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", KILLED_PACK, small_release, out]
+
+    killed = subprocess.run([*command, str(moment), str(ONE_EACH)], check=False)
+    had_index = (out / "index.parquet").is_file()
+    had_companions = (out / "shards.json").is_file() and len([*out.glob("dali/*.idx")]) == 4
+    subprocess.run([*command, "0", str(ONE_EACH)], check=True)
+
+    assert killed.returncode == -signal.SIGKILL
+    assert had_companions or not had_index
+    assert sorted(path.relative_to(out) for path in out.rglob("*")) == sorted(
+        path.relative_to(packed) for path in packed.rglob("*")
+    )
+    assert bytes_of(out) == bytes_of(packed)

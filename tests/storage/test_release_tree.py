@@ -157,7 +157,8 @@ def test_a_folder_that_may_not_be_read_is_listed(tree, monkeypatch):
 
     assert len(folders.keys) == 3
     assert folders.refused == {
-        "train/IPD_Gaussian": "cannot be searched (Permission denied). Give read permission."
+        "train/IPD_Gaussian": "cannot be searched (Permission denied). Give permission, or choose "
+        "another place."
     }
 
 

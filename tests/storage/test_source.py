@@ -2,6 +2,9 @@
 
 import os
 import pickle
+import shutil
+import subprocess
+import sys
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +16,7 @@ from stereogenbench_data.errors import SchemaError, ShardError, StereoGenBenchEr
 from stereogenbench_data.schema.records import Member, ShardFacts
 from stereogenbench_data.storage.index import SceneIndex
 from stereogenbench_data.storage.location import is_remote, joined, local_path, shown, split_name
+from stereogenbench_data.storage.pack import pack
 from stereogenbench_data.storage.source import MemberSource, member_path, open_local
 from tests.servers.fault import Answer
 
@@ -289,3 +293,42 @@ def test_a_file_url_is_a_path_of_this_machine(tmp_path):
 def test_the_last_part_of_a_url_is_its_name():
     assert split_name("https://h/a/index.parquet?k=1") == ("https://h/a?k=1", "index.parquet")
     assert split_name("hf://datasets/o/n/x.parquet") == ("hf://datasets/o/n", "x.parquet")
+
+
+OUT_OF_FILES = """
+import os, resource, sys
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.errors import StorageError
+
+pairs = StereoPairs(sys.argv[1], fields=("left",))
+pairs[0]
+opened = [os.open(os.devnull, os.O_RDONLY)]
+_, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+resource.setrlimit(resource.RLIMIT_NOFILE, (opened[0] + 1, most))
+for opens in (lambda: pairs[len(pairs) - 1], lambda: StereoPairs(sys.argv[1])):
+    try:
+        opens()
+    except StorageError as error:
+        print(str(error).replace(chr(10), " "))
+"""
+
+
+@pytest.mark.parametrize("kind", ["tree", "shards", "packed depth"])
+def test_too_many_open_files_are_told_as_such(kind, small_release, tmp_path):
+    data = small_release
+    if kind == "tree":
+        data = shutil.copytree(small_release, tmp_path / "tree")
+        SceneIndex.open(data).write(data / "index.parquet")
+    else:
+        data = tmp_path / "shards"
+        codec = "released" if kind == "shards" else "blosc2"
+        pack(small_release, data, depth_codec=codec, workers=1)
+
+    told = subprocess.run(
+        [sys.executable, "-c", OUT_OF_FILES, data], check=True, capture_output=True, text=True
+    ).stdout.splitlines()
+
+    assert len(told) == 2
+    for line in told:
+        assert "(Too many open files). Raise the limit of open files (`ulimit -n`)" in line
+        assert "again" not in line

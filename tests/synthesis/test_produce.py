@@ -142,7 +142,7 @@ def test_a_full_disk_is_an_error_that_names_scene_camera_and_cure(tmp_path, monk
     monkeypatch.setattr(VideoFile, "write", fail)
 
     with pytest.raises(
-        SynthesisError, match=r"scene_000000: camera 0 .* No space left .* that the disk has room"
+        SynthesisError, match=r"scene_000000: camera 0 .* No space left .* Make room"
     ):
         synthesise(tmp_path, SynthRequest(**SMALL))
     assert not list(tmp_path.iterdir())

@@ -1,7 +1,9 @@
 """A web server for one reader: on this machine alone, read-only, for its own page alone."""
 
 import json
+import socket
 import threading
+import time
 from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -24,8 +26,11 @@ _HEADERS: Final = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
 }
-_MOST_CONNECTIONS: Final = 32
-_IDLE_S: Final = 60
+_MOST_CONNECTIONS: Final = 64
+_SILENT_S: Final = 20
+"""How long a connection may stay silent, or leave an answer unread."""
+_LEAST_WAIT_S: Final = 0.25
+"""How long a connection may take for its question before others may have its place."""
 
 
 class PageServer(ThreadingHTTPServer):
@@ -38,6 +43,7 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
     allow_reuse_address = True
+    request_queue_size = 128
 
     def __init__(self, service: Service, *, port: int = 0) -> None:
         """Take a port, 0 for any that is free.
@@ -46,7 +52,9 @@ class PageServer(ThreadingHTTPServer):
             OSError: If the port is taken.
         """
         self.service = service
-        self.places = threading.BoundedSemaphore(_MOST_CONNECTIONS)
+        self._places = threading.BoundedSemaphore(_MOST_CONNECTIONS)
+        self._waiting: dict[socket.socket, float] = {}
+        self._lock = threading.Lock()
         super().__init__((LOOPBACK, port), _Handler)
         port = self.server_address[1]
         self.hosts = frozenset({f"{LOOPBACK}:{port}", f"localhost:{port}"})
@@ -57,18 +65,52 @@ class PageServer(ThreadingHTTPServer):
         return f"http://{LOOPBACK}:{self.server_address[1]}/"
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread of its own, unless too many are at work."""
-        if not self.places.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
+        """Answer in a thread of its own; where too many are open, the longest silent one goes."""
+        while not self._places.acquire(blocking=False):
+            if not self._end_longest_silent():
+                self.shutdown_request(request)
+                return
+            if self._places.acquire(timeout=_LEAST_WAIT_S):
+                break
+        self.begin_waiting(request)
         super().process_request(request, client_address)
+
+    def begin_waiting(self, request: socket.socket) -> None:
+        """Note that a connection has nothing to be answered from now on."""
+        with self._lock:
+            self._waiting[request] = time.monotonic()
+
+    def end_waiting(self, request: socket.socket) -> None:
+        """Note that a connection has asked something, or ends: its place is its own."""
+        with self._lock:
+            self._waiting.pop(request, None)
+
+    def _end_longest_silent(self) -> bool:
+        """End the connection that has been silent for longest, after a moment's patience.
+
+        Returns:
+            Whether there was one; if not, all of them are being answered.
+        """
+        with self._lock:
+            if not self._waiting:
+                return False
+            request, since = min(self._waiting.items(), key=lambda each: each[1])
+        time.sleep(max(0.0, since + _LEAST_WAIT_S - time.monotonic()))
+        with self._lock:
+            if self._waiting.get(request) != since:
+                return True
+            del self._waiting[request]
+            with suppress(OSError):  # its thread meets the end, and frees its place
+                request.shutdown(socket.SHUT_RDWR)
+        return True
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Answer one connection, and make room for another."""
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self.places.release()
+            self.end_waiting(request)
+            self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing: a browser that went away is no error, and errors are told to the page."""
@@ -79,15 +121,23 @@ class _Handler(BaseHTTPRequestHandler):
     server_version = "stereogenbench"
     sys_version = ""
     protocol_version = "HTTP/1.1"
-    timeout = _IDLE_S
+    timeout = _SILENT_S
 
     def do_GET(self) -> None:
         """Answer a question."""
-        self._answer(body="send")
+        self._answer_alone(body="send")
 
     def do_HEAD(self) -> None:
         """Answer a question without its content."""
-        self._answer(body="leave out")
+        self._answer_alone(body="leave out")
+
+    def _answer_alone(self, *, body: str) -> None:
+        """Answer, and keep the connection from being ended meanwhile."""
+        self.server.end_waiting(self.connection)
+        try:
+            self._answer(body=body)
+        finally:
+            self.server.begin_waiting(self.connection)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """Say what is wrong, as JSON: also where the library finds a request malformed."""
