@@ -187,6 +187,16 @@ class EpochBatches(Sampler[list[int]]):
             )
 
     @property
+    def batch_size(self) -> int:
+        """How many samples a full batch of one rank has."""
+        return self.rule.batch_size
+
+    @property
+    def samples_of_epoch(self) -> int:
+        """How many samples an epoch has, of all ranks."""
+        return len(self.dataset.plan)
+
+    @property
     def left_out(self) -> int:
         """How many samples of an epoch no rank gets: of ``tail="drop"`` only."""
         return max(0, len(self.dataset.plan) - self.end() * self.rule.batch_size)

@@ -7,16 +7,13 @@ Batches and streams that are shared twice all the same are refused.
 """
 
 import sys
-from collections.abc import Iterator, Sized
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Iterable, Iterator, Sized
+from typing import Any, Final, Protocol
 
 import torch
 from torch.utils.data import DistributedSampler
 
 from stereogenbench_data.errors import SelectionError
-
-if TYPE_CHECKING:
-    from stereogenbench_data.datasets.batches import EpochBatches
 
 _SHARED_TWICE: Final = (
     "Accelerate shares these batches among {processes} processes, and this {name} gives rank "
@@ -25,13 +22,47 @@ _SHARED_TWICE: Final = (
 )
 
 
+class RankBatches(Protocol):
+    """The batches of one rank: what this module asks of `EpochBatches`."""
+
+    rank: int
+    world_size: int
+
+    @property
+    def tail(self) -> str:
+        """What becomes of the last batches."""
+        ...
+
+    @property
+    def samples_of_epoch(self) -> int:
+        """How many samples an epoch has, of all ranks."""
+        ...
+
+    @property
+    def batch_size(self) -> int:
+        """How many samples a batch of one rank has."""
+        ...
+
+    def __iter__(self) -> Iterator[Iterable[int]]: ...
+
+    def __len__(self) -> int: ...
+
+    def set_epoch(self, epoch: int) -> None:
+        """Go to another epoch."""
+        ...
+
+    def require_group(self, rank: int, world_size: int) -> None:
+        """Require that these are the batches of a rank of so many."""
+        ...
+
+
 class ShareSampler(DistributedSampler[Any]):
     """The samples of one rank, as the sampler that tells frameworks that they are shared out."""
 
-    def __init__(self, batches: "EpochBatches") -> None:
+    def __init__(self, batches: RankBatches) -> None:
         """Stand for the samples of these batches."""
         super().__init__(
-            batches.dataset,  # type: ignore[arg-type]  # a protocol: only its length is asked for
+            range(batches.samples_of_epoch),  # type: ignore[arg-type]  # only its length is asked for
             num_replicas=batches.world_size,
             rank=batches.rank,
         )
@@ -44,7 +75,7 @@ class ShareSampler(DistributedSampler[Any]):
 
     def __len__(self) -> int:
         """The number of samples in this rank's full batches."""
-        return len(self._batches) * self._batches.rule.batch_size
+        return len(self._batches) * self._batches.batch_size
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the batches: Lightning does before each epoch."""
@@ -61,7 +92,7 @@ class AcceleratedLoader:
             where all are none.
     """
 
-    batches: "EpochBatches"
+    batches: RankBatches
     use_stateful_dataloader: Final = True
     end_of_dataloader = False
     remainder = 0
@@ -71,12 +102,12 @@ class AcceleratedLoader:
     @property
     def total_batch_size(self) -> int:
         """How many samples the batches of all ranks hold together."""
-        return self.batches.rule.batch_size * self.batches.world_size
+        return self.batches.batch_size * self.batches.world_size
 
     @property
     def total_dataset_length(self) -> int:
         """How many samples an epoch has."""
-        return len(self.batches.dataset.plan)
+        return self.batches.samples_of_epoch
 
     @property
     def _is_accelerate_prepared(self) -> bool:

@@ -85,7 +85,12 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
     ``accelerator.prepare(loader)`` of Accelerate returns the loader itself, as it shares batches
     among ranks already; from then on batches come on the accelerator's device, and
     ``save_state`` and ``load_state`` keep its position.
+
+    Attributes:
+        batches: The samples of its batches, in their order.
     """
+
+    batches: EpochBatches
 
     def __init__(
         self, dataset: Keeping, batches: EpochBatches, *, num_workers: int, **options: Any

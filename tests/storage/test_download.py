@@ -214,7 +214,8 @@ def test_a_link_out_of_the_data_is_not_copied(small_release, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("root", "target"), [("data", "data/else/x"), ("a/snapshots/0123", "a/blobs/4567")]
+    ("root", "target"),
+    [("data", "data/else/x"), ("datasets--a--b/snapshots/0123", "datasets--a--b/blobs/4567")],
 )
 def test_a_link_within_the_data_is_copied(small_release, tmp_path, root, target):
     linked(small_release, tmp_path / root, tmp_path / target)

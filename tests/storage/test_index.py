@@ -392,6 +392,7 @@ def recording(scenes, path, root):
     return path
 
 
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.storage.stale_index.StaleIndexWarning")
 @pytest.mark.parametrize(
     ("root", "reason"),
     [
@@ -466,6 +467,7 @@ def test_a_plain_url_of_a_store_is_opened_on_a_files_word(scenes, tmp_path, root
     assert SceneIndex.open(recording(scenes, tmp_path / "index.parquet", root)).root == root
 
 
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.storage.stale_index.StaleIndexWarning")
 def test_a_chain_that_runs_commands_is_not_opened(scenes, tmp_path, monkeypatch):
     template = "{{ cycler.__init__.__globals__.os.system('touch RAN') }}"
     members = [member.path for member in scenes[0].members.values()]
