@@ -251,7 +251,8 @@ class VideoReader:
         return Decoder(container, clock=self._clock, threads=self._threads)
 
     def _survey(self, container: InputContainer) -> TableClock:
-        clock = table_clock(container, name=self.name)
+        steady = steady_clock(container, frames=self.frames)
+        clock = table_clock(container, name=self.name, steady=steady)
         found, expected = len(clock.times), self.frames
         if found != expected:
             raise MediaError(
