@@ -123,6 +123,9 @@ class Decoder:
         if first.dts is not None and first.pts is not None and first.pts > pts:
             # MP4 seeks by decoding time, and this key frame is shown after the frame sought.
             first = self._seek_pts(first.dts - 1)
+        if self._is_intra_only and not first.is_keyframe:
+            # FFV1 keeps its statistics from the last key frame on, and shows nonsense without.
+            raise Astray(f"the packet shown at {first.pts} ticks is no key frame")
         found = [first]
         if self._is_intra_only and index == 0:
             found.extend(islice(self._packets, 1))
