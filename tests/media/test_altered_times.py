@@ -102,8 +102,7 @@ def test_an_altered_time_is_told_with_frame_and_ticks(depth):
         VideoReader(io.BytesIO(flipped(depth, block, 4)), name="clip", frames=FRAMES) as reader,
         pytest.raises(MediaError, match=r"clip: its frame number \d+ as stored is shown at \d+ t"),
     ):
-        for index in range(FRAMES):
-            reader.frame(index)
+        reader.frame(FRAMES - 1)
 
 
 @pytest.mark.parametrize("codec", [("-g", "6"), ("-g", "1"), ("-bf", "0")])
