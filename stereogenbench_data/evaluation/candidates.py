@@ -30,7 +30,10 @@ class Views(Protocol):
     """The right views of one scene while it is scored."""
 
     def read(self, wanted: Wanted, samples: Sequence[Sample]) -> Sequence[Any]:
-        """Return the right view of each sample, frames of one pair in order: uint8 (3, h, w)."""
+        """Return the right view of each sample, frames of one pair in order: uint8 (3, h, w).
+
+        Each is of the evaluated size, or of that of the scene's own pictures.
+        """
         ...
 
     def close(self) -> None:

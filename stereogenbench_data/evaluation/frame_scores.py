@@ -1,11 +1,12 @@
 """The scores of frames: one candidate's right views of one pair, against the rendered ones."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from av.video.reformatter import VideoReformatter
 
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.columns import columns_of
@@ -13,6 +14,7 @@ from stereogenbench_data.evaluation.frechet import Spread
 from stereogenbench_data.evaluation.matching import TargetMatches, match_error, target_matches
 from stereogenbench_data.evaluation.patches import PatchScore, outside_window, patch_psnr
 from stereogenbench_data.evaluation.pixels import psnr_db, ssim
+from stereogenbench_data.evaluation.predictions import scaled_rgb
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
 from stereogenbench_data.evaluation.protocols import KeypointMatcher
 from stereogenbench_data.evaluation.scale import fit_scale
@@ -40,12 +42,37 @@ class TargetFrame:
     """One frame of one pair, with what of its scores does not depend on the prediction."""
 
     def __init__(
-        self, sample: Sample, protocol: EvaluationProtocol, matcher: KeypointMatcher | None
+        self,
+        sample: Sample,
+        protocol: EvaluationProtocol,
+        matcher: KeypointMatcher | None,
+        *,
+        stored_right: Callable[[], Any],
     ) -> None:
-        """Take the sample; nothing is computed yet."""
+        """Take the sample; nothing is computed yet.
+
+        Args:
+            sample: Its fields, pictures at the evaluated size.
+            protocol: How it is scored.
+            matcher: The matcher of keypoints, if one is needed.
+            stored_right: Returns the rendered right view at its stored size.
+        """
         self.sample = sample
         self.protocol = protocol
         self._matcher = matcher
+        self._stored_right = stored_right
+
+    @cached_property
+    def scaled_from_stored(self) -> "TargetFrame":
+        """The frame whose right view is scaled in RGB, as predictions of the stored size are.
+
+        The one of the sample is scaled before it becomes RGB, with other roundings.
+        """
+        right = scaled_rgb(
+            self._stored_right(), size=self.right.shape[1:], scaler=VideoReformatter()
+        )
+        sample = {**self.sample, "right": right}
+        return TargetFrame(sample, self.protocol, self._matcher, stored_right=self._stored_right)
 
     @property
     def left(self) -> Any:
@@ -94,8 +121,20 @@ class PairScorer:
         self._target: dict[str, Spread] = {}
         self._clip: list[tuple[Any, Any]] = []
 
-    def add(self, pictures: Sequence[Any], targets: Sequence[TargetFrame]) -> None:
-        """Score some frames: right views, and what they are compared with."""
+    def add(self, given: Sequence[Any], frames: Sequence[TargetFrame]) -> None:
+        """Score some frames: right views, and what they are compared with.
+
+        A view of the stored size is scaled, and compared with the rendered one scaled likewise.
+        """
+        scaler = VideoReformatter()
+        pictures = [
+            scaled_rgb(picture, size=frame.right.shape[1:], scaler=scaler)
+            for picture, frame in zip(given, frames, strict=True)
+        ]
+        targets = [
+            frame if picture.shape == frame.right.shape else frame.scaled_from_stored
+            for picture, frame in zip(given, frames, strict=True)
+        ]
         for picture, target in zip(pictures, targets, strict=True):
             for name, number in self._frame(picture, target).items():
                 self._columns[name].append(float(number))

@@ -67,7 +67,7 @@ class Frames(Protocol):
     """The opened frames of one prediction."""
 
     def read(self, frame: int) -> Any:
-        """Return a frame as uint8 (3, h, w) of the evaluated size."""
+        """Return a frame as uint8 (3, h, w), of the evaluated size or the scene's own."""
         ...
 
     def close(self) -> None:
@@ -158,7 +158,6 @@ class _PngFrames:
     def __init__(self, folder: Path, wanted: Wanted) -> None:
         self._folder = folder
         self._wanted = wanted
-        self._scaler = VideoReformatter()
         there = {file.name for file in folder.iterdir()}
         missing = [frame for frame in wanted.frames if frame_name(frame) not in there]
         if missing:
@@ -197,7 +196,7 @@ class _PngFrames:
             raise PredictionFault(
                 f"{_told(self._wanted)}: {path} is too large ({error})."
             ) from error
-        return scaled_rgb(pixels, size=self._wanted.size, scaler=self._scaler)
+        return np.ascontiguousarray(pixels.transpose(2, 0, 1))
 
     def _require(self, image: Image.Image, path: Path, *, bits: bytes) -> None:
         if image.mode != "RGB" or bits != b"\x08":
@@ -236,7 +235,7 @@ class _VideoFrames:
 
     def read(self, frame: int) -> Any:
         with self._faults():
-            return read_rgb(self._reader, self._order[frame], size=self._wanted.size)
+            return read_rgb(self._reader, self._order[frame])
 
     @contextmanager
     def _faults(self) -> Iterator[None]:
@@ -249,16 +248,18 @@ class _VideoFrames:
         self._reader.close()
 
 
-def scaled_rgb(pixels: Any, *, size: Size, scaler: VideoReformatter) -> Any:
-    """Return an (h, w, 3) uint8 picture as (3, h, w) of a size, by area as the views are.
+def scaled_rgb(picture: Any, *, size: Size, scaler: VideoReformatter) -> Any:
+    """Return a (3, h, w) uint8 picture at another size, by area where it shrinks, else bicubic.
 
     A picture that has the size already is not touched.
     """
-    if pixels.shape[:2] == size:
-        return np.ascontiguousarray(pixels.transpose(2, 0, 1))
-    shrinks = size[0] * size[1] < pixels.shape[0] * pixels.shape[1]
+    if picture.shape[1:] == size:
+        return picture
+    shrinks = size[0] * size[1] < picture.shape[1] * picture.shape[2]
     frame = scaler.reformat(
-        av.VideoFrame.from_ndarray(pixels, format="rgb24"),
+        av.VideoFrame.from_ndarray(
+            np.ascontiguousarray(picture.transpose(1, 2, 0)), format="rgb24"
+        ),
         width=size[1],
         height=size[0],
         format="gbrp",

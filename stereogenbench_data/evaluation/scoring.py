@@ -7,7 +7,8 @@ need all their frames, those of one scene.
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -50,6 +51,8 @@ class SceneWork:
         return self.wanted[0].scene
 
 
+_STORED_RIGHT: Final = Request(kind="pairs", fields=("right",), layout="single")
+
 SceneScores = dict[tuple[str, Pair], PairScores]
 
 
@@ -81,10 +84,16 @@ def score_scene(
             candidate.name: stack.enter_context(closing(candidate.open(work.index)))
             for candidate in work.candidates
         }
+        stored = stack.enter_context(closing(SampleLoader(work.index, _STORED_RIGHT)))
         for frames in _loaded(work):
             for wanted in work.wanted:
                 targets = [
-                    TargetFrame(sample, tools.protocol, frames.matcher(tools))
+                    TargetFrame(
+                        sample,
+                        tools.protocol,
+                        frames.matcher(tools),
+                        stored_right=partial(_stored_right, stored, work, wanted.pair, sample),
+                    )
                     for sample in frames.samples[wanted.pair]
                 ]
                 for name, given in views.items():
@@ -93,6 +102,13 @@ def score_scene(
                 after_frames(len(targets))
     with one_thread():
         return {place: scorer.scores() for place, scorer in scorers.items()}
+
+
+def _stored_right(loader: SampleLoader, work: SceneWork, pair: Pair, sample: Sample) -> Any:
+    """Return the right view of a sample at its stored size."""
+    row = list(work.index.column("key")).index(work.scene)
+    address = Address(row, pair[0], (pair[1],), (int(sample["frame_index"]),))
+    return loader.load(address, clip="frame", generator=np.random.default_rng(0))["right"]
 
 
 def _score(
@@ -121,7 +137,7 @@ class _LoadedFrames:
     """The samples of some frames; pictures of one camera and frame are one array."""
 
     samples: dict[Pair, list[Sample]]
-    found: dict[int, Keypoints] = field(default_factory=dict)
+    found: dict[int, tuple[Any, Keypoints]] = field(default_factory=dict)
 
     def matcher(self, tools: Tools) -> KeypointMatcher | None:
         """Return the matcher, which looks at each of these pictures once."""
@@ -162,7 +178,7 @@ class _OnceAPicture:
     """A keypoint matcher that keeps what it found in each picture, by the picture's identity."""
 
     matcher: KeypointMatcher
-    found: dict[int, Keypoints]
+    found: dict[int, tuple[Any, Keypoints]]
 
     @property
     def name(self) -> str:
@@ -174,8 +190,9 @@ class _OnceAPicture:
 
     def detect(self, picture: Any) -> Keypoints:
         if id(picture) not in self.found:
-            self.found[id(picture)] = self.matcher.detect(picture)
-        return self.found[id(picture)]
+            # The picture is kept too, so that no other takes its identity.
+            self.found[id(picture)] = picture, self.matcher.detect(picture)
+        return self.found[id(picture)][1]
 
     def match(self, left: Keypoints, right: Keypoints) -> Any:
         return self.matcher.match(left, right)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import pairwise
+from typing import Final
 
 import av
 from av.container import InputContainer
@@ -86,11 +87,28 @@ def _is_steady(container: InputContainer, *, step: Fraction) -> bool:
     )
 
 
-def table_clock(container: InputContainer, *, name: str) -> TableClock:
+INTRA_ONLY: Final = frozenset(
+    {"ffv1", "ffvhuff", "huffyuv", "mjpeg", "png", "prores", "rawvideo", "utvideo"}
+)
+"""Codecs that store each picture by itself, so that pictures are shown in the order of the file."""
+
+
+def table_clock(
+    container: InputContainer, *, name: str, steady: SteadyClock | None = None
+) -> TableClock:
     """Return the times of all frames, read by going through all packets from where they stand.
 
+    Frames of an intra-only codec are counted in the order of the file, with which their times
+    must agree; and with the rate, where the header tells one.
+
+    Args:
+        container: An open file.
+        name: What messages call it.
+        steady: The clock that the header tells, if it tells one.
+
     Raises:
-        MediaError: If a packet is cut short, or carries no time or another packet's time.
+        MediaError: If a packet is cut short, carries no time or another packet's time, or one
+            that contradicts the order of the file.
     """
     times: list[int] = []
     try:
@@ -113,6 +131,8 @@ def table_clock(container: InputContainer, *, name: str) -> TableClock:
             f"{name}: cannot be read past its frame number {len(times)} as stored "
             f"({error.strerror}): fetch it again."
         ) from error
+    if container.streams.video[0].codec_context.codec.canonical_name in INTRA_ONLY:
+        _require_file_order(times, steady, name=name)
     times.sort()
     twice = next((a for a, b in pairwise(times) if a == b), None)
     if twice is not None:
@@ -121,3 +141,22 @@ def table_clock(container: InputContainer, *, name: str) -> TableClock:
             f"not defined: store it anew with one time a frame."
         )
     return TableClock(times)
+
+
+def _require_file_order(times: Sequence[int], steady: SteadyClock | None, *, name: str) -> None:
+    """Refuse times that do not ascend as frames are stored, or are not those of the rate."""
+    for number, (before, after) in enumerate(pairwise(times), 1):
+        if after <= before:
+            raise MediaError(
+                f"{name}: its frame number {number} as stored is shown at {after} ticks and the "
+                f"one before it at {before}, and its codec stores frames in the order in which "
+                f"they are shown. A time was altered: compare the file with its checksum, or "
+                f"fetch it again."
+            )
+    odd = [n for n, pts in enumerate(times) if steady is not None and steady.index(pts) != n]
+    if odd:
+        raise MediaError(
+            f"{name}: its frame number {odd[0]} as stored is shown at {times[odd[0]]} ticks, which "
+            f"is not its time at the rate that the header tells. A time was altered: compare the "
+            f"file with its checksum, or fetch it again."
+        )

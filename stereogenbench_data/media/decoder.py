@@ -6,7 +6,7 @@ drives it decides whether the file is at fault.
 
 from collections import deque
 from collections.abc import Iterator
-from itertools import chain
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final
 
 from av.container import InputContainer
@@ -14,7 +14,7 @@ from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from stereogenbench_data.media.clock import Clock
+from stereogenbench_data.media.clock import INTRA_ONLY, Clock
 from stereogenbench_data.media.integrity import fails_slice_checksums
 
 if TYPE_CHECKING:
@@ -53,9 +53,12 @@ class Decoder:
         # FFV1 before version 3 keeps no record beside its packets, and no checksums in them.
         is_ffv1 = self._context.codec.canonical_name == "ffv1"
         self._has_checksums = is_ffv1 and bool(self._context.extradata)
+        self._is_intra_only = self._context.codec.canonical_name in INTRA_ONLY
         self._knows_key_frames = self._stream.frames > 0
         self._packets: Iterator[VideoPacket] = container.demux(self._stream)
         self._pending: deque[tuple[int, VideoFrame]] = deque()
+        # The frame that the packet before stood for, in the order of the file.
+        self._stored_before: int | None = -1
         # The frame after the last one given, and the frames whose packets came from there on.
         self._next = 0
         self._fed: set[int] = set()
@@ -113,12 +116,23 @@ class Decoder:
 
     def _seek(self, index: int) -> None:
         """Go to a key frame that is shown, not only decoded, at or before a frame."""
-        pts = self._clock.latest(index)
+        # The time of one packet may have been altered: of two that follow each other, it shows.
+        pts = self._clock.latest(max(0, index - 1) if self._is_intra_only else index)
+        self._stored_before = None
         first = self._seek_pts(pts)
         if first.dts is not None and first.pts is not None and first.pts > pts:
             # MP4 seeks by decoding time, and this key frame is shown after the frame sought.
             first = self._seek_pts(first.dts - 1)
-        self._packets = chain([first], self._packets)
+        if self._is_intra_only and not first.is_keyframe:
+            # FFV1 keeps its statistics from the last key frame on, and shows nonsense without.
+            raise Astray(f"the packet shown at {first.pts} ticks is no key frame")
+        found = [first]
+        if self._is_intra_only and index == 0:
+            found.extend(islice(self._packets, 1))
+        told = [self._index(packet) for packet in found if packet.size]
+        if self._is_intra_only and (told[0] > max(0, index - 1) or told[1:] not in ([], [1])):
+            raise Astray(f"frame {told[0]} by its time is stored where another is due")
+        self._packets = chain(found, self._packets)
         self._pending.clear()
         self._fed.clear()
         self._next = self._index(first)
@@ -157,6 +171,12 @@ class Decoder:
     def _register(self, packet: VideoPacket) -> None:
         """Take note of a packet that is to be decoded."""
         index = self._index(packet)
+        if self._is_intra_only:
+            if self._stored_before is not None and index != self._stored_before + 1:
+                raise Astray(
+                    f"frame {index} by its time is stored after frame {self._stored_before}"
+                )
+            self._stored_before = index
         if packet.is_corrupt:
             raise Astray(f"the packet of frame {index} is cut short")
         if self._has_checksums and fails_slice_checksums(bytes(packet)):

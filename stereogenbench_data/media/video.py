@@ -29,6 +29,13 @@ from stereogenbench_data.media.decoder import Astray, Decoder
 from stereogenbench_data.media.depth_frame_file import PACKED_SUFFIX
 from stereogenbench_data.media.depth_frames import probe_packed
 from stereogenbench_data.media.planes import plane_numbers
+from stereogenbench_data.media.siting import (
+    CENTRE,
+    Converter,
+    coded_siting,
+    is_subsampled,
+    picture_siting,
+)
 
 __all__ = ["StreamFacts", "VideoReader", "probe", "read_rgb"]
 
@@ -100,7 +107,8 @@ class VideoReader:
     Attributes:
         name: What messages call the file.
         frames: How many frames it has.
-        scaler: The scaler, whose tables are kept from frame to frame.
+        scaler: The scaler of pictures whose chroma lies where FFmpeg takes it to be.
+        converter: The scaler of all others; both keep their tables from frame to frame.
     """
 
     def __init__(self, file: VideoFile, *, name: str, frames: int, threads: int = 1) -> None:
@@ -123,6 +131,7 @@ class VideoReader:
         self.name = name
         self.frames = frames
         self.scaler = VideoReformatter()
+        self.converter = Converter()
         self._file = file
         self._threads = threads
         self._picture: tuple[str, int, int] | None = None
@@ -133,10 +142,11 @@ class VideoReader:
         container = open_container(file, name=name, pixel_format="later")
         try:
             require_whole_payload(container, name=name)
-            coded = container.streams.video[0].codec_context
-            self.size_px = (coded.width, coded.height)
+            context = container.streams.video[0].codec_context
+            self.size_px = (context.width, context.height)
             """Width and height by the header; 0 where it does not tell."""
-            if container.streams.video[0].codec_context.pix_fmt is not None:
+            self._siting = coded_siting(context.codec.canonical_name, context.extradata)
+            if context.pix_fmt is not None:
                 self._facts = stream_facts(container, name=name, frames=frames)
             steady = steady_clock(container, frames=frames)
             self._clock: Clock = steady or self._survey(container)
@@ -180,6 +190,12 @@ class VideoReader:
             self._require_same_picture(index, frame)
             self._current = (index, frame)
         return self._current[1]
+
+    def siting(self, frame: VideoFrame) -> str:
+        """Return where the chroma of this video lies: as it is tagged, else "center"."""
+        if self._siting is None:
+            self._siting = picture_siting(frame) if is_subsampled(frame) else CENTRE
+        return self._siting
 
     def close(self) -> None:
         """Close the file and the decoder; closing twice does nothing."""
@@ -237,7 +253,8 @@ class VideoReader:
         return Decoder(container, clock=self._clock, threads=self._threads)
 
     def _survey(self, container: InputContainer) -> TableClock:
-        clock = table_clock(container, name=self.name)
+        steady = steady_clock(container, frames=self.frames)
+        clock = table_clock(container, name=self.name, steady=steady)
         found, expected = len(clock.times), self.frames
         if found != expected:
             raise MediaError(
@@ -274,7 +291,8 @@ def read_rgb(
     """Return a frame as red, green and blue planes.
 
     At the stored size the numbers equal those of ``ffmpeg -pix_fmt rgb24``, bit for bit for
-    progressive 8-bit video, its colour matrix and range as the file tells them. At another size
+    progressive 8-bit video, its colour matrix and range as the file tells them. Chroma lies where
+    the file is tagged to have it, and in the middle of its pixels without a tag. At another size
     they are scaled before the conversion, antialiased, with pixel centres kept (u' = s u, where
     the first pixel's centre is 0.5): by area where the picture shrinks, else bicubic. The scaled
     conversion of yuv420p rounds, where ffmpeg's unscaled one cuts off: it is 1.1 grey levels
@@ -306,23 +324,63 @@ def read_rgb(
             f"{reader.name}: frame {index} needs room of uint8 (3, {height}, {width}), got "
             f"{out.dtype} {out.shape}: pass a fitting array or none."
         )
-    scaled = (height, width) != (frame.height, frame.width)
-    pixel_format = "gbrp" if scaled or _has_exact_planes(frame) else "rgb24"
-    picture = reader.scaler.reformat(
-        frame,
-        width=width,
-        height=height,
-        format=pixel_format,
-        interpolation=_interpolation(frame, height=height, width=width),
-        threads=1,
-    )
-    if pixel_format == "rgb24":
+    try:
+        picture = _converted(reader, frame, size=(height, width))
+    except av.FFmpegError as error:
+        raise MediaError(
+            f"{reader.name}: frame {index} ({frame.format.name}, {frame.width}x{frame.height}) "
+            f"cannot be converted to RGB of {width}x{height} ({error.strerror}): store it anew."
+        ) from error
+    if picture.format.name == "rgb24":
         pixels = plane_numbers(picture, 0, dtype="u1", per_pixel=3)
         out[...] = pixels.reshape(height, width, 3).transpose(2, 0, 1)
         return out
     for channel, plane in enumerate(_RED_GREEN_BLUE):
         out[channel] = plane_numbers(picture, plane, dtype="u1")
     return out
+
+
+def _converted(reader: VideoReader, frame: VideoFrame, *, size: tuple[int, int]) -> VideoFrame:
+    """Return a picture as gbrp or rgb24 at a size, its chroma from where it lies.
+
+    At the stored size, FFmpeg takes subsampled chroma of 8 bits to lie in the middle, whatever
+    the tag; that conversion is left where it does not.
+    """
+    stored = (frame.height, frame.width)
+    siting = reader.siting(frame)
+    if size == stored and (siting == CENTRE or not is_subsampled(frame)):
+        pixel_format = "gbrp" if _has_exact_planes(frame) else "rgb24"
+        if _ignores_siting(frame):
+            return reader.scaler.reformat(
+                frame, format=pixel_format, interpolation=Interpolation.BICUBIC, threads=1
+            )
+        return reader.converter.convert(
+            frame, size=size, pixel_format=pixel_format, flags="bicubic", siting=siting
+        )
+    if size == stored:
+        return reader.converter.convert(
+            frame, size=size, pixel_format="gbrp", flags="bicubic+accurate_rnd", siting=siting
+        )
+    if is_subsampled(frame) and (frame.width % 2 or frame.height % 2):
+        # FFmpeg stretches the chroma that reaches half a pixel beyond the edge.
+        frame = _converted(reader, frame, size=stored)
+    shrinks = size[0] * size[1] < frame.height * frame.width
+    return reader.converter.convert(
+        frame,
+        size=size,
+        pixel_format="gbrp",
+        flags="area" if shrinks else "bicubic",
+        siting=siting,
+    )
+
+
+def _ignores_siting(frame: VideoFrame) -> bool:
+    """Return whether FFmpeg converts a picture at its stored size without a look at the tag."""
+    return not is_subsampled(frame) or (
+        frame.format.name in ("yuv420p", "yuvj420p", "yuv422p", "yuvj422p")
+        and frame.height % 2 == 0
+        and frame.width % 2 == 0
+    )
 
 
 def _has_exact_planes(frame: VideoFrame) -> bool:
@@ -336,8 +394,3 @@ def _has_exact_planes(frame: VideoFrame) -> bool:
         and frame.height % 2 == 0
         and not 1 <= frame.width % 16 <= 8
     )
-
-
-def _interpolation(frame: VideoFrame, *, height: int, width: int) -> Interpolation:
-    shrinks = height * width < frame.height * frame.width
-    return Interpolation.AREA if shrinks else Interpolation.BICUBIC

@@ -160,6 +160,19 @@ def test_a_video_as_released_is_a_prediction_of_the_stored_size(scored_index, tm
     assert [pair.tallies["psnr"].infinite for pair in scores.pairs] == [FRAMES] * 3
 
 
+@pytest.mark.parametrize("written", ["at the evaluated size", "at the stored size"])
+@pytest.mark.parametrize("evaluated", [SIZE, (40, 90), (96, 128), (33, 47)])
+def test_a_png_identical_to_the_rendered_view_scores_infinitely(
+    scored_index, tmp_path, written, evaluated
+):
+    folder = write_pngs(tmp_path, scored_index, size=evaluated if "evaluated" in written else None)
+    protocol = EvaluationProtocol(metrics=("psnr", "ssim"), size=evaluated)
+    scores = scored(scored_index, folder, protocol)
+
+    assert [pair.tallies["psnr"].infinite for pair in scores.pairs] == [FRAMES] * 3
+    assert [pair.tallies["ssim"].mean for pair in scores.pairs] == [1.0] * 3
+
+
 def test_all_pairs_are_scored_with_one_prediction_each(scored_index, protocol, tmp_path):
     scores = scored(
         scored_index, lambda inputs: inputs["left"], protocol, pairs="all", frames=[0],

@@ -4,6 +4,7 @@ import av
 import cv2
 import numpy as np
 import pytest
+from av.video.reformatter import VideoReformatter
 from PIL import Image
 
 from stereogenbench_data.evaluation.predictions import (
@@ -13,6 +14,7 @@ from stereogenbench_data.evaluation.predictions import (
     frame_name,
     item_name,
     open_prediction,
+    scaled_rgb,
     stamp_prediction,
 )
 
@@ -87,13 +89,15 @@ def test_a_video_of_the_evaluated_frames_is_read_in_order(tmp_path):
     assert levels(find_prediction(tmp_path, WANTED)) == [10, 20]
 
 
-def test_pictures_of_the_stored_size_are_resized(item):
+def test_pictures_of_the_stored_size_are_read_as_they_are_and_scaled_by_area(item):
     pixels = picture(0, size=(32, 32))
     pixels[:, 16:] = 200
     for frame in (0, 2):
         write_png(item, frame, pixels)
-    view = open_prediction(item, WANTED).read(0)
+    stored = open_prediction(item, WANTED).read(0)
+    view = scaled_rgb(stored, size=WANTED.size, scaler=VideoReformatter())
 
+    assert stored.shape == (3, 32, 32)
     assert view.shape == (3, 8, 16)
     assert view[:, :, :7].max() == 0
     assert view[:, :, 9:].min() == 200

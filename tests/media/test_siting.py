@@ -1,0 +1,103 @@
+"""Colour stays where brightness is, at any size, wherever the file says that its samples lie."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from stereogenbench_data.media.video import VideoReader, read_rgb
+
+X264 = ("-c:v", "libx264", "-crf", "10", "-pix_fmt", "yuv420p")
+HEVC = ("-c:v", "libx265", "-crf", "10", "-pix_fmt", "yuv420p", "-x265-params")
+TO_YCC = np.array([[0.299, 0.587, 0.114], [-0.1687, -0.3313, 0.5], [0.5, -0.4187, -0.0813]])
+FILES = {
+    "untagged": ("un.mp4", X264),
+    "tagged left": ("left.mp4", (*X264, "-bsf:v", "h264_metadata=chroma_sample_loc_type=0")),
+    "tagged center": ("center.mp4", (*X264, "-chroma_sample_location", "center")),
+    "tagged topleft": ("topleft.mp4", (*X264, "-chroma_sample_location", "topleft")),
+    "tagged bottom": ("bottom.mp4", (*X264, "-chroma_sample_location", "bottom")),
+    "hevc untagged": ("hevc.mp4", (*HEVC, "log-level=0")),
+    "hevc tagged left": ("hevcl.mp4", (*HEVC, "log-level=0:chromaloc=0")),
+    "mpeg4": ("mpeg4.mp4", ("-c:v", "mpeg4", "-q:v", "1", "-pix_fmt", "yuv420p")),
+    "ffv1 untagged": ("un.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p")),
+    "ffv1 tagged left": (
+        "left.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p", "-chroma_sample_location", "left"),
+    ),
+    "ten bits": ("ten.mp4", ("-c:v", "libx264", "-crf", "5", "-pix_fmt", "yuv420p10le")),
+    "odd": ("odd.mkv", ("-vf", "crop=159:255:0:0", "-c:v", "ffv1", "-pix_fmt", "yuv420p")),
+}  # fmt: skip
+PLACES = {
+    "untagged": (0.0, 0.0),
+    "tagged center": (0.0, 0.0),
+    "tagged left": (-0.5, 0.0),
+    "tagged topleft": (-0.5, -0.5),
+    "tagged bottom": (0.0, 0.5),
+    "hevc untagged": (0.0, 0.0),
+    "hevc tagged left": (-0.5, 0.0),
+    "mpeg4": (0.0, 0.0),
+    "ffv1 untagged": (0.0, 0.0),
+    "ffv1 tagged left": (-0.5, 0.0),
+    "ten bits": (0.0, 0.0),
+}
+
+
+def texture():
+    noise = np.random.default_rng(5).normal(size=(256, 256, 3))
+    layers = sum(ndimage.gaussian_filter(noise, (s, s, 0)) * s for s in (2, 4, 8))
+    return np.uint8((layers - layers.min()) / np.ptp(layers) * 255)
+
+
+def read(clips, name, *, size=None):
+    file, codec = FILES[name]
+    path = clips.rgb(f"siting {file}", *codec, pictures=texture()[None])
+    with VideoReader(path, name="clip", frames=1) as reader:
+        return read_rgb(reader, 0, size=size).astype(float)
+
+
+def shifts_px(picture, reference):
+    """Return how far Y, Cb and Cr of a picture lie from those of another, as (3, 2): x and y."""
+    found = []
+    for values, expected in zip(
+        np.einsum("ij,jhw->ihw", TO_YCC, picture),
+        np.einsum("ij,jhw->ihw", TO_YCC, reference),
+        strict=True,
+    ):
+        down, right = np.gradient(expected)
+        slopes = np.stack([right.ravel(), down.ravel(), np.ones(right.size)], axis=1)
+        found.append(np.linalg.lstsq(slopes, (expected - values).ravel(), rcond=None)[0][:2])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("size", [(128, 128), (255, 257), (480, 832), (90, 147), (301, 77)])
+@pytest.mark.parametrize("name", FILES)
+def test_colour_is_where_brightness_is_at_any_size(clips, name, size):
+    stored = torch.from_numpy(read(clips, name))[None]
+    areas = torch.nn.functional.interpolate(stored, size=size, mode="bilinear", antialias=True)
+
+    found = shifts_px(read(clips, name, size=size), areas[0].numpy())
+
+    assert np.abs(found).max() < 0.05
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_chroma_at_the_stored_size_lies_where_the_file_is_tagged_to_have_it(clips, name):
+    reference = texture().transpose(2, 0, 1).astype(float)
+    centred = shifts_px(read(clips, "ffv1 untagged"), reference)
+
+    moved = shifts_px(read(clips, name), reference) - centred
+
+    np.testing.assert_allclose(moved, [(0, 0), PLACES[name], PLACES[name]], atol=0.06)
+
+
+@pytest.mark.parametrize("size", [(120, 208), (400, 500)])
+def test_an_untagged_file_is_scaled_as_ffmpegs_own_filter_does(clips, size):
+    found = read(clips, "untagged", size=size)
+    shrinks = size[0] * size[1] < 256 * 256
+    scale = f"scale={size[1]}:{size[0]}:flags={'area' if shrinks else 'bicubic'}+full_chroma_int"
+    raw = clips.ffmpeg(
+        "-i", clips.folder / "siting un.mp4", "-vf", f"{scale},format=gbrp",
+        "-f", "rawvideo", "-pix_fmt", "rgb24", "-",
+    )  # fmt: skip
+    expected = np.frombuffer(raw, np.uint8).reshape(*size, 3).transpose(2, 0, 1)
+
+    assert np.abs(found - expected).max() <= 3
