@@ -305,6 +305,7 @@ class Alignment:
         moved_smooth: Points of smooth surfaces taken from one audited frame to the next.
         moved_through: Those of them that are seen through there.
         picture_px: Pixels of the scene's pictures to one of those compared.
+        disparity_px: Mean disparity of compared points, in pixels of the pictures compared.
     """
 
     pairs: tuple[PairFit, ...] = ()
@@ -313,13 +314,14 @@ class Alignment:
     moved_smooth: int = 0
     moved_through: int = 0
     picture_px: float = 1.0
+    disparity_px: float = math.nan
 
     @classmethod
     def revived(cls, plain: dict[str, Any]) -> "Alignment":
         """Return the record that `plain` turned into JSON."""
         return cls(
             **{
-                **plain,
+                **_numbers(plain),
                 "pairs": tuple(PairFit(**_numbers(each)) for each in plain["pairs"]),
                 "estimates": tuple(Estimate(**_numbers(each)) for each in plain["estimates"]),
                 "lags": tuple((camera, lag, gain) for camera, lag, gain in plain["lags"]),

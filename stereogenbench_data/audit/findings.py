@@ -94,8 +94,12 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
             f"{moved:.0%} of its points (limit {limits.moved_through:.0%})"
         )
         yield Finding(scene.key, "", "motion", text)
+    has_wrong_depth = bool(through) or any(
+        each.is_first and each.check == "depth" for each in found.estimates
+    )
     for each in found.estimates:
-        if each.is_first:
+        # Depth that contradicts itself tells nothing of focal lengths.
+        if each.is_first and not (has_wrong_depth and each.check == "motion"):
             yield from _estimate_findings(scene, each, limits)
     for camera, lag, gained in found.lags:
         if gained > limits.picture_lag:
@@ -146,7 +150,9 @@ def _estimate_findings(scene: SceneAudit, each: Estimate, limits: AuditLimits) -
         text = f"from frame to frame, depth and poses fit if {what} is corrected {-each.value:+.2%}"
     else:
         shift = each.what in _SHIFTS
-        limit = limits.picture_shift_px if shift else limits.picture_scale
+        # A factor is told no better than the shift that it causes.
+        least = limits.picture_shift_px / max(scene.alignment.disparity_px, 1e-6)
+        limit = limits.picture_shift_px if shift else max(limits.picture_scale, least)
         name = "" if each.camera < 0 else rgb_name(each.camera)
         text = (
             f"pictures of {of} are {each.value * scene.alignment.picture_px:+.2f} px "
