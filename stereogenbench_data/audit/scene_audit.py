@@ -191,15 +191,17 @@ class _SceneCheck:
     def _seen(self, camera: int, frame: int) -> Any:
         """Return a picture, None where it cannot be read; those beside it are kept with it."""
         near = range(max(0, frame - 1), min(frame + 2, self.scene.frames))
-        kept = {at: self.seen.pop((camera, at), None) for at in near}
+        kept = {at: self.seen.get((camera, at)) for at in near}
         self.seen = {place: each for place, each in self.seen.items() if place[0] != camera}
         for at in near:
-            if kept[at] is None:
+            found = kept[at]
+            if found is None:
                 picture = self.files.attempt(rgb_name(camera), self.files.picture, camera, at)
-                kept[at] = None if picture is None else (picture, band(picture))
-            if kept[at] is not None:
-                self.seen[camera, at] = kept[at]
-        return None if kept[frame] is None else kept[frame][0]
+                found = None if picture is None else (picture, band(picture))
+            if found is not None:
+                self.seen[camera, at] = found
+        shown = self.seen.get((camera, frame))
+        return None if shown is None else shown[0]
 
     def _reproject(self, frame: int, depths: dict[int, MeasuredDepth], poses: CameraPoses) -> None:
         for (left, right), found in self.errors.items():
