@@ -4,7 +4,7 @@ Numbers are nan where they could not be measured; `plain` turns them into JSON's
 """
 
 import math
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Final
 
 from stereogenbench_data.errors import SelectionError
@@ -36,6 +36,21 @@ class AuditLimits:
         change: Least mean change of luma from one audited frame to the next, where the camera
             moves.
         occluder: Largest share of a picture hidden from its border.
+        see_through: Largest share of points of smooth surfaces of one camera that another sees
+            through, of any compared pair.
+        moved_through: The same from one audited frame to the next; things that move cause it.
+        depth_shift_px: Largest shift of one camera's depth against that of the others.
+        depth_scale: Largest factor, less 1, by which one camera's depth differs.
+        depth_ray: How far depth may be from depth along the axis towards depth along the ray,
+            from 0 to 1.
+        focal: Largest factor, less 1, by which a focal length, or the unit of depth, differs from
+            what depth says while the cameras move.
+        picture_shift_px: Largest shift of one camera's pictures against the others, in pixels of
+            the picture that is looked at, which is at most 320 a side.
+        picture_scale: Largest factor, less 1, between disparity in the pictures and by depth.
+        picture_fit: Least correlation of a camera's pictures with those of the camera that they
+            fit best, taken there by depth.
+        picture_lag: By how much that may grow if another frame's pictures are taken.
     """
 
     intrinsics_px: float = 1e-3
@@ -51,6 +66,16 @@ class AuditLimits:
     contrast: float = 8
     change: float = 0.25
     occluder: float = 0.1
+    see_through: float = 0.02
+    moved_through: float = 0.35
+    depth_shift_px: float = 0.25
+    depth_scale: float = 0.005
+    depth_ray: float = 0.25
+    focal: float = 0.01
+    picture_shift_px: float = 0.15
+    picture_scale: float = 0.01
+    picture_fit: float = 0.5
+    picture_lag: float = 0.01
 
     @classmethod
     def parse(cls, settings: list[str]) -> "AuditLimits":
@@ -215,6 +240,96 @@ class RigAudit:
 
 
 @dataclass(frozen=True, slots=True)
+class Estimate:
+    """One parameter that explains what is left between cameras, frames or pictures.
+
+    Attributes:
+        check: "depth" (cameras of one moment), "motion" (one camera over time) or "pictures".
+        what: "scale", "ray", "shift_x", "shift_y", "focal", "focal_x" or "focal_y"; factors are
+            less 1, shifts in pixels to the right or down of what was compared.
+        camera: Of which camera; -1 for all.
+        value: The estimate, nan where nothing tells.
+        error: Its standard error.
+        explained: How much of what is left it explains, the more the better.
+        is_first: Whether it explains more than any other, once the first ones before are left out.
+    """
+
+    check: str
+    what: str
+    camera: int
+    value: float = math.nan
+    error: float = math.nan
+    explained: float = math.nan
+    is_first: bool = False
+
+    def as_first(self) -> "Estimate":
+        """Return it as one that explains more than any other."""
+        return replace(self, is_first=True)
+
+
+@dataclass(frozen=True, slots=True)
+class PairFit:
+    """How well two cameras fit, points taken both ways.
+
+    Attributes:
+        left: One camera.
+        right: The other.
+        smooth: Points of smooth surfaces that land on smooth surfaces.
+        through: Those of them that lie before what the other camera sees there.
+        contrast: Standard deviation of compared pictures, grey levels; nan where none was.
+        correlation: Of the pictures at the same points; nan where they have no texture.
+    """
+
+    left: int
+    right: int
+    smooth: int
+    through: int
+    contrast: float
+    correlation: float
+
+    @property
+    def see_through(self) -> float:
+        """The share that is seen through, nan where fewer than 100 points tell."""
+        return self.through / self.smooth if self.smooth >= 100 else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Whether pictures, depth, poses and focal length fit together, see `alignment`.
+
+    Attributes:
+        pairs: The cameras that were compared.
+        estimates: What may be off, and by how much.
+        lags: (camera, lag, gain): by how much the correlation of pictures grows if a camera's
+            (-1: all cameras') pictures of frame t + lag are taken.
+        moved_smooth: Points of smooth surfaces taken from one audited frame to the next.
+        moved_through: Those of them that are seen through there.
+        picture_px: Pixels of the scene's pictures to one of those compared.
+        disparity_px: Mean disparity of compared points, in pixels of the pictures compared.
+    """
+
+    pairs: tuple[PairFit, ...] = ()
+    estimates: tuple[Estimate, ...] = ()
+    lags: tuple[tuple[int, int, float], ...] = ()
+    moved_smooth: int = 0
+    moved_through: int = 0
+    picture_px: float = 1.0
+    disparity_px: float = math.nan
+
+    @classmethod
+    def revived(cls, plain: dict[str, Any]) -> "Alignment":
+        """Return the record that `plain` turned into JSON."""
+        return cls(
+            **{
+                **_numbers(plain),
+                "pairs": tuple(PairFit(**_numbers(each)) for each in plain["pairs"]),
+                "estimates": tuple(Estimate(**_numbers(each)) for each in plain["estimates"]),
+                "lags": tuple((camera, lag, gain) for camera, lag, gain in plain["lags"]),
+            }
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class SceneAudit:
     """What was found of one scene.
 
@@ -227,6 +342,7 @@ class SceneAudit:
         pairs: Reprojection of the primary pair, of cameras 0 and 5, and, of fewer pixels, of the
             other adjacent pairs.
         problems: File (or empty) and what could not be read of it.
+        alignment: Whether pictures, depth, poses and focal length fit together.
     """
 
     key: str
@@ -236,6 +352,7 @@ class SceneAudit:
     cameras: tuple[CameraAudit, ...]
     pairs: tuple[PairAudit, ...]
     problems: tuple[tuple[str, str], ...]
+    alignment: Alignment = field(default_factory=Alignment)
 
     @classmethod
     def revived(cls, plain: dict[str, Any]) -> "SceneAudit":
@@ -255,6 +372,7 @@ class SceneAudit:
             cameras=cameras,
             pairs=tuple(PairAudit.revived(each) for each in plain["pairs"]),
             problems=tuple((name, text) for name, text in plain["problems"]),
+            alignment=Alignment.revived(plain["alignment"]),
         )
 
 

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Iterator
+from typing import Final
 
 from stereogenbench_data.audit.audit_records import (
     At,
     AuditLimits,
     CameraAudit,
+    Estimate,
     Finding,
     SceneAudit,
 )
@@ -22,6 +24,7 @@ def findings_of(scene: SceneAudit, limits: AuditLimits) -> list[Finding]:
     ]
     unreadable = {name for name, _ in scene.problems}
     found += _rig_findings(scene, limits)
+    found += _alignment_findings(scene, limits)
     for number in range(CAMERA_COUNT):
         for name, of_camera in (
             (rgb_name(number), _rgb_findings),
@@ -65,6 +68,100 @@ def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
                 f"(limit {limits.agreement:.0%})"
             )
             yield Finding(scene.key, "", "agreement", text)
+
+
+_CERTAIN: Final = 6.0
+_SHIFTS: Final = {"shift_x": "to the right", "shift_y": "down"}
+
+
+def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
+    """Yield what does not fit between cameras, frames and pictures."""
+    found = scene.alignment
+    through = [pair for pair in found.pairs if pair.see_through > limits.see_through]
+    if through:
+        worst = max(through, key=lambda pair: pair.see_through)
+        pairs = ", ".join(f"{pair.left}-{pair.right}" for pair in through)
+        text = (
+            f"depth of cameras {pairs} contradicts: of pair {worst.left}-{worst.right}, "
+            f"{worst.see_through:.1%} of the points of smooth surfaces lie before what the other "
+            f"camera sees there (limit {limits.see_through:.0%})"
+        )
+        yield Finding(scene.key, "", "depth consistency", text)
+    moved = found.moved_through / found.moved_smooth if found.moved_smooth >= 1000 else 0.0
+    if moved > limits.moved_through:
+        text = (
+            f"depth of one frame contradicts that of the next audited one by the recorded poses at "
+            f"{moved:.0%} of its points (limit {limits.moved_through:.0%})"
+        )
+        yield Finding(scene.key, "", "motion", text)
+    has_wrong_depth = bool(through) or any(
+        each.is_first and each.check == "depth" for each in found.estimates
+    )
+    for each in found.estimates:
+        # Depth that contradicts itself tells nothing of focal lengths.
+        if each.is_first and not (has_wrong_depth and each.check == "motion"):
+            yield from _estimate_findings(scene, each, limits)
+    for camera, lag, gained in found.lags:
+        if gained > limits.picture_lag:
+            of = "all cameras" if camera < 0 else f"camera {camera}"
+            text = (
+                f"pictures of {of} fit better, by {gained:.3f} of correlation, if those of the "
+                f"frame {'before' if lag < 0 else 'after'} are taken "
+                f"(limit {limits.picture_lag:g})"
+            )
+            name = "" if camera < 0 else rgb_name(camera)
+            yield Finding(scene.key, name, "picture time", text)
+    for camera in range(CAMERA_COUNT):
+        fits = [pair.correlation for pair in found.pairs if camera in (pair.left, pair.right)
+                and not math.isnan(pair.correlation)]  # fmt: skip
+        if fits and max(fits) < limits.picture_fit:
+            text = (
+                f"pictures of camera {camera}, taken to any other camera by depth, correlate with "
+                f"its pictures at {max(fits):.2f} or less (limit {limits.picture_fit:g})"
+            )
+            yield Finding(scene.key, rgb_name(camera), "picture content", text)
+
+
+def _estimate_findings(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> Iterator[Finding]:
+    of = "all cameras" if each.camera < 0 else f"camera {each.camera}"
+    size = abs(each.value)
+    if each.check == "depth":
+        limit = {"scale": limits.depth_scale, "ray": limits.depth_ray}.get(
+            each.what, limits.depth_shift_px
+        )
+        name = "" if each.camera < 0 else depth_name(each.camera)
+        what = {
+            "scale": f"differs from that of the others by {each.value:+.2%}",
+            "ray": f"is {each.value:.0%} of the way from the axis to along the ray",
+        }.get(
+            each.what,
+            f"is {each.value:+.2f} px {_SHIFTS.get(each.what, '')} of where the others see it",
+        )
+        text = f"depth of {of} {what}"
+    elif each.check == "motion":
+        limit, name = (limits.depth_ray if each.what == "ray" else limits.focal), ""
+        what = {
+            "scale": "the unit of depth or of poses",
+            "ray": "depth along the ray, by",
+            "focal": "the focal length",
+            "focal_x": "the horizontal focal length (sensor width)",
+            "focal_y": "the vertical focal length (sensor height)",
+        }[each.what]
+        text = f"from frame to frame, depth and poses fit if {what} is corrected {-each.value:+.2%}"
+    else:
+        shift = each.what in _SHIFTS
+        # A factor is told no better than the shift that it causes.
+        least = limits.picture_shift_px / max(scene.alignment.disparity_px, 1e-6)
+        limit = limits.picture_shift_px if shift else max(limits.picture_scale, least)
+        name = "" if each.camera < 0 else rgb_name(each.camera)
+        text = (
+            f"pictures of {of} are {each.value * scene.alignment.picture_px:+.2f} px "
+            f"{_SHIFTS[each.what]} of where depth and the others put them"
+            if shift
+            else f"disparity of the pictures differs from that of depth by {each.value:+.2%}"
+        )
+    if size > limit and size > _CERTAIN * each.error:
+        yield Finding(scene.key, name, f"{each.check} fit", f"{text} (limit {limit:g})")
 
 
 def _expected_frames(scene: SceneAudit, limits: AuditLimits) -> int:

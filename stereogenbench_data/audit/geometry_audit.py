@@ -37,7 +37,7 @@ from stereogenbench_data.storage.walk import walk
 Progress = Callable[[int, int], None]
 
 DEFAULT_FRAMES: Final = 5
-_FORMAT: Final = 1
+_FORMAT: Final = 2
 _KEY_FILTERS: Final = {"split": "split", "subset": "subset", "family": "family",
                        "map": "map_name", "scenes": "key"}  # fmt: skip
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from stereogenbench_data.audit.alignment import AlignmentCheck, band
 from stereogenbench_data.audit.audit_records import At, CameraAudit, RigAudit, SceneAudit
 from stereogenbench_data.audit.audited_files import SceneFiles
 from stereogenbench_data.audit.picture_check import (
@@ -114,6 +115,8 @@ class _SceneCheck:
         self.measured_pairs = (task.scene.rig.primary_pair, LONG_PAIR)
         pairs = dict.fromkeys([*self.measured_pairs, *ADJACENT_PAIRS])
         self.errors: dict[tuple[int, int], list[PairErrors]] = {pair: [] for pair in pairs}
+        self.alignment = AlignmentCheck(self.intrinsics)
+        self.seen: dict[tuple[int, int], tuple[Any, Any]] = {}
 
     def run(self, after_bytes: AfterBytes) -> SceneAudit:
         """Audit the scene."""
@@ -140,6 +143,7 @@ class _SceneCheck:
                 for pair, found in self.errors.items()
             ),
             problems=tuple(sorted(self.files.problems.items())),
+            alignment=self.alignment.result(),
         )
 
     def _metadata(self) -> tuple[RigAudit, CameraPoses | None]:
@@ -179,13 +183,30 @@ class _SceneCheck:
                 self.payload[camera].take(
                     stored[camera], depths[camera].measured, frame, moved=moved
                 )
-            picture = self.files.attempt(rgb_name(camera), self.files.picture, camera, frame)
+            picture = self._seen(camera, frame)
             if picture is not None:
                 pictures[camera] = picture
                 self.light[camera].take(picture, frame, moved=moved)
         self._compare(pictures)
         if poses is not None:
             self._reproject(frame, depths, poses)
+            bands = {place: found[1] for place, found in self.seen.items()}
+            self.alignment.take(frame, depths, bands, poses)
+
+    def _seen(self, camera: int, frame: int) -> Any:
+        """Return a picture, None where it cannot be read; those beside it are kept with it."""
+        near = range(max(0, frame - 1), min(frame + 2, self.scene.frames))
+        kept = {at: self.seen.get((camera, at)) for at in near}
+        self.seen = {place: each for place, each in self.seen.items() if place[0] != camera}
+        for at in near:
+            found = kept[at]
+            if found is None:
+                picture = self.files.attempt(rgb_name(camera), self.files.picture, camera, at)
+                found = None if picture is None else (picture, band(picture))
+            if found is not None:
+                self.seen[camera, at] = found
+        shown = self.seen.get((camera, frame))
+        return None if shown is None else shown[0]
 
     def _reproject(self, frame: int, depths: dict[int, MeasuredDepth], poses: CameraPoses) -> None:
         for (left, right), found in self.errors.items():
