@@ -165,6 +165,15 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             self._forget(self._persistent)
         self._keeping.close()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy needs: it has passes and workers of its own."""
+        return self.__dict__ | {"_unfinished": None, "_persistent": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become a copy."""
+        self.__dict__.update(state)
+        self._unfinished = WeakSet()
+
     def _forget(self, workers: "_Workers") -> None:
         """End workers; the next pass starts others."""
         if workers is self._persistent:

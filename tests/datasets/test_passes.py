@@ -1,9 +1,11 @@
 """A pass over a loader owns its state: within another pass, in a fork, and broken off."""
 
+import copy
 import gc
 import itertools
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -111,6 +113,23 @@ def test_epochs_set_during_a_pass_are_those_of_the_next_one(small_index):
 
         assert found == expected[0]
         assert keys_of(loader) == expected[1]
+
+
+@pytest.mark.parametrize(
+    "copied", [copy.copy, copy.deepcopy, lambda loader: pickle.loads(pickle.dumps(loader))]
+)
+def test_a_copy_of_a_loader_has_passes_of_its_own(pairs, truth, copied):
+    loader = pairs.loader(9, num_workers=1, persistent_workers=True)
+    batches = iter(loader)
+    taken = [next(batches)]
+    other = copied(loader)
+
+    assert keys_of(other) == keys_of(pairs.loader(9))
+    taken += batches
+    assert sum(wrong(batch, truth) for batch in taken) == 0
+    assert keys_of(taken) == keys_of(pairs.loader(9))
+    loader.close()
+    other.close()
 
 
 def fork_and(act):
