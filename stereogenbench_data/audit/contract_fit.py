@@ -45,8 +45,13 @@ class Term:
 
     @property
     def pair(self) -> Pair:
-        """The two files."""
-        return self.shot.left, self.shot.right
+        """The two files, the lower number first."""
+        return self.shot.pair
+
+    @property
+    def sign(self) -> int:
+        """1 if the pixels are those of the lower number, whose way offsets are counted, else -1."""
+        return 1 if self.shot.left < self.shot.right else -1
 
 
 def fitted(views: SceneViews, shots: Sequence[Shot], structure: Structure, *, free: Free) -> Scored:
@@ -72,6 +77,16 @@ def fit_terms(views: SceneViews, shots: Sequence[Shot], structure: Structure) ->
     return terms
 
 
+def voted_agreement(views: SceneViews, shots: Sequence[Shot], structure: Structure) -> float:
+    """Return how many matches a structure explains at the scale that most of them agree on."""
+    terms = fit_terms(views, shots, structure)
+    if not terms:
+        return 0.0
+    found = np.concatenate([term.matched_px for term in terms])
+    predicted = np.concatenate([term.predicted_px for term in terms])
+    return _agreement(found, _voted_scale(found, predicted) * predicted)
+
+
 def _start(terms: Sequence[Term], *, free: Free) -> tuple[float, dict[Pair, float]]:
     """Return a scale and offsets from the matches alone."""
     found = np.concatenate([term.matched_px for term in terms])
@@ -83,12 +98,16 @@ def _start(terms: Sequence[Term], *, free: Free) -> tuple[float, dict[Pair, floa
         widest = max(terms, key=lambda term: len(term.matched_px)).pair
         own = [term for term in terms if term.pair == widest]
         scale = _drawn_scale(
-            np.concatenate([term.matched_px for term in own]),
-            np.concatenate([term.predicted_px for term in own]),
+            np.concatenate([term.sign * term.matched_px for term in own]),
+            np.concatenate([term.sign * term.predicted_px for term in own]),
         )
     offsets_px = {}
     for pair in dict.fromkeys(term.pair for term in terms):
-        rest = [term.matched_px - scale * term.predicted_px for term in terms if term.pair == pair]
+        rest = [
+            term.sign * (term.matched_px - scale * term.predicted_px)
+            for term in terms
+            if term.pair == pair
+        ]
         offsets_px[pair] = _densest(np.concatenate(rest))
     return scale, offsets_px
 
@@ -198,7 +217,7 @@ def _equations(
     for number, term in enumerate(terms):
         full = np.zeros(len(term.shot.rows))
         full[term.known] = scale * term.predicted_px
-        shift_px = offsets_px.get(term.pair, 0.0)
+        shift_px = term.shot.shift_px(offsets_px)
         difference, slope, inside = (
             part[term.known] for part in differences(views, term.shot, full + shift_px)
         )
@@ -211,7 +230,7 @@ def _equations(
             if name == "scale":
                 columns[:, place] = slope * scale * term.predicted_px
             elif name == term.pair:
-                columns[:, place] = slope
+                columns[:, place] = term.sign * slope
         normals[number] = (columns * weight[:, None]).T @ columns
         rights[number] = columns.T @ (weight * difference)
     return normals, rights

@@ -106,7 +106,7 @@ def _draw_views(
         best_scale = diagnosis.scale
     shift_px = 0.0
     if diagnosis.changed in ("offset", "both"):
-        shift_px = diagnosis.offsets_px.get((shot.left, shot.right), 0.0)
+        shift_px = shot.shift_px(diagnosis.offsets_px)
     by_declared = _warped(views, shot, diagnosis.declared, right, scale=1.0, shift_px=0.0)
     by_best = _warped(views, shot, diagnosis.best, right, scale=best_scale, shift_px=shift_px)
     pair = f"frame {shot.frame}, cam {shot.left} and {shot.right}"

@@ -42,6 +42,11 @@ class RayPower:
         away = self.power - (1 if kind == "ray" else 0)
         return kind if abs(away) <= 2 * _BIAS + LEAST_ERRORS * self.error else None
 
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The power and half its 95 % interval, what it is off by on any data included."""
+        return self.power, math.hypot(1.96 * self.error, _BIAS)
+
 
 def ray_power(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> RayPower:
     """Return the power that fits a contract's pictures best, scale and its offsets fitted too."""
@@ -58,7 +63,7 @@ def ray_power(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> Ray
             log_ray = np.log(views.ray_per_planar[shot.rows, shot.columns])[term.known]
             grown_px = term.predicted_px * np.exp(log_scale + bend * log_ray)
             full = np.zeros(len(shot.rows))
-            full[term.known] = grown_px + offsets_px.get(term.pair, 0.0)
+            full[term.known] = grown_px + shot.shift_px(offsets_px)
             difference, slope, inside = (
                 part[term.known] for part in differences(views, shot, full)
             )
@@ -70,7 +75,7 @@ def ray_power(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> Ray
             columns[:, 0] = slope * grown_px
             columns[:, 1] = slope * grown_px * log_ray
             if term.pair in offsets_px:
-                columns[:, 2 + pairs.index(term.pair)] = slope
+                columns[:, 2 + pairs.index(term.pair)] = term.sign * slope
             normals[number] = (columns * weight[:, None]).T @ columns
             rights[number] = columns.T @ (weight * difference)
         step, spread = solved(normals, rights)
