@@ -98,6 +98,9 @@ def structure_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
         named, told = f"primary: left {left}, right {right}", f"left {right}, right {left}"
         note = "by poses and pictures alike"
         return Answer(TOPICS[question], named, told, "wrong", nearest, note)
+    if question == "order" and best.startswith("depth of") and changes(first, "offset"):
+        note = f"a shifted picture, which is not where its depth is, looks like {said(best)}"
+        return replace(blank, behind=gains.get(declared), note=note)
     if best == declared:
         if close or lacking or not tested:
             return replace(blank, behind=nearest, note=words)

@@ -17,6 +17,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from stereogenbench_data.audit.contract_fit import voted_scale
 from stereogenbench_data.audit.contract_hypotheses import Question, Structure
 from stereogenbench_data.audit.contract_matching import Luma, match_rows
 from stereogenbench_data.audit.contract_scoring import Pair, Scored, sampled
@@ -33,6 +34,7 @@ _LEAST_DEFICIT: Final = 0.12
 """A share of matches by which pairs of a camera stay behind pairs as wide of others."""
 _LEAST_ASYMMETRY: Final = 0.03
 _LEAST_GAIN: Final = 0.01
+_LEAST_LATER: Final = 0.03
 _LEAST_AWAY: Final = 0.25
 """Two depths of one point agree if their disparities differ by less, in pixels."""
 _GAIN_ERRORS: Final = 3.0
@@ -170,11 +172,7 @@ class CameraComparison:
         faults = dict(column_faults)
         for camera in sorted({*row_faults, *self._behind()}):
             faults[camera] = self._picture_fault(camera, rows_px[camera], row_faults.get(camera))
-        depth_faults = self._depth_faults(scales, scale_faults, beside=set(faults))
-        faults |= {
-            camera: f"{faults[camera]}; {words}" if camera in faults else words
-            for camera, words in depth_faults.items()
-        }
+        faults |= self._depth_faults(scales, scale_faults, beside=set(faults))
         found = [faults[camera] for camera in sorted(faults)]
         if not found:
             found = self._width_faults()
@@ -309,8 +307,11 @@ class CameraComparison:
             if lag and usable:
                 shot = min(usable, key=lambda each: abs(each.frame - middle.frame))
                 share = self._share([(shot, self._band(shot.frame + lag, camera))])
+                many = "s" if abs(lag) > 1 else ""
                 word = "late" if lag > 0 else "early"
-                readings.append((share, f"{abs(lag)} frames {word}"))
+                readings.append((share, f"{abs(lag)} frame{many} {word}"))
+        everywhere = [each for each in self._shots if (each.left, each.right) == (other, camera)]
+        readings.append((self._share_elsewhere(everywhere), _ELSEWHERE))
         share, words = max(readings, default=(0.0, ""))
         wanted = max(
             (beside.share for pair, beside in self._pairs.items() if camera not in pair),
@@ -322,7 +323,27 @@ class CameraComparison:
                 f"pictures of camera {camera} do not fit those of the others, by the depth of "
                 f"either: other rows, another moment or another place{found}"
             )
+        if words == _ELSEWHERE:
+            return f"camera {camera} {words}"
         return f"pictures of camera {camera} are {words}" if words else row_fault or ""
+
+    def _share_elsewhere(self, shots: Sequence[Shot]) -> float:
+        """Return the share of matches that depth explains if the two stand otherwise apart."""
+        found, predicted = [], []
+        for shot in shots:
+            told = self._views.predicted(shot, self._contract.structure)
+            if told is not None:
+                found.append(shot.matched_px[told[1]])
+                predicted.append(told[0][told[1]])
+        if not sum(map(len, found)):
+            return 0.0
+        found_px, predicted_px = np.concatenate(found), np.concatenate(predicted)
+        # The two may even stand the other way round.
+        aways = [
+            voted_scale(found_px, sign * predicted_px) * sign * predicted_px - found_px
+            for sign in (1, -1)
+        ]
+        return max(float((np.abs(away) < shots[0].grain_px).mean()) for away in aways)
 
     def _band(self, frame: int, camera: int) -> Luma:
         return self._views.band(frame, camera)
@@ -350,14 +371,14 @@ class CameraComparison:
     ) -> dict[int, str]:
         """Return cameras whose depth explains less than it should, and what would explain more."""
         faults = {}
-        for camera in range(CAMERA_COUNT):
+        for camera in sorted(set(range(CAMERA_COUNT)) - beside - self._aside()):
             own = [
                 each for each in self._of(camera)
-                if not set(each.pair) - {camera} & (beside | set(scale_faults))
+                if not (set(each.pair) - {camera}) & (beside | set(scale_faults))
             ] or self._of(camera)  # fmt: skip
             if not own:
                 continue
-            others = [
+            behind = [
                 each.near[camera] - next(n for c, n in each.near.items() if c != camera)
                 for each in own
             ]
@@ -366,12 +387,25 @@ class CameraComparison:
                 faults[camera] = better
             elif camera in scale_faults:
                 faults[camera] = scale_faults[camera]
-            elif float(np.median(others)) < -_LEAST_ASYMMETRY:
+            elif float(np.median(behind)) < -_LEAST_ASYMMETRY:
                 faults[camera] = (
                     f"depth of camera {camera} explains {own[0].near[camera]:.0%} of the matches "
-                    f"for which that of its neighbour explains {own[0].share:.0%}"
+                    f"of which that of its neighbour explains {own[0].share:.0%}"
                 )
         return faults
+
+    def _aside(self) -> set[int]:
+        """Return cameras all of whose pairs have an offset: pictures that are not where depth is."""
+        offsets_px = self._contract.offsets_px
+        return {
+            camera
+            for camera in range(CAMERA_COUNT)
+            if offsets_px
+            and all(
+                abs(offsets_px.get(beside.pair, math.inf)) >= MOST_COLUMNS_PX
+                for beside in self._of(camera)
+            )
+        }
 
     def _better_depth(self, camera: int, *, scale: float) -> str:
         """Return another reading of one camera's depth that explains clearly more, in words."""
@@ -389,9 +423,11 @@ class CameraComparison:
             for other in structure.alternatives(question):
                 words = _READINGS[question].format(getattr(other, question))
                 factor = self._own_factor(shots, other) if question == "form" else 1.0
-                readings.append(
-                    (f"{subject} fits better {words}", self._shares(shots, other, factor=factor))
-                )
+                if question == "frame_lag" and self._is_late(camera, other):
+                    words = f"pictures of camera {camera} are {self._lateness(other)}"
+                else:
+                    words = f"{subject} fits better {words}"
+                readings.append((words, self._shares(shots, other, factor=factor)))
         for file in range(CAMERA_COUNT):
             if file != structure.depth_file(camera):
                 readings.append(
@@ -407,6 +443,30 @@ class CameraComparison:
             if is_clear and gain > most + _LEAST_GAIN * bool(best):
                 best, most = words, gain
         return best
+
+    def _lateness(self, lagged: Structure) -> str:
+        lag = self._contract.structure.frame_lag - lagged.frame_lag
+        return f"{abs(lag)} frame{'s' if abs(lag) > 1 else ''} {'late' if lag > 0 else 'early'}"
+
+    def _is_late(self, camera: int, lagged: Structure) -> bool:
+        """Tell whether it is a camera's pictures that lag rather than its depth.
+
+        Depth before its time fits pictures that are late. If they are, then a later picture fits
+        the depth of the neighbours better.
+        """
+        lag = self._contract.structure.frame_lag - lagged.frame_lag
+        (neighbour,) = set(self._of(camera)[0].pair) - {camera}
+        shots = [
+            shot
+            for shot in self._shots
+            if (shot.left, shot.right) == (neighbour, camera)
+            and 0 <= shot.frame + lag < self._views.scene.frames
+        ]
+        now, then = (
+            self._share([(shot, self._band(shot.frame + by, camera)) for shot in shots])
+            for by in (0, lag)
+        )
+        return then > now + _LEAST_LATER
 
     def _own_factor(self, shots: Sequence[Shot], structure: Structure) -> float:
         """Return the factor that most of a camera's matches agree on."""
@@ -454,7 +514,7 @@ class CameraComparison:
             pair: beside for pair, beside in self._pairs.items()
             if beside.rms_px > 2.0 and beside.share >= LEAST_SHARE
         }  # fmt: skip
-        if len(told) < _MAJORITY:
+        if len(told) < _MAJORITY or self._contract.offsets_px:
             return []
         middle = float(np.median([beside.log_scale for beside in told.values()]))
         off = {
@@ -469,7 +529,7 @@ class CameraComparison:
         whose = ""
         if len(common) == 1:
             (camera,) = common
-            whose = f": camera {camera} is not where it is said to be, or its pictures are aside"
+            whose = f": camera {camera} {_ELSEWHERE}"
         return [f"distances between cameras disagree: {words}{whose}"]
 
 
@@ -478,6 +538,7 @@ _TURNED: Final[dict[str, Callable[[Luma], Luma]]] = {
     "upside down": lambda band: band[::-1],
     "turned by 180 degrees": lambda band: band[::-1, ::-1],
 }
+_ELSEWHERE: Final = "is not where it is said to be, or its pictures are aside"
 _READINGS: Final[dict[Question, str]] = {
     "frame_lag": "with a lag of {:+d} frames", "flip": "flipped ({})", "form": "as {} depth",
     "kind": "along the {}",

@@ -84,7 +84,7 @@ def voted_agreement(views: SceneViews, shots: Sequence[Shot], structure: Structu
         return 0.0
     found = np.concatenate([term.matched_px for term in terms])
     predicted = np.concatenate([term.predicted_px for term in terms])
-    return _agreement(found, _voted_scale(found, predicted) * predicted)
+    return _agreement(found, voted_scale(found, predicted) * predicted)
 
 
 def _start(terms: Sequence[Term], *, free: Free) -> tuple[float, dict[Pair, float]]:
@@ -92,7 +92,7 @@ def _start(terms: Sequence[Term], *, free: Free) -> tuple[float, dict[Pair, floa
     found = np.concatenate([term.matched_px for term in terms])
     predicted = np.concatenate([term.predicted_px for term in terms])
     if free == "scale":
-        return _voted_scale(found, predicted), {}
+        return voted_scale(found, predicted), {}
     scale = 1.0
     if free == "both":
         widest = max(terms, key=lambda term: len(term.matched_px)).pair
@@ -118,7 +118,7 @@ def _agreement(found: Points, predicted: Points) -> float:
     return float((1 / (1 + away * away)).sum())
 
 
-def _voted_scale(found: Points, predicted: Points) -> float:
+def voted_scale(found: Points, predicted: Points) -> float:
     """Return the scale that most matches agree on, of those that their ratios propose."""
     usable = (found * predicted > 0) & (np.abs(found) > 0.1)
     if not usable.any():

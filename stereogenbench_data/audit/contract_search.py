@@ -65,10 +65,14 @@ class Search:
         """Take what the contracts are judged by, and how far off a unit may be."""
         self._views = views
         self._least_log_scale = least_log_scale
-        self._shots = shots
+        self._every = shots
+        near = views.neighbours(Structure())
+        # Those next but one are for the comparison of cameras.
+        self._shots = [shot for shot in shots if shot.pair in near] or list(shots)
         self._bias = BIAS_PX / max(disparity_px(shots), 1e-6)
         self._bias_beside_offset = BIAS_PX / max(spread_px(shots), 1e-6)
         self._fitted: dict[tuple[Structure, Free], _Candidate] = {}
+        self._likely: dict[Structure, tuple[Structure, ...]] = {}
         self._powers: dict[tuple[Structure, Free], RayPower] = {}
         self.declared = self.candidate(Structure.declared(views.encoding), free="nothing")
 
@@ -120,7 +124,10 @@ class Search:
     def _one_change(self, current: _Candidate) -> Iterator[_Candidate]:
         """Yield contracts that change one answer, or let one length be fitted."""
         for question in QUESTIONS:
-            for structure in current.structure.alternatives(question):
+            others = current.structure.alternatives(question)
+            if question == "order" and current.free != "nothing":
+                others = self._promising(current.structure)
+            for structure in others:
                 free = _freed(current.free, "scale") if question == "form" else current.free
                 yield self.candidate(structure, free=free)
         for length in ("scale", "offset"):
@@ -142,12 +149,15 @@ class Search:
                     yield self.candidate(structure, free=free)
             yield self.candidate(current.structure, free="both")
 
-    def _promising(self, current: Structure) -> list[Structure]:
+    def _promising(self, current: Structure) -> tuple[Structure, ...]:
         """Return the orders that explain most matches, whatever the scale."""
-        orders = current.alternatives("order")
-        few = [shot for shot in self._shots if shot.frame == self._shots[0].frame]
-        shares = {order: voted_agreement(self._views, few, order) for order in orders}
-        return sorted(orders, key=lambda order: -shares[order])[:_PROMISING]
+        if current not in self._likely:
+            orders = current.alternatives("order")
+            few = [shot for shot in self._shots if shot.frame == self._shots[0].frame]
+            shares = {order: voted_agreement(self._views, few, order) for order in orders}
+            best = sorted(orders, key=lambda order: -shares[order])[:_PROMISING]
+            self._likely[current] = tuple(best)
+        return self._likely[current]
 
     def _most_better(self, current: _Candidate, others: Iterator[_Candidate]) -> _Candidate | None:
         """Return the contract that is clearly better than the current one by most."""
@@ -188,9 +198,13 @@ class Search:
     def cameras(self, contract: _Candidate, *, depth_step: float) -> CameraCheck:
         """Return what a contract leaves to explain, its scale fitted."""
         fitted_too = self.candidate(contract.structure, free=_freed(contract.free, "scale"))
-        return CameraComparison(
-            self._views, self._shots, fitted_too.score, depth_step=depth_step
-        ).check()
+        structure = contract.structure
+        shots = self._every
+        if structure.order != self.declared.structure.order:
+            # Other files stand beside each other.
+            frames = len({shot.frame for shot in shots})
+            shots = self._views.shots(frames=frames, structure=structure)
+        return CameraComparison(self._views, shots, fitted_too.score, depth_step=depth_step).check()
 
     def rivals(self, best: _Candidate) -> tuple[Rival, ...]:
         """Return the other answers to every question, each with its own scale."""
@@ -219,6 +233,24 @@ class Search:
             and self._is_better(other, self.declared)
             and not self.gain(best, other).is_clear()
         )
+
+    def told(self, best: _Candidate) -> Evidence:
+        """Return by how much a contract is better than the declared one, where the two differ.
+
+        An offset of one camera leaves the pairs of the others as they are.
+        """
+        if best.structure != self.declared.structure or best.free != "offset":
+            return self.gain(best, self.declared)
+        moved = [
+            place
+            for place, shot in enumerate(self._shots)
+            if abs(shot.shift_px(best.score.offsets_px)) >= LEAST_OFFSET_PX
+        ]
+        ours, theirs = (
+            replace(score, errors=[score.errors[place] for place in moved])
+            for score in (best.score, self.declared.score)
+        )
+        return evidence([self._shots[place] for place in moved], ours, theirs)
 
     def without_parallax(self, best: _Candidate) -> Evidence:
         """Return by how much a contract is better than if all were infinitely far."""
@@ -311,7 +343,7 @@ def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
     basics: dict[str, Any] = {
         "key": views.scene.id.key,
         "views": len(shots) // 2,
-        "pairs": tuple(views.chosen_pairs()),
+        "pairs": tuple(views.chosen_pairs(Structure())),
         "matches": sum(len(shot.rows) for shot in shots[::2]),
         "textured": sum(shot.textured for shot in shots[::2]),
         "unit_m": views.unit_m(file),
@@ -366,7 +398,7 @@ def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
         scale_error=with_scale.scale_error,
         other_kind_scale=of_other_kind.scale,
         offsets_px=search.candidate(best.structure, free=shifted).score.offsets_px,
-        gain=search.gain(best, search.declared),
+        gain=search.told(best),
         parallax=parallax,
         agreement=check.agreement,
         check=check,

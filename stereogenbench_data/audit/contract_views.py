@@ -30,7 +30,8 @@ _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 _BLUR: Final = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
 _MEAN_RADIUS_PX: Final = 6
 _MOST_POINTS: Final = 2000
-_MOST_DEPTHS: Final = 2 * CAMERA_COUNT
+_MOST_DEPTH_BYTES: Final = 96 * 2**20
+"""Decoded depth that is kept: every lag of every camera of small pictures."""
 SIDE_CELLS: Final = 4
 """Parts of a picture along each side, by which it is told how sure a comparison is."""
 
@@ -130,7 +131,7 @@ class SceneViews:
         _require_size(units.shape, expected, where=f"{self.scene.id.key}/{name}")
         pixel_format = self._streams.pixel_format(self.scene, name)
         known = measured(units, encoding=self.encoding, pixel_format=pixel_format)
-        if len(self._depths) >= _MOST_DEPTHS:
+        if (len(self._depths) + 1) * units.size * 3 > _MOST_DEPTH_BYTES and self._depths:
             self._depths.pop(next(iter(self._depths)))
         self._depths[frame, file] = units, known & (units > 0)
         return self._depths[frame, file]
@@ -167,28 +168,39 @@ class SceneViews:
         y = (np.arange(camera.height_px) + 0.5 - camera.cy_px) / camera.fy_px
         return np.sqrt(1 + x**2 + y[:, None] ** 2)
 
-    def shots(self, *, frames: int) -> list[Shot]:
-        """Return what pairs of several frames have in common, seen from either side."""
+    def shots(self, *, frames: int, structure: Structure | None = None) -> list[Shot]:
+        """Return what pairs of several frames have in common, seen from either side.
+
+        The pairs are those that stand beside each other by a structure's order of cameras.
+        """
         return [
             shot
             for frame in chosen_frames(self.scene.frames, count=frames)
-            for left, right in self.chosen_pairs()
+            for left, right in self.chosen_pairs(structure or Structure())
             for shot in self._both_ways(frame, left, right)
         ]
 
-    def chosen_pairs(self) -> list[tuple[int, int]]:
+    def chosen_pairs(self, structure: Structure) -> list[tuple[int, int]]:
         """Return pairs in which every camera stands beside others: next to it, and next but one.
 
         The primary and the widest pair are among them. The lower number comes first.
         """
-        across = [int(camera) for camera in np.argsort(self.scene.lateral_m, kind="stable")]
-        pairs = [
-            self.primary,
-            *itertools.pairwise(across),
-            *zip(across, across[2:], strict=False),
-            (across[0], across[-1]),
-        ]
+        across = self._across(structure)
+        beside = ((min(pair), max(pair)) for pair in zip(across, across[2:], strict=False))
+        return list(dict.fromkeys([*self.neighbours(structure), *beside]))
+
+    def neighbours(self, structure: Structure) -> list[tuple[int, int]]:
+        """Return the primary pair, those that stand next to each other, and the widest."""
+        across = self._across(structure)
+        pairs = [self.primary, *itertools.pairwise(across), (across[0], across[-1])]
         return list(dict.fromkeys((min(pair), max(pair)) for pair in pairs))
+
+    def _across(self, structure: Structure) -> list[int]:
+        """Return the numbers of the pictures' files from left to right."""
+        return sorted(
+            range(CAMERA_COUNT),
+            key=lambda file: self.scene.lateral_m[structure.camera_of(file, content="rgb")],
+        )
 
     def _both_ways(self, frame: int, left: int, right: int) -> tuple[Shot, Shot]:
         """Return one set of matches from both sides, so that either camera's depth is tested."""

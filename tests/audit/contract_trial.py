@@ -102,13 +102,13 @@ def drawn_requests(seed: int, count: int) -> list[SynthRequest]:
 def cases(rng: np.random.Generator, *, frames: int) -> Iterator[Case]:
     """Yield what is made wrong with one scene."""
     yield Case("nothing", lambda folder: None)
-    yield from _contract_cases(rng)
+    yield from _contract_cases(rng, frames=frames)
     yield from _camera_cases(rng, frames=frames)
     yield from _picture_cases(rng, frames=frames)
     yield from _combined_cases(rng)
 
 
-def _contract_cases(rng: np.random.Generator) -> Iterator[Case]:
+def _contract_cases(rng: np.random.Generator, *, frames: int) -> Iterator[Case]:
     quotient = {"false": frozenset({QUOTIENT}), "blamed": frozenset({QUOTIENT})}
     for factor in (float(rng.choice([0.95, 0.97, 1.03, 1.05])), float(rng.choice([0.1, 2.0, 100]))):
         yield Case(
@@ -143,7 +143,7 @@ def _contract_cases(rng: np.random.Generator) -> Iterator[Case]:
         "inverse depth", lambda f: rewrite_depth(f, as_inverse(f)),
         named="inverse depth", false=frozenset({FORM, QUOTIENT}), blamed=frozenset({FORM}),
     )  # fmt: skip
-    lag = int(rng.choice([-2, -1, 1, 2, 5]))
+    lag = int(rng.choice([lag for lag in (-2, -1, 1, 2, 5) if abs(lag) < frames - 1]))
     yield Case(
         "depth of all lagged", lambda f: rewrite_depth(f, lagged(lag)),
         named=rf"(^| ){lag}( |$)" if abs(lag) < 4 else "or beyond",
