@@ -395,7 +395,7 @@ class CameraComparison:
         return faults
 
     def _aside(self) -> set[int]:
-        """Return cameras all of whose pairs have an offset: pictures that are not where depth is."""
+        """Return cameras all of whose pairs have an offset: their pictures left their depth."""
         offsets_px = self._contract.offsets_px
         return {
             camera
@@ -413,6 +413,7 @@ class CameraComparison:
         shots = [shot for shot in self._shots if shot.left == camera]
         now = self._shares(shots, structure)
         subject = f"depth of camera {camera}"
+        lagged: dict[str, Structure] = {}
         readings: list[tuple[str, Float64[np.ndarray, " shots"]]] = [
             (
                 f"{subject} is {scale:.4g} x that of the others",
@@ -423,10 +424,9 @@ class CameraComparison:
             for other in structure.alternatives(question):
                 words = _READINGS[question].format(getattr(other, question))
                 factor = self._own_factor(shots, other) if question == "form" else 1.0
-                if question == "frame_lag" and self._is_late(camera, other):
-                    words = f"pictures of camera {camera} are {self._lateness(other)}"
-                else:
-                    words = f"{subject} fits better {words}"
+                words = f"{subject} fits better {words}"
+                if question == "frame_lag":
+                    lagged[words] = other
                 readings.append((words, self._shares(shots, other, factor=factor)))
         for file in range(CAMERA_COUNT):
             if file != structure.depth_file(camera):
@@ -442,6 +442,8 @@ class CameraComparison:
             # The first of them are the simplest.
             if is_clear and gain > most + _LEAST_GAIN * bool(best):
                 best, most = words, gain
+        if best in lagged and self._is_late(camera, lagged[best]):
+            return f"pictures of camera {camera} are {self._lateness(lagged[best])}"
         return best
 
     def _lateness(self, lagged: Structure) -> str:

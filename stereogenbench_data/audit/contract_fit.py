@@ -225,14 +225,16 @@ def _equations(
         weight = robust_weights(difference, inside & near)
         if weight is None:
             continue
-        columns = np.zeros((len(difference), len(unknowns)))
-        for place, name in enumerate(unknowns):
-            if name == "scale":
-                columns[:, place] = slope * scale * term.predicted_px
-            elif name == term.pair:
-                columns[:, place] = term.sign * slope
-        normals[number] = (columns * weight[:, None]).T @ columns
-        rights[number] = columns.T @ (weight * difference)
+        # Of all unknowns a shot depends on its own pair's, and on the scale.
+        columns = {
+            place: slope * scale * term.predicted_px if name == "scale" else term.sign * slope
+            for place, name in enumerate(unknowns)
+            if name in ("scale", term.pair)
+        }
+        for place, column in columns.items():
+            rights[number, place] = (column * weight * difference).sum()
+            for other, beside in columns.items():
+                normals[number, place, other] = (column * weight * beside).sum()
     return normals, rights
 
 

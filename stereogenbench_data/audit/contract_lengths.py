@@ -88,6 +88,11 @@ def length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer
     where = {"tag": "by the files' tag", "default": "by default", "user": "as given"}
     declared = f"{first.unit_m:g} m, {where.get(first.unit_source, 'tags unreadable')}"
     quotient = _quotient(scenes, unit)
+    if first.problem:
+        blank = (
+            Answer(topic, "", "", "cannot tell", note=first.problem) for topic in (UNIT, FOCAL)
+        )
+        return quotient, *blank
     found = ""
     if quotient.found:
         found = f"{unit.metres:.5g} m ± {unit.uncertainty:.2%} if the rest is right"

@@ -71,13 +71,13 @@ def ray_power(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> Ray
             weight = robust_weights(difference, usable)
             if weight is None:
                 continue
-            columns = np.zeros((len(difference), 2 + len(pairs)))
-            columns[:, 0] = slope * grown_px
-            columns[:, 1] = slope * grown_px * log_ray
+            columns = {0: slope * grown_px, 1: slope * grown_px * log_ray}
             if term.pair in offsets_px:
-                columns[:, 2 + pairs.index(term.pair)] = term.sign * slope
-            normals[number] = (columns * weight[:, None]).T @ columns
-            rights[number] = columns.T @ (weight * difference)
+                columns[2 + pairs.index(term.pair)] = term.sign * slope
+            for place, column in columns.items():
+                rights[number, place] = (column * weight * difference).sum()
+                for other, beside in columns.items():
+                    normals[number, place, other] = (column * weight * beside).sum()
         step, spread = solved(normals, rights)
         log_scale += float(np.clip(step[0], -0.1, 0.1))
         bend += float(np.clip(step[1], -_LARGEST_STEP, _LARGEST_STEP))

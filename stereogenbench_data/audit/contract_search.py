@@ -322,11 +322,11 @@ def _checked(
     declared one, with a scale where it asks for one, that is checked.
     """
     check = search.cameras(best, depth_step=depth_step)
-    if not (check.faults or check.unexplained) or best.structure == search.declared.structure:
-        return best, check
     plain = search.simplest()
+    if not (check.faults or check.unexplained) or best is plain:
+        return best, check
     other = search.cameras(plain, depth_step=depth_step)
-    if len(other.faults) <= max(len(check.faults), 1):
+    if len(other.faults) <= max(len(check.faults), 2) and not other.agreement < check.agreement / 2:
         return plain, other
     return best, check
 
