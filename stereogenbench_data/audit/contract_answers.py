@@ -22,7 +22,7 @@ TOPICS: Final[dict[Question, str]] = {
     "order": "left and right",
     "flip": "flip of depth",
 }
-CAMERAS_DIFFER: Final = "not told while single cameras do not fit the others, see below"
+CAMERAS_DIFFER: Final = "not told while cameras do not fit, see below"
 _WORDS: Final[dict[Any, str]] = {
     "planar": "the optical axis",
     "ray": "the ray",

@@ -49,9 +49,7 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     """
     if not report.scenes:
         raise SelectionError(f"{report.data}: no scene was judged, so there is nothing to draw.")
-    diagnosis = max(
-        report.scenes, key=lambda scene: (not scene.problem, scene.gain.mean_db, scene.matches)
-    )
+    diagnosis = max(report.scenes, key=_tells)
     task = scene_task(index, diagnosis.key, encoding=report.declared)
     figure = _figure_class()(figsize=(14, 13.5), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(2, 1))
@@ -68,6 +66,11 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     figure.savefig(path, dpi=90)
 
 
+def _tells(scene: SceneDiagnosis) -> tuple[bool, bool, float, int]:
+    """Return by what the scene that tells most is the largest."""
+    return not scene.problem, bool(scene.check.faults), scene.gain.mean_db, scene.matches
+
+
 def _figure_class() -> Any:
     try:
         from matplotlib.figure import Figure
@@ -81,16 +84,18 @@ def _figure_class() -> Any:
 def _title(diagnosis: SceneDiagnosis) -> str:
     if diagnosis.problem:
         return f"cannot tell ({diagnosis.problem})"
+    if diagnosis.check.faults:
+        return "; ".join(diagnosis.check.faults)
     changes = [
         f"{question} {getattr(diagnosis.best, question)}"
         for question in diagnosis.best.changes_from(diagnosis.declared)
     ]
     if diagnosis.changed in ("scale", "both") or diagnosis.best.form != diagnosis.declared.form:
-        changes.append(f"{diagnosis.unit_m / diagnosis.scale:.4g} m a unit")
+        changes.append(f"unit / (focal length x baseline) {1 / diagnosis.scale:.4g} x declared")
     if diagnosis.changed in ("offset", "both"):
         changes.append("an offset")
     if not changes:
-        return "the declared contract fits"
+        return "nothing contradicts the declared contract"
     return f"{', '.join(changes)}: {diagnosis.gain.mean_db:.2f} dB better than declared"
 
 
@@ -194,7 +199,11 @@ def _draw_curves(
         )
     if units_m[0] <= diagnosis.unit_m <= units_m[-1]:
         axis.axvline(diagnosis.unit_m, color="grey", linestyle=":", label="declared unit")
-    axis.set(xscale="log", xlabel="metres a unit", ylabel="dB better than no agreement")
+    axis.set(
+        xscale="log",
+        xlabel="metres a unit, if focal length and baselines are right",
+        ylabel="dB better than no agreement",
+    )
     axis.set_xlim(units_m[0], units_m[-1])
     axis.legend(fontsize=8)
 

@@ -24,6 +24,7 @@ from stereogenbench_data.audit.contract_diagnosis import (
 )
 from stereogenbench_data.audit.contract_hypotheses import QUESTIONS, Structure
 from stereogenbench_data.audit.contract_lengths import (
+    QUOTIENT,
     common_unit,
     kind_explains_scale,
     length_answers,
@@ -196,7 +197,7 @@ def _contract_words(structure: Structure, first: SceneDiagnosis, *, free: str, s
         for question in structure.changes_from(first.declared)
     ]
     if free in ("scale", "both"):
-        words.append(f"{first.unit_m / scale:.5g} m a unit")
+        words.append(f"{QUOTIENT} {1 / scale:.4g} x declared")
     if free in ("offset", "both"):
         words.append("an offset for each pair")
     return ", ".join(words)
@@ -230,7 +231,7 @@ def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
     """Tell whether a scene may have the contract of another."""
     if scene.declared != leader.declared:
         return False
-    if bool(scene.check.faults) or bool(leader.check.faults):
+    if has_doubts([scene, leader]):
         # What is wrong with single cameras of a scene is its own.
         return False
     error = allowed_log_scale(max(scene.depth_step, leader.depth_step))

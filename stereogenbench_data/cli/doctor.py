@@ -41,7 +41,8 @@ QUOTIENT_MEANS = (
 )
 NOT_ASKED = (
     "Not asked here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
-    "beside the poses, colours, frames other than those looked at, depth where there is no texture."
+    "beside the poses, colours, depth that lies a pixel aside or where there is no texture, "
+    "frames other than those looked at."
 )
 _DB_NOTE = (
     "dB of the quotient, kind and offset count small differences under a tight cap: they "
@@ -126,8 +127,10 @@ def _lines(report: "DoctorReport") -> list[str]:
     ]
     for key, reason in report.left_out.items():
         lines.append(f"left out: {key}: {reason}")
+    if not report.verdicts:
+        lines.append("NOT TESTED: no scene could be judged. Run `stereogenbench audit`.")
     if len(report.verdicts) > 1:
-        lines.append(f"SCENES DIFFER: {len(report.verdicts)} contracts were found.")
+        lines.append(f"SCENES DIFFER: {len(report.verdicts)} verdicts follow.")
     silent = [scene for scene in report.scenes if scene.problem]
     if silent and len(silent) < len(report.scenes):
         lines += [f"{scene.key}: cannot tell: {scene.problem}" for scene in silent]
@@ -169,6 +172,10 @@ def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
         lines.append("Nothing to paste: no DepthEncoding is sure to put this right.")
     elif verdict.fits:
         lines.append(f"The declared contract fits: {encoding_line(report.declared)}")
+    elif math.isfinite(verdict.agreement) and not verdict.unexplained_cameras:
+        open_topics = [a.topic for a in verdict.answers if a.status == "cannot tell"]
+        untold = f" Not told: {', '.join(open_topics)}." if open_topics else ""
+        lines.append(f"Cannot tell on the whole: nothing contradicts what is declared.{untold}")
     else:
         lines.append("Cannot tell: the pictures do not decide on the declared contract.")
     return lines

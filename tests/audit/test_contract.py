@@ -16,7 +16,7 @@ from stereogenbench_data.audit.contract_lengths import QUOTIENT, Unit
 from stereogenbench_data.audit.contract_matching import match_rows
 from stereogenbench_data.audit.contract_ray import RayPower
 from stereogenbench_data.audit.contract_statistics import Evidence, interval, pooled
-from stereogenbench_data.audit.contract_verdict import encoding_line, judge
+from stereogenbench_data.audit.contract_verdict import encoding_line, grouped, judge
 from stereogenbench_data.audit.contract_views import relative_step
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.records import DepthEncoding
@@ -337,6 +337,26 @@ def test_nothing_is_pasted_and_nothing_fits_while_a_camera_does_not(check, words
     assert not verdict.fits
     assert verdict.is_wrong == bool(words or not (verdict.faults or verdict.unexplained_cameras))
     assert words in " ".join(verdict.faults)
+
+
+def test_a_scene_with_a_faulty_camera_gets_a_verdict_of_its_own():
+    faulty = replace(FITTING, faults=("depth of camera 2 is 0.5 x that of the others",))
+    scenes = [diagnosed(key="a"), diagnosed(key="b", check=faulty), diagnosed(key="c")]
+
+    groups = grouped(scenes)
+
+    assert sorted([scene.key for scene in group] for group in groups) == [["a", "c"], ["b"]]
+
+
+def test_cameras_of_which_too_little_was_found_are_untested():
+    few = CameraFigures(4, 20, 0.9, 1.0, 0.0, 0.0)
+    low = CameraFigures(5, 999, 0.3, 1.0, 0.0, 0.0)
+
+    check = CameraCheck((*FITTING.cameras[:4], few, low))
+
+    assert check.untested == (4,)
+    assert check.unexplained == (5,)
+    assert check.agreement == pytest.approx((4 * 0.9 + 0.3) / 5)
 
 
 @pytest.mark.parametrize(("offset_px", "status"), [(0.1, "not contradicted"), (0.8, "cannot tell")])
