@@ -311,8 +311,11 @@ class CameraComparison:
                 word = "late" if lag > 0 else "early"
                 readings.append((share, f"{abs(lag)} frame{many} {word}"))
         everywhere = [each for each in self._shots if (each.left, each.right) == (other, camera)]
-        readings.append((self._share_elsewhere(everywhere), _ELSEWHERE))
         share, words = max(readings, default=(0.0, ""))
+        elsewhere = self._share_elsewhere(everywhere)
+        # Where disparities are small another place explains what is wrong with rows as well.
+        if elsewhere > share + _LEAST_DEFICIT:
+            share, words = elsewhere, _ELSEWHERE
         wanted = max(
             (beside.share for pair, beside in self._pairs.items() if camera not in pair),
             default=1.0,

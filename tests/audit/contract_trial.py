@@ -225,7 +225,7 @@ def _picture_cases(rng: np.random.Generator, *, frames: int) -> Iterator[Case]:
         yield Case(
             "pictures of one camera late by 1 to 15 frames",
             lambda f, c=camera, n=frames_late: rewrite_rgb(f, c, late(n)),
-            named=f"camera {camera} are {frames_late} frames late", cameras=frozenset({camera}),
+            named=f"camera {camera} are {frames_late} frames? late", cameras=frozenset({camera}),
             details=f"camera {camera} by {frames_late} of {frames}",
         )  # fmt: skip
     camera = int(rng.integers(6))
