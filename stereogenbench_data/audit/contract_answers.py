@@ -118,7 +118,8 @@ def structure_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
         return replace(
             blank, found=said(best), status="confirmed", behind=nearest, note=words, is_sure=True
         )
-    if declared in close or declared in doubtful:
+    # To be called wrong the declared answer must be behind; to be pasted, by the margin too.
+    if declared in close or not (declared in gains and _is_behind(gains[declared])):
         note = f"{said(best)} fits best, but not surely better"
         return replace(blank, behind=gains[declared], note=f"{note}; {words}" if words else note)
     others = [answer for answer in [*close, *lacking, *doubtful] if answer != declared]
@@ -138,6 +139,10 @@ def _each(scenes: Sequence[SceneDiagnosis], rival: Rival) -> list[Gain]:
         for other in scene.rivals
         if (other.question, other.answer) == (rival.question, rival.answer)
     ]
+
+
+def _is_behind(gain: Gain) -> bool:
+    return gain.by_shape or gain.low_db > 0
 
 
 def _named(answers: Sequence[Any]) -> str:
