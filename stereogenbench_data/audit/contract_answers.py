@@ -200,7 +200,8 @@ def offset_answer(scenes: Sequence[SceneDiagnosis]) -> Answer:
         return Answer(topic, "0 px", "", "cannot tell", note=CAMERAS_DIFFER)
     if changes(first, "offset"):
         gain = pooled([scene.gain for scene in scenes])
-        return Answer(topic, "0 px", offset_words(first.offsets_px), "wrong", gain)
+        note = "or pictures of another moment, which look alike where little moves"
+        return Answer(topic, "0 px", offset_words(first.offsets_px), "wrong", gain, note)
     largest_px = max((abs(px) for scene in scenes for px in scene.offsets_px.values()), default=0.0)
     if largest_px > LEAST_OFFSET_PX or math.isnan(first.agreement):
         note = f"fits up to {largest_px:.2g} px, none clearly better than 0"
