@@ -5,9 +5,8 @@ Every hypothesis on the contract predicts another disparity for them; the pictur
 at that disparity, on the same pixels for all. The declared contract is changed as little as the
 pictures ask for, and where two fit alike it is said that they do.
 
-What cannot be seen: focal length and unit enter disparity as focal length / unit alone, so a wrong
-one looks like a wrong other; which of them it is rests on whether a file states its unit, and on
-whether another reading of the sensor explains the factor.
+What cannot be seen: unit, focal length and baselines enter disparity as one quotient, so that a
+wrong one looks like a wrong other, and two may make up for each other.
 """
 
 from collections.abc import Callable, Iterator
@@ -57,7 +56,7 @@ class DoctorReport:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether a contract other than the declared one is clearly better for some scene."""
+        """Whether for some scene another contract is clearly better, or a camera does not fit."""
         return any(verdict.is_wrong for verdict in self.verdicts)
 
 

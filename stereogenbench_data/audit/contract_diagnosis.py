@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from stereogenbench_data.audit.contract_cameras import CameraCheck
 from stereogenbench_data.audit.contract_fit import Free
 from stereogenbench_data.audit.contract_hypotheses import Question, Structure
 from stereogenbench_data.audit.contract_scoring import Pair
@@ -54,12 +55,13 @@ class SceneDiagnosis:
         offsets_px: Constant disparity of each pair at the best contract.
         gain: By how much the best contract beats the declared one.
         parallax: By how much it beats no disparity at all.
-        agreement: Share of matches that the best contract explains to a pixel.
+        agreement: Share of the matches of neighbouring cameras that the best contract explains.
         rivals: The other answers.
         equals: Contracts with as few changes that are not clearly worse, in words.
         disparity_px: Root mean square of the disparities found.
         spread_px: Root mean square of the same, less the mean of each view.
         depth_step: How far apart neighbouring stored depths lie, as a share.
+        check: What the best contract leaves to explain, camera by camera.
         problem: Why nothing could be told; empty where something could.
     """
 
@@ -87,6 +89,7 @@ class SceneDiagnosis:
     disparity_px: float = math.inf
     spread_px: float = math.inf
     depth_step: float = 0.0
+    check: CameraCheck = field(default_factory=CameraCheck)
     problem: str = ""
 
 

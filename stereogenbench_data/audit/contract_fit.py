@@ -45,8 +45,13 @@ class Term:
 
     @property
     def pair(self) -> Pair:
-        """The two files."""
-        return self.shot.left, self.shot.right
+        """The two files, the lower number first."""
+        return self.shot.pair
+
+    @property
+    def sign(self) -> int:
+        """1 if the pixels are those of the lower number, whose way offsets are counted, else -1."""
+        return 1 if self.shot.left < self.shot.right else -1
 
 
 def fitted(views: SceneViews, shots: Sequence[Shot], structure: Structure, *, free: Free) -> Scored:
@@ -72,23 +77,37 @@ def fit_terms(views: SceneViews, shots: Sequence[Shot], structure: Structure) ->
     return terms
 
 
+def voted_agreement(views: SceneViews, shots: Sequence[Shot], structure: Structure) -> float:
+    """Return how many matches a structure explains at the scale that most of them agree on."""
+    terms = fit_terms(views, shots, structure)
+    if not terms:
+        return 0.0
+    found = np.concatenate([term.matched_px for term in terms])
+    predicted = np.concatenate([term.predicted_px for term in terms])
+    return _agreement(found, voted_scale(found, predicted) * predicted)
+
+
 def _start(terms: Sequence[Term], *, free: Free) -> tuple[float, dict[Pair, float]]:
     """Return a scale and offsets from the matches alone."""
     found = np.concatenate([term.matched_px for term in terms])
     predicted = np.concatenate([term.predicted_px for term in terms])
     if free == "scale":
-        return _voted_scale(found, predicted), {}
+        return voted_scale(found, predicted), {}
     scale = 1.0
     if free == "both":
         widest = max(terms, key=lambda term: len(term.matched_px)).pair
         own = [term for term in terms if term.pair == widest]
         scale = _drawn_scale(
-            np.concatenate([term.matched_px for term in own]),
-            np.concatenate([term.predicted_px for term in own]),
+            np.concatenate([term.sign * term.matched_px for term in own]),
+            np.concatenate([term.sign * term.predicted_px for term in own]),
         )
     offsets_px = {}
     for pair in dict.fromkeys(term.pair for term in terms):
-        rest = [term.matched_px - scale * term.predicted_px for term in terms if term.pair == pair]
+        rest = [
+            term.sign * (term.matched_px - scale * term.predicted_px)
+            for term in terms
+            if term.pair == pair
+        ]
         offsets_px[pair] = _densest(np.concatenate(rest))
     return scale, offsets_px
 
@@ -99,7 +118,7 @@ def _agreement(found: Points, predicted: Points) -> float:
     return float((1 / (1 + away * away)).sum())
 
 
-def _voted_scale(found: Points, predicted: Points) -> float:
+def voted_scale(found: Points, predicted: Points) -> float:
     """Return the scale that most matches agree on, of those that their ratios propose."""
     usable = (found * predicted > 0) & (np.abs(found) > 0.1)
     if not usable.any():
@@ -198,7 +217,7 @@ def _equations(
     for number, term in enumerate(terms):
         full = np.zeros(len(term.shot.rows))
         full[term.known] = scale * term.predicted_px
-        shift_px = offsets_px.get(term.pair, 0.0)
+        shift_px = term.shot.shift_px(offsets_px)
         difference, slope, inside = (
             part[term.known] for part in differences(views, term.shot, full + shift_px)
         )
@@ -206,14 +225,16 @@ def _equations(
         weight = robust_weights(difference, inside & near)
         if weight is None:
             continue
-        columns = np.zeros((len(difference), len(unknowns)))
-        for place, name in enumerate(unknowns):
-            if name == "scale":
-                columns[:, place] = slope * scale * term.predicted_px
-            elif name == term.pair:
-                columns[:, place] = slope
-        normals[number] = (columns * weight[:, None]).T @ columns
-        rights[number] = columns.T @ (weight * difference)
+        # Of all unknowns a shot depends on its own pair's, and on the scale.
+        columns = {
+            place: slope * scale * term.predicted_px if name == "scale" else term.sign * slope
+            for place, name in enumerate(unknowns)
+            if name in ("scale", term.pair)
+        }
+        for place, column in columns.items():
+            rights[number, place] = (column * weight * difference).sum()
+            for other, beside in columns.items():
+                normals[number, place, other] = (column * weight * beside).sum()
     return normals, rights
 
 

@@ -4,27 +4,49 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, get_args
 
 from stereogenbench_data.schema.records import DepthEncoding, DepthForm, DepthKind
-from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.release import CAMERA_COUNT, CAMERA_PAIRS
 
 Flip = Literal["none", "vertical", "horizontal"]
-Order = Literal[
-    "as recorded",
-    "mirrored",
-    "primary pair swapped",
-    "pictures of the primary pair swapped",
-    "depth of the primary pair swapped",
-    "reversed",
-    "pictures reversed",
-    "depth reversed",
-]
+Content = Literal["rgb", "depth"]
 Question = Literal["kind", "form", "frame_lag", "order", "flip"]
 
 LAGS: Final = (-3, -2, -1, 0, 1, 2, 3)
+_SAME: Final = tuple(range(CAMERA_COUNT))
+_KINDS_OF_FILES: Final[dict[str, tuple[Content, ...]]] = {
+    "": ("rgb", "depth"), "pictures": ("rgb",), "depth": ("depth",),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Order:
+    """Which camera each file of some kinds is of; every such exchange is its own inverse."""
+
+    cameras: tuple[int, ...] = _SAME
+    contents: tuple[Content, ...] = ()
+    is_mirrored: bool = False
+
+
+def _orders() -> dict[str, _Order]:
+    """Return every order that is asked about, by its words."""
+    orders = {"as recorded": _Order(), "mirrored": _Order(is_mirrored=True)}
+    for words, contents in _KINDS_OF_FILES.items():
+        orders[f"{words} reversed".strip()] = _Order(_SAME[::-1], contents)
+    for words, contents in _KINDS_OF_FILES.items():
+        for pair in CAMERA_PAIRS:
+            swapped = dict(zip(pair, pair[::-1], strict=True))
+            cameras = tuple(swapped.get(camera, camera) for camera in _SAME)
+            subject = f"{words} of cameras" if words else "cameras"
+            name = f"{subject} {pair[0]} and {pair[1]} exchanged"
+            orders[name] = _Order(cameras, contents)
+    return orders
+
+
+_ORDERS: Final = _orders()
 _ANSWERS: Final[dict[Question, tuple[Any, ...]]] = {
     "kind": ("planar", "ray"),
     "form": ("depth", "inverse"),
     "frame_lag": LAGS,
-    "order": get_args(Order),
+    "order": tuple(_ORDERS),
     "flip": get_args(Flip),
 }
 QUESTIONS: Final = tuple(_ANSWERS)
@@ -39,15 +61,15 @@ class Structure:
         form: "depth" or "inverse".
         frame_lag: RGB frame t shows what depth frame t + frame_lag measured.
         order: Which camera each file is of. "mirrored": the recorded places run the other way;
-            "swapped": files of the primary pair's two cameras are exchanged; "reversed": files
-            of camera c are those of camera 5 - c. Of pictures, of depth, or of both.
+            "exchanged": the files of two cameras are; "reversed": files of camera c are those of
+            camera 5 - c. Of pictures, of depth, or of both.
         flip: How stored depth is turned over.
     """
 
     kind: DepthKind = "planar"
     form: DepthForm = "depth"
     frame_lag: int = 0
-    order: Order = "as recorded"
+    order: str = "as recorded"
     flip: Flip = "none"
 
     @classmethod
@@ -71,20 +93,28 @@ class Structure:
             if answer != getattr(self, question)
         )
 
-    def camera_of(
-        self, file: int, *, content: Literal["rgb", "depth"], primary: tuple[int, int]
-    ) -> int:
-        """Return the camera that a numbered file is of."""
-        other = "depth" if content == "rgb" else "pictures"
-        if self.order in ("as recorded", "mirrored") or self.order.startswith(other):
-            return file
-        if self.order.endswith("reversed"):
-            return CAMERA_COUNT - 1 - file
-        exchanged = {primary[0]: primary[1], primary[1]: primary[0]}
-        return exchanged.get(file, file)
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the recorded places of the cameras run the other way."""
+        return _ORDERS[self.order].is_mirrored
 
-    def depth_file(self, rgb_file: int, *, primary: tuple[int, int]) -> int:
+    def camera_of(self, file: int, *, content: Content) -> int:
+        """Return the camera that a numbered file is of."""
+        order = _ORDERS[self.order]
+        return order.cameras[file] if content in order.contents else file
+
+    def depth_file(self, rgb_file: int) -> int:
         """Return the number of the depth file that belongs to a numbered picture."""
-        camera = self.camera_of(rgb_file, content="rgb", primary=primary)
-        # Every exchange is its own inverse.
-        return self.camera_of(camera, content="depth", primary=primary)
+        return self.camera_of(self.camera_of(rgb_file, content="rgb"), content="depth")
+
+    def reads_alike(self, other: "Structure", *, left: int, right: int) -> bool:
+        """Tell whether both take the same numbers and places for the pictures of two files."""
+        return self.changed("order", other.order) == other and all(
+            mine == theirs
+            for mine, theirs in (
+                (self.is_mirrored, other.is_mirrored),
+                (self.depth_file(left), other.depth_file(left)),
+                (self.camera_of(left, content="rgb"), other.camera_of(left, content="rgb")),
+                (self.camera_of(right, content="rgb"), other.camera_of(right, content="rgb")),
+            )
+        )

@@ -1,4 +1,4 @@
-"""Answers on the two lengths that disparity shows as one: metres a unit, and the focal length."""
+"""Answers on what disparity shows of lengths: unit / (focal length x baseline), one quotient."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,14 @@ from typing import Final
 
 import numpy as np
 
-from stereogenbench_data.audit.contract_answers import Answer, Status, behind, changes, said
+from stereogenbench_data.audit.contract_answers import (
+    CAMERAS_DIFFER,
+    Answer,
+    behind,
+    changes,
+    has_doubts,
+    said,
+)
 from stereogenbench_data.audit.contract_diagnosis import (
     BIAS_PX,
     LEAST_LOG_SCALE,
@@ -17,21 +24,25 @@ from stereogenbench_data.audit.contract_diagnosis import (
 from stereogenbench_data.audit.contract_statistics import LEAST_ERRORS, interval, pooled
 
 _BIAS: Final = 0.002
-"""Share by which units may be off however many pixels agree: interpolation, rounding of depth."""
-_VAGUE: Final = 0.02
-"""Half the 95 % interval of log(unit) beyond which the unit is not told."""
+"""Share by which quotients may be off however many pixels agree: interpolation, rounding."""
+MARGIN: Final = 0.02
+"""A quotient is confirmed if its 95 % interval lies within this share of what is declared."""
 _LEAST_TOLERANCE: Final = 0.005
-_COMMON_SLIP: Final = 0.12
-"""Units are taken to be off by as much, as a share, or by as much more or less than twofold."""
 
-_UNIT: Final = "metres a unit"
-_FOCAL: Final = "focal length"
-_WIDTH: Final = "from the width"
+QUOTIENT: Final = "unit / (focal length x baseline)"
+UNIT: Final = "metres a unit"
+FOCAL: Final = "focal length"
+_ALONE: Final = "not seen alone: only the quotient above is"
 
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """Metres in a stored unit of depth: value, and half its 95 % interval as a share."""
+    """Metres in a stored unit of depth, if focal length and baselines are right.
+
+    Attributes:
+        metres: The value.
+        uncertainty: Half its 95 % interval, as a share.
+    """
 
     metres: float
     uncertainty: float
@@ -68,90 +79,96 @@ def common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     return Unit(math.exp(float(weights @ logs)), math.hypot(half, bias))
 
 
-def length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer, Answer]:
-    """Return the answers on the unit and on the focal length, of which one quotient is seen."""
+def length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer, ...]:
+    """Return the answers on the quotient, on the unit and on the focal length.
+
+    Of the last two nothing is ever told by itself.
+    """
     first = scenes[0]
     where = {"tag": "by the files' tag", "default": "by default", "user": "as given"}
     declared = f"{first.unit_m:g} m, {where.get(first.unit_source, 'tags unreadable')}"
-    found = f"{unit.metres:.5g} m ± {unit.uncertainty:.2%}"
-    if first.best.form == "inverse":
-        found = f"depth = {found} / stored"
-    if not first.problem and changes(first, "scale"):
-        return _wrong_length(scenes, unit, declared=declared, found=found)
-    note = first.problem or _doubt(first, unit, found=found)
-    if note:
-        blank = Answer(_UNIT, declared, "", "cannot tell", note=note)
-        return blank, _focal(first, status="cannot tell", note=note)
+    quotient = _quotient(scenes, unit)
+    if first.problem:
+        blank = (
+            Answer(topic, "", "", "cannot tell", note=first.problem) for topic in (UNIT, FOCAL)
+        )
+        return quotient, *blank
+    found = ""
+    if quotient.found:
+        found = f"{unit.metres:.5g} m ± {unit.uncertainty:.2%} if the rest is right"
+    return (
+        quotient,
+        Answer(UNIT, declared, found, "not seen alone", note=_ALONE),
+        Answer(FOCAL, "from the sensor's width", "", "not seen alone", note=_ALONE),
+    )
+
+
+def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
+    first = scenes[0]
+    blank = Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=first.problem)
+    if first.problem:
+        return blank
+    if has_doubts(scenes):
+        return Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=CAMERAS_DIFFER)
+    found = f"{unit.metres / first.unit_m:.5g} x declared ± {unit.uncertainty:.2%}"
+    if first.best.form != first.declared.form:
+        note = f"numbers of another form: {said(first.best.form)} has a unit of its own"
+        return Answer(QUOTIENT, "1 x declared", found, "cannot tell", note=note)
+    if changes(first, "scale"):
+        gain = pooled([scene.gain for scene in scenes])
+        if kind_explains_scale(scenes):
+            note = f"{found} if depth is along {said(first.best.kind)}, as declared if it is not"
+            return Answer(QUOTIENT, "1 x declared", "", "cannot tell", gain, note)
+        if unit.uncertainty > abs(math.log(unit.metres / first.unit_m)):
+            note = f"{found} fits best, but is not surely another"
+            return Answer(QUOTIENT, "1 x declared", "", "cannot tell", gain, note)
+        note = "the unit, the focal length or the baselines: they are not told apart"
+        return Answer(QUOTIENT, "1 x declared", found, "wrong", gain, note)
+    doubt = _doubt(first, unit, found=found)
+    if doubt:
+        return Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=doubt)
     if first.unit_source == "unreadable":
-        return Answer(_UNIT, declared, found, "wrong"), _focal(first, status="cannot tell")
-    known = Answer(_UNIT, declared, found, "confirmed")
-    reading = _focal_reading(scenes, unit, least=0.0)
-    if reading is not None:
-        note = f"{reading} is within the error of the unit"
-        return known, _focal(first, status="cannot tell", note=note)
-    return known, _focal(first, status="confirmed", note="with the declared unit")
+        return Answer(QUOTIENT, "tags unreadable", found, "cannot tell")
+    note = f"the 95 % interval lies within {MARGIN:.0%} of what is declared"
+    return Answer(QUOTIENT, "1 x declared", found, "confirmed", note=note)
 
 
 def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
-    """Return why a unit that nothing is clearly better than is not confirmed either, if so."""
+    """Return why a quotient that nothing is clearly better than is not confirmed, if so."""
     off = abs(math.log(unit.metres / first.unit_m))
     is_coarse = allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE
     why = "depth is stored in too large steps" if is_coarse else "too little parallax"
-    if unit.uncertainty > _VAGUE:
+    if unit.uncertainty > MARGIN:
         return f"known to {unit.uncertainty:.0%} alone: {why}"
     if off > LEAST_LOG_SCALE:
         return f"{found} fits best, but is not clearly better{': ' + why if is_coarse else ''}"
     if off > max(unit.uncertainty, _LEAST_TOLERANCE):
         return f"{found} fits best; less than {LEAST_LOG_SCALE:.0%} is not called wrong"
+    if off + unit.uncertainty > MARGIN:
+        return f"{found}: the 95 % interval reaches beyond {MARGIN:.0%}"
     return ""
 
 
-def _wrong_length(
-    scenes: Sequence[SceneDiagnosis], unit: Unit, *, declared: str, found: str
-) -> tuple[Answer, Answer]:
-    """Return the same where disparity is off by a factor."""
-    first = scenes[0]
-    gain = pooled([scene.gain for scene in scenes])
-    if kind_explains_scale(scenes):
-        note = f"{found} if depth is along {said(first.best.kind)}, as declared if it is not"
-        return Answer(_UNIT, declared, "", "cannot tell", gain, note), _focal(
-            first, status="cannot tell"
-        )
-    if first.best.form != first.declared.form:
-        note = "numbers of another form: no factor is left to compare"
-        unknown = _focal(first, status="cannot tell", note=note)
-        return Answer(_UNIT, declared, found, "wrong", gain), unknown
-    reading = _focal_reading(scenes, unit, least=_LEAST_TOLERANCE)
-    if reading is None:
-        note = "no other reading of the sensor explains the factor; wrong millimetres would"
-        kept = _focal(first, status="confirmed", note=note)
-        return Answer(_UNIT, declared, found, "wrong", gain), kept
-    if _is_blamed(scenes, unit, reading):
-        alike = f"the same as a unit of {unit.metres:.5g} m: only focal length / unit is seen"
-        return (
-            Answer(_UNIT, declared, "", "cannot tell", note="right if the focal length is wrong"),
-            Answer(_FOCAL, _WIDTH, reading, "wrong", gain, f"{alike}, and the unit is stated"),
-        )
-    note = "or it is right and the focal length wrong: these two cannot be told apart"
-    other = "or it is right and the unit wrong: these two cannot be told apart"
-    return (
-        Answer(_UNIT, declared, found, "one is wrong", gain, note),
-        Answer(_FOCAL, _WIDTH, reading, "one is wrong", gain, other),
-    )
+def length_choices(scenes: Sequence[SceneDiagnosis], unit: Unit, pasted: str) -> tuple[str, ...]:
+    """Return what would each by itself explain the quotient, none of them certain.
 
-
-def _is_blamed(scenes: Sequence[SceneDiagnosis], unit: Unit, reading: str) -> bool:
-    """Tell whether a reading of the focal length is to blame rather than the unit.
-
-    The pictures show focal length / unit alone. What decides is that the unit is stated, and that
-    the reading explains the very factor, which is none that units are commonly off by.
+    ``pasted`` is the contract with the unit that it would take if the rest is right.
     """
-    if scenes[0].unit_source not in ("tag", "user"):
-        return False
-    ratio = scenes[0].focal_ratios[reading]
-    if any(abs(math.log(ratio / slip)) < _COMMON_SLIP for slip in (1.0, 2.0, 0.5)):
-        return False
-    return _explains(reading, scenes, min(LEAST_LOG_SCALE, _tolerance(unit, _LEAST_TOLERANCE)))
+    first = scenes[0]
+    factor = first.unit_m / unit.metres
+    words = [f"if focal length and baselines are right: {pasted}"]
+    if first.best.form == first.declared.form:
+        focal = (
+            f"if unit and baselines are right: a focal length of {factor:.4g} x what is recorded"
+        )
+        reading = _focal_reading(scenes, unit)
+        if reading:
+            focal += f", as {reading} gives"
+        words += [
+            focal,
+            f"if unit and focal length are right: baselines of {factor:.4g} x those of the poses",
+        ]
+    return tuple(words)
 
 
 def kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
@@ -169,35 +186,20 @@ def kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
     )
 
 
-def _focal(first: SceneDiagnosis, *, status: Status, note: str = "") -> Answer:
-    """Return the answer on the focal length, which does not matter where all readings agree."""
-    if not first.focal_ratios:
-        same = "width and height say the same"
-        return Answer(_FOCAL, _WIDTH, _WIDTH, "does not matter", note=same)
-    return Answer(_FOCAL, _WIDTH, _WIDTH if status == "confirmed" else "", status, note=note)
-
-
-def _focal_reading(scenes: Sequence[SceneDiagnosis], unit: Unit, *, least: float) -> str | None:
-    """Return the reading of the focal length that explains all the scale, if one may.
-
-    ``least`` is the smallest difference in log(scale) that rules a reading out.
-    """
+def _focal_reading(scenes: Sequence[SceneDiagnosis], unit: Unit) -> str | None:
+    """Return another reading of the sensor that gives the quotient found, if one does."""
     first = scenes[0]
-    tolerance = _tolerance(unit, least)
-    may_be = [words for words in first.focal_ratios if _explains(words, scenes, tolerance)]
+    tolerance = max(LEAST_ERRORS * unit.uncertainty / 1.96, _LEAST_TOLERANCE)
+    may_be = [
+        words
+        for words in first.focal_ratios
+        if all(
+            abs(math.log(scene.scale / scene.focal_ratios.get(words, 1.0))) <= tolerance
+            for scene in scenes
+        )
+    ]
     return min(
         may_be,
         key=lambda words: abs(math.log(first.scale / first.focal_ratios[words])),
         default=None,
-    )
-
-
-def _tolerance(unit: Unit, least: float) -> float:
-    return max(LEAST_ERRORS * unit.uncertainty / 1.96, least)
-
-
-def _explains(words: str, scenes: Sequence[SceneDiagnosis], tolerance: float) -> bool:
-    return all(
-        abs(math.log(scene.scale / scene.focal_ratios.get(words, 1.0))) <= tolerance
-        for scene in scenes
     )

@@ -37,12 +37,14 @@ class Matches:
         columns: (n,) columns.
         disparity_px: (n,) how far to the left each was found, negative for to the right.
         textured: How many pixels were looked for.
+        grain_px: Size of the pixels that were compared.
     """
 
     rows: Int64[np.ndarray, " n"]
     columns: Int64[np.ndarray, " n"]
     disparity_px: Float32[np.ndarray, " n"]
     textured: int
+    grain_px: float = 1.0
 
 
 def match_rows(left: Luma, right: Luma) -> Matches:
@@ -139,4 +141,5 @@ def _gathered(
         columns=columns.astype(np.int64) * factor + factor // 2,
         disparity_px=(disparity_px * factor).astype(np.float32),
         textured=textured,
+        grain_px=float(factor),
     )

@@ -50,9 +50,7 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     """
     if not report.scenes:
         raise SelectionError(f"{report.data}: no scene was judged, so there is nothing to draw.")
-    diagnosis = max(
-        report.scenes, key=lambda scene: (not scene.problem, scene.gain.mean_db, scene.matches)
-    )
+    diagnosis = max(report.scenes, key=_tells)
     task = scene_task(index, diagnosis.key, encoding=report.declared)
     figure = _figure_class()(figsize=(14, 13.5), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(2, 1))
@@ -70,6 +68,11 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
         figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=90)
 
 
+def _tells(scene: SceneDiagnosis) -> tuple[bool, bool, float, int]:
+    """Return by what the scene that tells most is the largest."""
+    return not scene.problem, bool(scene.check.faults), scene.gain.mean_db, scene.matches
+
+
 def _figure_class() -> Any:
     try:
         from matplotlib.figure import Figure
@@ -83,16 +86,18 @@ def _figure_class() -> Any:
 def _title(diagnosis: SceneDiagnosis) -> str:
     if diagnosis.problem:
         return f"cannot tell ({diagnosis.problem})"
+    if diagnosis.check.faults:
+        return "; ".join(diagnosis.check.faults)
     changes = [
         f"{question} {getattr(diagnosis.best, question)}"
         for question in diagnosis.best.changes_from(diagnosis.declared)
     ]
     if diagnosis.changed in ("scale", "both") or diagnosis.best.form != diagnosis.declared.form:
-        changes.append(f"{diagnosis.unit_m / diagnosis.scale:.4g} m a unit")
+        changes.append(f"unit / (focal length x baseline) {1 / diagnosis.scale:.4g} x declared")
     if diagnosis.changed in ("offset", "both"):
         changes.append("an offset")
     if not changes:
-        return "the declared contract fits"
+        return "nothing contradicts the declared contract"
     return f"{', '.join(changes)}: {diagnosis.gain.mean_db:.2f} dB better than declared"
 
 
@@ -108,7 +113,7 @@ def _draw_views(
         best_scale = diagnosis.scale
     shift_px = 0.0
     if diagnosis.changed in ("offset", "both"):
-        shift_px = diagnosis.offsets_px.get((shot.left, shot.right), 0.0)
+        shift_px = shot.shift_px(diagnosis.offsets_px)
     by_declared = _warped(views, shot, diagnosis.declared, right, scale=1.0, shift_px=0.0)
     by_best = _warped(views, shot, diagnosis.best, right, scale=best_scale, shift_px=shift_px)
     pair = f"frame {shot.frame}, cam {shot.left} and {shot.right}"
@@ -196,7 +201,11 @@ def _draw_curves(
         )
     if units_m[0] <= diagnosis.unit_m <= units_m[-1]:
         axis.axvline(diagnosis.unit_m, color="grey", linestyle=":", label="declared unit")
-    axis.set(xscale="log", xlabel="metres a unit", ylabel="dB better than no agreement")
+    axis.set(
+        xscale="log",
+        xlabel="metres a unit, if focal length and baselines are right",
+        ylabel="dB better than no agreement",
+    )
     axis.set_xlim(units_m[0], units_m[-1])
     axis.legend(fontsize=8)
 

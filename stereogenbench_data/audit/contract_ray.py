@@ -42,6 +42,11 @@ class RayPower:
         away = self.power - (1 if kind == "ray" else 0)
         return kind if abs(away) <= 2 * _BIAS + LEAST_ERRORS * self.error else None
 
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The power and half its 95 % interval, what it is off by on any data included."""
+        return self.power, math.hypot(1.96 * self.error, _BIAS)
+
 
 def ray_power(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> RayPower:
     """Return the power that fits a contract's pictures best, scale and its offsets fitted too."""
@@ -58,7 +63,7 @@ def ray_power(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> Ray
             log_ray = np.log(views.ray_per_planar[shot.rows, shot.columns])[term.known]
             grown_px = term.predicted_px * np.exp(log_scale + bend * log_ray)
             full = np.zeros(len(shot.rows))
-            full[term.known] = grown_px + offsets_px.get(term.pair, 0.0)
+            full[term.known] = grown_px + shot.shift_px(offsets_px)
             difference, slope, inside = (
                 part[term.known] for part in differences(views, shot, full)
             )
@@ -66,13 +71,13 @@ def ray_power(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> Ray
             weight = robust_weights(difference, usable)
             if weight is None:
                 continue
-            columns = np.zeros((len(difference), 2 + len(pairs)))
-            columns[:, 0] = slope * grown_px
-            columns[:, 1] = slope * grown_px * log_ray
+            columns = {0: slope * grown_px, 1: slope * grown_px * log_ray}
             if term.pair in offsets_px:
-                columns[:, 2 + pairs.index(term.pair)] = slope
-            normals[number] = (columns * weight[:, None]).T @ columns
-            rights[number] = columns.T @ (weight * difference)
+                columns[2 + pairs.index(term.pair)] = term.sign * slope
+            for place, column in columns.items():
+                rights[number, place] = (column * weight * difference).sum()
+                for other, beside in columns.items():
+                    normals[number, place, other] = (column * weight * beside).sum()
         step, spread = solved(normals, rights)
         log_scale += float(np.clip(step[0], -0.1, 0.1))
         bend += float(np.clip(step[1], -_LARGEST_STEP, _LARGEST_STEP))

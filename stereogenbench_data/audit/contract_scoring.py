@@ -31,7 +31,8 @@ class Scored:
     Attributes:
         structure: Its answers.
         scale: Measured disparity over that at the declared unit: the unit is declared / scale.
-        offsets_px: Constant disparity that is added, by pair; what is missing is 0.
+        offsets_px: Constant disparity that is added, by pair (lower number first, seen from it);
+            what is missing is 0.
         scale_error: Standard error of log(scale), inf where it was not fitted.
         errors: For each shot the squared difference at each pixel, capped; nan where the
             contract does not tell.
@@ -95,7 +96,7 @@ def scored(
         squares = np.full(len(shot.rows), np.nan, dtype=np.float32)
         if predicted is not None:
             disparity_px, known = predicted
-            shift_px = offsets_px.get((shot.left, shot.right), 0.0)
+            shift_px = shot.shift_px(offsets_px)
             difference, _, inside = differences(views, shot, scale * disparity_px + shift_px)
             capped = np.where(inside, np.minimum(difference**2, shot.cap), shot.cap)
             squares[known] = capped[known]
@@ -106,10 +107,11 @@ def scored(
 def evidence(shots: Sequence[Shot], better: Scored, worse: Scored) -> Evidence:
     """Return by how many dB one contract explains a scene better than another.
 
-    Both are judged by the pixels of which both tell. Contracts that take the same numbers from the
-    same places (another unit, ray, offset) differ by a little at many pixels: there a pixel counts
-    at most a small part of the cap, so that wrong matches do not outweigh it. Others (lag, order,
-    flips) differ by much at some pixels, which then count in full.
+    Both are judged by the pixels of which both tell, in the views that they do not read alike (an
+    exchange of two cameras leaves the others as they are). Contracts that take the same numbers
+    from the same places (another unit, ray, offset) differ by a little at many pixels: there a
+    pixel counts at most a small part of the cap, so that wrong matches do not outweigh it. Others
+    (lag, order, flips) differ by much at some pixels, which then count in full.
 
     There are two errors, and the smaller holds: by how much views (a pair in a frame) differ, which
     is large where something is wrong with some cameras; and a jackknife over parts of the picture,
@@ -119,7 +121,12 @@ def evidence(shots: Sequence[Shot], better: Scored, worse: Scored) -> Evidence:
     same_places = better.structure.changed("kind", worse.structure.kind) == worse.structure
     share = _FINE_CAP if same_places else 1.0
     sums = np.zeros((2, 0, SIDE_CELLS**2))
+    orders_differ = better.structure.order != worse.structure.order
     for shot, low, high in zip(shots, better.errors, worse.errors, strict=True):
+        if orders_differ and better.structure.reads_alike(
+            worse.structure, left=shot.left, right=shot.right
+        ):
+            continue
         both = np.isfinite(low) & np.isfinite(high)
         if both.sum() >= _FEWEST_POINTS:
             cells = [
@@ -144,7 +151,11 @@ def evidence(shots: Sequence[Shot], better: Scored, worse: Scored) -> Evidence:
         each = _mean_db(ours[None, :, 0], theirs[None, :, 0])
         errors.append(float(each.std(ddof=1)) / math.sqrt(views) * t_975(views - 1) / t_975(99))
     least_db = LEAST_DB if same_places else LEAST_DB_ELSEWHERE
-    return Evidence(float(_mean_db(ours, theirs)[0]), min(errors), least_db=least_db)
+    finite = [error for error in errors if math.isfinite(error)]
+    return Evidence(
+        float(_mean_db(ours, theirs)[0]), min(errors), least_db=least_db,
+        wide_db=max(finite, default=math.inf),
+    )  # fmt: skip
 
 
 def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:
@@ -161,8 +172,8 @@ def agreement(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> flo
         predicted = views.predicted(shot, contract.structure)
         if predicted is not None:
             disparity_px, known = predicted
-            shift_px = contract.offsets_px.get((shot.left, shot.right), 0.0)
+            shift_px = shot.shift_px(contract.offsets_px)
             away = contract.scale * disparity_px + shift_px - shot.matched_px
-            near += int((np.abs(away[known]) < 1).sum())
+            near += int((np.abs(away[known]) < shot.grain_px).sum())
             told += int(known.sum())
     return near / told if told else math.nan

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from stereogenbench_data.audit.contract_cameras import CameraCheck, CameraComparison
 from stereogenbench_data.audit.contract_diagnosis import (
     BIAS_PX,
     LEAST_LOG_SCALE,
@@ -13,7 +14,7 @@ from stereogenbench_data.audit.contract_diagnosis import (
     SceneDiagnosis,
     allowed_log_scale,
 )
-from stereogenbench_data.audit.contract_fit import Free, fitted
+from stereogenbench_data.audit.contract_fit import Free, fitted, voted_agreement
 from stereogenbench_data.audit.contract_hypotheses import QUESTIONS, Structure
 from stereogenbench_data.audit.contract_ray import RayPower, ray_power
 from stereogenbench_data.audit.contract_rig import crossed_pair, focal_ratios
@@ -32,6 +33,8 @@ _LEAST_SCALE_DB: Final = 0.02
 _SCALE_ERRORS: Final = 1.5
 """Less is asked of the score of a scale, which has an error of its own to be judged by."""
 _MOST_CHANGES: Final = 4
+_PROMISING: Final = 4
+"""Of the exchanges of cameras so many are tried with a scale of their own."""
 FEWEST_MATCHES: Final = 200
 _LEAST_PARALLAX_PX: Final = 0.3
 """Smaller disparities (root mean square) are those of noise."""
@@ -62,10 +65,14 @@ class Search:
         """Take what the contracts are judged by, and how far off a unit may be."""
         self._views = views
         self._least_log_scale = least_log_scale
-        self._shots = shots
+        self._every = shots
+        near = views.neighbours(Structure())
+        # Those next but one are for the comparison of cameras.
+        self._shots = [shot for shot in shots if shot.pair in near] or list(shots)
         self._bias = BIAS_PX / max(disparity_px(shots), 1e-6)
         self._bias_beside_offset = BIAS_PX / max(spread_px(shots), 1e-6)
         self._fitted: dict[tuple[Structure, Free], _Candidate] = {}
+        self._likely: dict[Structure, tuple[Structure, ...]] = {}
         self._powers: dict[tuple[Structure, Free], RayPower] = {}
         self.declared = self.candidate(Structure.declared(views.encoding), free="nothing")
 
@@ -75,6 +82,16 @@ class Search:
             score = fitted(self._views, self._shots, structure, free=free)
             self._fitted[structure, free] = _Candidate(free, score)
         return self._fitted[structure, free]
+
+    def _at(self, structure: Structure, other: _Candidate) -> _Candidate:
+        """Return a structure with the scale and the offsets of another contract."""
+        score = other.score
+        return _Candidate(
+            other.free,
+            scored(
+                self._views, self._shots, structure, scale=score.scale, offsets_px=score.offsets_px
+            ),
+        )
 
     def best(self) -> _Candidate:
         """Return the contract with the fewest changes that no further change clearly improves."""
@@ -107,7 +124,10 @@ class Search:
     def _one_change(self, current: _Candidate) -> Iterator[_Candidate]:
         """Yield contracts that change one answer, or let one length be fitted."""
         for question in QUESTIONS:
-            for structure in current.structure.alternatives(question):
+            others = current.structure.alternatives(question)
+            if question == "order" and current.free != "nothing":
+                others = self._promising(current.structure)
+            for structure in others:
                 free = _freed(current.free, "scale") if question == "form" else current.free
                 yield self.candidate(structure, free=free)
         for length in ("scale", "offset"):
@@ -120,9 +140,24 @@ class Search:
         free = _freed(current.free, "scale")
         if free != current.free:
             for question in QUESTIONS:
-                for structure in current.structure.alternatives(question):
+                others = (
+                    self._promising(current.structure)
+                    if question == "order"
+                    else current.structure.alternatives(question)
+                )
+                for structure in others:
                     yield self.candidate(structure, free=free)
             yield self.candidate(current.structure, free="both")
+
+    def _promising(self, current: Structure) -> tuple[Structure, ...]:
+        """Return the orders that explain most matches, whatever the scale."""
+        if current not in self._likely:
+            orders = current.alternatives("order")
+            few = [shot for shot in self._shots if shot.frame == self._shots[0].frame]
+            shares = {order: voted_agreement(self._views, few, order) for order in orders}
+            best = sorted(orders, key=lambda order: -shares[order])[:_PROMISING]
+            self._likely[current] = tuple(best)
+        return self._likely[current]
 
     def _most_better(self, current: _Candidate, others: Iterator[_Candidate]) -> _Candidate | None:
         """Return the contract that is clearly better than the current one by most."""
@@ -155,13 +190,34 @@ class Search:
             if current.structure.form == declared.form or free in ("scale", "both"):
                 yield self.candidate(current.structure, free=free)
 
+    def simplest(self) -> _Candidate:
+        """Return the declared contract, with another scale only if that is clearly better."""
+        scaled = self.candidate(self.declared.structure, free="scale")
+        return scaled if self._is_better(scaled, self.declared) else self.declared
+
+    def cameras(self, contract: _Candidate, *, depth_step: float) -> CameraCheck:
+        """Return what a contract leaves to explain, its scale fitted."""
+        fitted_too = self.candidate(contract.structure, free=_freed(contract.free, "scale"))
+        structure = contract.structure
+        shots = self._every
+        if structure.order != self.declared.structure.order:
+            # Other files stand beside each other.
+            frames = len({shot.frame for shot in shots})
+            shots = self._views.shots(frames=frames, structure=structure)
+        return CameraComparison(self._views, shots, fitted_too.score, depth_step=depth_step).check()
+
     def rivals(self, best: _Candidate) -> tuple[Rival, ...]:
         """Return the other answers to every question, each with its own scale."""
         free = _freed(best.free, "scale")
+        likely = self._promising(best.structure)
         found = []
         for question in QUESTIONS:
             for structure in best.structure.alternatives(question):
-                other = self.candidate(structure, free=free)
+                if question == "order" and structure not in likely:
+                    # Two cameras exchanged leave the others, and with them the scale, as they are.
+                    other = self._at(structure, best)
+                else:
+                    other = self.candidate(structure, free=free)
                 answer = getattr(structure, question)
                 found.append(Rival(question, answer, self.gain(best, other)))
         return tuple(found)
@@ -178,6 +234,24 @@ class Search:
             and not self.gain(best, other).is_clear()
         )
 
+    def told(self, best: _Candidate) -> Evidence:
+        """Return by how much a contract is better than the declared one, where the two differ.
+
+        An offset of one camera leaves the pairs of the others as they are.
+        """
+        if best.structure != self.declared.structure or best.free != "offset":
+            return self.gain(best, self.declared)
+        moved = [
+            place
+            for place, shot in enumerate(self._shots)
+            if abs(shot.shift_px(best.score.offsets_px)) >= LEAST_OFFSET_PX
+        ]
+        ours, theirs = (
+            replace(score, errors=[score.errors[place] for place in moved])
+            for score in (best.score, self.declared.score)
+        )
+        return evidence([self._shots[place] for place in moved], ours, theirs)
+
     def without_parallax(self, best: _Candidate) -> Evidence:
         """Return by how much a contract is better than if all were infinitely far."""
         flat = scored(self._views, self._shots, best.structure, scale=1e-12)
@@ -191,9 +265,10 @@ class Search:
         # Coarse depth has a shape of its own.
         is_fine = self._least_log_scale <= LEAST_LOG_SCALE
         if is_fine and only_kind and worse.free in (better.free, _freed(better.free, "scale")):
-            told = self._power(better).kind
+            power = self._power(better)
+            told = power.kind
             if told is not None and (told != kind or found.mean_db > 0):
-                return replace(found, by_shape=told == kind)
+                return replace(found, by_shape=told == kind, shape=power.interval)
         return found
 
     def _power(self, candidate: _Candidate) -> RayPower:
@@ -238,6 +313,24 @@ def _freed(free: Free, length: str) -> Free:
     return "both"
 
 
+def _checked(
+    search: Search, best: _Candidate, *, depth_step: float
+) -> tuple[_Candidate, CameraCheck]:
+    """Return the contract to go by, and what it leaves to explain, camera by camera.
+
+    Where single files are wrong a contract for all may have been bent to them: then it is the
+    declared one, with a scale where it asks for one, that is checked.
+    """
+    check = search.cameras(best, depth_step=depth_step)
+    plain = search.simplest()
+    if not (check.faults or check.unexplained) or best is plain:
+        return best, check
+    other = search.cameras(plain, depth_step=depth_step)
+    if len(other.faults) <= max(len(check.faults), 2) and not other.agreement < check.agreement / 2:
+        return plain, other
+    return best, check
+
+
 def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
     """Return what a scene's pictures say about its declared contract.
 
@@ -249,10 +342,10 @@ def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
     declared = Structure.declared(views.encoding)
     basics: dict[str, Any] = {
         "key": views.scene.id.key,
-        "views": len(shots),
-        "pairs": tuple(views.chosen_pairs()),
-        "matches": sum(len(shot.rows) for shot in shots),
-        "textured": sum(shot.textured for shot in shots),
+        "views": len(shots) // 2,
+        "pairs": tuple(views.chosen_pairs(Structure())),
+        "matches": sum(len(shot.rows) for shot in shots[::2]),
+        "textured": sum(shot.textured for shot in shots[::2]),
         "unit_m": views.unit_m(file),
         "unit_source": "user" if views.encoding.unit_m else views.scene.depth_unit_source[file],
         "focal_ratios": focal_ratios(views.scene.rig),
@@ -280,7 +373,7 @@ def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
             problem=f"too little parallax: disparities are of {basics['disparity_px']:.2f} px",
         )  # fmt: skip
     search = Search(views, shots, least_log_scale=least_log_scale)
-    best = search.best()
+    best, check = _checked(search, search.best(), depth_step=basics["depth_step"])
     share_told = agreement(views, shots, best.score)
     parallax = search.without_parallax(best)
     if math.isnan(share_told) or not parallax.is_clear():
@@ -305,9 +398,10 @@ def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
         scale_error=with_scale.scale_error,
         other_kind_scale=of_other_kind.scale,
         offsets_px=search.candidate(best.structure, free=shifted).score.offsets_px,
-        gain=search.gain(best, search.declared),
+        gain=search.told(best),
         parallax=parallax,
-        agreement=share_told,
+        agreement=check.agreement,
+        check=check,
         rivals=search.rivals(best),
         equals=search.equals(best),
     )

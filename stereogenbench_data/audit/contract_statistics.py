@@ -27,13 +27,17 @@ class Evidence:
     """By how many dB one contract is better than another in one scene, and its standard error.
 
     ``by_shape`` is whether it is the better one by the shape of disparity over the picture, which
-    then decides; None where that does not tell. Less than ``least_db`` is not believed.
+    then decides; None where that does not tell. ``shape`` is the power of the ray's length and half
+    its 95 % interval. Less than ``least_db`` is not believed. ``error_db`` is the smaller of two
+    estimates, by which contracts are searched; ``wide_db`` the larger, by which intervals are told.
     """
 
     mean_db: float
     error_db: float
     by_shape: bool | None = None
     least_db: float = LEAST_DB
+    wide_db: float | None = None
+    shape: tuple[float, float] | None = None
 
     def is_clear(self, *, least_db: float | None = None, errors: float = LEAST_ERRORS) -> bool:
         """Tell whether the difference is large and sure enough to be believed."""
@@ -55,6 +59,8 @@ class Gain:
         count: How many scenes tell.
         is_clear: Whether the difference may be believed.
         by_shape: Whether that is so by the shape of disparity, however few dB it makes.
+        shape: The power of the ray's length, and half its 95 % interval; None where not told.
+        margin_db: What the interval must keep away by, to confirm.
     """
 
     mean_db: float
@@ -64,6 +70,13 @@ class Gain:
     count: int
     is_clear: bool
     by_shape: bool = False
+    shape: tuple[float, float] | None = None
+    margin_db: float = LEAST_DB
+
+    @property
+    def is_excluded(self) -> bool:
+        """Whether the other answer is kept away: the whole interval is beyond the margin."""
+        return self.by_shape or self.low_db >= self.margin_db
 
 
 def t_975(freedom: int) -> float:
@@ -90,15 +103,17 @@ def pooled(scenes: Sequence[Evidence]) -> Gain:
     by_shape = any(scene.by_shape for scene in told)
     if len(told) <= 1:
         scene = told[0] if told else Evidence(math.nan, math.inf)
-        half = _NORMAL_975 * scene.error_db
+        half = _NORMAL_975 * (scene.error_db if scene.wide_db is None else scene.wide_db)
         ends = (scene.mean_db - half, scene.mean_db + half)
         return Gain(
-            scene.mean_db, *ends, "parts of the pictures", len(told), scene.is_clear(), by_shape
-        )
+            scene.mean_db, *ends, "parts of the pictures", len(told), scene.is_clear(),
+            by_shape, scene.shape, scene.least_db,
+        )  # fmt: skip
     mean, low, high = interval([scene.mean_db for scene in told])
     against = (replace(scene, mean_db=-scene.mean_db) for scene in told if scene.by_shape is None)
     opposed = any(scene.is_clear() for scene in against)
     clear = (mean >= max(scene.least_db for scene in told) and low > 0) or (
         not opposed and any(scene.is_clear() for scene in told)
     )
-    return Gain(mean, low, high, "scenes", len(told), clear, by_shape)
+    least_db = max(scene.least_db for scene in told)
+    return Gain(mean, low, high, "scenes", len(told), clear, by_shape, margin_db=least_db)

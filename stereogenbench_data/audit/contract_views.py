@@ -1,7 +1,8 @@
 """The pictures and stored depth of one scene that its depth contract is judged by."""
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
@@ -16,7 +17,7 @@ from stereogenbench_data.media.depth import measured
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
-    CAMERA_PAIRS,
+    CAMERA_COUNT,
     DEFAULT_DEPTH_UNIT_M,
     depth_name,
     rgb_name,
@@ -28,7 +29,9 @@ _Numbers = tuple[UInt16[np.ndarray, " n"], Bool[np.ndarray, " n"]]
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 _BLUR: Final = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
 _MEAN_RADIUS_PX: Final = 6
-_MOST_POINTS: Final = 3000
+_MOST_POINTS: Final = 2000
+_MOST_DEPTH_BYTES: Final = 96 * 2**20
+"""Decoded depth that is kept: every lag of every camera of small pictures."""
 SIDE_CELLS: Final = 4
 """Parts of a picture along each side, by which it is told how sure a comparison is."""
 
@@ -49,6 +52,7 @@ class Shot:
         cells: (n,) in which part of the picture each pixel lies.
         cap: The square of a difference between pixels that have nothing to do with each other.
         textured: How many pixels were looked for.
+        grain_px: Size of the pixels that were matched: those of large pictures are put together.
     """
 
     frame: int
@@ -62,6 +66,17 @@ class Shot:
     cells: Int64[np.ndarray, " n"]
     cap: float
     textured: int
+    grain_px: float = 1.0
+
+    @property
+    def pair(self) -> tuple[int, int]:
+        """The two files, the lower number first."""
+        return min(self.left, self.right), max(self.left, self.right)
+
+    def shift_px(self, offsets_px: dict[tuple[int, int], float]) -> float:
+        """Return the constant disparity here, of those of pairs seen from their lower number."""
+        offset_px = offsets_px.get(self.pair, 0.0)
+        return offset_px if self.left < self.right else -offset_px
 
 
 class SceneViews:
@@ -75,6 +90,7 @@ class SceneViews:
         self._streams = streams
         self._bands: dict[tuple[int, int], Luma] = {}
         self._stored: dict[tuple[int, int, int], tuple[Shot, dict[Flip, _Numbers]]] = {}
+        self._depths: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     @property
     def primary(self) -> tuple[int, int]:
@@ -107,13 +123,18 @@ class SceneViews:
         self, frame: int, file: int
     ) -> tuple[UInt16[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
         """Return stored depth and where it was measured."""
+        if (frame, file) in self._depths:
+            return self._depths[frame, file]
         name = depth_name(file)
         units = self._streams.depth_units(self.scene, name, frame, encoding=self.encoding)
         expected = (self.intrinsics.height_px, self.intrinsics.width_px)
         _require_size(units.shape, expected, where=f"{self.scene.id.key}/{name}")
         pixel_format = self._streams.pixel_format(self.scene, name)
         known = measured(units, encoding=self.encoding, pixel_format=pixel_format)
-        return units, known & (units > 0)
+        if (len(self._depths) + 1) * units.size * 3 > _MOST_DEPTH_BYTES and self._depths:
+            self._depths.pop(next(iter(self._depths)))
+        self._depths[frame, file] = units, known & (units > 0)
+        return self._depths[frame, file]
 
     def _numbers(self, shot: Shot, *, frame: int, file: int) -> dict[Flip, _Numbers]:
         """Return what a depth frame stores at a shot's pixels, as it is and turned over.
@@ -147,25 +168,42 @@ class SceneViews:
         y = (np.arange(camera.height_px) + 0.5 - camera.cy_px) / camera.fy_px
         return np.sqrt(1 + x**2 + y[:, None] ** 2)
 
-    def shots(self, *, frames: int) -> list[Shot]:
-        """Return what pairs of several frames have in common."""
+    def shots(self, *, frames: int, structure: Structure | None = None) -> list[Shot]:
+        """Return what pairs of several frames have in common, seen from either side.
+
+        The pairs are those that stand beside each other by a structure's order of cameras.
+        """
         return [
-            self._shot(frame, left, right)
+            shot
             for frame in chosen_frames(self.scene.frames, count=frames)
-            for left, right in self.chosen_pairs()
+            for left, right in self.chosen_pairs(structure or Structure())
+            for shot in self._both_ways(frame, left, right)
         ]
 
-    def chosen_pairs(self) -> list[tuple[int, int]]:
-        """Return the primary pair, the narrowest, one that touches the primary, two wider ones."""
-        lateral_m = np.array(self.scene.lateral_m)
-        by_width = sorted(
-            CAMERA_PAIRS, key=lambda pair: abs(float(lateral_m[pair[1]] - lateral_m[pair[0]]))
-        )
-        touching = next(pair for pair in by_width if len(set(pair) & set(self.primary)) == 1)
-        wanted = [self.primary, by_width[0], touching, by_width[7], by_width[-1]]
-        return list(dict.fromkeys(wanted))
+    def chosen_pairs(self, structure: Structure) -> list[tuple[int, int]]:
+        """Return pairs in which every camera stands beside others: next to it, and next but one.
 
-    def _shot(self, frame: int, left: int, right: int) -> Shot:
+        The primary and the widest pair are among them. The lower number comes first.
+        """
+        across = self._across(structure)
+        beside = ((min(pair), max(pair)) for pair in zip(across, across[2:], strict=False))
+        return list(dict.fromkeys([*self.neighbours(structure), *beside]))
+
+    def neighbours(self, structure: Structure) -> list[tuple[int, int]]:
+        """Return the primary pair, those that stand next to each other, and the widest."""
+        across = self._across(structure)
+        pairs = [self.primary, *itertools.pairwise(across), (across[0], across[-1])]
+        return list(dict.fromkeys((min(pair), max(pair)) for pair in pairs))
+
+    def _across(self, structure: Structure) -> list[int]:
+        """Return the numbers of the pictures' files from left to right."""
+        return sorted(
+            range(CAMERA_COUNT),
+            key=lambda file: self.scene.lateral_m[structure.camera_of(file, content="rgb")],
+        )
+
+    def _both_ways(self, frame: int, left: int, right: int) -> tuple[Shot, Shot]:
+        """Return one set of matches from both sides, so that either camera's depth is tested."""
         here, there = self.band(frame, left), self.band(frame, right)
         matches = match_rows(here, there)
         keep = np.arange(len(matches.rows))
@@ -173,51 +211,85 @@ class SceneViews:
             chosen = np.random.default_rng(0).choice(keep, _MOST_POINTS, replace=False)
             keep = np.sort(chosen)
         rows, columns = matches.rows[keep], matches.columns[keep]
-        brightness = here[rows, columns]
+        matched_px = matches.disparity_px[keep].astype(np.float64)
         width = here.shape[1]
-        after, before = np.minimum(columns + 1, width - 1), np.maximum(columns - 1, 0)
-        return Shot(
-            frame=frame,
-            left=left,
-            right=right,
-            rows=rows,
-            columns=columns,
-            matched_px=matches.disparity_px[keep].astype(np.float64),
-            brightness=brightness,
-            slope=(here[rows, after] - here[rows, before]) / 2,
-            cells=rows * SIDE_CELLS // here.shape[0] * SIDE_CELLS + columns * SIDE_CELLS // width,
-            cap=2 * float((brightness**2).mean()) if len(rows) else 1.0,
-            textured=matches.textured,
+        found = np.clip(np.rint(columns - matched_px), 0, width - 1).astype(np.int64)
+        shots = (
+            _shot_of(here, rows, columns, matched_px, frame=frame, files=(left, right)),
+            _shot_of(there, rows, found, -matched_px, frame=frame, files=(right, left)),
         )
+        here_seen, there_seen = (
+            replace(shot, textured=matches.textured, grain_px=matches.grain_px) for shot in shots
+        )
+        return here_seen, there_seen
 
     def predicted(
-        self, shot: Shot, structure: Structure
+        self, shot: Shot, structure: Structure, *, depth_file: int | None = None
     ) -> tuple[Points, Bool[np.ndarray, " n"]] | None:
         """Return the disparity of a shot's pixels at the declared unit, and where it is known.
 
-        None where the frame of depth does not exist.
+        None where the frame of depth does not exist. ``depth_file`` is read in place of the one
+        that the structure names.
         """
-        file = structure.depth_file(shot.left, primary=self.primary)
+        file = structure.depth_file(shot.left) if depth_file is None else depth_file
         frame = shot.frame + structure.frame_lag
         if not 0 <= frame < self.scene.frames:
             return None
         units, known = self._numbers(shot, frame=frame, file=file)[structure.flip]
         number = np.where(known, units, 1).astype(np.float64)
+        place = shot.rows, shot.columns
+        return self.disparity_of(number, shot, structure, place=place, file=file), known
+
+    def disparity_of(
+        self,
+        number: Points,
+        shot: Shot,
+        structure: Structure,
+        *,
+        place: tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]],
+        file: int,
+    ) -> Points:
+        """Return the disparity in a shot's pair that a depth file's numbers mean at some pixels."""
         unit_m = self.unit_m(file)
         per_m = 1 / (unit_m * number) if structure.form == "depth" else number / unit_m
         if structure.kind == "ray":
-            per_m *= self.ray_per_planar[shot.rows, shot.columns]
-        return self.intrinsics.fx_px * self.baseline_m(shot, structure) * per_m, known
+            per_m *= self.ray_per_planar[place]
+        disparity_px: Points = self.intrinsics.fx_px * self.baseline_m(shot, structure) * per_m
+        return disparity_px
 
     def baseline_m(self, shot: Shot, structure: Structure) -> float:
         """Return the signed baseline of a shot's two files."""
-        left, right = (
-            structure.camera_of(file, content="rgb", primary=self.primary)
-            for file in (shot.left, shot.right)
-        )
+        left, right = (structure.camera_of(file, content="rgb") for file in (shot.left, shot.right))
         lateral_m = self.scene.lateral_m
         baseline_m = lateral_m[right] - lateral_m[left]
-        return -baseline_m if structure.order == "mirrored" else baseline_m
+        return -baseline_m if structure.is_mirrored else baseline_m
+
+
+def _shot_of(
+    here: Luma,
+    rows: Int64[np.ndarray, " n"],
+    columns: Int64[np.ndarray, " n"],
+    matched_px: Points,
+    *,
+    frame: int,
+    files: tuple[int, int],
+) -> Shot:
+    brightness = here[rows, columns]
+    height, width = here.shape
+    after, before = np.minimum(columns + 1, width - 1), np.maximum(columns - 1, 0)
+    return Shot(
+        frame=frame,
+        left=files[0],
+        right=files[1],
+        rows=rows,
+        columns=columns,
+        matched_px=matched_px,
+        brightness=brightness,
+        slope=(here[rows, after] - here[rows, before]) / 2,
+        cells=rows * SIDE_CELLS // height * SIDE_CELLS + columns * SIDE_CELLS // width,
+        cap=2 * float((brightness**2).mean()) if len(rows) else 1.0,
+        textured=0,
+    )
 
 
 def disparity_px(shots: Sequence[Shot]) -> float:

@@ -2,7 +2,8 @@
 
 import json
 import math
-from dataclasses import asdict, fields, replace
+from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -33,11 +34,19 @@ if TYPE_CHECKING:
     from stereogenbench_data.audit.contract_answers import Answer
     from stereogenbench_data.audit.contract_statistics import Gain
     from stereogenbench_data.audit.contract_verdict import Verdict
-    from stereogenbench_data.schema.records import DepthEncoding
 
 
+QUOTIENT_MEANS = (
+    "Only unit / (focal length x baseline) is seen in disparity: which of the three is wrong where "
+    "the quotient is, or whether two of them make up for each other, no picture tells."
+)
+NOT_ASKED = (
+    "Not asked here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
+    "beside the poses, colours, depth that lies a pixel aside or where there is no texture, "
+    "frames other than those looked at."
+)
 _DB_NOTE = (
-    "dB of unit, kind, focal length and offset count small differences under a tight cap: they "
+    "dB of the quotient, kind and offset count small differences under a tight cap: they "
     "are not comparable with dB of flips, lags and orders."
 )
 
@@ -74,10 +83,10 @@ def doctor(  # noqa: PLR0913 - one parameter an option
 ) -> None:
     """Find out from the pictures how stored depth becomes metres, and where it belongs.
 
-    Compares what a scene's cameras see with what depth predicts: metres in a unit, planar or ray,
-    inverse, frame lag, camera order, focal length, flips, offset. -o writes a picture.
-    The exit status is 0 if the declared contract is confirmed or nothing can be told, 1 if another
-    one is clearly better, 2 if it could not be done.
+    Compares what a scene's cameras see with what depth predicts: planar or ray, inverse, frame lag,
+    camera order, flips, offset, unit / (focal length x baseline), and each camera beside the
+    others. -o writes a picture. The exit status is 0 if the declared contract fits or nothing can
+    be told, 1 if another one is clearly better or a camera does not fit, 2 if it could not be done.
     """
     from stereogenbench_data.audit.contract import diagnose
     from stereogenbench_data.audit.contract_picture import draw_report, require_picture_file
@@ -120,15 +129,17 @@ def _lines(report: "DoctorReport") -> list[str]:
     ]
     for key, reason in report.left_out.items():
         lines.append(f"left out: {key}: {reason}")
+    if not report.verdicts:
+        lines.append("NOT TESTED: no scene could be judged. Run `stereogenbench audit`.")
     if len(report.verdicts) > 1:
-        lines.append(f"SCENES DIFFER: {len(report.verdicts)} contracts were found.")
+        lines.append(f"SCENES DIFFER: {len(report.verdicts)} verdicts follow.")
     silent = [scene for scene in report.scenes if scene.problem]
     if silent and len(silent) < len(report.scenes):
         lines += [f"{scene.key}: cannot tell: {scene.problem}" for scene in silent]
     for verdict in report.verdicts:
         lines += ["", *_verdict_lines(verdict, report)]
     if any(math.isfinite(scene.gain.mean_db) for scene in report.scenes):
-        lines += ["", _DB_NOTE]
+        lines += ["", QUOTIENT_MEANS, _DB_NOTE]
     return lines
 
 
@@ -142,20 +153,62 @@ def _verdict_lines(verdict: "Verdict", report: "DoctorReport") -> list[str]:
     for row in rows:
         cells = [text.ljust(width) for text, width in zip(row, widths, strict=False)]
         lines.append("  ".join([*cells, row[4]]).rstrip())
-    lines.append("")
-    if verdict.is_wrong:
+    lines += ["", *_conclusion(verdict, report), *_tested_lines(verdict)]
+    return [*lines, *verdict.beside]
+
+
+def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
+    from stereogenbench_data.audit.contract_verdict import encoding_line
+
+    lines = [f"WRONG: {fault}." for fault in verdict.faults]
+    if any(answer.status == "wrong" for answer in verdict.answers):
         lines.append(
             f"Another contract is {_gain_words(verdict.gain)} better than the declared one."
         )
+    if verdict.choices:
+        lines.append("One of these explains the quotient, and the pictures do not tell which:")
+        lines += [f"  - {choice}" for choice in verdict.choices]
+    if verdict.encoding is not None:
         lines.append(f"Paste: {encoding_line(verdict.encoding)}")
-    elif all(answer.status == "cannot tell" for answer in verdict.answers[:2]):
-        lines.append("Cannot tell: the pictures do not decide on the declared contract.")
+    elif verdict.is_wrong:
+        lines.append("Nothing to paste: no DepthEncoding is sure to put this right.")
+    elif verdict.fits:
+        lines.append(f"The declared contract fits: {encoding_line(report.declared)}")
+    elif math.isfinite(verdict.agreement) and not verdict.unexplained_cameras:
+        open_topics = [a.topic for a in verdict.answers if a.status == "cannot tell"]
+        untold = f" Not told: {', '.join(open_topics)}." if open_topics else ""
+        lines.append(f"Cannot tell on the whole: nothing contradicts what is declared.{untold}")
     else:
-        lines.append("The declared contract fits; no other is clearly better.")
-        lines.append(f"It is: {encoding_line(verdict.encoding)}")
+        lines.append("Cannot tell: the pictures do not decide on the declared contract.")
+    return lines
+
+
+def _tested_lines(verdict: "Verdict") -> list[str]:
+    """Return which cameras were tested, how much is explained, and what is not asked here."""
+    lines = []
     if math.isfinite(verdict.agreement):
-        lines.append(f"It explains {verdict.agreement:.0%} of the matches to a pixel.")
-    return [*lines, *verdict.beside]
+        lines.append(
+            f"It explains {verdict.agreement:.0%} of the matches of neighbouring cameras to a "
+            "pixel."
+        )
+    if verdict.unexplained_cameras:
+        lines.append(
+            "NOT EXPLAINED: more than half of the matches of "
+            f"{_cameras(verdict.unexplained_cameras)}. Run `stereogenbench audit`."
+        )
+    if verdict.tested_cameras:
+        lines.append(f"Depth and pictures tested: {_cameras(verdict.tested_cameras)}.")
+    if verdict.untested_cameras:
+        lines.append(
+            f"NOT TESTED, for want of matches: {_cameras(verdict.untested_cameras)}. "
+            "Run `stereogenbench audit`."
+        )
+    return [*lines, NOT_ASKED]
+
+
+def _cameras(cameras: Sequence[int]) -> str:
+    words = ", ".join(map(str, cameras))
+    return f"camera {words}" if len(cameras) == 1 else f"cameras {words}"
 
 
 def _row(answer: "Answer") -> tuple[str, str, str, str, str]:
@@ -175,29 +228,24 @@ def _gain_words(gain: "Gain") -> str:
     )
 
 
-def encoding_line(encoding: "DepthEncoding") -> str:
-    """Return the Python expression of a contract, defaults left out."""
-    default = replace(encoding, unit_m=None, kind="planar", form="depth", frame_lag=0)
-    told = [
-        f"{field.name}={getattr(encoding, field.name)!r}"
-        for field in fields(encoding)
-        if getattr(encoding, field.name) != getattr(default, field.name)
-    ]
-    return f"DepthEncoding({', '.join(told)})"
-
-
 def _json(report: "DoctorReport") -> str:
     document = {
         "data": report.data,
         "is_wrong": report.is_wrong,
-        "verdicts": [
-            _plain(asdict(verdict) | {"paste": encoding_line(verdict.encoding)})
-            for verdict in report.verdicts
-        ],
+        "quotient_means": QUOTIENT_MEANS,
+        "not_asked": NOT_ASKED,
+        "verdicts": [_plain(_verdict_document(verdict)) for verdict in report.verdicts],
         "scenes": [_plain(_scene_document(asdict(scene))) for scene in report.scenes],
         "left_out": report.left_out,
     }
     return json.dumps(document, indent=2)
+
+
+def _verdict_document(verdict: "Verdict") -> dict[str, Any]:
+    from stereogenbench_data.audit.contract_verdict import encoding_line
+
+    encoding = verdict.encoding
+    return asdict(verdict) | {"paste": None if encoding is None else encoding_line(encoding)}
 
 
 def _scene_document(scene: dict[str, Any]) -> dict[str, Any]:

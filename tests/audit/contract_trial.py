@@ -1,71 +1,77 @@
-"""A blind trial of the doctor: fresh scenes, one thing wrong in each, every verdict counted.
+"""A blind trial of the doctor: fresh scenes, one thing or two made wrong, every verdict counted.
 
     python -m tests.audit.contract_trial FOLDER --seed 7 --scenes 12
 
 draws as many scenes, rewrites their files in ways that the doctor is not told, asks it about each
 alone by four frames, and prints a table of verdicts. Each is kept in FOLDER/verdicts.jsonl.
+``--rendered ROOT`` spoils copies of scenes in the released layout beside those that are drawn.
 """
 
 import argparse
 import json
-import math
 import re
 import shutil
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from stereogenbench_data.audit.contract import diagnose
-from stereogenbench_data.audit.contract_diagnosis import SceneDiagnosis
-from stereogenbench_data.audit.contract_verdict import Verdict
+from stereogenbench_data.audit.contract_verdict import Verdict, encoding_line
 from stereogenbench_data.synthesis import ExportContract, SynthRequest, synthesise
 from tests.audit.corruption import (
     as_inverse,
+    as_ray,
     copied,
     edit_baseline,
     exchange,
+    lagged,
+    late,
+    place_cameras,
+    read_depth,
     rewrite_depth,
+    rewrite_one_depth,
     rewrite_rgb,
+    scaled,
 )
 
 FAMILIES = ("IPD_Gaussian", "Uniform", "Pairwise_Uniform")
 SENSORS_MM = ((23.76, 23.76), (36.0, 24.0), (22.3, 14.9), (13.2, 8.8))
-SLIGHT = (0.95, 0.97, 0.98, 1.02, 1.03, 1.05)
-GROSS = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
-ORDERS = {
-    "primary pair swapped": ({0: 1, 1: 0}, ("rgb.mp4", "depth.mkv")),
-    "pictures of the primary pair swapped": ({0: 1, 1: 0}, ("rgb.mp4",)),
-    "depth of the primary pair swapped": ({0: 1, 1: 0}, ("depth.mkv",)),
-    "reversed": ({c: 5 - c for c in range(6)}, ("rgb.mp4", "depth.mkv")),
-    "pictures reversed": ({c: 5 - c for c in range(6)}, ("rgb.mp4",)),
-    "depth reversed": ({c: 5 - c for c in range(6)}, ("depth.mkv",)),
-}
-UNIT, KIND, FORM, LAG = "metres a unit", "depth along", "stored is", "frame lag"
-ORDER, FLIP, FOCAL, OFFSET = "left and right", "flip of depth", "focal length", "disparity offset"
-
-BY_HEIGHT = "f / sensor height * picture height"
+SIZES_PX = (96, 128, 160, 192, 256)
+QUOTIENT, KIND, FORM = "unit / (focal length x baseline)", "depth along", "stored is"
+LAG, ORDER, FLIP, OFFSET = "frame lag", "left and right", "flip of depth", "disparity offset"
+NOTHING = ("rgb.mp4", "depth.mkv")
+OUTCOMES = ("right", "named", "seen", "cannot tell", "WRONG")
 
 
 @dataclass(frozen=True)
 class Case:
-    """A scene with one thing wrong, and what is right to say of it.
+    """A scene with something wrong, and what may be said of it.
 
-    Topics that are ``allowed`` may be called wrong too.
+    Attributes:
+        sort: The row of the table.
+        corrupt: Rewrites the files.
+        named: A regular expression that a right name of the fault matches; empty if there is none.
+        paste: The one line that may be pasted; None where nothing may.
+        false: Topics that are not as declared, and may not be confirmed.
+        blamed: Topics that may be called wrong.
+        cameras: Cameras that may be named as not fitting.
+        hidden: Whether pictures do not show it: nothing is asked but that nothing else is blamed.
+        details: What was done.
     """
 
     sort: str
-    topic: str | None
-    request: SynthRequest
-    corrupt: Callable[[Path], None] = lambda folder: None
-    is_told: Callable[[Verdict, SceneDiagnosis], bool] = lambda verdict, scene: True
-    may_be: Callable[[str], bool] = lambda found: False
-    allowed: frozenset[str] = frozenset()
+    corrupt: Callable[[Path], object]
+    named: str = ""
+    paste: str | None = None
+    false: frozenset[str] = frozenset()
+    blamed: frozenset[str] = frozenset()
+    cameras: frozenset[int] = frozenset()
+    hidden: bool = False
     details: str = ""
-    facts: dict[str, float] = field(default_factory=dict)
 
 
 def drawn_requests(seed: int, count: int) -> list[SynthRequest]:
@@ -73,8 +79,8 @@ def drawn_requests(seed: int, count: int) -> list[SynthRequest]:
     rng = np.random.default_rng(seed)
     requests = []
     for number in range(count):
-        width = 2 * int(rng.integers(48, 97))
         shape = float(rng.choice([1.0, 3 / 4, 2 / 3]))
+        width = int(rng.choice(SIZES_PX))
         contract = ExportContract(
             sensor_mm=SENSORS_MM[int(rng.integers(len(SENSORS_MM)))],
             depth_unit_m=float(rng.choice([0.0005, 0.001, 0.002, 0.01])),
@@ -84,7 +90,7 @@ def drawn_requests(seed: int, count: int) -> list[SynthRequest]:
                 family=FAMILIES[number % 3],
                 size_px=width,
                 height_px=2 * round(width * shape / 2),
-                frames=int(rng.integers(4, 17)),
+                frames=int(rng.integers(4, 21)),
                 seed=seed * 1000 + number,
                 focal_mm=round(float(rng.uniform(0.75, 3.4)) * contract.sensor_mm[0], 1),
                 contract=contract,
@@ -93,238 +99,281 @@ def drawn_requests(seed: int, count: int) -> list[SynthRequest]:
     return requests
 
 
-def cases(request: SynthRequest, rng: np.random.Generator) -> Iterator[Case]:
+def cases(rng: np.random.Generator, *, frames: int) -> Iterator[Case]:
     """Yield what is made wrong with one scene."""
-    yield Case("nothing", None, request)
-    yield Case("nothing, one frame", None, replace(request, frames=1))
-    for sort, factors in (("unit by 2 to 5 %", SLIGHT), ("unit by powers of ten", GROSS)):
-        for factor in rng.choice(factors, 2, replace=False):
-            yield unit_case(sort, request, float(factor))
-    yield contract_case("ray depth", KIND, request, depth_kind="ray")
-    yield inverse_case(request)
-    for lag in rng.choice([-3, -2, -1, 1, 2, 3], 2, replace=False):
-        yield contract_case("frame lag", LAG, request, frame_lag=int(lag))
-    for name in rng.choice(list(ORDERS), 2, replace=False):
-        yield order_case(request, str(name))
-    for flip, axis in (("vertical", 1), ("horizontal", 2)):
-        yield flip_case(request, flip, axis)
-    for shift in rng.choice([-6, -3, -1, 1, 2, 5], 2, replace=False):
-        yield offset_case(request, int(rng.integers(2)), int(shift))
-    yield focal_case(request, float(rng.choice([0.75, 0.8, 1.25, 1.4])))
-    # Not quite square pixels: the reading of the height differs by 1.6 %.
-    oblong = replace(
-        request, size_px=128, height_px=84, contract=replace(request.contract, sensor_mm=(36, 24))
-    )
-    alike = float(rng.choice([0.976, 0.98, 0.984, 0.988]))
-    yield unit_case("unit by nearly what a focal length explains", oblong, alike)
-    near = focal_case(request, float(rng.choice([0.97, 0.98, 1.02, 1.03])))
-    yield replace(near, sort="focal length of the height, off by 2 or 3 %")
+    yield Case("nothing", lambda folder: None)
+    yield from _contract_cases(rng, frames=frames)
+    yield from _camera_cases(rng, frames=frames)
+    yield from _picture_cases(rng, frames=frames)
+    yield from _combined_cases(rng)
+
+
+def _contract_cases(rng: np.random.Generator, *, frames: int) -> Iterator[Case]:
+    quotient = {"false": frozenset({QUOTIENT}), "blamed": frozenset({QUOTIENT})}
+    for factor in (float(rng.choice([0.95, 0.97, 1.03, 1.05])), float(rng.choice([0.1, 2.0, 100]))):
+        yield Case(
+            "unit wrong", lambda f, x=factor: rewrite_depth(f, lambda u: u, unit_factor=x),
+            named=r"if focal length and baselines are right", details=f"x {factor}", **quotient,
+        )  # fmt: skip
+    focal = float(rng.choice([0.95, 1.05]))
     yield Case(
-        "control: no texture", None, request,
-        lambda folder: [
-            rewrite_rgb(folder, camera, lambda p: np.full_like(p, 110)) for camera in range(6)
-        ] and None,
+        "focal length wrong by 5 %", lambda f: _camera(f, focal_length_mm=focal),
+        named=r"if unit and baselines are right", details=f"x {focal}", **quotient,
     )  # fmt: skip
     yield Case(
-        "control: no parallax", None, request,
-        lambda folder: exchange(folder, dict.fromkeys(range(6), 2)),
+        "sensor's height of 4:3", lambda f: _camera(f, sensor_height_mm=0.75),
+        hidden=True,
     )  # fmt: skip
-    tiny = replace(request, size_px=96, height_px=64, focal_mm=0.5 * request.contract.sensor_mm[0])
-    slight = float(rng.choice(SLIGHT))
-    yield unit_case("control: little parallax, unit by 2 to 5 %", tiny, slight)
-    single = replace(request, frames=1)
-    yield unit_case("one frame, unit by 2 to 5 %", single, float(rng.choice(SLIGHT)))
-    yield flip_case(single, "vertical", 1, sort="one frame, flip")
-
-
-def unit_case(sort: str, request: SynthRequest, factor: float) -> Case:
-    truth_m = request.contract.depth_unit_m
-    return Case(
-        sort, UNIT, request,
-        lambda folder: rewrite_depth(folder, lambda units: units, unit_factor=factor),
-        is_told=lambda verdict, _: is_within(verdict, truth_m),
-        details=f"x {factor:g}", facts={"unit_m": truth_m},
+    yield Case(
+        "all distances wrong by 6 %", lambda f: place_cameras(f, dict.fromkeys(range(6), 1.06)),
+        named=r"if unit and focal length are right", **quotient,
     )  # fmt: skip
-
-
-def is_within(verdict: Verdict, unit_m: float) -> bool:
-    """Tell whether a unit is found to 1 %, or to what the verdict says is its error."""
-    told = re.search(r"± ([0-9.]+)%", found_for(verdict, UNIT))
-    error = float(told[1]) / 100 if told else 0.0
-    return abs(verdict.unit_m / unit_m - 1) <= max(0.01, error)
-
-
-def contract_case(sort: str, topic: str, request: SynthRequest, **changes) -> Case:
-    """Return a scene that is written with another contract than the default, which is declared."""
-    ((name, value),) = changes.items()
-    name = name.removeprefix("depth_")
-    return Case(
-        sort, topic, replace(request, contract=replace(request.contract, **changes)),
-        is_told=lambda verdict, _: getattr(verdict.encoding, name) == value,
-        may_be=lambda found: f"{value}" in found.split(" or "),
-        details=f"{value}",
+    camera = int(rng.integers(1, 6))
+    yield Case(
+        "one camera recorded elsewhere",
+        lambda f: place_cameras(f, {camera: 1.15}), named=f"camera {camera}( is|'s picture)",
+        cameras=frozenset({camera}), details=f"camera {camera}", blamed=frozenset({OFFSET}),
     )  # fmt: skip
-
-
-def inverse_case(request: SynthRequest) -> Case:
-    facts: dict[str, float] = {}
-
-    def corrupt(folder: Path) -> None:
-        change = as_inverse(folder)
-        stored = int(change(np.full((1, 1, 1), 20000)).item())
-        facts["unit_m"] = request.contract.depth_unit_m * 2e4 * stored
-        rewrite_depth(folder, change)
-
-    return Case(
-        "inverse depth", FORM, request, corrupt,
-        is_told=lambda verdict, _: verdict.encoding.form == "inverse"
-        and is_within(verdict, facts["unit_m"]),
-        allowed=frozenset({UNIT}), facts=facts,
+    yield Case(
+        "depth along the ray", lambda f: rewrite_depth(f, as_ray(f)),
+        named="the ray", paste="DepthEncoding(kind='ray')",
+        false=frozenset({KIND}), blamed=frozenset({KIND}),
     )  # fmt: skip
-
-
-def order_case(request: SynthRequest, name: str) -> Case:
-    cameras, kinds = ORDERS[name]
-    return Case(
-        "order", ORDER, request,
-        lambda folder: exchange(folder, cameras, kinds=kinds),
-        is_told=lambda verdict, scene: scene.best.order == name,
-        may_be=lambda found: name in found.split(" or "),
-        details=name,
+    yield Case(
+        "inverse depth", lambda f: rewrite_depth(f, as_inverse(f)),
+        named="inverse depth", false=frozenset({FORM, QUOTIENT}), blamed=frozenset({FORM}),
     )  # fmt: skip
-
-
-def flip_case(request: SynthRequest, flip: str, axis: int, *, sort: str = "flip") -> Case:
-    return Case(
-        sort, FLIP, request,
-        lambda folder: rewrite_depth(folder, lambda units: np.flip(units, axis)),
-        is_told=lambda verdict, scene: scene.best.flip == flip,
-        may_be=lambda found: flip in found.split(" or "),
-        details=flip,
+    lag = int(rng.choice([lag for lag in (-2, -1, 1, 2, 5) if abs(lag) < frames - 1]))
+    yield Case(
+        "depth of all lagged", lambda f: rewrite_depth(f, lagged(lag)),
+        named=rf"(^| ){lag}( |$)" if abs(lag) < 4 else "or beyond",
+        paste=f"DepthEncoding(frame_lag={lag})",
+        false=frozenset({LAG}), blamed=frozenset({LAG}), details=f"{lag}",
     )  # fmt: skip
+    axis = int(rng.integers(1, 3))
+    yield Case(
+        "depth of all flipped", lambda f: rewrite_depth(f, lambda u: np.flip(u, axis)),
+        named="vertical" if axis == 1 else "horizontal", false=frozenset({FLIP}),
+        blamed=frozenset({FLIP}), details=f"axis {axis}",
+    )  # fmt: skip
+    for words, kinds in (("", NOTHING), ("pictures", NOTHING[:1]), ("depth", NOTHING[1:])):
+        yield Case(
+            "order of all cameras reversed",
+            lambda f, k=kinds: exchange(f, {c: 5 - c for c in range(6)}, kinds=k),
+            named=f"{words} reversed|mirrored".strip(), false=frozenset({ORDER}),
+            blamed=frozenset({ORDER}), details=words,
+        )  # fmt: skip
+        # The primary pair, its neighbour, and any two.
+        for pair in ((0, 1), (1, 2), tuple(sorted(rng.choice(6, 2, replace=False).tolist()))):
+            yield Case(
+                f"files of two cameras exchanged: {words or 'both'}",
+                lambda f, k=kinds, p=pair: exchange(f, {p[0]: p[1], p[1]: p[0]}, kinds=k),
+                named=f"cameras {pair[0]} and {pair[1]} exchanged",
+                false=frozenset({ORDER}), blamed=frozenset({ORDER}),
+                cameras=frozenset(pair), details=f"{pair}",
+            )  # fmt: skip
 
 
-def offset_case(request: SynthRequest, camera: int, shift: int) -> Case:
-    def is_told(verdict: Verdict, scene: SceneDiagnosis) -> bool:
-        return all(
-            abs(px - shift * ((pair[0] == camera) - (pair[1] == camera))) < 0.35
-            for pair, px in scene.offsets_px.items()
-        )
-
-    return Case(
-        "offset", OFFSET, request,
-        lambda folder: rewrite_rgb(folder, camera, lambda p: np.roll(p, shift, axis=2)),
-        is_told=is_told, details=f"camera {camera} by {shift} px",
+def _camera_cases(rng: np.random.Generator, *, frames: int) -> Iterator[Case]:
+    for sort, change, named in (
+        ("depth of one camera halved", scaled(0.5), r"0\.5\d* x"),
+        ("depth of one camera scaled by 3 to 5 %", scaled(float(rng.choice([0.95, 1.03, 1.05]))),
+         r"is \d\.\d+ x"),
+        ("depth of one camera lagged", lagged(int(rng.choice([-3, -1, 1, 2]))), "lag|explains"),
+        ("depth of one camera flipped", lambda u: np.flip(u, 1 + int(rng.integers(2))), "flip"),
+        ("depth of one camera one pixel aside", lambda u: np.roll(u, 1, axis=2), "depth of"),
+    ):  # fmt: skip
+        if "lagged" in sort and frames < 4:
+            continue
+        camera = int(rng.integers(6))
+        yield Case(
+            sort, lambda f, c=camera, ch=change: rewrite_one_depth(f, c, ch),
+            named=f"depth of camera {camera} .*({named})", cameras=frozenset({camera}),
+            details=f"camera {camera}", hidden="aside" in sort,
+        )  # fmt: skip
+    for sort, change_of, named in (
+        ("depth of one camera along the ray", as_ray, "ray| x that"),
+        ("depth of one camera inverse", as_inverse, "inverse| x that|explains"),
+    ):
+        camera = int(rng.integers(6))
+        yield Case(
+            sort, lambda f, c=camera, g=change_of: rewrite_one_depth(f, c, g(f)),
+            named=f"depth of camera {camera} .*({named})", cameras=frozenset({camera}),
+            details=f"camera {camera}",
+        )  # fmt: skip
+    camera, factor = int(rng.integers(6)), float(rng.choice([10.0, 0.1, 1.1]))
+    yield Case(
+        "tag of one camera wrong",
+        lambda f: rewrite_one_depth(f, camera, lambda u: u, unit_factor=factor),
+        named=f"depth of camera {camera} is", cameras=frozenset({camera}),
+        details=f"camera {camera} x {factor}",
     )  # fmt: skip
 
 
-def focal_case(request: SynthRequest, factor: float) -> Case:
-    """Return a scene whose sensor's recorded width is wrong, so that its height is the one to use.
-
-    The sensor's height is recorded as that which square pixels have.
-    """
-
-    def corrupt(folder: Path) -> None:
-        def change(document: dict) -> None:
-            camera = document["camera_intrinsics"]
-            by_width = document["image_width"] / camera["sensor_width_mm"]
-            camera["sensor_height_mm"] = document["image_height"] / by_width
-            camera["sensor_width_mm"] *= factor
-
-        edit_baseline(folder, change)
-
-    return Case(
-        "focal length of the height", FOCAL, request, corrupt,
-        is_told=lambda verdict, _: found_for(verdict, FOCAL) == BY_HEIGHT,
-        details=f"width x {factor:g}",
+def _picture_cases(rng: np.random.Generator, *, frames: int) -> Iterator[Case]:
+    for axis, sort in ((1, "pictures of one camera 1 px higher or lower"),
+                       (2, "pictures of one camera 1 to 3 px aside")):  # fmt: skip
+        camera = int(rng.integers(6))
+        shift = int(rng.choice([-1, 1] if axis == 1 else [-1, 1, 3]))
+        yield Case(
+            sort, lambda f, c=camera, a=axis, n=shift: rewrite_rgb(f, c, rolled(n, a)),
+            named=f"camera {camera}('s picture| are)", blamed=frozenset({OFFSET}),
+            cameras=frozenset({camera}), details=f"camera {camera} by {shift}",
+        )  # fmt: skip
+    for frames_late in sorted({1, min(3, frames - 1), min(15, frames - 1)}):
+        camera = int(rng.integers(6))
+        yield Case(
+            "pictures of one camera late by 1 to 15 frames",
+            lambda f, c=camera, n=frames_late: rewrite_rgb(f, c, late(n)),
+            named=f"camera {camera} are {frames_late} frames? late", cameras=frozenset({camera}),
+            details=f"camera {camera} by {frames_late} of {frames}",
+        )  # fmt: skip
+    camera = int(rng.integers(6))
+    yield Case(
+        "pictures of one camera mirrored",
+        lambda f: rewrite_rgb(f, camera, lambda p: p[:, :, ::-1]),
+        named=f"camera {camera} are mirrored", cameras=frozenset({camera}),
+        details=f"camera {camera}",
+    )  # fmt: skip
+    yield Case(
+        "pictures of all cameras mirrored",
+        lambda f: [rewrite_rgb(f, c, lambda p: p[:, :, ::-1]) for c in range(6)],
+        named="horizontal|mirrored", false=frozenset({ORDER, FLIP}),
+        blamed=frozenset({ORDER, FLIP}),
+    )  # fmt: skip
+    yield Case(
+        "red and blue exchanged",
+        lambda f: [rewrite_rgb(f, c, lambda p: p[..., ::-1]) for c in range(6)], hidden=True,
+    )  # fmt: skip
+    yield Case(
+        "no texture",
+        lambda f: [rewrite_rgb(f, c, lambda p: np.full_like(p, 110)) for c in range(6)],
+        hidden=True, false=frozenset({QUOTIENT, KIND, FORM, LAG, ORDER, FLIP}),
+    )  # fmt: skip
+    yield Case(
+        "six equal views", lambda f: exchange(f, dict.fromkeys(range(6), 2)),
+        hidden=True, false=frozenset({QUOTIENT, KIND, FORM, LAG, ORDER, FLIP}),
     )  # fmt: skip
 
 
-def found_for(verdict: Verdict, topic: str) -> str:
-    return next(answer.found for answer in verdict.answers if answer.topic == topic)
+def rolled(shift: int, axis: int) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda pictures: np.roll(pictures, shift, axis)
 
 
-def outcome(case: Case, verdict: Verdict, scene: SceneDiagnosis) -> str:
-    """Return how good a verdict is, in a word."""
-    status = {answer.topic: answer.status for answer in verdict.answers}
-    blamed = {topic for topic, said in status.items() if said == "wrong"}
-    either = {topic for topic, said in status.items() if said == "one is wrong"}
-    if case.topic is None:
-        return "wrong" if verdict.is_wrong else "right"
-    if blamed - {case.topic} - case.allowed:
-        return "wrong"
-    if case.topic in blamed:
-        found = found_for(verdict, case.topic)
-        if " or " in found:
-            return "narrowed" if case.may_be(found) else "wrong"
-        return "right" if case.is_told(verdict, scene) else "wrong"
-    if case.topic in either:
-        return "one of two" if case.is_told(verdict, scene) else "wrong"
-    if either or status[case.topic] in ("confirmed", "does not matter"):
-        return "wrong"
-    return "cannot tell"
+def _combined_cases(rng: np.random.Generator) -> Iterator[Case]:
+    def unit_and_ray(folder: Path) -> None:
+        rewrite_depth(folder, as_ray(folder), unit_factor=1.04)
+
+    def unit_and_exchange(folder: Path) -> None:
+        rewrite_depth(folder, lambda u: u, unit_factor=0.9)
+        exchange(folder, {2: 4, 4: 2})
+
+    def two_depths(folder: Path) -> None:
+        rewrite_one_depth(folder, 1, scaled(0.5))
+        rewrite_one_depth(folder, 4, scaled(1.2))
+
+    def higher_and_halved(folder: Path) -> None:
+        rewrite_rgb(folder, 5, lambda p: np.roll(p, -1, 1))
+        rewrite_one_depth(folder, 0, scaled(0.5))
+
+    def cycle(folder: Path) -> None:
+        exchange(folder, {c: (c + 1) % 6 for c in range(6)})
+
+    every = frozenset({QUOTIENT, KIND, FORM, LAG, ORDER, FLIP, OFFSET})
+    for sort, corrupt, blamed, cameras, false in (
+        ("two things: unit and ray", unit_and_ray, {KIND, QUOTIENT}, set(), {KIND, QUOTIENT}),
+        ("two things: unit and cameras 2, 4", unit_and_exchange, {ORDER, QUOTIENT}, {2, 4},
+         {ORDER, QUOTIENT}),
+        ("two things: depth of cameras 1, 4", two_depths, set(), {1, 4}, set()),
+        ("two things: picture 5, depth 0", higher_and_halved, {OFFSET}, {0, 5}, set()),
+        ("files numbered one too high", cycle, {ORDER}, set(range(6)), {ORDER}),
+    ):  # fmt: skip
+        yield Case(
+            sort, corrupt, named=".", blamed=frozenset(blamed), cameras=frozenset(cameras),
+            false=frozenset(false & every), details="",
+        )  # fmt: skip
 
 
-def run(root: Path, *, seed: int, count: int) -> list[dict]:
+def _camera(folder: Path, **factors: float) -> None:
+    def change(document: dict) -> None:
+        for name, factor in factors.items():
+            document["camera_intrinsics"][name] *= factor
+
+    edit_baseline(folder, change)
+
+
+def outcome(case: Case, verdict: Verdict) -> tuple[str, str]:
+    """Return how good a verdict is, in a word, and why where it is wrong."""
+    untouched = case.sort == "nothing"
+    pasted = None if verdict.encoding is None else encoding_line(verdict.encoding)
+    if pasted is not None and pasted != case.paste:
+        return "WRONG", f"pasted {pasted}"
+    confirmed = {a.topic for a in verdict.answers if a.status == "confirmed"}
+    if confirmed & case.false:
+        return "WRONG", f"confirmed {sorted(confirmed & case.false)}"
+    if verdict.fits and not (untouched or case.hidden):
+        return "WRONG", "declared contract fits"
+    blamed = {a.topic for a in verdict.answers if a.status == "wrong"}
+    if blamed - case.blamed:
+        return "WRONG", f"blamed {sorted(blamed - case.blamed)}"
+    named = {int(c) for words in verdict.faults for c in re.findall(r"camera (\d)", words)}
+    if named - case.cameras or (verdict.faults and not named and not case.cameras):
+        return "WRONG", f"faults {verdict.faults}"
+    if not verdict.is_wrong:
+        return ("right" if untouched and verdict.fits else "cannot tell"), ""
+    found = [a.found for a in verdict.answers if a.status == "wrong"]
+    words = [*found, *verdict.faults, *verdict.choices]
+    return ("named" if any(re.search(case.named, w) for w in words) else "seen"), ""
+
+
+def run(root: Path, *, seed: int, count: int, rendered: Path | None) -> list[dict]:
     """Draw, spoil and ask; return one record a case."""
     rng = np.random.default_rng([seed, 1])
-    drawn: dict[SynthRequest, Path] = {}
+    sources = list(rendered.glob("*/*/*/scene_*")) if rendered else []
+    for number, request in enumerate(drawn_requests(seed, count)):
+        place = root / f"drawn_{number}"
+        (key,) = synthesise(place, request, workers=1)
+        sources.append(place / key)
     records = []
     with (root / "verdicts.jsonl").open("w") as log:
-        for request in drawn_requests(seed, count):
-            for case in cases(request, rng):
-                if case.request not in drawn:
-                    place = root / f"drawn_{len(drawn)}"
-                    (key,) = synthesise(place, case.request, workers=1)
-                    drawn[case.request] = place / key
+        for source in sources:
+            for case in cases(rng, frames=len(read_depth(source, 0)[0])):
                 spoilt = root / "spoilt"
                 shutil.rmtree(spoilt, ignore_errors=True)
-                case.corrupt(copied(drawn[case.request], spoilt))
+                case.corrupt(copied(source, spoilt))
                 report = diagnose(spoilt, frames=4, workers=1)
-                record = recorded(case, report.verdicts[0], report.scenes[0])
+                record = recorded(case, report.verdicts[0]) | {"scene": f"{source}"}
                 records.append(record)
                 log.write(json.dumps(record) + "\n")
                 log.flush()
     return records
 
 
-def recorded(case: Case, verdict: Verdict, scene: SceneDiagnosis) -> dict:
+def recorded(case: Case, verdict: Verdict) -> dict:
     """Return what is kept of a verdict."""
-    truth_m = case.facts.get("unit_m", math.nan)
+    word, why = outcome(case, verdict)
     return {
         "sort": case.sort,
         "details": case.details,
-        "outcome": outcome(case, verdict, scene),
-        "unit_off": verdict.unit_m / truth_m - 1,
-        "status": {answer.topic: answer.status for answer in verdict.answers},
-        "found": {answer.topic: answer.found for answer in verdict.answers},
-        "notes": {answer.topic: answer.note for answer in verdict.answers if answer.note},
-        "offsets_px": list(scene.offsets_px.values()),
-        "disparity_px": scene.disparity_px,
+        "outcome": word,
+        "why": why,
+        "answers": {a.topic: [a.status, a.found, a.note] for a in verdict.answers},
+        "faults": verdict.faults,
+        "paste": verdict.encoding and encoding_line(verdict.encoding),
+        "choices": verdict.choices,
         "agreement": verdict.agreement,
-        "request": f"{case.request}",
+        "quotient": [verdict.quotient, verdict.quotient_error],
+        "unexplained": verdict.unexplained_cameras,
+        "untested": verdict.untested_cameras,
     }
 
 
 def table(records: list[dict]) -> str:
-    """Return a row a sort of mistake: how many were told, left open, or wrong."""
-    words = ("right", "one of two", "narrowed", "cannot tell", "wrong")
-    lines = ["| made wrong | " + " | ".join(words) + " |", "|---" * (len(words) + 1) + "|"]
+    """Return a row a sort of mistake: how many were named, seen, left open, or wrong."""
+    lines = ["| made wrong | " + " | ".join(OUTCOMES) + " |", "|---" * (len(OUTCOMES) + 1) + "|"]
     for sort in dict.fromkeys(record["sort"] for record in records):
         told = Counter(record["outcome"] for record in records if record["sort"] == sort)
-        lines.append(f"| {sort} | " + " | ".join(str(told[word] or "") for word in words) + " |")
-    sharp = [abs(r["unit_off"]) for r in records if r["outcome"] in ("right", "one of two")
-             and math.isfinite(r["unit_off"])]  # fmt: skip
-    lines.append(f"units told: {len(sharp)}, to 0.5 %: {sum(off <= 0.005 for off in sharp)}")
-    controls = [r for r in records if r["sort"].startswith(("nothing", "control"))]
-    for sort in dict.fromkeys(record["sort"] for record in controls):
-        said = Counter(
-            (topic, status)
-            for r in controls
-            if r["sort"] == sort
-            for topic, status in r["status"].items()
-        )
-        lines.append(f"{sort}: " + ", ".join(f"{t} {s} {n}" for (t, s), n in sorted(said.items())))
+        lines.append(f"| {sort} | " + " | ".join(str(told[word] or "") for word in OUTCOMES) + " |")
     return "\n".join(lines)
 
 
@@ -333,9 +382,13 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--scenes", type=int, default=12)
+    parser.add_argument("--rendered", type=Path)
     options = parser.parse_args()
     options.folder.mkdir(parents=True)
-    sys.stdout.write(table(run(options.folder, seed=options.seed, count=options.scenes)) + "\n")
+    records = run(
+        options.folder, seed=options.seed, count=options.scenes, rendered=options.rendered
+    )
+    sys.stdout.write(table(records) + "\n")
 
 
 if __name__ == "__main__":

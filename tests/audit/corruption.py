@@ -39,13 +39,18 @@ def write_depth(folder: Path, camera: int, units: np.ndarray, tags: dict[str, st
 def rewrite_depth(folder: Path, change, *, unit_factor: float = 1.0) -> None:
     """Replace every camera's depth by change(units), and multiply what the tag says."""
     for camera in CAMERAS:
-        units, tags = read_depth(folder, camera)
-        kept = {
-            key: repr(float(value) * unit_factor)
-            for key, value in tags.items()
-            if "scale" in key.lower()
-        }
-        write_depth(folder, camera, change(units), kept)
+        rewrite_one_depth(folder, camera, change, unit_factor=unit_factor)
+
+
+def rewrite_one_depth(folder: Path, camera: int, change, *, unit_factor: float = 1.0) -> None:
+    """Replace one camera's depth by change(units), and multiply what its tag says."""
+    units, tags = read_depth(folder, camera)
+    kept = {
+        key: repr(float(value) * unit_factor)
+        for key, value in tags.items()
+        if "scale" in key.lower()
+    }
+    write_depth(folder, camera, change(units), kept)
 
 
 def rewrite_rgb(folder: Path, camera: int, change) -> None:
@@ -62,6 +67,31 @@ def edit_baseline(folder: Path, change) -> None:
     document = json.loads(path.read_text())
     change(document)
     path.write_text(json.dumps(document))
+
+
+def place_cameras(folder: Path, factors: dict[int, float]) -> None:
+    """Record cameras so many times as far from camera 0, in the poses and the baselines alike."""
+    path = folder / "trajectory.json"
+    document = json.loads(path.read_text())
+    for frame in document["frames"]:
+        first = {axis: frame["cameras"][0]["location"][axis] for axis in "xyz"}
+        for camera, factor in factors.items():
+            location = frame["cameras"][camera]["location"]
+            for axis in "xyz":
+                location[axis] = first[axis] + factor * (location[axis] - first[axis])
+    path.write_text(json.dumps(document))
+    places = [
+        np.array([camera["location"][axis] for axis in "xyz"])
+        for camera in document["frames"][0]["cameras"]
+    ]
+
+    def change(baseline):
+        for name in ("adjacent_pairs", "pairwise_pairs"):
+            for pair in baseline[name]:
+                a, b = pair["camera_index_a"], pair["camera_index_b"]
+                pair["baseline_cm"] = float(np.linalg.norm(places[a] - places[b]))
+
+    edit_baseline(folder, change)
 
 
 def ray_lengths(folder: Path, *, shape: tuple[int, int]) -> np.ndarray:
@@ -101,6 +131,25 @@ def lagged(lag: int):
 
     def change(units):
         return units[np.clip(np.arange(len(units)) - lag, 0, len(units) - 1)]
+
+    return change
+
+
+def scaled(factor: float):
+    """Return the change to depth so many times as large."""
+
+    def change(units):
+        known = (units > 0) & (units < 65535)
+        return np.where(known, np.clip(np.rint(units * factor), 1, 65534), units)
+
+    return change
+
+
+def late(frames: int):
+    """Return the change after which a picture shows what was so many frames before."""
+
+    def change(pictures):
+        return pictures[np.clip(np.arange(len(pictures)) - frames, 0, len(pictures) - 1)]
 
     return change
 

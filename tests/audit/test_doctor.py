@@ -6,9 +6,10 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from stereogenbench_data.audit.contract_verdict import encoding_line
 from stereogenbench_data.cli.commands import app
-from stereogenbench_data.cli.doctor import encoding_line
 from stereogenbench_data.schema.records import DepthEncoding
+from tests.audit.corruption import copied, rewrite_one_depth, scaled
 
 
 def run(*arguments):
@@ -16,27 +17,51 @@ def run(*arguments):
     return CliRunner().invoke(app, ["doctor", *map(str, arguments), *few])
 
 
-def test_a_right_tree_ends_with_0_and_the_contract_to_paste(detailed_release, tmp_path):
+def test_a_right_tree_ends_with_0_and_says_what_was_tested(detailed_release, tmp_path):
     picture = tmp_path / "doctor.png"
 
     result = run(detailed_release, "-o", picture)
 
     assert result.exit_code == 0, result.output
-    assert "The declared contract fits" in result.stdout
+    assert "Depth and pictures tested: cameras 0, 1, 2, 3, 4, 5." in result.stdout
+    assert "Only unit / (focal length x baseline) is seen" in result.stdout
+    assert "Not asked here, see `stereogenbench audit`: the sensor's height" in result.stdout
     assert "are not comparable with dB" in result.stdout
-    assert "DepthEncoding(unit_m=0.001)" in result.stdout
+    assert "Paste" not in result.stdout
     with Image.open(picture) as image:
         assert min(image.size) > 800
 
 
-def test_a_wrong_unit_ends_with_1_and_json_alone_on_stdout(detailed_release):
+def test_a_wrong_quotient_ends_with_1_and_no_unit_to_paste(detailed_release):
+    said = run(detailed_release, "--unit-m", "0.1")
     result = run(detailed_release, "--json", "--unit-m", "0.1")
 
-    assert result.exit_code == 1
+    assert said.exit_code == result.exit_code == 1
+    assert "Paste" not in said.stdout
+    assert "Nothing to paste" in said.stdout
     document = json.loads(result.stdout)
+    assert "Only unit / (focal length x baseline) is seen" in document["quotient_means"]
     assert document["is_wrong"]
-    assert document["verdicts"][0]["paste"] == "DepthEncoding(unit_m=0.001)"
-    assert document["verdicts"][0]["unit_m"] == pytest.approx(0.001, rel=0.005)
+    (verdict,) = document["verdicts"]
+    assert verdict["paste"] is None
+    assert verdict["quotient"] == pytest.approx(0.01, rel=0.01)
+    assert verdict["choices"][0] == (
+        "if focal length and baselines are right: DepthEncoding(unit_m=0.001)"
+    )
+    assert verdict["choices"][1].startswith("if unit and baselines are right: a focal length of ")
+    assert verdict["choices"][2].startswith("if unit and focal length are right: baselines of ")
+
+
+def test_a_camera_that_does_not_fit_ends_with_1(detailed_release, tmp_path):
+    (scene,) = detailed_release.glob("*/*/*/scene_*")
+    rewrite_one_depth(copied(scene, tmp_path), 4, scaled(0.5))
+
+    result = run(tmp_path)
+
+    assert result.exit_code == 1
+    assert "WRONG: depth of camera 4 is 0.5" in result.stdout
+    assert "The declared contract fits" not in result.stdout
+    assert "Paste" not in result.stdout
 
 
 def test_a_picture_of_no_known_kind_is_refused_before_anything_is_read(tmp_path):

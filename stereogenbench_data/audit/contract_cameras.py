@@ -1,0 +1,626 @@
+"""Each camera held against the others: one file may be wrong where all together look right.
+
+A match of two pictures is judged twice, by the depth of either camera. Where nothing is wrong both
+explain as many matches, whatever the pictures are like; where one camera's depth is wrong, it
+alone explains fewer, or differs in scale from the other. What is wrong with a picture (its rows do
+not align, it is of another moment) shows in all pairs of its camera, by either depth.
+
+Cameras that agree with one another are the ones that others are held against: the largest group of
+them, if it is more than half.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from stereogenbench_data.audit.contract_fit import voted_scale
+from stereogenbench_data.audit.contract_hypotheses import Question, Structure
+from stereogenbench_data.audit.contract_matching import Luma, match_rows
+from stereogenbench_data.audit.contract_scoring import Pair, Scored, sampled
+from stereogenbench_data.audit.contract_views import SceneViews, Shot
+from stereogenbench_data.schema.release import CAMERA_COUNT
+
+LEAST_SHARE: Final = 0.5
+"""Of a camera's matches with its neighbours as many at least must be explained by its depth."""
+MOST_LOG_SCALE: Final = 0.005
+MOST_ROWS_PX: Final = 0.25
+MOST_COLUMNS_PX: Final = 0.4
+"""Beyond these a camera differs from the others: scale of its depth, rows, columns."""
+_LEAST_DEFICIT: Final = 0.12
+"""A share of matches by which pairs of a camera stay behind pairs as wide of others."""
+_LEAST_ASYMMETRY: Final = 0.03
+_LEAST_GAIN: Final = 0.01
+_LEAST_LATER: Final = 0.03
+_LEAST_AWAY: Final = 0.25
+"""Two depths of one point agree if their disparities differ by less, in pixels."""
+_GAIN_ERRORS: Final = 3.0
+_FEWEST_MATCHES: Final = 100
+_NARROWEST: Final = 2
+_ROWS_BESIDE: Final = 2
+_FARTHEST_FRAMES: Final = 30
+_MAJORITY: Final = CAMERA_COUNT // 2 + 1
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFigures:
+    """One camera beside the others.
+
+    Attributes:
+        camera: Its number, as its files have it.
+        matches: Pixels found both in its pictures and in those of its two nearest neighbours.
+        agreement: Share of them that its own depth explains to a pixel; nan where untested.
+        depth_scale: Its depth over that of the cameras that agree, the same points; nan if unknown.
+        row_px: How far down its pictures lie, beside those of the cameras that agree.
+        column_px: How far to the right, beside what depth predicts.
+    """
+
+    camera: int
+    matches: int
+    agreement: float
+    depth_scale: float
+    row_px: float
+    column_px: float
+
+    @property
+    def is_tested(self) -> bool:
+        """Whether enough was found to judge it by."""
+        return self.matches >= _FEWEST_MATCHES and math.isfinite(self.agreement)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCheck:
+    """What a contract leaves to explain, camera by camera.
+
+    Attributes:
+        cameras: Figures of all six.
+        faults: In words, what is wrong with single cameras; each names its camera.
+    """
+
+    cameras: tuple[CameraFigures, ...] = ()
+    faults: tuple[str, ...] = ()
+
+    @property
+    def agreement(self) -> float:
+        """Share of the matches of neighbouring cameras that is explained; nan where untested."""
+        tested = [figures for figures in self.cameras if figures.is_tested]
+        count = sum(figures.matches for figures in tested)
+        told = sum(figures.matches * figures.agreement for figures in tested)
+        return told / count if count else math.nan
+
+    @property
+    def untested(self) -> tuple[int, ...]:
+        """Cameras of which too little was found in other pictures."""
+        tested = {figures.camera for figures in self.cameras if figures.is_tested}
+        return tuple(camera for camera in range(CAMERA_COUNT) if camera not in tested)
+
+    @property
+    def unexplained(self) -> tuple[int, ...]:
+        """Cameras whose depth explains less than half of their matches."""
+        return tuple(
+            figures.camera
+            for figures in self.cameras
+            if figures.is_tested and figures.agreement < LEAST_SHARE
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Beside:
+    """Two cameras, all their matches of all frames, and what either depth says of them."""
+
+    pair: Pair
+    width_m: float
+    count: int
+    near: Mapping[int, float]
+    log_ratio: float
+    ratio_error: float
+    row_px: float
+    column_px: float
+    log_scale: float
+    rms_px: float
+
+    @property
+    def share(self) -> float:
+        """The share of matches that the better of both depths explains."""
+        return max(self.near.values())
+
+
+class CameraComparison:
+    """A scene's cameras at one contract."""
+
+    def __init__(
+        self, views: SceneViews, shots: Sequence[Shot], contract: Scored, *, depth_step: float
+    ) -> None:
+        """Take shots from both sides by turns, and a contract with its scale fitted."""
+        self._views = views
+        self._shots = shots
+        self._contract = contract
+        self._depth_step = depth_step
+        self._most_log_scale = max(MOST_LOG_SCALE, depth_step / 4)
+        self._partner: dict[int, Shot] = {}
+        for here, there in zip(shots[::2], shots[1::2], strict=True):
+            self._partner |= {id(here): there, id(there): here}
+        self._pairs = {beside.pair: beside for beside in self._besides()}
+
+    def check(self) -> CameraCheck:
+        """Return every camera's figures and faults."""
+        if not self._pairs:
+            return CameraCheck()
+        scales, scale_faults = self._scales()
+        rows_px, row_faults = self._shifts(
+            {p: b.row_px for p, b in self._pairs.items()}, MOST_ROWS_PX, ("lower", "higher")
+        )
+        columns_px, column_faults = self._shifts(
+            {p: b.column_px for p, b in self._pairs.items()},
+            MOST_COLUMNS_PX,
+            ("to the right", "to the left"),
+        )
+        figures = []
+        for camera in range(CAMERA_COUNT):
+            nearest = self._of(camera)[:_NARROWEST]
+            count = sum(beside.count for beside in nearest)
+            told = sum(beside.count * beside.near[camera] for beside in nearest)
+            figures.append(
+                CameraFigures(
+                    camera, count, told / count if count else math.nan,
+                    scales[camera], rows_px[camera], columns_px[camera],
+                )
+            )  # fmt: skip
+        faults = dict(column_faults)
+        for camera in sorted({*row_faults, *self._behind()}):
+            faults[camera] = self._picture_fault(camera, rows_px[camera], row_faults.get(camera))
+        faults |= self._depth_faults(scales, scale_faults, beside=set(faults))
+        found = [faults[camera] for camera in sorted(faults)]
+        if not found:
+            found = self._width_faults()
+        return CameraCheck(tuple(figures), tuple(found))
+
+    def _besides(self) -> Iterator[_Beside]:
+        grouped: dict[Pair, list[tuple[Shot, Shot]]] = {}
+        for here, there in zip(self._shots[::2], self._shots[1::2], strict=True):
+            grouped.setdefault(here.pair, []).append((here, there))
+        for pair, both in grouped.items():
+            found = self._beside(pair, both)
+            if found is not None:
+                yield found
+
+    def _beside(self, pair: Pair, both: Sequence[tuple[Shot, Shot]]) -> _Beside | None:
+        parts = []
+        structure, scale = self._contract.structure, self._contract.scale
+        for here, there in both:
+            mine = self._views.predicted(here, structure)
+            theirs = self._views.predicted(there, structure)
+            if mine is None or theirs is None:
+                continue
+            known = mine[1] & theirs[1]
+            shift_px = here.shift_px(self._contract.offsets_px)
+            rows = row_terms(self._views, here)
+            parts.append([
+                part[known]
+                for part in (scale * mine[0] + shift_px, shift_px - scale * theirs[0],
+                             scale * mine[0], -scale * theirs[0], here.matched_px, *rows)
+            ])  # fmt: skip
+        if not parts or sum(len(part[0]) for part in parts) < _FEWEST_MATCHES:
+            return None
+        by_left, by_right, left_px, right_px, found, upward, steep = map(
+            np.concatenate, zip(*parts, strict=True)
+        )
+        grain_px = both[0][0].grain_px
+        near = np.abs(by_left - found) < grain_px, np.abs(by_right - found) < grain_px
+        usable = left_px * right_px > 0
+        log_ratios = np.log(left_px[usable] / right_px[usable])
+        log_ratio, ratio_error = _median(log_ratios)
+        agreed = near[0] & near[1]
+        either = near[0] | near[1]
+        column_px, _ = _median((found - (by_left + by_right) / 2)[agreed])
+        predicted = ((left_px + right_px) / 2)[agreed]
+        rms_px = float(np.sqrt((predicted**2).mean())) if agreed.any() else 0.0
+        wide = np.abs(predicted) > max(rms_px / 2, 2.0)
+        log_scale, _ = _median(np.log(np.maximum(found[agreed][wide] / predicted[wide], 1e-3)))
+        return _Beside(
+            pair=pair,
+            width_m=abs(self._views.baseline_m(both[0][0], structure)),
+            count=len(found),
+            near={pair[0]: float(near[0].mean()), pair[1]: float(near[1].mean())},
+            log_ratio=log_ratio,
+            ratio_error=ratio_error,
+            row_px=float(upward[either].sum() / max(steep[either].sum(), 1e-6)),
+            column_px=column_px,
+            log_scale=log_scale,
+            rms_px=rms_px,
+        )
+
+    def _of(self, camera: int) -> list[_Beside]:
+        """Return a camera's pairs, the narrowest first."""
+        own = [beside for pair, beside in self._pairs.items() if camera in pair]
+        return sorted(own, key=lambda beside: beside.width_m)
+
+    def _scales(self) -> tuple[list[float], dict[int, str]]:
+        """Return each camera's depth over that of those that agree, and which differ.
+
+        Disparity goes with the inverse of depth, so that the sign is turned.
+        """
+        values = {pair: -beside.log_ratio for pair, beside in self._pairs.items()}
+        limits = {
+            pair: max(self._most_log_scale, 4 * beside.ratio_error)
+            for pair, beside in self._pairs.items()
+        }
+        logs, group = _levels(values, limits)
+        least = max(limits.values(), default=0.0)
+        words = {
+            camera: f"depth of camera {camera} is {math.exp(value):.4g} x that of the others"
+            for camera, value in enumerate(logs)
+            if abs(value) > min(least, 0.02)
+        }
+        return [math.exp(value) for value in logs], _or_all(words, group, "scale of depth")
+
+    def _shifts(
+        self, values: dict[Pair, float], most_px: float, directions: tuple[str, str]
+    ) -> tuple[list[float], dict[int, str]]:
+        """Return how far each camera's picture is shifted, and those shifted too far."""
+        levels, group = _levels(values, dict.fromkeys(values, most_px))
+        words = {
+            camera: f"pictures of camera {camera} are {abs(value):.1f} px {directions[value < 0]}"
+            for camera, value in enumerate(levels)
+            if abs(value) > most_px
+        }
+        return levels, _or_all(words, group, f"pictures ({directions[0]} or {directions[1]})")
+
+    def _behind(self) -> Iterator[int]:
+        """Yield cameras all of whose pairs explain fewer matches than pairs as wide of others."""
+        for camera in range(CAMERA_COUNT):
+            deficits = []
+            for beside in self._of(camera):
+                others = [
+                    other.share
+                    for pair, other in self._pairs.items()
+                    if camera not in pair and other.width_m >= 0.9 * beside.width_m
+                ]
+                if others:
+                    deficits.append(max(others) - beside.share)
+            if len(deficits) >= _NARROWEST and min(deficits) > _LEAST_DEFICIT:
+                yield camera
+
+    def _picture_fault(self, camera: int, row_px: float, row_fault: str | None) -> str:
+        """Return what is wrong with a camera's pictures: which other reading of them fits best."""
+        behind = set(self._behind()) - {camera}
+        own = self._of(camera)
+        neighbour = next((beside for beside in own if not set(beside.pair) & behind), own[0])
+        (other,) = set(neighbour.pair) - {camera}
+        shots = [shot for shot in self._shots if (shot.left, shot.right) == (other, camera)]
+        middle = shots[len(shots) // 2]
+        frames = self._views.scene.frames
+        now = self._share([(middle, self._band(middle.frame, camera))])
+        readings = [
+            (self._share([(middle, turned(self._band(middle.frame, camera)))]), words)
+            for words, turned in _TURNED.items()
+        ]
+        if row_fault is not None:
+            rows = int(np.rint(row_px)) or int(np.sign(row_px))
+            band = np.roll(self._band(middle.frame, camera), -rows, axis=0)
+            readings.append((self._share([(middle, band)]), ""))
+        for lag in range(-_FARTHEST_FRAMES, _FARTHEST_FRAMES + 1):
+            usable = [shot for shot in shots if 0 <= shot.frame + lag < frames]
+            if lag and usable:
+                shot = min(usable, key=lambda each: abs(each.frame - middle.frame))
+                share = self._share([(shot, self._band(shot.frame + lag, camera))])
+                many = "s" if abs(lag) > 1 else ""
+                word = "late" if lag > 0 else "early"
+                readings.append((share, f"{abs(lag)} frame{many} {word}"))
+        everywhere = [each for each in self._shots if (each.left, each.right) == (other, camera)]
+        share, words = max(readings, default=(0.0, ""))
+        elsewhere = self._share_elsewhere(everywhere)
+        # Where disparities are small another place explains what is wrong with rows as well.
+        if elsewhere > share + _LEAST_DEFICIT:
+            share, words = elsewhere, _ELSEWHERE
+        wanted = max(
+            (beside.share for pair, beside in self._pairs.items() if camera not in pair),
+            default=1.0,
+        )
+        if share < max(0.7 * wanted, now + _LEAST_DEFICIT / 2):
+            found = f", perhaps {row_fault.split(' are ')[1]}" if row_fault else ""
+            return (
+                f"pictures of camera {camera} do not fit those of the others, by the depth of "
+                f"either: other rows, another moment or another place{found}"
+            )
+        if words == _ELSEWHERE:
+            return f"camera {camera} {words}"
+        return f"pictures of camera {camera} are {words}" if words else row_fault or ""
+
+    def _share_elsewhere(self, shots: Sequence[Shot]) -> float:
+        """Return the share of matches that depth explains if the two stand otherwise apart."""
+        found, predicted = [], []
+        for shot in shots:
+            told = self._views.predicted(shot, self._contract.structure)
+            if told is not None:
+                found.append(shot.matched_px[told[1]])
+                predicted.append(told[0][told[1]])
+        if not sum(map(len, found)):
+            return 0.0
+        found_px, predicted_px = np.concatenate(found), np.concatenate(predicted)
+        # The two may even stand the other way round.
+        aways = [
+            voted_scale(found_px, sign * predicted_px) * sign * predicted_px - found_px
+            for sign in (1, -1)
+        ]
+        return max(float((np.abs(away) < shots[0].grain_px).mean()) for away in aways)
+
+    def _band(self, frame: int, camera: int) -> Luma:
+        return self._views.band(frame, camera)
+
+    def _share(self, shots: Sequence[tuple[Shot, Luma]]) -> float:
+        """Return the share of matches with other right pictures that depth explains."""
+        near, count = 0, 0
+        structure = self._contract.structure
+        for shot, right in shots:
+            matches = match_rows(self._views.band(shot.frame, shot.left), right)
+            file = structure.depth_file(shot.left)
+            frame = min(max(shot.frame + structure.frame_lag, 0), self._views.scene.frames - 1)
+            units, known = self._views.depth(frame, file)
+            place = matches.rows, matches.columns
+            number = np.where(known[place], units[place], 1).astype(np.float64)
+            predicted = self._contract.scale * self._views.disparity_of(
+                number, shot, structure, place=place, file=file
+            )
+            near += int((np.abs(predicted - matches.disparity_px) < matches.grain_px).sum())
+            count += len(matches.rows)
+        return near / count if count else 0.0
+
+    def _depth_faults(
+        self, scales: Sequence[float], scale_faults: dict[int, str], *, beside: set[int]
+    ) -> dict[int, str]:
+        """Return cameras whose depth explains less than it should, and what would explain more."""
+        faults = {}
+        for camera in sorted(set(range(CAMERA_COUNT)) - beside - self._aside()):
+            own = [
+                each for each in self._of(camera)
+                if not (set(each.pair) - {camera}) & (beside | set(scale_faults))
+            ] or self._of(camera)  # fmt: skip
+            if not own:
+                continue
+            behind = [
+                each.near[camera] - next(n for c, n in each.near.items() if c != camera)
+                for each in own
+            ]
+            better = self._better_depth(camera, scale=scales[camera])
+            if better:
+                faults[camera] = better
+            elif camera in scale_faults:
+                faults[camera] = scale_faults[camera]
+            elif float(np.median(behind)) < -_LEAST_ASYMMETRY:
+                faults[camera] = (
+                    f"depth of camera {camera} explains {own[0].near[camera]:.0%} of the matches "
+                    f"of which that of its neighbour explains {own[0].share:.0%}"
+                )
+        return faults
+
+    def _aside(self) -> set[int]:
+        """Return cameras all of whose pairs have an offset: their pictures left their depth."""
+        offsets_px = self._contract.offsets_px
+        return {
+            camera
+            for camera in range(CAMERA_COUNT)
+            if offsets_px
+            and all(
+                abs(offsets_px.get(beside.pair, math.inf)) >= MOST_COLUMNS_PX
+                for beside in self._of(camera)
+            )
+        }
+
+    def _better_depth(self, camera: int, *, scale: float) -> str:
+        """Return another reading of one camera's depth that explains clearly more, in words."""
+        structure = self._contract.structure
+        shots = [shot for shot in self._shots if shot.left == camera]
+        now = self._shares(shots, structure)
+        subject = f"depth of camera {camera}"
+        lagged: dict[str, Structure] = {}
+        readings: list[tuple[str, Float64[np.ndarray, " shots"]]] = [
+            (
+                f"{subject} is {scale:.4g} x that of the others",
+                self._shares(shots, structure, factor=scale),
+            )
+        ]
+        for question in _READINGS:
+            for other in structure.alternatives(question):
+                words = _READINGS[question].format(getattr(other, question))
+                factor = self._own_factor(shots, other) if question == "form" else 1.0
+                words = f"{subject} fits better {words}"
+                if question == "frame_lag":
+                    lagged[words] = other
+                readings.append((words, self._shares(shots, other, factor=factor)))
+        for file in range(CAMERA_COUNT):
+            if file != structure.depth_file(camera):
+                readings.append(
+                    (
+                        f"{subject} fits worse than that of file {file} does in its place",
+                        self._shares(shots, structure, file=file),
+                    )
+                )
+        best, most = "", 0.0
+        for words, shares in readings:
+            gain, is_clear = _gain(shares, now)
+            # The first of them are the simplest.
+            if is_clear and gain > most + _LEAST_GAIN * bool(best):
+                best, most = words, gain
+        if best in lagged and self._is_late(camera, lagged[best]):
+            return f"pictures of camera {camera} are {self._lateness(lagged[best])}"
+        return best
+
+    def _lateness(self, lagged: Structure) -> str:
+        lag = self._contract.structure.frame_lag - lagged.frame_lag
+        return f"{abs(lag)} frame{'s' if abs(lag) > 1 else ''} {'late' if lag > 0 else 'early'}"
+
+    def _is_late(self, camera: int, lagged: Structure) -> bool:
+        """Tell whether it is a camera's pictures that lag rather than its depth.
+
+        Depth before its time fits pictures that are late. If they are, then a later picture fits
+        the depth of the neighbours better.
+        """
+        lag = self._contract.structure.frame_lag - lagged.frame_lag
+        (neighbour,) = set(self._of(camera)[0].pair) - {camera}
+        shots = [
+            shot
+            for shot in self._shots
+            if (shot.left, shot.right) == (neighbour, camera)
+            and 0 <= shot.frame + lag < self._views.scene.frames
+        ]
+        now, then = (
+            self._share([(shot, self._band(shot.frame + by, camera)) for shot in shots])
+            for by in (0, lag)
+        )
+        return then > now + _LEAST_LATER
+
+    def _own_factor(self, shots: Sequence[Shot], structure: Structure) -> float:
+        """Return the factor that most of a camera's matches agree on."""
+        ratios = []
+        for shot in shots:
+            predicted = self._views.predicted(shot, structure)
+            if predicted is not None:
+                disparity_px, known = predicted
+                ratio = shot.matched_px[known] / (self._contract.scale * disparity_px[known])
+                ratios.append(ratio[ratio > 0])
+        told = np.concatenate(ratios) if ratios else np.ones(1)
+        return math.exp(float(np.median(np.log(told)))) if len(told) else 1.0
+
+    def _shares(
+        self,
+        shots: Sequence[Shot],
+        structure: Structure,
+        *,
+        file: int | None = None,
+        factor: float = 1.0,
+    ) -> Float64[np.ndarray, " shots"]:
+        """Return at what share of each shot's matches a reading agrees with the other's depth.
+
+        Depth agrees more sharply with depth than with matches, some of which are wrong. ``factor``
+        is what depth is divided by, in that disparity is multiplied.
+        """
+        shares = np.full(len(shots), np.nan)
+        for place, shot in enumerate(shots):
+            predicted = self._views.predicted(shot, structure, depth_file=file)
+            other = self._views.predicted(self._partner[id(shot)], self._contract.structure)
+            if predicted is not None and other is not None:
+                known = predicted[1] & other[1]
+                expected_px = -self._contract.scale * other[0][known]
+                away = self._contract.scale * factor * predicted[0][known] - expected_px
+                allowed = _LEAST_AWAY * shot.grain_px + 2 * self._depth_step * np.abs(expected_px)
+                shares[place] = float((np.abs(away) < allowed).mean()) if known.any() else np.nan
+        return shares
+
+    def _width_faults(self) -> list[str]:
+        """Return whether pairs disagree on how wide they are, and which camera is common to them.
+
+        The others' distances are taken for right.
+        """
+        told = {
+            pair: beside for pair, beside in self._pairs.items()
+            if beside.rms_px > 2.0 and beside.share >= LEAST_SHARE
+        }  # fmt: skip
+        if len(told) < _MAJORITY or self._contract.offsets_px:
+            return []
+        middle = float(np.median([beside.log_scale for beside in told.values()]))
+        off = {
+            pair: beside.log_scale - middle
+            for pair, beside in told.items()
+            if abs(beside.log_scale - middle) > max(0.01, 0.25 / beside.rms_px)
+        }
+        if not off:
+            return []
+        common = set.intersection(*map(set, off))
+        words = ", ".join(f"{a}-{b} by {math.expm1(v):+.1%}" for (a, b), v in off.items())
+        whose = ""
+        if len(common) == 1:
+            (camera,) = common
+            whose = f": camera {camera} {_ELSEWHERE}"
+        return [f"distances between cameras disagree: {words}{whose}"]
+
+
+_TURNED: Final[dict[str, Callable[[Luma], Luma]]] = {
+    "mirrored": lambda band: band[:, ::-1],
+    "upside down": lambda band: band[::-1],
+    "turned by 180 degrees": lambda band: band[::-1, ::-1],
+}
+_ELSEWHERE: Final = "is not where it is said to be, or its pictures are aside"
+_READINGS: Final[dict[Question, str]] = {
+    "frame_lag": "with a lag of {:+d} frames", "flip": "flipped ({})", "form": "as {} depth",
+    "kind": "along the {}",
+}  # fmt: skip
+
+
+def row_terms(
+    views: SceneViews, shot: Shot
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Return how far lower the left picture lies at each match: numerator and denominator.
+
+    One step of Lucas and Kanade along the column, over five rows, at the disparity that was found.
+    """
+    left, right = views.band(shot.frame, shot.left), views.band(shot.frame, shot.right)
+    place = shot.columns - shot.matched_px
+    numerator, denominator = np.zeros(len(place)), np.zeros(len(place))
+    for beside in range(-_ROWS_BESIDE, _ROWS_BESIDE + 1):
+        rows = np.clip(shot.rows + beside, 1, len(left) - 2)
+        there, _, inside = sampled(right, rows, place)
+        above, _, _ = sampled(right, rows - 1, place)
+        below, _, _ = sampled(right, rows + 1, place)
+        own = (left[rows + 1, shot.columns] - left[rows - 1, shot.columns]) / 2
+        slope = ((below - above) / 2 + own) / 2
+        numerator += np.where(inside, slope * (there - left[rows, shot.columns]), 0)
+        denominator += np.where(inside, slope * slope, 0)
+    return numerator, denominator
+
+
+def _median(values: Float64[np.ndarray, " n"]) -> tuple[float, float]:
+    """Return the median and its standard error by the spread; nan and inf of nothing."""
+    if not len(values):
+        return math.nan, math.inf
+    middle = float(np.median(values))
+    return middle, 1.4826 * float(np.median(np.abs(values - middle))) / math.sqrt(len(values))
+
+
+def _levels(
+    values: Mapping[Pair, float], limits: Mapping[Pair, float]
+) -> tuple[list[float], set[int]]:
+    """Return each camera's level from differences (first less second), and those that agree.
+
+    The largest group that agrees is at 0; the others are at their median difference from it.
+    """
+    group = {camera: {camera} for camera in range(CAMERA_COUNT)}
+    for pair, value in values.items():
+        if abs(value) <= limits[pair]:
+            joined = group[pair[0]] | group[pair[1]]
+            for camera in joined:
+                group[camera] = joined
+    largest = max(group.values(), key=len)
+    levels = []
+    for camera in range(CAMERA_COUNT):
+        differences = [
+            value if camera == pair[0] else -value
+            for pair, value in values.items()
+            if camera in pair and (set(pair) - {camera}) <= largest and math.isfinite(value)
+        ]
+        levels.append(
+            0.0 if camera in largest or not differences else float(np.median(differences))
+        )
+    return levels, largest
+
+
+def _or_all(words: dict[int, str], group: set[int], what: str) -> dict[int, str]:
+    """Return the words, or that cameras disagree where no majority of them agrees."""
+    if not words or len(group) >= _MAJORITY:
+        return words
+    return dict.fromkeys(words, f"cameras disagree in {what}, and no majority of them agrees")
+
+
+def _gain(
+    better: Float64[np.ndarray, " n"], worse: Float64[np.ndarray, " n"]
+) -> tuple[float, bool]:
+    """Return by how much one set of shares is larger on average, and whether that is sure."""
+    both: Bool[np.ndarray, " n"] = np.isfinite(better) & np.isfinite(worse)
+    gains = (better - worse)[both]
+    if len(gains) < _NARROWEST + 1:
+        return 0.0, False
+    mean, error = float(gains.mean()), float(gains.std(ddof=1)) / math.sqrt(len(gains))
+    return mean, mean > max(_LEAST_GAIN, _GAIN_ERRORS * error)
