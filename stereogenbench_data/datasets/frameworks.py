@@ -129,15 +129,16 @@ class AcceleratedLoader:
     def _is_accelerate_prepared(self, value: bool) -> None:
         """Take note of nothing: Accelerate sets what it has asked for before."""
 
-    def _enter_pass(self) -> None:
-        self.end_of_dataloader = False
+    def _enter_loop(self) -> None:
+        """Tell Accelerate that a loop over this loader begins."""
         if self._gradient_state is not None:
             self.remainder = 0
             if self.batches.tail != "drop":
                 self.remainder = self.total_dataset_length % self.total_batch_size
             self._gradient_state._add_dataloader(self)
 
-    def _leave_pass(self) -> None:
+    def _leave_loop(self) -> None:
+        """Tell Accelerate that the loop is over."""
         if self._gradient_state is not None:
             self._gradient_state._remove_dataloader(self)
 

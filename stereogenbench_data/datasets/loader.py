@@ -108,6 +108,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         self._position = batches.next_position()
         self._completed: tuple[int, tuple[int, ...]] | None = None
         self._unfinished: WeakSet[LoaderPass] = WeakSet()
+        self._running = 0
         self._clock = 0
         self._persistent: _Workers | None = None
         # Past torch's guard against another sampler: it says that the batches are a rank's share.
@@ -167,7 +168,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: it has passes and workers of its own."""
-        return self.__dict__ | {"_unfinished": None, "_persistent": None}
+        return self.__dict__ | {"_unfinished": None, "_persistent": None, "_running": 0}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy."""
@@ -180,16 +181,23 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             self._persistent = None
         workers.end()
 
-    def _begin(self, begun: "LoaderPass") -> tuple[int, int]:
+    def _next_position(self) -> tuple[int, int]:
         """Return the epoch and the global batch at which a pass begins now."""
         epoch, start = self.batches.next_position()
         if start == 0 and self._completed == (epoch, self._keeping.epoch_version):
             epoch += 1
-            self._keeping.advance_epoch(epoch)
+        return epoch, start
+
+    def _begun(self, begun: "LoaderPass") -> None:
+        """Take note that a pass begins."""
+        if begun.epoch != self.epoch:
+            self._keeping.advance_epoch(begun.epoch)
         self.batches.begin()
         self._unfinished.add(begun)
-        self._enter_pass()
-        return epoch, start
+        self._running += 1
+        if self._running == 1:
+            self._enter_loop()
+        self.end_of_dataloader = False
 
     def _taken(self, by: "LoaderPass") -> None:
         """Take note that a pass gives a batch."""
@@ -205,12 +213,17 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     def _ended(self, ended: "LoaderPass") -> None:
         """Take note that a pass is over: if it was left within another one, that one counts."""
-        self._leave_pass()
+        self._running -= 1
+        if self._running == 0:
+            self._leave_loop()
         if ended in self._unfinished:
             self._unfinished.discard(ended)
             if self._unfinished and self._position == ended.position:
                 latest = max(self._unfinished, key=lambda each: each.last_taken)
                 self._position = latest.position
+
+
+_NOTHING: Final = object()
 
 
 class LoaderPass(Iterator[Any]):
@@ -233,22 +246,29 @@ class LoaderPass(Iterator[Any]):
         self._share: range | None = None
         self._pid = os.getpid()
         self._over: str | None = None
+        self._loaded: Any = _NOTHING
 
     def _begin(self) -> None:
         """Begin at the position that the loader is at now."""
         loader, batches = self._loader, self._loader.batches
-        self.epoch, start = self.position = loader._begin(self)
+        self.epoch, start = self.position = loader._next_position()
         self._end = batches.end(start)
-        self._share = batches.share(start)
+        share = batches.share(start)
         # No reference to this pass in it: without a cycle, a pass that is left ends at once.
-        numbers = map(partial(batches.batch, epoch=self.epoch), self._share)
+        numbers = map(partial(batches.batch, epoch=self.epoch), share)
         if loader.persistent_workers:
             loader._persistent = loader._persistent or _Workers(loader)
             self._workers = loader._persistent
         else:
             self._workers = _Workers(loader)
-        self._loaded = self._workers.begin(numbers)
-        self._number = self._workers.passes
+        loader._begun(self)
+        self._share = share
+        try:
+            self._loaded = self._workers.begin(numbers)
+        finally:
+            self._number = self._workers.passes
+            if self._loaded is _NOTHING:
+                self.close()
 
     @property
     def is_complete(self) -> bool:
@@ -258,7 +278,7 @@ class LoaderPass(Iterator[Any]):
     def __len__(self) -> int:
         """Return how many batches it has in all."""
         if self._share is None:
-            return len(self._loader.batches.share(self._loader.batches.next_position()[1]))
+            return len(self._loader.batches.share(self._loader._next_position()[1]))
         return len(self._share)
 
     def __next__(self) -> Any:
@@ -282,7 +302,7 @@ class LoaderPass(Iterator[Any]):
             f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} batches "
             "with an error: begin another one, or load a state."
         )
-        batch = None
+        batch: Any = _NOTHING
         try:
             batch = next(self._loaded)
         except StopIteration:
@@ -295,7 +315,7 @@ class LoaderPass(Iterator[Any]):
             self._loader._forget(workers)
             raise death from error
         finally:
-            if batch is None:
+            if batch is _NOTHING:
                 self.close()
         self._over = None
         self.taken += 1

@@ -75,9 +75,11 @@ class WorkerContext:
         """Return an error that names the worker that died; None if none did.
 
         Args:
-            noticed: What the loop met.
+            noticed: What the loop met. What a worker raised, torch begins with "Caught": that is
+                no death.
         """
-        if not self._is_dead.wait(_NOTICED_AFTER_S) or self.dead is None:
+        is_a_workers_own = str(noticed).startswith("Caught ")
+        if is_a_workers_own or not self._is_dead.wait(_NOTICED_AFTER_S) or self.dead is None:
             return None
         self.dead.join(_NOTICED_AFTER_S)
         code = self.dead.exitcode
