@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from scipy.stats import linregress
 
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.protocols import StereoMatcher
@@ -77,6 +78,45 @@ def test_few_gross_outliers_ruin_least_squares_and_are_left_out_by_the_filter(tr
     assert filtered.outlier_ratio == 12 / 600
     assert filtered.valid_ratio == pytest.approx(588 / 600)
     assert filtered.answered_ratio == 1
+
+
+def test_both_fits_are_those_worked_by_hand():
+    # 95 pixels lie at (0, 0), 95 at (10, 5) and 10 outliers at (10, 105). Without the outliers the
+    # slope is 5 / 10. With them the true disparity at 10 is (95 * 5 + 10 * 105) / 105 in the mean.
+    estimated = np.array([0.0] * 95 + [10.0] * 105).reshape(20, 10)
+    true = np.array([0.0] * 95 + [5.0] * 95 + [105.0] * 10).reshape(20, 10)
+    everywhere = np.ones((20, 10), dtype=bool)
+
+    filtered = fit_scale(estimated, true, scored=everywhere, method="filtered")
+    plain = fit_scale(estimated, true, scored=everywhere, method="least_squares")
+
+    assert (filtered.slope, filtered.drift, filtered.outliers) == (pytest.approx(0.5), 0.5, 10)
+    assert plain.slope == pytest.approx(1525 / 1050)
+    assert plain.drift == pytest.approx(475 / 1050)
+    assert (plain.pixels, plain.outliers) == (200, 0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_both_fits_are_those_of_scipy_with_and_without_what_lies_off_the_line(seed):
+    rng = np.random.default_rng(seed)
+    true = rng.uniform(3, 40, SIZE)
+    estimated = (true + 4) / 0.8 + rng.uniform(-0.3, 0.3, SIZE)
+    off = rng.choice(true.size, 60, replace=False)
+    estimated.reshape(-1)[off] += rng.choice([-1, 1], 60) * rng.uniform(20, 90, 60)
+    whole = linregress(estimated.ravel(), true.ravel())
+    inliers = linregress(np.delete(estimated, off), np.delete(true, off))
+
+    filtered = fit_scale(estimated, true, scored=EVERYWHERE, method="filtered")
+    plain = fit_scale(estimated, true, scored=EVERYWHERE, method="least_squares")
+
+    assert plain.slope == pytest.approx(whole.slope, rel=1e-9)
+    assert plain.offset_px == pytest.approx(whole.intercept, rel=1e-9)
+    assert plain.r_squared == pytest.approx(whole.rvalue**2, rel=1e-9)
+    assert filtered.outliers == 60
+    assert filtered.slope == pytest.approx(inliers.slope, rel=1e-9)
+    assert filtered.offset_px == pytest.approx(inliers.intercept, rel=1e-9)
+    assert filtered.drift < 0.21
+    assert plain.drift > 2 * filtered.drift
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -221,7 +261,19 @@ def test_sgbm_is_a_stereo_matcher_and_the_settings_name_the_choices(sgbm):
     assert isinstance(sgbm, StereoMatcher)
     assert settings["matcher"].startswith("SGBM (OpenCV ")
     assert (settings["fit"], settings["disparities"]) == ("theil_sen", 128)
-    assert "median slope" in settings["fit_meaning"]
+    assert "median slope" in settings["sd_theil_sen"]
+    assert settings["sd_least_squares"] == "least squares of all answered pixels"
+    assert "3 robust standard deviations and 1 px" in settings["sd_filtered"]
+    assert "does not state its rule for outliers" in settings["paper"]
+
+
+def test_two_fits_are_reported_whichever_judges_relations(sgbm):
+    by_filter, by_least_squares = (
+        {name for name in scale_settings(sgbm, method=method) if name.startswith("sd_")}
+        for method in ("filtered", "least_squares")
+    )
+
+    assert by_filter == by_least_squares == {"sd_filtered", "sd_least_squares"}
 
 
 def test_pictures_narrower_than_the_search_are_refused():
