@@ -10,6 +10,8 @@ from PIL import Image
 from scipy.stats import linregress
 
 from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.frame_scores import PairScorer, TargetFrame
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
 from stereogenbench_data.evaluation.protocols import StereoMatcher
 from stereogenbench_data.evaluation.scale import fit_scale, scale_settings
 from stereogenbench_data.evaluation.sgbm import Sgbm
@@ -197,6 +199,34 @@ def test_wrong_questions_are_refused(truth):
         fit_scale(truth, truth, scored=EVERYWHERE, method="ransac")
     with pytest.raises(EvaluationError, match=r"\(20, 30\), \(20, 29\) and \(20, 30\)"):
         fit_scale(truth, truth[:, 1:], scored=EVERYWHERE)
+
+
+@pytest.mark.parametrize(("outliers", "filtered", "least_squares"), [(0, 0.5, 0.5), (30, 0.5, 1.0)])
+def test_a_frames_record_has_sd_by_every_fit_of_one_estimate(
+    truth, outliers, filtered, least_squares
+):
+    estimated = 2 * truth
+    estimated.reshape(-1)[:outliers] += 900
+    calls = []
+    tools = Tools(EvaluationProtocol(metrics=("sd",), fit="theil_sen"))
+    tools.stereo_matcher = lambda left, right: calls.append(1) or estimated
+    picture = np.zeros((3, *SIZE), dtype=np.uint8)
+    sample = {
+        "left": picture, "right": picture, "disparity": truth[None], "visible": EVERYWHERE[None],
+    }  # fmt: skip
+    frame = TargetFrame(sample, tools.protocol, None, stored_right=lambda: picture)
+    scorer = PairScorer(tools)
+
+    scorer.add([picture], [frame])
+    columns = scorer.scores().columns
+
+    assert tuple(columns) == tools.protocol.columns
+    assert columns["sd_filtered"] == [pytest.approx(filtered, abs=1e-3)]
+    assert columns["sd_theil_sen"] == [pytest.approx(0.5, abs=0.02)]
+    assert columns["sd_least_squares"] == [pytest.approx(least_squares, abs=0.02)]
+    assert columns["sd_filtered_outliers"] == [outliers / 600]
+    assert columns["sd_least_squares_outliers"] == [0]
+    assert len(calls) == 1
 
 
 @pytest.fixture(scope="module")
