@@ -43,7 +43,12 @@ StereoOption = Annotated[
     typer.Option("--stereo-matcher", help="For SD: sgbm, or foundation-stereo (the paper's)."),
 ]
 FitOption = Annotated[
-    str, typer.Option("--fit", help="For SD: filtered, least_squares or theil_sen.")
+    str,
+    typer.Option(
+        "--fit",
+        help="The fit of SD that relations are judged by: filtered, least_squares or theil_sen. "
+        "Reports always show the first two.",
+    ),
 ]
 WeightsOption = Annotated[
     Path | None,

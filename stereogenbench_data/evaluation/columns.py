@@ -19,6 +19,7 @@ class Column:
         digits: Decimals in tables.
         meaning: What it is, with its unit.
         backend: Which of a protocol's backends it was measured with, "" for none.
+        fit: Of SD, the fit that it is of; "" for what does not depend on one.
     """
 
     label: str
@@ -26,6 +27,33 @@ class Column:
     digits: int
     meaning: str
     backend: Literal["", "keypoint_matcher", "stereo_matcher"] = ""
+    fit: str = ""
+
+
+_SD_FITS: Final = {
+    "filtered": "filtered",
+    "least_squares": "least squares",
+    "theil_sen": "Theil-Sen",
+}
+"""The fits of SD and what tables call them; the first is the one beside the paper's numbers."""
+
+
+def _fit_columns(fit: str) -> dict[str, Column]:
+    """Return what explains SD by one fit."""
+    told: dict[str, tuple[str, int, str]] = {
+        "slope": ("a", 4, "slope of true on found disparity"),
+        "offset_px": ("b", 2, "px; offset of the fit"),
+        "valid": ("fit pixels", 3, "share of pixels in the fit"),
+        "outliers": ("outliers", 3, "share of answered pixels left out of the fit"),
+        "residual_px": ("residual", 2, "px; standard deviation of the residuals"),
+        "r2": ("R2", 3, "share of variance explained"),
+    }
+    return {
+        f"sd_{fit}_{name}": Column(
+            f"{label} {_SD_FITS[fit]}", "neither", digits, meaning, "stereo_matcher", fit
+        )
+        for name, (label, digits, meaning) in told.items()
+    }
 
 
 COLUMNS: Final[dict[str, Column]] = {
@@ -36,7 +64,17 @@ COLUMNS: Final[dict[str, Column]] = {
         "E_match", "lower", 2, "%; change of the set of matched keypoints", "keypoint_matcher"
     ),
     "p_psnr": Column("P-PSNR", "higher", 2, "dB; mean over patches of the best match's"),
-    "sd": Column("SD", "lower", 4, "|slope - 1| of disparity, true on found", "stereo_matcher"),
+    **{
+        f"sd_{fit}": Column(
+            f"SD {words}",
+            "lower",
+            4,
+            "|slope - 1| of disparity, true on found",
+            "stereo_matcher",
+            fit,
+        )
+        for fit, words in _SD_FITS.items()
+    },
     "p_psnr_pooled": Column("P-PSNR pooled", "neither", 2, "dB of the best matches' mean MSE"),
     "p_psnr_ceiling": Column("P-PSNR of target", "neither", 2, "dB; what the rendered view gets"),
     "p_psnr_outside": Column(
@@ -48,19 +86,10 @@ COLUMNS: Final[dict[str, Column]] = {
         "M_pred", "neither", 0, "matches of the prediction", "keypoint_matcher"
     ),
     "common_matches": Column("M_both", "neither", 0, "matches of both", "keypoint_matcher"),
-    "sd_slope": Column("a", "neither", 4, "slope of true on found disparity", "stereo_matcher"),
-    "sd_offset_px": Column("b", "neither", 2, "px; offset of the fit", "stereo_matcher"),
-    "sd_valid": Column("fit pixels", "neither", 3, "share of pixels in the fit", "stereo_matcher"),
     "sd_answered": Column(
         "answered", "neither", 3, "share of visible pixels with a found disparity", "stereo_matcher"
     ),
-    "sd_outliers": Column(
-        "outliers", "neither", 3, "share of answered pixels left out of the fit", "stereo_matcher"
-    ),
-    "sd_residual_px": Column(
-        "residual", "neither", 2, "px; standard deviation of the residuals", "stereo_matcher"
-    ),
-    "sd_r2": Column("R2", "neither", 3, "share of variance explained", "stereo_matcher"),
+    **{name: column for fit in _SD_FITS for name, column in _fit_columns(fit).items()},
 }
 """Columns of frames, headline columns first."""
 
@@ -72,12 +101,16 @@ FRAME_METRICS: Final[dict[str, tuple[str, ...]]] = {
         "e_match", "keypoints", "target_matches", "predicted_matches", "common_matches",
     ),
     "p_psnr": ("p_psnr", "p_psnr_pooled", "p_psnr_ceiling", "p_psnr_outside"),
-    "sd": (
-        "sd", "sd_slope", "sd_offset_px", "sd_valid", "sd_answered", "sd_outliers",
-        "sd_residual_px", "sd_r2",
-    ),
+    "sd": tuple(name for name in COLUMNS if name.startswith("sd_")),
 }  # fmt: skip
-"""The columns of each metric that is computed frame by frame, its headline first."""
+"""The columns of each metric that is computed frame by frame.
+
+The first is the headline: the paper's numbers stand in it. Of SD that is the filtered fit, because
+the paper leaves outliers out, though it does not state by which rule.
+"""
+
+HEAVY_TAILED: Final = frozenset(f"sd_{fit}" for fit in _SD_FITS)
+"""Columns whose mean a few scenes can carry away: their median is shown and judged."""
 
 IMAGE_DISTANCES: Final[dict[str, str]] = {"fid": "inception", "fd-colour": "colour-statistics"}
 """Distances between sets of frames, and the features that each is of."""

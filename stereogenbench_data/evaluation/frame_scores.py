@@ -9,7 +9,6 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.columns import columns_of
 from stereogenbench_data.evaluation.frechet import Spread
 from stereogenbench_data.evaluation.matching import TargetMatches, match_error, target_matches
 from stereogenbench_data.evaluation.patches import PatchScore, outside_window, patch_psnr
@@ -114,9 +113,7 @@ class PairScorer:
         """Begin with no frame."""
         self.fault = ""
         self._tools = tools
-        self._columns: dict[str, list[float]] = {
-            name: [] for name in columns_of(tools.protocol.metrics)
-        }
+        self._columns: dict[str, list[float]] = {name: [] for name in tools.protocol.columns}
         self._predicted: dict[str, Spread] = {}
         self._target: dict[str, Spread] = {}
         self._clip: list[tuple[Any, Any]] = []
@@ -205,22 +202,27 @@ def _e_match(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float
 
 
 def _sd(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float]:
-    fit = fit_scale(
-        tools.stereo_matcher(target.left, picture),
-        target.sample["disparity"][0],
-        scored=target.sample["visible"][0],
-        method=tools.protocol.fit,
-    )
-    return {
-        "sd": fit.drift,
-        "sd_slope": fit.slope,
-        "sd_offset_px": fit.offset_px,
-        "sd_valid": fit.valid_ratio,
-        "sd_answered": fit.answered_ratio,
-        "sd_outliers": fit.outlier_ratio,
-        "sd_residual_px": fit.residual_std_px,
-        "sd_r2": fit.r_squared,
-    }
+    """Return SD by each fit of the protocol, all of one disparity map."""
+    estimated_px = tools.stereo_matcher(target.left, picture)
+    found: dict[str, float] = {}
+    for method in tools.protocol.fits:
+        fit = fit_scale(
+            estimated_px,
+            target.sample["disparity"][0],
+            scored=target.sample["visible"][0],
+            method=method,
+        )
+        found |= {
+            f"sd_{method}": fit.drift,
+            f"sd_{method}_slope": fit.slope,
+            f"sd_{method}_offset_px": fit.offset_px,
+            f"sd_{method}_valid": fit.valid_ratio,
+            f"sd_{method}_outliers": fit.outlier_ratio,
+            f"sd_{method}_residual_px": fit.residual_std_px,
+            f"sd_{method}_r2": fit.r_squared,
+            "sd_answered": fit.answered_ratio,
+        }
+    return found
 
 
 _OF_FRAME: Mapping[str, Any] = {

@@ -7,7 +7,7 @@ refused by the name of what differs.
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Final
@@ -24,7 +24,7 @@ from stereogenbench_data.storage.unfinished import write_whole
 Stamps = Mapping[tuple[str, Pair], str]
 
 STATE_JSON: Final = "evaluation.json"
-_FORMAT: Final = 2
+_FORMAT: Final = 3
 _SCENES: Final = "scenes"
 _ODD: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 
@@ -60,6 +60,13 @@ class PartialResults:
                 f"{folder}: partial results cannot be kept there ({error.strerror or error}). "
                 + cure_of(error, "Choose another folder with --out.")
             ) from error
+        if theirs is not None and theirs.get("format") != _FORMAT:
+            raise EvaluationError(
+                f"{folder}: holds partial results of format {theirs.get('format')}, written by "
+                f"another version of this package, and this one writes format {_FORMAT}: SD by "
+                f"two fits, each in a column of its own. Choose another folder with --out, or "
+                f"remove this one."
+            )
         if theirs is not None and theirs != ours:
             name, there, here = next(_differences(theirs, ours))
             raise EvaluationError(
@@ -112,13 +119,19 @@ class PartialResults:
                 + cure_of(error, "Choose another folder with --out.")
             ) from error
 
-    def is_done(self, scene: str, *, stamps: Stamps) -> bool:
+    def is_done(self, scene: str, *, stamps: Stamps, columns: Collection[str]) -> bool:
         """Return whether a scene was scored with these right views.
 
         What had no usable right view then and has another now is to be scored again.
 
+        Args:
+            scene: The scene's key.
+            stamps: What the right views are told by now.
+            columns: The columns that scores have.
+
         Raises:
-            EvaluationError: If right views that were scored have changed since.
+            EvaluationError: If right views that were scored have changed since, or the scores
+                have other columns.
         """
         document = _read_json(self._path(scene))
         if document is None or document.get("scene") != scene:
@@ -126,6 +139,8 @@ class PartialResults:
         pairs = document["pairs"]
         if pairs.keys() != {_place_name(place) for place in stamps}:
             return False
+        for place in stamps:
+            self._require_columns(scene, place, pairs[_place_name(place)], columns)
         changed = [place for place in stamps if pairs[_place_name(place)]["stamp"] != stamps[place]]
         for place in changed:
             if not pairs[_place_name(place)]["fault"]:
@@ -159,6 +174,24 @@ class PartialResults:
             place: _pair_scores(document["pairs"][_place_name(place)], arrays, _place_name(place))
             for place in places
         }
+
+    def _require_columns(
+        self,
+        scene: str,
+        place: tuple[str, Pair],
+        entry: Mapping[str, Any],
+        columns: Collection[str],
+    ) -> None:
+        """Refuse scores that another version of the package, or another protocol, has made."""
+        odd = sorted(set(entry["columns"]) ^ set(columns))
+        if odd and not entry["fault"]:
+            raise EvaluationError(
+                f"{self._path(scene)}: the scores of {scene}, cameras {pair_name(place[1])} "
+                f"({place[0]}), have other columns than this evaluation: {', '.join(odd[:3])} "
+                f"{'is' if len(odd) == 1 else 'are'} in one of the two alone. They were made by "
+                f"another version or protocol: choose another folder with --out, or remove "
+                f"{self.folder}."
+            )
 
     def _path(self, scene: str) -> Path:
         digest = hashlib.sha256(scene.encode()).hexdigest()[:24]

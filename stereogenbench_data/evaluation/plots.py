@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from stereogenbench_data.errors import ExtraError, StorageError, cure_of
 from stereogenbench_data.evaluation.aggregate import PairMeans, cell, grouped
-from stereogenbench_data.evaluation.columns import COLUMNS
+from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS, HEAVY_TAILED
 from stereogenbench_data.evaluation.reference import reference_rows
 from stereogenbench_data.evaluation.results import CONTROL, Scores, require_comparable
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
@@ -83,18 +83,19 @@ def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
         )  # fmt: skip
         _draw_bins(axes, pairs, column, colour, name=one.name)
     heights = [pair.tallies[column].mean for one in results for pair in _scored(one.pairs, column)]
-    if protocol.is_papers(column):
-        heights += _draw_reference(axes, results, column)
+    metric = {columns[0]: name for name, columns in FRAME_METRICS.items()}.get(column)
+    if metric is not None and protocol.is_papers(column):
+        heights += _draw_reference(axes, results, metric)
     _draw_edges(axes, results)
     better = f"{told.better} is better"
     axes.set_ylabel(f"{protocol.label(column)} ({better})")
     axes.set_xlabel("baseline in cm")
     # Intervals of few scenes may reach far beyond all that was seen: they are cut off.
     low, high = min(heights), max(heights)
-    if column == "sd" and high > _LINEAR_SD:
+    if column in HEAVY_TAILED and high > _LINEAR_SD:
         axes.set_yscale("symlog", linthresh=0.1)
     margin = (high - low) * _MARGIN or _MARGIN
-    axes.set_ylim(0 if column == "sd" else low - margin, high + margin)
+    axes.set_ylim(0 if column in HEAVY_TAILED else low - margin, high + margin)
     tier = "calibration controls" if results[0].tier == CONTROL else f"tier {results[0].tier}"
     axes.set_title(f"{protocol.label(column)} by baseline, {tier}", fontsize=11)
     axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
@@ -134,7 +135,7 @@ def _draw_bins(
     )  # fmt: skip
 
 
-def _draw_reference(axes: Any, results: Sequence[Scores], column: str) -> list[float]:
+def _draw_reference(axes: Any, results: Sequence[Scores], metric: str) -> list[float]:
     """Draw the paper's bins of the tier, where Uniform scenes are among those scored.
 
     Returns:
@@ -150,11 +151,11 @@ def _draw_reference(axes: Any, results: Sequence[Scores], column: str) -> list[f
         found = [row for row in rows if row["method"] == method]
         middles = [sum(BASELINE_BINS[row["baseline_bin_cm"]]) / 2 for row in found]
         axes.plot(
-            middles, [float(row[column]) for row in found], color="#777777", linewidth=0.9,
+            middles, [float(row[metric]) for row in found], color="#777777", linewidth=0.9,
             linestyle=("--", ":", "-.")[number % 3], marker="sDv^<>"[number % 6], markersize=3,
             label=f"{method} (paper, Uniform)",
         )  # fmt: skip
-    return [float(row[column]) for row in rows]
+    return [float(row[metric]) for row in rows]
 
 
 def _draw_edges(axes: Any, results: Sequence[Scores]) -> None:

@@ -20,6 +20,7 @@ from stereogenbench_data.evaluation.columns import (
     IMAGE_DISTANCES,
     OFFLINE_METRICS,
     VIDEO_DISTANCES,
+    columns_of,
     require_metrics,
 )
 from stereogenbench_data.evaluation.matching import match_settings
@@ -32,7 +33,7 @@ from stereogenbench_data.evaluation.protocols import (
     StereoMatcher,
     VideoFeatures,
 )
-from stereogenbench_data.evaluation.scale import FitMethod, scale_settings
+from stereogenbench_data.evaluation.scale import FitMethod, fits_of, require_fit, scale_settings
 from stereogenbench_data.schema.records import DepthEncoding
 
 PAPER_SIZE: Final = (480, 832)
@@ -60,7 +61,8 @@ class EvaluationProtocol:
         size: (height, width) in pixels at which everything is scored.
         keypoint_matcher: What finds the matches of E_match.
         stereo_matcher: What finds the disparity of SD.
-        fit: How SD's line is fitted.
+        fit: The fit of SD by which relations between controls are judged. Every report shows SD
+            "filtered" and by "least_squares", whatever this is, and "theil_sen" if it is that.
         depth: A depth contract instead of the one that files and release state.
         where: Where learned parts run and where their weights are.
         batch_frames: How many frames are held, and given to learned parts, at a time.
@@ -78,6 +80,7 @@ class EvaluationProtocol:
     def __post_init__(self) -> None:
         """Put metrics in order, and refuse what cannot be."""
         object.__setattr__(self, "metrics", require_metrics(self.metrics))
+        require_fit(self.fit)
         if self.batch_frames < 1:
             raise EvaluationError(f"batch_frames must be at least 1, got {self.batch_frames}.")
 
@@ -92,6 +95,17 @@ class EvaluationProtocol:
         if "sd" in self.metrics:
             needed.append("visible")
         return tuple(needed)
+
+    @property
+    def fits(self) -> tuple[FitMethod, ...]:
+        """The fits that SD is computed by."""
+        return fits_of(self.fit)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of every frame, in the order of `COLUMNS`."""
+        fits = ("", *self.fits)
+        return tuple(name for name in columns_of(self.metrics) if COLUMNS[name].fit in fits)
 
     def label(self, column: str) -> str:
         """Return what tables call a column: with the backend, where it is not the paper's."""

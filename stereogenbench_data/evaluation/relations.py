@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from stereogenbench_data.evaluation.aggregate import cell
-from stereogenbench_data.evaluation.columns import COLUMNS
+from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
 from stereogenbench_data.evaluation.controls import (
     COPIED_LEFT,
     RANDOM_RIGHT,
@@ -61,8 +61,9 @@ def relations(results: Sequence[Scores]) -> list[Relation]:
         judged.append(_of("e_match", copied, "is above 0", lambda mean: mean > 0))
         judged.append(_ordered("e_match", [target, copied, wrong], below=[random]))
     if "sd" in metrics:
-        judged.append(_ordered("sd", [target], below=[copied]))
-        judged.append(_ordered("sd", [target], below=[wrong]))
+        sd = f"sd_{target.protocol.fit}"
+        judged.append(_ordered(sd, [target], below=[copied]))
+        judged.append(_ordered(sd, [target], below=[wrong]))
         judged.append(_slope(wrong))
     return judged
 
@@ -100,40 +101,41 @@ def _ordered(column: str, lower: Sequence[Scores], *, below: Sequence[Scores]) -
 
 def _slope(wrong: Scores) -> Relation:
     """Judge whether the wrong camera's disparity is too large by the ratio of the baselines."""
+    sd = f"sd_{wrong.protocol.fit}"
+    what = (
+        f"the slope {_label(f'{sd}_slope')} of {WRONG_BASELINE} is the ratio of the two baselines"
+    )
     expected = []
     for pair in wrong.pairs:
         rig = wrong.index.scene(pair.row).rig
         other = rig.baseline_cm(pair.pair[0], wrong_camera(*pair.pair))
         expected.append(pair.baseline_cm / other)
-    found = [pair.tallies["sd_slope"] for pair in wrong.pairs]
-    explained = [pair.tallies["sd_r2"] for pair in wrong.pairs]
+    found = [pair.tallies[f"{sd}_slope"] for pair in wrong.pairs]
+    explained = [pair.tallies[f"{sd}_r2"] for pair in wrong.pairs]
     off = sorted(
         abs(slope.mean - ratio)
         for slope, r2, ratio in zip(found, explained, expected, strict=True)
         if slope.finite and r2.mean >= _TRUSTED_R2
     )
     if not off:
-        return Relation(_SLOPE_TOLD, None, "no fit explains enough of the variance")
+        return Relation(what, None, "no fit explains enough of the variance")
     middle = off[len(off) // 2]
     return Relation(
-        _SLOPE_TOLD,
+        what,
         middle <= _SLOPE_TOLERANCE,
         f"off by {middle:.3f} in the middle of {len(off)} pairs, {off[-1]:.3f} at most",
     )
 
 
-_SLOPE_TOLD: Final = f"the slope a of {WRONG_BASELINE} is the ratio of the two baselines"
-
-
 def _middle(column: str, one: Scores) -> float | None:
     """Return the mean over scenes; of SD, whose tail is heavy, the median."""
     found = cell(one.pairs, column)
-    return found.median if column == "sd" else found.mean
+    return found.median if column in HEAVY_TAILED else found.mean
 
 
 def _label(column: str) -> str:
     label = COLUMNS[column].label
-    return f"median {label}" if column == "sd" else label
+    return f"median {label}" if column in HEAVY_TAILED else label
 
 
 def _told(column: str, sides: Sequence[Scores]) -> str:

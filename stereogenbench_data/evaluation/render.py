@@ -8,14 +8,12 @@ from dataclasses import asdict
 from typing import Any, Final
 
 from stereogenbench_data.evaluation.aggregate import Cell
-from stereogenbench_data.evaluation.columns import COLUMNS
+from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
 from stereogenbench_data.evaluation.frechet import FrechetDistance
 from stereogenbench_data.evaluation.table_rows import Row, Table
 from stereogenbench_data.schema.problems import markdown_text
 
 ABSENT: Final = "-"
-_HEAVY_TAILED: Final = frozenset({"sd"})
-"""Columns whose mean a few scenes can carry away: their median is shown beside it."""
 _ARROWS: Final = {"higher": "↑", "lower": "↓", "neither": ""}
 _LATEX: Final = {
     "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
@@ -91,7 +89,7 @@ def heading(table: Table, column: str) -> str:
     """Return the head of a column: its name, what it was measured with, which way is better."""
     if column not in COLUMNS:
         return f"{_distance_label(column)}↓"
-    median = " [median]" if column in _HEAVY_TAILED else ""
+    median = " [median]" if column in HEAVY_TAILED else ""
     return f"{table.protocol.label(column)}{_ARROWS[COLUMNS[column].better]}{median}"
 
 
@@ -137,7 +135,7 @@ def _number_text(found: Cell, column: str) -> str:
     text = f"{found.mean:.{digits}f}"
     if found.ci95 is not None:
         text += f" ± {found.ci95:.{digits}f}"
-    if column in _HEAVY_TAILED:
+    if column in HEAVY_TAILED:
         text += f" [{found.median:.{digits}f}]"
     left_out = [
         f"{count} {what}"

@@ -21,7 +21,7 @@ from stereogenbench_data.storage.unfinished import write_whole
 
 Verdict = Mapping[bool | None, str]
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 _GAPS_TOLD: Final = 20
 _VERDICTS: Final[Verdict] = {True: "holds", False: "DOES NOT HOLD", None: "cannot be told"}
 

@@ -132,7 +132,7 @@ def score_all(extent: Extent, run: Run, *, partial: PartialResults, progress: Pr
             for candidate in run.candidates
             for each in pairs
         }
-        if partial.is_done(scene, stamps=stamps[scene]):
+        if partial.is_done(scene, stamps=stamps[scene], columns=run.protocol.columns):
             done += sum(len(each.frames) for each in pairs)
             faults.extend(partial.faults(scene))
             continue

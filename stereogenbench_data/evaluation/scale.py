@@ -19,6 +19,21 @@ _FEWEST_SHARE: Final = 0.01
 _MEDIAN_PIXELS: Final = 20_000
 """Of about how many pixels, evenly spaced in reading order, medians are taken for the fit."""
 
+REPORTED_FITS: Final[tuple[FitMethod, ...]] = ("filtered", "least_squares")
+"""The fits that every report shows, because SD depends on the choice and the paper leaves it open.
+
+The first stands beside the paper's numbers.
+"""
+
+SD_OF_THE_PAPER: Final = (
+    "the paper fits after 'outlier and occlusion filtering' and does not state its rule for "
+    "outliers. SD depends on that rule, by a factor of two and more where the matcher errs, so "
+    "two fits are reported: 'SD filtered' leaves out outliers by this package's own rule, 'SD "
+    "least squares' leaves out none. The paper's numbers stand in 'SD filtered', because the "
+    "paper leaves outliers out; a difference as large as that of the two fits may be the rule's"
+)
+"""What to know when SD is compared with the paper's."""
+
 _METHODS: Final[dict[FitMethod, str]] = {
     "least_squares": "least squares of all answered pixels",
     "theil_sen": "median slope of half-range pairs (Theil's incomplete method) of every n-th "
@@ -86,8 +101,7 @@ def fit_scale(
     Raises:
         EvaluationError: If the maps differ in size, or there is no such method.
     """
-    if method not in _METHODS:
-        raise EvaluationError(f"fit method must be one of {', '.join(_METHODS)}, got {method!r}.")
+    require_fit(method)
     if not estimated_px.shape == true_px.shape == scored.shape:
         raise EvaluationError(
             "estimated disparity, true disparity and where to score must be of one size, "
@@ -116,12 +130,34 @@ def fit_scale(
     return _fitted(estimated, true, None if reason else kept, scored=scored, reason=reason)
 
 
+def require_fit(method: str) -> None:
+    """Refuse a fit method that does not exist.
+
+    Raises:
+        EvaluationError: Naming those that do.
+    """
+    if method not in _METHODS:
+        raise EvaluationError(f"fit method must be one of {', '.join(_METHODS)}, got {method!r}.")
+
+
+def fits_of(method: FitMethod) -> tuple[FitMethod, ...]:
+    """Return the fits that are reported where relations are judged by the given one."""
+    return tuple(dict.fromkeys((*REPORTED_FITS, method)))
+
+
 def scale_settings(matcher: StereoMatcher, *, method: FitMethod = "filtered") -> Settings:
-    """Return every choice that SD depends on."""
+    """Return every choice that SD depends on, and what each of its columns is.
+
+    Args:
+        matcher: What finds the disparity.
+        method: The fit that relations between the controls are judged by, "fit" of the settings.
+    """
     return {
         "matcher": matcher.name,
         "fit": method,
-        "fit_meaning": _METHODS[method],
+        **{f"sd_{each}": _METHODS[each] for each in fits_of(method)},
+        "paper": SD_OF_THE_PAPER,
+        "occlusion": "pixels that the right camera does not see are not scored, by true depth",
         "direction": "true over estimated disparity",
         "fewest_pixels": _FEWEST_PIXELS,
         "fewest_share": _FEWEST_SHARE,

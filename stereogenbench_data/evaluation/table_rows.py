@@ -9,6 +9,7 @@ from stereogenbench_data.evaluation.frechet import FrechetDistance
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
 from stereogenbench_data.evaluation.reference import TableName, reference_table
 from stereogenbench_data.evaluation.results import Labels, Scores
+from stereogenbench_data.evaluation.scale import SD_OF_THE_PAPER
 from stereogenbench_data.schema.release import FRAME_COUNT
 
 _SOURCES: Mapping[str, tuple[TableName, ...]] = {
@@ -78,7 +79,8 @@ def paper_row(row: Mapping[str, str], labels: Labels) -> Row:
         value = row.get(name, "")
         if value:
             interval = row.get(f"{name}_ci95", "")
-            printed[name] = f"{value} ± {interval}" if interval else value
+            headline = FRAME_METRICS.get(name, (name,))[0]
+            printed[headline] = f"{value} ± {interval}" if interval else value
     return Row(
         method=f"{row.get('method') or row['control']} (paper)",
         labels=labels,
@@ -94,13 +96,17 @@ def notes_of(
     """Return what to know when reading a table: sources, and what is not comparable."""
     protocol = results[0].protocol
     notes = []
+    if any(COLUMNS[column].fit for column in columns if column in COLUMNS):
+        notes.append(f"SD: {SD_OF_THE_PAPER}.")
     if any(row.is_papers for row in rows):
         sources = "; ".join(reference_table(each).source for each in _SOURCES[name])
         notes.append(f"Rows of the paper as printed: {sources}.")
         others = [
             protocol.label(column)
             for column in columns
-            if column in COLUMNS and not protocol.is_papers(column)
+            if any(column in row.printed for row in rows)
+            and column in COLUMNS
+            and not protocol.is_papers(column)
         ]
         if others:
             notes.append(

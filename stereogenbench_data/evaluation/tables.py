@@ -8,7 +8,7 @@ from typing import Final, Literal
 
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.aggregate import PairMeans, cell, grouped, strata
-from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS
+from stereogenbench_data.evaluation.columns import COLUMNS
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.evaluation.reference import reference_rows
 from stereogenbench_data.evaluation.results import CONTROL, Labels, Scores, require_comparable
@@ -207,11 +207,10 @@ def _row(
 def _frame_columns(
     protocol: EvaluationProtocol, *, headline: Literal["yes", "no"]
 ) -> tuple[str, ...]:
-    filled = {column for name in protocol.metrics for column in FRAME_METRICS.get(name, ())}
     return tuple(
         name
-        for name, column in COLUMNS.items()
-        if name in filled and (column.better != "neither") == (headline == "yes")
+        for name in protocol.columns
+        if (COLUMNS[name].better != "neither") == (headline == "yes")
     )
 
 

@@ -1,7 +1,10 @@
 """Calibration controls: what each shows, and the relations that must hold between them."""
 
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,7 +13,10 @@ from stereogenbench_data import EvaluationError, EvaluationProtocol, score_contr
 from stereogenbench_data.evaluation.aggregate import cell
 from stereogenbench_data.evaluation.controls import CONTROLS, derangement, wrong_camera
 from stereogenbench_data.evaluation.relations import relations
+from stereogenbench_data.evaluation.sgbm import Sgbm
+from stereogenbench_data.samples.load import Request, SampleLoader
 from stereogenbench_data.schema.release import CAMERA_PAIRS
+from stereogenbench_data.selection.plan import Address
 from tests.evaluation.conftest import SIZE
 from tests.evaluation.test_evaluate import numbers, scored
 
@@ -67,7 +73,48 @@ def test_the_targets_scores_are_those_of_identity(on_the_sample):
     assert cell(target.pairs, "psnr").mean is None
     assert cell(target.pairs, "ssim").mean == pytest.approx(1, abs=1e-12)
     assert cell(target.pairs, "e_match").mean == 0
-    assert cell(target.pairs, "sd").median < 0.2
+    assert cell(target.pairs, "sd_filtered").median < 0.2
+
+
+def test_both_fits_of_a_frame_are_of_the_one_disparity_that_the_matcher_found(on_the_sample):
+    target = on_the_sample[0]
+    request = Request(
+        kind="pairs", fields=("left", "right", "disparity", "visible"), layout="single",
+        size=(240, 416),
+    )  # fmt: skip
+    for pair in target.pairs:
+        with closing(SampleLoader(target.index, request)) as loader:
+            address = Address(pair.row, pair.pair[0], (pair.pair[1],), (0,))
+            sample = loader.load(address, clip="frame", generator=np.random.default_rng(0))
+        found, true = Sgbm()(sample["left"], sample["right"]), sample["disparity"][0]
+        used = sample["visible"][0] & np.isfinite(found) & np.isfinite(true)
+        slope, offset = np.polyfit(found[used].astype(float), true[used].astype(float), 1)
+        numbers = {name: each.mean for name, each in pair.tallies.items()}
+
+        assert numbers["sd_least_squares"] == pytest.approx(abs(slope - 1), rel=1e-6)
+        assert numbers["sd_least_squares_slope"] == pytest.approx(slope, rel=1e-6)
+        assert numbers["sd_least_squares_offset_px"] == pytest.approx(offset, rel=1e-6)
+        assert numbers["sd_least_squares_outliers"] == 0
+        assert numbers["sd_filtered"] == abs(numbers["sd_filtered_slope"] - 1)
+        assert 0 < numbers["sd_filtered_outliers"] < 0.5
+        assert numbers["sd_filtered"] != pytest.approx(numbers["sd_least_squares"], rel=0.1)
+
+
+def test_relations_name_the_fit_that_they_are_judged_by(on_the_sample):
+    judged = [each.what for each in relations(on_the_sample) if "SD" in each.what]
+    slope = relations(on_the_sample)[-1].what
+    by_least_squares = [
+        replace(one, protocol=replace(one.protocol, fit="least_squares")) for one in on_the_sample
+    ]
+
+    assert judged == [
+        "median SD filtered of rendered target is below that of copied left",
+        "median SD filtered of rendered target is below that of wrong baseline",
+    ]
+    assert slope == "the slope a filtered of wrong baseline is the ratio of the two baselines"
+    assert "median SD least squares" in relations(by_least_squares)[-2].what
+    assert "the slope a least squares" in relations(by_least_squares)[-1].what
+    assert relations(by_least_squares)[-2].found != relations(on_the_sample)[-2].found
 
 
 def test_a_copied_lefts_match_error_is_what_the_formula_gives(on_the_sample):

@@ -303,6 +303,37 @@ def test_results_of_another_evaluation_are_refused_by_what_differs(
         scored(scored_index, right_views, **(options | change), out=tmp_path)
 
 
+def test_partial_results_of_an_earlier_version_are_refused_by_their_format(
+    scored_index, right_views, protocol, tmp_path
+):
+    scored(scored_index, right_views, protocol, out=tmp_path)
+    state = tmp_path / "evaluation.json"
+    state.write_text(json.dumps(json.loads(state.read_text()) | {"format": 2}))
+
+    with pytest.raises(
+        EvaluationError, match=r"partial results of format 2, .* writes format 3: SD"
+    ):
+        scored(scored_index, right_views, protocol, out=tmp_path)
+
+
+def test_a_scene_whose_scores_have_other_columns_is_refused_by_name(
+    scored_index, right_views, protocol, tmp_path
+):
+    scored(scored_index, right_views, protocol, out=tmp_path)
+    path = sorted((tmp_path / "scenes").glob("*.json"))[0]
+    document = json.loads(path.read_text())
+    (entry,) = document["pairs"].values()
+    entry["columns"]["sd"] = entry["columns"].pop("ssim")
+    path.write_text(json.dumps(document))
+
+    with pytest.raises(
+        EvaluationError,
+        match=rf"{path.name}: the scores of {document['scene']}, cameras 00-01 .* have other "
+        r"columns than this evaluation: sd, ssim are in one of the two alone",
+    ):
+        scored(scored_index, right_views, protocol, out=tmp_path)
+
+
 def test_results_of_other_predictions_are_refused(
     scored_index, right_views, copied, protocol, tmp_path
 ):

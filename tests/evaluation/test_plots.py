@@ -1,12 +1,15 @@
 """Plots: one of each metric that has numbers, of one tier alone."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol, score_controls
+from stereogenbench_data.evaluation import plots
+from stereogenbench_data.evaluation.aggregate import tally
 from stereogenbench_data.evaluation.plots import write_plots
 from tests.evaluation.conftest import SIZE
 from tests.evaluation.test_evaluate import scored
@@ -35,6 +38,34 @@ def test_a_metric_without_a_finite_number_has_no_plot(results, tmp_path):
     files = write_plots(tmp_path, results[:1])
 
     assert "psnr_by_baseline.png" not in [path.name for path in files]
+
+
+def test_the_papers_sd_is_drawn_beside_the_filtered_fit_alone(results, tmp_path, monkeypatch):
+    protocol = EvaluationProtocol(metrics=("sd",), size=SIZE, stereo_matcher="foundation-stereo")
+    with_sd = [
+        replace(
+            one,
+            protocol=protocol,
+            pairs=tuple(
+                replace(
+                    pair,
+                    tallies={"sd_filtered": tally([0.2]), "sd_least_squares": tally([0.4])},
+                )
+                for pair in one.pairs
+            ),
+        )
+        for one in results
+    ]
+    drawn = []
+    monkeypatch.setattr(
+        plots, "_draw_reference", lambda axes, results, metric: drawn.append(metric) or []
+    )
+    files = write_plots(tmp_path, with_sd)
+
+    assert [path.name for path in files] == [
+        "sd_filtered_by_baseline.png", "sd_least_squares_by_baseline.png",
+    ]  # fmt: skip
+    assert drawn == ["sd"]
 
 
 def test_methods_of_two_tiers_are_not_drawn_together(scored_index, tmp_path, protocol):

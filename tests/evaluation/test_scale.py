@@ -7,8 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
+from scipy.stats import linregress
 
 from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.frame_scores import PairScorer, TargetFrame
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
 from stereogenbench_data.evaluation.protocols import StereoMatcher
 from stereogenbench_data.evaluation.scale import fit_scale, scale_settings
 from stereogenbench_data.evaluation.sgbm import Sgbm
@@ -77,6 +80,45 @@ def test_few_gross_outliers_ruin_least_squares_and_are_left_out_by_the_filter(tr
     assert filtered.outlier_ratio == 12 / 600
     assert filtered.valid_ratio == pytest.approx(588 / 600)
     assert filtered.answered_ratio == 1
+
+
+def test_both_fits_are_those_worked_by_hand():
+    # 95 pixels lie at (0, 0), 95 at (10, 5) and 10 outliers at (10, 105). Without the outliers the
+    # slope is 5 / 10. With them the true disparity at 10 is (95 * 5 + 10 * 105) / 105 in the mean.
+    estimated = np.array([0.0] * 95 + [10.0] * 105).reshape(20, 10)
+    true = np.array([0.0] * 95 + [5.0] * 95 + [105.0] * 10).reshape(20, 10)
+    everywhere = np.ones((20, 10), dtype=bool)
+
+    filtered = fit_scale(estimated, true, scored=everywhere, method="filtered")
+    plain = fit_scale(estimated, true, scored=everywhere, method="least_squares")
+
+    assert (filtered.slope, filtered.drift, filtered.outliers) == (pytest.approx(0.5), 0.5, 10)
+    assert plain.slope == pytest.approx(1525 / 1050)
+    assert plain.drift == pytest.approx(475 / 1050)
+    assert (plain.pixels, plain.outliers) == (200, 0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_both_fits_are_those_of_scipy_with_and_without_what_lies_off_the_line(seed):
+    rng = np.random.default_rng(seed)
+    true = rng.uniform(3, 40, SIZE)
+    estimated = (true + 4) / 0.8 + rng.uniform(-0.3, 0.3, SIZE)
+    off = rng.choice(true.size, 60, replace=False)
+    estimated.reshape(-1)[off] += rng.choice([-1, 1], 60) * rng.uniform(20, 90, 60)
+    whole = linregress(estimated.ravel(), true.ravel())
+    inliers = linregress(np.delete(estimated, off), np.delete(true, off))
+
+    filtered = fit_scale(estimated, true, scored=EVERYWHERE, method="filtered")
+    plain = fit_scale(estimated, true, scored=EVERYWHERE, method="least_squares")
+
+    assert plain.slope == pytest.approx(whole.slope, rel=1e-9)
+    assert plain.offset_px == pytest.approx(whole.intercept, rel=1e-9)
+    assert plain.r_squared == pytest.approx(whole.rvalue**2, rel=1e-9)
+    assert filtered.outliers == 60
+    assert filtered.slope == pytest.approx(inliers.slope, rel=1e-9)
+    assert filtered.offset_px == pytest.approx(inliers.intercept, rel=1e-9)
+    assert filtered.drift < 0.21
+    assert plain.drift > 2 * filtered.drift
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -159,6 +201,34 @@ def test_wrong_questions_are_refused(truth):
         fit_scale(truth, truth[:, 1:], scored=EVERYWHERE)
 
 
+@pytest.mark.parametrize(("outliers", "filtered", "least_squares"), [(0, 0.5, 0.5), (30, 0.5, 1.0)])
+def test_a_frames_record_has_sd_by_every_fit_of_one_estimate(
+    truth, outliers, filtered, least_squares
+):
+    estimated = 2 * truth
+    estimated.reshape(-1)[:outliers] += 900
+    calls = []
+    tools = Tools(EvaluationProtocol(metrics=("sd",), fit="theil_sen"))
+    tools.stereo_matcher = lambda left, right: calls.append(1) or estimated
+    picture = np.zeros((3, *SIZE), dtype=np.uint8)
+    sample = {
+        "left": picture, "right": picture, "disparity": truth[None], "visible": EVERYWHERE[None],
+    }  # fmt: skip
+    frame = TargetFrame(sample, tools.protocol, None, stored_right=lambda: picture)
+    scorer = PairScorer(tools)
+
+    scorer.add([picture], [frame])
+    columns = scorer.scores().columns
+
+    assert tuple(columns) == tools.protocol.columns
+    assert columns["sd_filtered"] == [pytest.approx(filtered, abs=1e-3)]
+    assert columns["sd_theil_sen"] == [pytest.approx(0.5, abs=0.02)]
+    assert columns["sd_least_squares"] == [pytest.approx(least_squares, abs=0.02)]
+    assert columns["sd_filtered_outliers"] == [outliers / 600]
+    assert columns["sd_least_squares_outliers"] == [0]
+    assert len(calls) == 1
+
+
 @pytest.fixture(scope="module")
 def cloth(ground_truth):
     def read(name):
@@ -221,7 +291,19 @@ def test_sgbm_is_a_stereo_matcher_and_the_settings_name_the_choices(sgbm):
     assert isinstance(sgbm, StereoMatcher)
     assert settings["matcher"].startswith("SGBM (OpenCV ")
     assert (settings["fit"], settings["disparities"]) == ("theil_sen", 128)
-    assert "median slope" in settings["fit_meaning"]
+    assert "median slope" in settings["sd_theil_sen"]
+    assert settings["sd_least_squares"] == "least squares of all answered pixels"
+    assert "3 robust standard deviations and 1 px" in settings["sd_filtered"]
+    assert "does not state its rule for outliers" in settings["paper"]
+
+
+def test_two_fits_are_reported_whichever_judges_relations(sgbm):
+    by_filter, by_least_squares = (
+        {name for name in scale_settings(sgbm, method=method) if name.startswith("sd_")}
+        for method in ("filtered", "least_squares")
+    )
+
+    assert by_filter == by_least_squares == {"sd_filtered", "sd_least_squares"}
 
 
 def test_pictures_narrower_than_the_search_are_refused():

@@ -27,7 +27,13 @@ def scores(scored_index):
         pairs = []
         for row, frames in enumerate((*psnr, (8, 8))):
             scene = scored_index.scene(min(row, 2))
-            columns = {"psnr": frames, "ssim": (0.5, 0.75), "sd": (0.25, 0.75), "e_match": (1, NAN)}
+            columns = {
+                "psnr": frames,
+                "ssim": (0.5, 0.75),
+                "e_match": (1, NAN),
+                "sd_filtered": (0.25, 0.75),
+                "sd_least_squares": (0.5, 1.5),
+            }
             pairs.append(
                 PairMeans(
                     row=min(row, 2), scene=scene.id.key, pair=(0, 1) if row < 3 else (0, 5),
@@ -105,7 +111,8 @@ def test_what_is_not_comparable_with_the_paper_is_said(scores):
     text = markdown(table)
 
     assert "E_match (sift)↓" in text
-    assert "SD (sgbm)↓" in text
+    assert "SD filtered (sgbm)↓" in text
+    assert "SD least squares (sgbm)↓" in text
     assert "43.85 †" in text
     assert "The paper scores at 832x480, this at 416x240: not comparable" in text
     assert "The paper scores 81 frames a scene, this 2." in text
@@ -131,6 +138,75 @@ def test_the_median_of_sd_stands_beside_its_mean(scores):
     text = markdown(branch_table([scores()]))
 
     assert "0.5000 ± 0.0000 [0.5000]" in text
+    assert "1.0000 ± 0.0000 [1.0000]" in text
+
+
+@pytest.mark.parametrize("fit", ["filtered", "least_squares"])
+def test_the_papers_sd_stands_in_the_filtered_column_alone(scores, fit):
+    protocol = EvaluationProtocol(stereo_matcher="foundation-stereo", fit=fit)
+    table = branch_table([scores(tier="G1", protocol=protocol)])
+    paper = next(row for row in table.rows if row.is_papers)
+    lines = markdown(table).splitlines()
+    head = [each.strip() for each in lines[2].split("|")]
+    line = next(each for each in lines if "StereoSpace (paper)" in each and "seen_map" in each)
+    cells = dict(zip(head, (each.strip() for each in line.split("|")), strict=True))
+
+    assert paper.printed["sd_filtered"] == "0.3951"
+    assert cells["SD filtered↓ [median]"] == "0.3951"
+    assert cells["SD least squares↓ [median]"] == "-"
+
+
+def test_theil_sens_sd_is_a_third_column_where_it_is_asked_for(scores):
+    asked = branch_table([scores(protocol=EvaluationProtocol(fit="theil_sen"))])
+    plain = branch_table([scores()])
+
+    assert [name for name in asked.columns if name.startswith("sd")] == [
+        "sd_filtered", "sd_least_squares", "sd_theil_sen",
+    ]  # fmt: skip
+    assert [name for name in plain.columns if name.startswith("sd")] == [
+        "sd_filtered", "sd_least_squares",
+    ]  # fmt: skip
+
+
+def test_methods_of_two_fits_do_not_share_a_table(scores):
+    other = EvaluationProtocol(fit="least_squares")
+
+    with pytest.raises(EvaluationError, match="their protocol differs"):
+        tables_of([scores("one"), scores("two", protocol=other)])
+
+
+def test_every_form_of_a_report_has_sd_by_both_fits_and_says_why(scores, tmp_path):
+    one = scores()
+    files = {path.name: path for path in write_report(tmp_path, [one], tables_of([one]))}
+    texts = {name: path.read_text() for name, path in files.items() if path.suffix != ".png"}
+    told = json.loads(texts["results.json"])
+    head = texts["pairs.csv"].partition("\n")[0].split(",")
+
+    assert {"sd_filtered", "sd_least_squares"} <= set(head)
+    assert "sd" not in head
+    for table in told["tables"][:3]:
+        assert table["columns"]["sd_filtered"] == "SD filtered (sgbm)↓ [median]"
+        assert table["columns"]["sd_least_squares"] == "SD least squares (sgbm)↓ [median]"
+        cells = table["rows"][0]["cells"]
+        assert (cells["sd_filtered"]["mean"], cells["sd_least_squares"]["mean"]) == (0.5, 1)
+        assert any("does not state its rule for outliers" in note for note in table["notes"])
+    for name in ("report.md", "tables.tex", "tables.csv"):
+        assert "SD filtered" in texts[name]
+        assert "SD least squares" in texts[name]
+    for name in ("report.md", "tables.tex"):
+        assert "does not state its rule for outliers" in texts[name]
+    assert {"sd_filtered_by_baseline.png", "sd_least_squares_by_baseline.png"} <= set(files)
+
+
+def test_a_table_without_sd_has_no_note_on_its_fits(scores):
+    protocol = EvaluationProtocol(metrics=("psnr", "ssim"))
+
+    assert "rule for outliers" not in markdown(branch_table([scores(protocol=protocol)]))
+
+
+def test_an_unknown_fit_is_refused_when_the_protocol_is_made():
+    with pytest.raises(EvaluationError, match=r"fit method must be one of .* got 'ransac'"):
+        EvaluationProtocol(fit="ransac")
 
 
 def test_a_gap_is_a_column_of_the_table(scores):
