@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.geometry.arrays import take_flat
 from stereogenbench_data.geometry.disparity import (
     disparity_error_px,
     disparity_from_depth,
@@ -17,6 +18,7 @@ from stereogenbench_data.geometry.disparity import (
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.projection import (
     Projection,
+    landing_pixels,
     project_rectified,
     project_through_poses,
 )
@@ -207,7 +209,7 @@ class PairGeometry:
             measured=self.stored.measured,
             quantum_m=self.quantum_m(self._encoding),
         )
-        return visible
+        return self._shown_in_both(visible)
 
     def visible(self, target: "PairGeometry") -> MapBool:
         """Return what is visible in the target, by the depth of the target's own geometry."""
@@ -218,13 +220,26 @@ class PairGeometry:
             target_measured=target.stored.measured,
             quantum_m=self.quantum_m(self._facts.encodings[self._target]),
         )
-        return visible
+        return self._shown_in_both(visible)
+
+    def _shown_in_both(self, visible: MapBool) -> MapBool:
+        """Return what is visible, where both pictures show what their cameras saw."""
+        here, there = self._views.unseen(self._source), self._views.unseen(self._target)
+        if there is not None:
+            height_px, width_px = there.shape
+            _, pixel = landing_pixels(self.projection, height_px=height_px, width_px=width_px)
+            visible = visible & ~take_flat(np.broadcast_to(there, visible.shape), pixel)
+        return visible if here is None else visible & ~here
 
     @cached_property
     def splatted(self) -> tuple[Any, MapBool]:
         """The source picture in the target's view, and the holes in it."""
-        pictures = self._views.pictures[self._source]
-        return splat(pictures, self.projection, measured=self.stored.measured)
+        return self._splat(self._views.pictures[self._source])
+
+    def _splat(self, pictures: Any) -> tuple[Any, MapBool]:
+        warped, hole = splat(pictures, self.projection, measured=self.stored.measured)
+        padded = self._views.padded
+        return (warped, hole) if padded is None else (warped * ~padded, hole | padded)
 
     @cached_property
     def hole(self) -> MapBool:
@@ -232,8 +247,7 @@ class PairGeometry:
         if self._source in self._views.pictures:
             return self.splatted[1]
         blank = np.zeros((len(self.depth_m), 1, *self.depth_m.shape[-2:]), dtype=np.uint8)
-        hole: MapBool = splat(blank, self.projection, measured=self.stored.measured)[1]
-        return hole
+        return self._splat(blank)[1]
 
 
 def _as_seen(transforms: Motions, views: Views) -> Motions:

@@ -2,8 +2,9 @@
 
 Each maps `Views` to `Views` with the random numbers of one sample, so the same seed gives the same
 sample in whatever process it is made. Pictures are averaged when they shrink; stored depth takes
-the nearest pixel centre, never a mixture of two depths. Every frame and camera of a sample is
-treated alike, but where a docstring says otherwise.
+the nearest pixel centre, never a mixture of two depths. A pixel that was averaged with padding is
+no more measured than the padding. Every frame and camera of a sample is treated alike, but where a
+docstring says otherwise.
 """
 
 from collections.abc import Iterator, Sequence
@@ -90,7 +91,10 @@ class Resize(_Sized):
 
 @dataclass(frozen=True, slots=True)
 class Letterbox(_Sized):
-    """Scale to fit a size in pixels without stretching, centred; the rest is black, unmeasured."""
+    """Scale to fit a size in pixels without stretching, centred; the rest is black, unmeasured.
+
+    So is, after a later resize, every pixel that has part of that black in it.
+    """
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return scaled and padded views."""
@@ -215,18 +219,19 @@ class HorizontalFlip:
             source=views.targets[0],
             targets=(views.source,),
             pictures={
-                camera: np.ascontiguousarray(pictures[..., ::-1])
-                for camera, pictures in views.pictures.items()
+                camera: pictures[..., ::-1].copy() for camera, pictures in views.pictures.items()
             },
             depths={
                 camera: StoredDepth(
-                    np.ascontiguousarray(depth.units[..., ::-1]),
-                    np.ascontiguousarray(depth.measured[..., ::-1]),
+                    depth.units[..., ::-1].copy(),
+                    depth.measured[..., ::-1].copy(),
                 )
                 for camera, depth in views.depths.items()
             },
             intrinsics=views.intrinsics.flipped(),
             world="mirrored" if views.world == "as filmed" else "as filmed",
+            padded=None if views.padded is None else views.padded[..., ::-1].copy(),
+            erased={camera: erased[..., ::-1].copy() for camera, erased in views.erased.items()},
         )
 
 
@@ -256,7 +261,8 @@ class ColorJitter:
         """Return views with other colours."""
         common = self._draw(generator)
         apart = generator.random() < self.asymmetric_probability
-        grey = float(np.mean([_luma(pictures).mean() for pictures in views.pictures.values()]))
+        lumas = [_own(_luma(pictures), views) for pictures in views.pictures.values()]
+        grey = float(np.mean([luma.mean() for luma in lumas]))
         pictures = {
             camera: _recoloured(pictures, self._draw(generator) if apart else common, grey=grey)
             for camera, pictures in sorted(views.pictures.items())
@@ -274,7 +280,8 @@ class ColorJitter:
 class Eraser:
     """Paint boxes of the target views over with their mean colour: what the source sees is hidden.
 
-    The source view, depth and disparity stay. Boxes have sides of ``low`` to ``high`` pixels.
+    The source view, depth and disparity stay; what is painted over is not visible. Boxes have sides
+    of ``low`` to ``high`` pixels.
     """
 
     probability: float = 0.5
@@ -299,14 +306,18 @@ class Eraser:
             top, left = int(generator.integers(height)), int(generator.integers(width))
             tall, wide = (int(side) for side in generator.integers(self.low, self.high + 1, 2))
             boxes.append((slice(top, top + tall), slice(left, left + wide)))
-        pictures = dict(views.pictures)
+        pictures, erased = dict(views.pictures), dict(views.erased)
+        for camera in views.targets:
+            erased[camera] = erased.get(camera, np.zeros((height, width), dtype=bool)).copy()
+            for box in boxes:
+                erased[camera][box] = True
         for camera in set(views.targets) & set(pictures):
-            erased = pictures[camera].copy()
-            mean = erased.mean(axis=(-2, -1), keepdims=True).round().astype(np.uint8)
+            painted = pictures[camera].copy()
+            mean = _own(painted, views).mean(axis=(-2, -1), keepdims=True).round().astype(np.uint8)
             for rows, columns in boxes:
-                erased[..., rows, columns] = mean
-            pictures[camera] = erased
-        return replace(views, pictures=pictures)
+                painted[..., rows, columns] = mean
+            pictures[camera] = painted
+        return replace(views, pictures=pictures, erased=erased)
 
 
 def _require_size(height: Any, width: Any) -> None:
@@ -333,8 +344,19 @@ def _require_range(transform: Any, least: float, *names: str) -> None:
         )
 
 
+def _own(maps: Any, views: Views) -> Any:
+    """Return the pixels of (..., h, w) maps outside padding, (..., n, 1); all if there are none."""
+    if views.padded is None or views.padded.all():
+        return maps
+    return maps[..., ~views.padded, None]
+
+
 def _resized(views: Views, *, height: int, width: int) -> Views:
     size = (height, width)
+    padded = None if views.padded is None else _resized_marks(views.padded, size=size)
+    measured = {
+        camera: resized_nearest(depth.measured, size=size) for camera, depth in views.depths.items()
+    }
     return replace(
         views,
         pictures={
@@ -344,26 +366,50 @@ def _resized(views: Views, *, height: int, width: int) -> Views:
         depths={
             camera: StoredDepth(
                 resized_nearest(depth.units, size=size),
-                resized_nearest(depth.measured, size=size),
+                measured[camera] if padded is None else measured[camera] & ~padded,
             )
             for camera, depth in views.depths.items()
         },
         intrinsics=views.intrinsics.resized(width_px=width, height_px=height),
+        padded=padded,
+        erased={
+            camera: _resized_marks(erased, size=size) for camera, erased in views.erased.items()
+        },
     )
 
 
+def _resized_marks(marks: Any, *, size: tuple[int, int]) -> Any:
+    """Return which pixels of resized pictures have part of a marked pixel (h, w) in them."""
+    return _resized_pictures(marks[None, None].astype(np.float32), size=size)[0, 0] > 0
+
+
 def _resized_pictures(pictures: Any, *, size: tuple[int, int]) -> Any:
-    resized = torch.nn.functional.interpolate(
+    """Return (t, c, h, w) pictures averaged to a size, in their own dtype."""
+    height, width = size
+    if width > 1:
+        return _averaged(pictures, size)
+    # torch 2.13 averages wrongly along a single column, and with uint8 writes beyond the result:
+    # floats are averaged to the column, and that as a row.
+    column = _averaged(pictures.astype(np.float32), (pictures.shape[-2], 1))
+    resized = _averaged(column.swapaxes(-1, -2), (1, height)).swapaxes(-1, -2)
+    return (np.rint(resized) if pictures.dtype == np.uint8 else resized).astype(pictures.dtype)
+
+
+def _averaged(pictures: Any, size: tuple[int, int]) -> Any:
+    averaged = torch.nn.functional.interpolate(
         torch.from_numpy(np.ascontiguousarray(pictures)),
         size=size,
         mode="bilinear",
         antialias=True,
     )
-    return resized.numpy()
+    return averaged.numpy()
 
 
 def _windowed(views: Views, *, top: int, left: int, size: tuple[int, int]) -> Views:
     height, width = size
+    old, padded = views.intrinsics, views.padded
+    if min(top, left) < 0 or top + height > old.height_px or left + width > old.width_px:
+        padded = np.zeros((old.height_px, old.width_px), dtype=bool) if padded is None else padded
     return replace(
         views,
         pictures={
@@ -380,6 +426,11 @@ def _windowed(views: Views, *, top: int, left: int, size: tuple[int, int]) -> Vi
         intrinsics=views.intrinsics.cropped(
             left_px=left, top_px=top, width_px=width, height_px=height
         ),
+        padded=None if padded is None else ~_window(~padded, top=top, left=left, size=size),
+        erased={
+            camera: _window(erased, top=top, left=left, size=size)
+            for camera, erased in views.erased.items()
+        },
     )
 
 

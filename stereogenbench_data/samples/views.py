@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, UInt8, UInt16
 
+from stereogenbench_data.errors import FieldError
 from stereogenbench_data.geometry.camera import Intrinsics
 
 Pictures = UInt8[np.ndarray, "t 3 h w"]
@@ -42,6 +43,13 @@ class Views:
         depths: Stored depth for each camera whose depth is wanted.
         intrinsics: Of every camera, after what was done to the pictures.
         world: "as filmed", or "mirrored" (x negated) after a horizontal flip.
+        padded: (h, w) bool, pixels of every view that are not made of its camera's own pixels
+            alone: padding, and what was averaged with it. They are never `measured`. None where
+            there are none.
+        erased: (h, w) bool for each camera whose picture was painted over: where it was.
+
+    Raises:
+        FieldError: If ``padded`` or ``erased`` is not of the pictures' size.
     """
 
     source: int
@@ -51,3 +59,22 @@ class Views:
     depths: dict[int, StoredDepth]
     intrinsics: Intrinsics
     world: Literal["as filmed", "mirrored"] = "as filmed"
+    padded: Bool[np.ndarray, "h w"] | None = None
+    erased: dict[int, Bool[np.ndarray, "h w"]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse maps that a transform forgot to move together with the pictures."""
+        height_px, width_px = self.intrinsics.height_px, self.intrinsics.width_px
+        for name, maps in (("padded", [self.padded]), ("erased", self.erased.values())):
+            for pixels in maps:
+                if pixels is not None and pixels.shape != (height_px, width_px):
+                    raise FieldError(
+                        f"`{name}` of the views has shape {pixels.shape}, their pictures are "
+                        f"{height_px} pixels high and {width_px} wide: a transform that moves "
+                        f"pictures must move `{name}` with them."
+                    )
+
+    def unseen(self, camera: int) -> Bool[np.ndarray, "h w"] | None:
+        """Return where a camera's picture does not show what the camera saw; None is nowhere."""
+        maps = [pixels for pixels in (self.padded, self.erased.get(camera)) if pixels is not None]
+        return np.logical_or.reduce(maps) if maps else None

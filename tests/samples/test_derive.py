@@ -1,5 +1,7 @@
 """What is derived from decoded views, against hand-worked numbers and the long way round."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -169,3 +171,19 @@ def test_contracts_of_the_metadata_give_the_same_pictures_depth(tmp_path, contra
     error = np.mean((warped - left)[:, visible] ** 2)
     unmoved = np.mean((right - left)[:, visible] ** 2)
     assert 10 * np.log10(unmoved / error) > 5
+
+
+@pytest.mark.parametrize("residual_px", [0.0, 1.0], ids=["rectified", "through poses"])
+def test_nothing_is_visible_in_a_padded_target_nor_warped_into_it(residual_px):
+    plain = geometry(some_units(), DepthEncoding(0.1), residual_px=residual_px)
+    padded = np.zeros((20, 40), dtype=bool)
+    padded[:, 10:15], padded[4:6] = True, True
+    boxed = PairGeometry(replace(plain._views, padded=padded), plain._facts, source=0, target=1)
+
+    columns = np.nan_to_num(np.floor(plain.projection.u_px)).clip(0, 39).astype(int)
+    on_padding = padded[np.arange(20)[:, None], columns]
+    expected = plain.visible_from_source & ~on_padding & ~padded
+    assert (plain.visible_from_source & on_padding & ~padded).any()
+    assert np.array_equal(boxed.visible_from_source, expected)
+    assert np.array_equal(boxed.visible(boxed), plain.visible(plain) & ~on_padding & ~padded)
+    assert np.array_equal(boxed.hole, plain.hole | padded)

@@ -1,8 +1,12 @@
 """Transforms keep a pair a pair: warping the right view by disparity still gives the left one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import example, given
+from hypothesis import strategies as st
 from scipy import ndimage
 
 from stereogenbench_data import (
@@ -16,6 +20,7 @@ from stereogenbench_data import (
     RandomCrop,
     RandomScale,
     Resize,
+    SceneViews,
     StereoPairs,
 )
 from stereogenbench_data.geometry.camera import Intrinsics
@@ -155,6 +160,245 @@ def made_views(height=40, width=60):
         depths={0: StoredDepth(units, units > 2)},
         intrinsics=Intrinsics(50.0, 50.0, width / 2, height / 2, width, height),
     )
+
+
+def scene_of_one_colour(colour, *, height=24, width=36):
+    """Return views whose pictures have one colour and whose depth is measured everywhere."""
+    pictures = np.full((2, 3, height, width), colour, dtype=np.uint8)
+    units = np.full((2, height, width), 50, dtype=np.uint16)
+    return Views(
+        source=0,
+        targets=(1,),
+        frames=(0, 1),
+        pictures={0: pictures, 1: pictures.copy()},
+        depths={camera: StoredDepth(units.copy(), units > 0) for camera in (0, 1)},
+        intrinsics=Intrinsics(50.0, 50.0, width / 2, height / 2, width, height),
+    )
+
+
+class CropPart:
+    """Cut a random window that has these parts of the picture's height and width."""
+
+    swaps_views = False
+
+    def __init__(self, *parts):
+        self.parts = parts
+
+    def __repr__(self):
+        return f"CropPart{self.parts}"
+
+    def __call__(self, views, generator):
+        size = (views.intrinsics.height_px, views.intrinsics.width_px)
+        window = [max(1, int(side * part)) for side, part in zip(size, self.parts, strict=True)]
+        return RandomCrop(*window)(views, generator)
+
+
+sides = st.integers(1, 70)
+parts = st.floats(0.3, 1.0)
+steps = st.one_of(
+    st.builds(Letterbox, sides, sides),
+    st.builds(Resize, sides, sides),
+    st.builds(CropPart, parts, parts),
+    st.just(RandomScale(-0.7, 0.7)),
+    st.just(HorizontalFlip(0.5)),
+)
+
+
+@given(chain=st.lists(steps, max_size=5), start=st.builds(Letterbox, sides, sides))
+def test_no_measured_pixel_has_padding_in_it_whatever_follows_a_letterbox(chain, start):
+    moved = Compose([start, *chain])(scene_of_one_colour(255), np.random.default_rng(0))
+
+    for camera in (0, 1):
+        measured = moved.depths[camera].measured
+        picture = moved.pictures[camera].min(axis=1)
+        assert picture[measured].min(initial=255) == 255
+        assert moved.padded is None or not measured[:, moved.padded].any()
+        assert moved.padded is None or measured[:, ~moved.padded].all()
+
+
+def clean_range(content, *, before_px, after_px):
+    """Return the first and last place of an axis whose average has content alone in it, and slack.
+
+    The average's weights fall in a triangle from a place's centre to max(1, scale) source pixels.
+    """
+    scale = before_px / after_px
+    centres = (np.arange(after_px) + 0.5) * scale
+    reach = max(1.0, scale) + np.array([[-1e-3], [1e-3]])
+    # Centres of the outermost pixels beside the content may lie on the triangle's foot.
+    below = content[0] - 0.5 if content[0] > 0 else -np.inf
+    above = content[1] + 0.5 if content[1] < before_px else np.inf
+    return (centres - reach >= below) & (centres + reach <= above)
+
+
+@given(box=st.tuples(sides, sides), size=st.tuples(sides, sides))
+def test_no_more_is_padded_after_a_resize_than_what_padding_went_into(box, size):
+    boxed = Letterbox(*box)(scene_of_one_colour(255), np.random.default_rng(0))
+    padded = Resize(*size)(boxed, np.random.default_rng(0)).padded
+    own = np.ones(box, bool) if boxed.padded is None else ~boxed.padded
+    axes = []
+    for axis in (0, 1):
+        places = np.flatnonzero(own.any(axis=1 - axis))
+        content = (places[0], places[-1] + 1)
+        axes.append(clean_range(content, before_px=box[axis], after_px=size[axis]))
+    most, least = (rows[:, None] & columns for rows, columns in zip(*axes, strict=True))
+
+    clean = np.ones(size, bool) if padded is None else ~padded
+    assert not (least & ~clean).any()
+    assert not (clean & ~most).any()
+
+
+MAPS = (
+    "left", "right", "disparity", "valid", "visible", "visible_from_left", "disparity_error",
+    "depth", "depth_right", "disparity_right", "valid_right", "visible_right", "warped_right",
+    "hole",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_a_letterbox_that_scales_nothing_pads_every_field(detailed_release, name):
+    frames = ("clips", 2)
+    whole = StereoPairs(detailed_release, fields=[name], frames=frames)[0][name]
+    boxed = StereoPairs(
+        detailed_release, fields=[name], frames=frames, transform=Letterbox(160, 220)
+    )[0][name]
+
+    padded = torch.nn.functional.pad(whole, (30, 30), value=name == "hole")
+    assert torch.equal(boxed, padded)
+
+
+def padded_columns(before_px, after_px, *, content):
+    """Return which columns of a resized picture have padding beside the content in them."""
+    return torch.from_numpy(~clean_range(content, before_px=before_px, after_px=after_px)[1])
+
+
+@pytest.mark.parametrize(
+    ("first", "size_px"), [("as stored", 160), ("half", 80)], ids=["as stored", "size="]
+)
+def test_what_a_resize_mixed_with_black_is_neither_valid_nor_visible(
+    detailed_release, first, size_px
+):
+    fields = tuple(dict.fromkeys((*FIELDS, *MAPS)))
+    size = (size_px, size_px) if first == "half" else None
+    transform = Compose([Letterbox(160, 220), Resize(73, 101)])
+    boxed = StereoPairs(
+        detailed_release, fields=fields, frames=("clips", 2), size=size, transform=transform
+    )[0]
+
+    outside = padded_columns(220, 101, content=(30, 190))
+    assert outside.tolist() == [True] * 15 + [False] * 71 + [True] * 15
+    for name in set(MAPS) - {"left", "right", "hole"}:
+        assert not boxed[name][..., outside].any(), name
+        assert boxed[name][..., ~outside].any(), name
+    assert boxed["left"][..., 14].any()
+    assert boxed["hole"][..., outside].all()
+    rows = torch.arange(101) + 0.5
+    for name, disparity, sign in (
+        ("visible", "disparity", -1),
+        ("visible_from_left", "disparity", -1),
+        ("visible_right", "disparity_right", 1),
+    ):
+        landed = (rows + sign * boxed[disparity]).floor().long()[boxed[name]]
+        assert not outside[landed].any(), name
+
+
+def test_a_view_by_itself_is_not_valid_where_a_resize_mixed_it_with_black(detailed_release):
+    views = SceneViews(
+        detailed_release,
+        cameras=(0, 2),
+        fields=("image", "depth", "valid"),
+        transform=Compose([Letterbox(220, 160), Resize(101, 73)]),
+    )[0]
+
+    outside = padded_columns(220, 101, content=(30, 190))
+    assert views["image"][:, :, 14].any()
+    for name in ("valid", "depth"):
+        assert not views[name][:, :, outside].any(), name
+        assert views[name][:, :, ~outside].any(), name
+
+
+@pytest.mark.parametrize("last", [Resize(160, 160), Resize(60, 75), Resize(200, 190)], ids=str)
+def test_what_the_eraser_painted_is_not_visible_though_it_is_valid(detailed_release, last):
+    fields = (*FIELDS, "visible_from_left")
+    eraser = Eraser(1.0, most_boxes=1, low=40, high=60)
+    plain = StereoPairs(detailed_release, fields=fields, transform=last)[0]
+    erased = StereoPairs(detailed_release, fields=fields, transform=Compose([eraser, last]))[0]
+    unseen = StereoPairs(
+        detailed_release, fields=("visible_from_left",), transform=Compose([eraser, last])
+    )[0]
+
+    painted = (erased["right"] != plain["right"]).any(dim=0)
+    assert 0.01 < painted.float().mean() < 0.3
+    for name in set(fields) - {"right", "visible", "visible_right", "visible_from_left"}:
+        assert torch.equal(erased[name], plain[name]), name
+    height_px, width_px = painted.shape
+    columns = torch.arange(width_px) + 0.5
+    landed = (columns - plain["disparity"][0]).floor().long().clamp(0, width_px - 1)
+    on_paint = painted[torch.arange(height_px)[:, None], landed]
+    for name in ("visible", "visible_from_left"):
+        assert (plain[name][0] & on_paint).any(), name
+        assert not (erased[name][0] & on_paint).any(), name
+        assert not (erased[name] & ~plain[name]).any(), name
+        assert erased[name].float().mean() > 0.5 * plain[name].float().mean(), name
+    assert not (erased["visible_right"][0] & painted).any()
+    assert torch.equal(unseen["visible_from_left"], erased["visible_from_left"])
+
+
+@pytest.mark.parametrize("other", [ColorJitter(), Eraser(1.0, low=200, high=200)], ids=str)
+def test_colours_do_not_depend_on_padding(other):
+    views = made_views()
+    box = Letterbox(40, 90)
+
+    before = box(other(views, np.random.default_rng(2)), np.random.default_rng(0))
+    after = other(box(views, np.random.default_rng(0)), np.random.default_rng(2))
+
+    if isinstance(other, Eraser):
+        own = after.unseen(1) & ~after.padded & before.unseen(1)
+    else:
+        own = ~after.padded
+    assert own.any()
+    np.testing.assert_array_equal(after.pictures[1][..., own], before.pictures[1][..., own])
+
+
+def test_a_view_that_is_padding_alone_still_has_colours():
+    views = replace(made_views(), padded=np.ones((40, 60), dtype=bool))
+
+    jittered = ColorJitter()(views, np.random.default_rng(0))
+
+    assert jittered.pictures[0].any()
+
+
+@pytest.mark.parametrize("first", [Letterbox(40, 90), Eraser(1.0)], ids=["padded", "erased"])
+def test_a_transform_that_forgets_what_is_not_of_the_scene_is_told(first):
+    views = first(made_views(), np.random.default_rng(0))
+    width_px = views.intrinsics.width_px
+    smaller = views.intrinsics.resized(width_px=20, height_px=20)
+
+    with pytest.raises(FieldError, match=rf"has shape \(40, {width_px}\), their pictures are 20"):
+        replace(views, pictures={}, depths={}, intrinsics=smaller)
+
+
+def triangle_weights(before_px, after_px):
+    """Return the (after, before) weights of an average over a triangle, in float64."""
+    scale = before_px / after_px
+    centres = (np.arange(after_px)[:, None] + 0.5) * scale
+    distances = np.abs(np.arange(before_px) + 0.5 - centres)
+    weights = np.maximum(0, 1 - distances / max(1.0, scale))
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+@given(before=st.tuples(sides, sides), size=st.tuples(sides, sides))
+@example(before=(20, 30), size=(11, 1))
+@example(before=(2, 1), size=(3, 1))
+@example(before=(9, 9), size=(1, 1))
+def test_a_resize_is_an_average_over_a_triangle_at_every_size(before, size):
+    views = made_views(*before)
+
+    resized = Resize(*size)(views, np.random.default_rng(0)).pictures[0]
+
+    rows, columns = (triangle_weights(*axis) for axis in zip(before, size, strict=True))
+    expected = rows @ views.pictures[0] @ columns.T
+    assert resized.dtype == np.uint8
+    assert np.abs(resized - expected).max() <= 2
 
 
 def test_symmetric_jitter_changes_both_views_alike_and_asymmetric_apart():
