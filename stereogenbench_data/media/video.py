@@ -5,6 +5,7 @@ expect (a gap, a cut, a damaged packet), reading is an error, never a neighbouri
 """
 
 from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Literal, NoReturn
 
@@ -16,7 +17,14 @@ from av.video.reformatter import Interpolation, VideoReformatter
 from jaxtyping import UInt8
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.clock import Clock, TableClock, steady_clock, table_clock
+from stereogenbench_data.media.clock import (
+    INTRA_ONLY,
+    Clock,
+    TableClock,
+    require_file_order,
+    steady_clock,
+    table_clock,
+)
 from stereogenbench_data.media.container import (
     StreamFacts,
     VideoFile,
@@ -61,7 +69,8 @@ def probe(
     """Return what a video file is, from its header where the header can be trusted.
 
     Frames are counted by the header of an MP4 file, and by duration and rate of a Matroska file
-    if its last frame is found where they place it. Else all packets are counted.
+    if its last frame is found where they place it. Else all packets are counted. The times of all
+    packets of an intra-only codec are held against their order, where a path is given.
 
     Args:
         file: A path, or a seekable binary file; the latter stays the caller's to close.
@@ -80,10 +89,15 @@ def probe(
         require_whole_payload(container, name=name)
         frames = _told_frames(container)
         facts = stream_facts(container, name=name, frames=frames, pixel_format=pixel_format)
-    if frames:
+    is_intra_only = facts.codec in INTRA_ONLY
+    if frames and not (is_intra_only and isinstance(file, str | Path)):
         return facts
-    with open_container(file, name=name) as container:
-        frames = len(table_clock(container, name=name).times)
+    with open_container(file, name=name, pixel_format="later") as container:
+        times = table_clock(container, name=name).times
+        frames = len(times)
+        if frames and is_intra_only:
+            steady = steady_clock(container, frames=frames)
+            require_file_order(times, steady, name=name)
     if frames == 0:
         raise MediaError(f"{name}: holds no frame (0 packets): fetch it again.")
     return replace(facts, frames=frames)
