@@ -65,8 +65,10 @@ def audit(  # noqa: PLR0913 - one parameter an option
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            help="Depth that lost something: 8-bit, lossy, chroma; may be given again.",
-            autocompletion=complete_from(("8-bit", "lossy", "chroma")),
+            help="Depth that lost something: 8-bit (to 14-bit), lossy, chroma; may be repeated.",
+            autocompletion=complete_from(
+                ("8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma")
+            ),
         ),
     ] = None,
     limit: Annotated[

@@ -132,7 +132,7 @@ def table_clock(
             f"({error.strerror}): fetch it again."
         ) from error
     if container.streams.video[0].codec_context.codec.canonical_name in INTRA_ONLY:
-        _require_file_order(times, steady, name=name)
+        require_file_order(times, steady, name=name)
     times.sort()
     twice = next((a for a, b in pairwise(times) if a == b), None)
     if twice is not None:
@@ -143,8 +143,12 @@ def table_clock(
     return TableClock(times)
 
 
-def _require_file_order(times: Sequence[int], steady: SteadyClock | None, *, name: str) -> None:
-    """Refuse times that do not ascend as frames are stored, or are not those of the rate."""
+def require_file_order(times: Sequence[int], steady: SteadyClock | None, *, name: str) -> None:
+    """Refuse times that do not ascend as frames are stored, or are not those of the rate.
+
+    Raises:
+        MediaError: Naming the first such frame.
+    """
     for number, (before, after) in enumerate(pairwise(times), 1):
         if after <= before:
             raise MediaError(

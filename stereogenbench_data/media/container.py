@@ -6,8 +6,9 @@ containers of the release are let in, and a path is never read as an address.
 
 import errno
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 from typing import Final, Literal, Protocol, runtime_checkable
 
@@ -15,6 +16,7 @@ import av
 from av.container import InputContainer
 
 from stereogenbench_data.errors import MediaError, StorageError, cure_of
+from stereogenbench_data.media.siting import has_coded_chroma
 
 
 @runtime_checkable
@@ -37,6 +39,8 @@ _OPTIONS: Final = {"format_whitelist": "mov,matroska"}
 _UNDECODED: Final = {**_OPTIONS, "probesize": "32", "skip_frame": "all"}
 """FFmpeg decodes the first picture of H.264 only to learn its pixel format: not with these."""
 
+_COLOURS: Final = 3
+_LEAST_BITS: Final = 8
 _MICROSECONDS: Final = 1_000_000
 _OUT_OF_FILES: Final = (errno.EMFILE, errno.ENFILE)
 
@@ -55,6 +59,10 @@ class StreamFacts:
         frame_rate_hz: Average rate; 0.0 where the file does not tell.
         tags: Metadata of the container and of the stream, keys in lower case. A key that both
             have, with another value, is kept as ``stream.<key>`` too.
+        is_colour: Whether its pictures are of colours alone, see `is_colour_format`; None where
+            only a picture would tell.
+        pixel_aspect: Width of a pixel in heights of one, 0.0 where the file does not tell.
+        container: FFmpeg's names of the container, such as "matroska,webm".
     """
 
     codec: str
@@ -64,6 +72,9 @@ class StreamFacts:
     frames: int
     frame_rate_hz: float
     tags: Mapping[str, str]
+    is_colour: bool | None = None
+    pixel_aspect: float = 0.0
+    container: str = field(default="", compare=False)
 
 
 def open_container(
@@ -154,6 +165,9 @@ def stream_facts(
             f"{context.pix_fmt}, {context.width}x{context.height}). The file is cut short or "
             f"damaged: fetch it again."
         )
+    is_colour = has_coded_chroma(context.codec.canonical_name, context.extradata)
+    if context.pix_fmt is not None and is_colour is not False:
+        is_colour = is_colour_format(context.pix_fmt)
     return StreamFacts(
         codec=context.codec.canonical_name,
         pixel_format=context.pix_fmt or "",
@@ -162,6 +176,23 @@ def stream_facts(
         frames=frames,
         frame_rate_hz=float(stream.average_rate or 0),
         tags=merged_tags(container.metadata, stream.metadata),
+        is_colour=is_colour,
+        pixel_aspect=float(stream.sample_aspect_ratio or 0),
+        container=container.format.name,
+    )
+
+
+@cache
+def is_colour_format(pixel_format: str) -> bool:
+    """Return whether a pixel format holds three colours of 8 bits or more, and nothing else.
+
+    Neither a palette nor an alpha channel is let in: what they mean for a view is not defined.
+    """
+    layout = av.VideoFormat(pixel_format)
+    return (
+        len(layout.components) == _COLOURS
+        and not layout.has_palette
+        and all(each.bits >= _LEAST_BITS and not each.is_alpha for each in layout.components)
     )
 
 

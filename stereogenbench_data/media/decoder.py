@@ -123,21 +123,47 @@ class Decoder:
         if first.dts is not None and first.pts is not None and first.pts > pts:
             # MP4 seeks by decoding time, and this key frame is shown after the frame sought.
             first = self._seek_pts(first.dts - 1)
-        if self._is_intra_only and not first.is_keyframe:
-            # FFV1 keeps its statistics from the last key frame on, and shows nonsense without.
-            raise Astray(f"the packet shown at {first.pts} ticks is no key frame")
-        found = [first]
-        if self._is_intra_only and index == 0:
-            found.extend(islice(self._packets, 1))
-        told = [self._index(packet) for packet in found if packet.size]
-        if self._is_intra_only and (told[0] > max(0, index - 1) or told[1:] not in ([], [1])):
-            raise Astray(f"frame {told[0]} by its time is stored where another is due")
+        found = self._in_file_order(first, index) if self._is_intra_only else [first]
         self._packets = chain(found, self._packets)
         self._pending.clear()
         self._fed.clear()
-        self._next = self._index(first)
+        self._next = self._index(found[0])
         self._newest = 0
         self._knows_key_frames = True
+
+    def _in_file_order(self, first: VideoPacket, index: int) -> list[VideoPacket]:
+        """Return the packets to decode first for a frame of an intra-only codec.
+
+        Of what is stored before a key frame only the times are read: nothing of it is decoded.
+
+        Args:
+            first: Where the stream stands: at the key frame before the frame, or at the start.
+            index: The frame.
+        """
+        if not first.is_keyframe:
+            # FFV1 keeps its statistics from the last key frame on, and shows nonsense without.
+            raise Astray(f"the packet shown at {first.pts} ticks is no key frame")
+        place = self._index(first)
+        if place > max(0, index - 1):
+            raise Astray(f"frame {place} by its time is stored where another is due")
+        if index == 0:
+            after = list(islice(self._packets, 1))
+            if any(packet.size and self._index(packet) != 1 for packet in after):
+                raise Astray("the packet after the first one is not of frame 1")
+            return [first, *after]
+        entries = self._stream.index_entries
+        key = entries.search_timestamp(self._clock.latest(index))
+        if place < index - 1 and (key < 0 or self._clock.index(entries[key].timestamp) != index):
+            return [first]
+        found = [first]
+        for due, packet in enumerate(islice(self._packets, index - place), place + 1):
+            if not packet.size or self._index(packet) != due:
+                raise Astray(f"something shown at {packet.pts} ticks is stored as frame {due}")
+            if packet.is_keyframe:
+                self._stored_before = due - 1
+                found.clear()
+            found.append(packet)
+        return found
 
     def _seek_pts(self, pts: int) -> VideoPacket:
         self._container.seek(pts, stream=self._stream)

@@ -7,7 +7,7 @@ FFmpeg: its conversion to 8 bits drops the low byte, and one between 10, 12 and 
 import math
 import re
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt16
@@ -27,6 +27,9 @@ _LOSSLESS_CODECS: Final = frozenset(
     {CODEC_NAME, "ffv1", "ffvhuff", "huffyuv", "png", "rawvideo", "utvideo"}
 )
 """Codecs that return what they were given, whatever their settings."""
+
+ANY_DEPTH: Final = DepthEncoding(accept=frozenset(get_args(DepthRisk)))
+"""A contract that takes whatever holds one number a pixel."""
 
 _NUMBER_FORMAT: Final = re.compile(
     r"(?P<kind>gray|yuvj?\d{3}p)(?P<bits>9|10|12|14|16)?(?P<order>le|be)?"
@@ -82,8 +85,8 @@ def require_depth_stream(
     """Refuse a stream that cannot have kept 16-bit depth whole, unless the encoding accepts it.
 
     Raises:
-        MediaError: If the stream stores colours, or has a risk (8 bits, a lossy codec, chroma
-            planes) that ``encoding.accept`` does not name.
+        MediaError: If the stream stores colours, or has a risk (fewer than 16 bits, a lossy codec,
+            chroma planes) that ``encoding.accept`` does not name.
     """
     _accepted_layout(codec, pixel_format, encoding, name=name)
 
@@ -119,6 +122,10 @@ def _accepted_layout(
         )
     risks: dict[DepthRisk, bool] = {
         "8-bit": layout.bits == 8,
+        "9-bit": layout.bits == 9,
+        "10-bit": layout.bits == 10,
+        "12-bit": layout.bits == 12,
+        "14-bit": layout.bits == 14,
         "lossy": codec not in _LOSSLESS_CODECS,
         "chroma": layout.has_chroma,
     }

@@ -195,4 +195,5 @@ def _facts(clip: StoredClip, *, frames: int) -> StreamFacts:
         frames=frames,
         frame_rate_hz=clip.rate[0] / clip.rate[1],
         tags=merged_tags(clip.tags, clip.stream_tags),
+        is_colour=False,
     )

@@ -16,7 +16,7 @@ from jaxtyping import UInt16
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.container import VideoFile, open_container
-from stereogenbench_data.media.depth import read_depth_units, require_depth_stream
+from stereogenbench_data.media.depth import ANY_DEPTH, read_depth_units, require_depth_stream
 from stereogenbench_data.media.depth_frame_file import (
     StoredClip,
     blosc2_module,
@@ -28,7 +28,7 @@ from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.video import VideoReader
 from stereogenbench_data.schema.records import DepthEncoding
 
-_ANY_DEPTH: Final = DepthEncoding(accept=frozenset({"8-bit"}))
+_ANY_BITS: Final = DepthEncoding(accept=ANY_DEPTH.accept - {"lossy", "chroma"})
 _FFV1_OPTIONS: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
 _WRITERS_TAGS: Final = frozenset({"encoder", "duration"})
 """Tags that whoever writes a Matroska file sets itself."""
@@ -61,11 +61,11 @@ def packed_depth(
                 f"Pack with --depth-codec released."
             )
         require_depth_stream(
-            codec=facts.codec, pixel_format=facts.pixel_format, encoding=_ANY_DEPTH, name=name
+            codec=facts.codec, pixel_format=facts.pixel_format, encoding=_ANY_BITS, name=name
         )
         time_base = Fraction(1)
         for index in range(frames):
-            units = read_depth_units(reader, index, encoding=_ANY_DEPTH)
+            units = read_depth_units(reader, index, encoding=_ANY_BITS)
             chunk = compressed_chunk(units.tobytes())
             frame = reader.frame(index)
             pts.append(_ticks(frame, name=name))
@@ -171,7 +171,7 @@ def _require_same_video(packed: DepthFrames, target: Path) -> None:
     with VideoReader(target, name=str(target), frames=packed.frames) as reader:
         for index, pts in enumerate(clip.pts):
             frame = reader.frame(index)
-            units = read_depth_units(reader, index, encoding=_ANY_DEPTH)
+            units = read_depth_units(reader, index, encoding=_ANY_BITS)
             shown_s = None if frame.time_base is None else (frame.pts or 0) * frame.time_base
             if not np.array_equal(units, packed.units(index)):
                 raise _not_unpacked(name, f"frame {index} has other numbers")

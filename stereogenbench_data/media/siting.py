@@ -29,6 +29,7 @@ _HIGH_PROFILES: Final = frozenset({44, 83, 86, 100, 110, 118, 122, 128, 134, 135
 _EXTENDED_ASPECT: Final = 255
 _H264_SPS: Final = 7
 _HEVC_SPS: Final = 33
+_GREY: Final = 0
 _SEPARATE_PLANES: Final = 3
 _PROFILE_BITS: Final = 88
 
@@ -127,16 +128,45 @@ def coded_siting(codec: str, extradata: bytes | None) -> str | None:
         return CENTRE
     if codec not in ("h264", "hevc"):
         return None
-    parse, wanted = (_h264_siting, _H264_SPS) if codec == "h264" else (_hevc_siting, _HEVC_SPS)
+    bits = _sequence_parameters(codec, extradata)
+    if bits is None:
+        return CENTRE
+    try:
+        place = _h264_siting(bits) if codec == "h264" else _hevc_siting(bits)
+    except EOFError:
+        return CENTRE
+    return _SITINGS[place] if place is not None and place < len(_SITINGS) else CENTRE
+
+
+def has_coded_chroma(codec: str, extradata: bytes | None) -> bool | None:
+    """Return whether a codec's header says that pictures have chroma, None where it does not say.
+
+    FFmpeg decodes grey H.264 to yuv420p whose chroma it makes up.
+    """
+    bits = _sequence_parameters(codec, extradata)
+    if bits is None:
+        return None
+    try:
+        if codec == "hevc":
+            _skip_to_hevc_chroma(bits)
+            return bits.golomb() != _GREY
+        bits.skip(8)
+        profile = bits.take(8)
+        bits.skip(8, 8, 0)
+        return profile not in _HIGH_PROFILES or bits.golomb() != _GREY
+    except EOFError:
+        return None
+
+
+def _sequence_parameters(codec: str, extradata: bytes | None) -> "_Bits | None":
+    """Return the first sequence parameter set of a header of H.264 or HEVC, None without one."""
+    if codec not in ("h264", "hevc"):
+        return None
     for unit in _units(codec, extradata or b""):
         kind = unit[0] & 31 if codec == "h264" else unit[0] >> 1 & 63
-        if kind == wanted:
-            try:
-                place = parse(_Bits(unit.replace(b"\0\0\3", b"\0\0")))
-            except EOFError:
-                return CENTRE
-            return _SITINGS[place] if place is not None and place < len(_SITINGS) else CENTRE
-    return CENTRE
+        if kind == (_H264_SPS if codec == "h264" else _HEVC_SPS):
+            return _Bits(unit.replace(b"\0\0\3", b"\0\0"))
+    return None
 
 
 def _units(codec: str, extradata: bytes) -> list[bytes]:
@@ -243,10 +273,7 @@ def _skip_scaling_list(bits: _Bits, size: int) -> None:
 
 
 def _hevc_siting(bits: _Bits) -> int | None:
-    bits.skip(16, 4)
-    layers = bits.take(3)
-    _skip_profiles(bits, layers)
-    bits.skip(0)
+    layers = _skip_to_hevc_chroma(bits)
     if bits.golomb() == _SEPARATE_PLANES:
         bits.skip(1)
     bits.skip(0, 0)
@@ -270,6 +297,15 @@ def _hevc_siting(bits: _Bits) -> int | None:
             bits.skip(order_bits, 1)
     bits.skip(1, 1)
     return _vui_siting(bits) if bits.take() else None
+
+
+def _skip_to_hevc_chroma(bits: _Bits) -> int:
+    """Pass over all before chroma_format_idc; return how many layers there are beside the first."""
+    bits.skip(16, 4)
+    layers = bits.take(3)
+    _skip_profiles(bits, layers)
+    bits.skip(0)
+    return layers
 
 
 def _skip_profiles(bits: _Bits, layers: int) -> None:

@@ -5,8 +5,9 @@ expect (a gap, a cut, a damaged packet), reading is an error, never a neighbouri
 """
 
 from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
-from typing import Final, Literal, NoReturn
+from typing import Any, Final, Literal, NoReturn
 
 import av
 import numpy as np
@@ -16,11 +17,19 @@ from av.video.reformatter import Interpolation, VideoReformatter
 from jaxtyping import UInt8
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.clock import Clock, TableClock, steady_clock, table_clock
+from stereogenbench_data.media.clock import (
+    INTRA_ONLY,
+    Clock,
+    TableClock,
+    require_file_order,
+    steady_clock,
+    table_clock,
+)
 from stereogenbench_data.media.container import (
     StreamFacts,
     VideoFile,
     frames_by_duration,
+    is_colour_format,
     open_container,
     require_whole_payload,
     stream_facts,
@@ -33,11 +42,22 @@ from stereogenbench_data.media.siting import (
     CENTRE,
     Converter,
     coded_siting,
+    has_coded_chroma,
     is_subsampled,
     picture_siting,
 )
+from stereogenbench_data.schema.records import Rig
 
-__all__ = ["StreamFacts", "VideoReader", "probe", "read_rgb"]
+__all__ = ["StreamFacts", "VideoReader", "probe", "read_rgb", "require_pixel_aspect"]
+
+NO_COLOUR: Final = (
+    ", and a video of views holds YUV or RGB with 8 bits or more a colour, without alpha channel "
+    "and palette. Another video stands under this name, or it was made otherwise: fetch it again."
+)
+"""How the refusal of a video that should hold colours ends."""
+
+_ASPECT_SHARE: Final = 0.01
+"""By how much a tagged shape of pixels, kept as a small fraction, may be off the rig's."""
 
 _RED_GREEN_BLUE: Final = (2, 0, 1)
 """Where the planes of FFmpeg's gbrp are."""
@@ -49,7 +69,8 @@ def probe(
     """Return what a video file is, from its header where the header can be trusted.
 
     Frames are counted by the header of an MP4 file, and by duration and rate of a Matroska file
-    if its last frame is found where they place it. Else all packets are counted.
+    if its last frame is found where they place it. Else all packets are counted. The times of all
+    packets of an intra-only codec are held against their order, where a path is given.
 
     Args:
         file: A path, or a seekable binary file; the latter stays the caller's to close.
@@ -68,10 +89,15 @@ def probe(
         require_whole_payload(container, name=name)
         frames = _told_frames(container)
         facts = stream_facts(container, name=name, frames=frames, pixel_format=pixel_format)
-    if frames:
+    is_intra_only = facts.codec in INTRA_ONLY
+    if frames and not (is_intra_only and isinstance(file, str | Path)):
         return facts
-    with open_container(file, name=name) as container:
-        frames = len(table_clock(container, name=name).times)
+    with open_container(file, name=name, pixel_format="later") as container:
+        times = table_clock(container, name=name).times
+        frames = len(times)
+        if frames and is_intra_only:
+            steady = steady_clock(container, frames=frames)
+            require_file_order(times, steady, name=name)
     if frames == 0:
         raise MediaError(f"{name}: holds no frame (0 packets): fetch it again.")
     return replace(facts, frames=frames)
@@ -145,6 +171,10 @@ class VideoReader:
             context = container.streams.video[0].codec_context
             self.size_px = (context.width, context.height)
             """Width and height by the header; 0 where it does not tell."""
+            self.pixel_aspect = float(container.streams.video[0].sample_aspect_ratio or 0)
+            """Width of a pixel in heights of one by the header; 0 where it does not tell."""
+            coded_chroma = has_coded_chroma(context.codec.canonical_name, context.extradata)
+            self._is_coded_grey = coded_chroma is False
             self._siting = coded_siting(context.codec.canonical_name, context.extradata)
             if context.pix_fmt is not None:
                 self._facts = stream_facts(container, name=name, frames=frames)
@@ -190,6 +220,18 @@ class VideoReader:
             self._require_same_picture(index, frame)
             self._current = (index, frame)
         return self._current[1]
+
+    def colour_frame(self, index: int) -> VideoFrame:
+        """Return a frame as `frame` does, of a video of views.
+
+        Raises:
+            MediaError: If it cannot be read, or is no colour picture.
+        """
+        frame = self.frame(index)
+        if self._is_coded_grey or not is_colour_format(frame.format.name):
+            found = "coded as grey" if self._is_coded_grey else f"stored as {frame.format.name}"
+            raise MediaError(f"{self.name}: frame {index} is {found}{NO_COLOUR}")
+        return frame
 
     def siting(self, frame: VideoFrame) -> str:
         """Return where the chroma of this video lies: as it is tagged, else "center"."""
@@ -268,17 +310,56 @@ class VideoReader:
         if self._facts is not None:
             facts = self._facts
             self._picture = (facts.pixel_format, facts.width_px, facts.height_px)
-        expected = self._picture = self._picture or found
+        elif self._picture is None:
+            # The first picture seen may be one after a change; the header is of them all.
+            width_px, height_px = self.size_px
+            self._picture = (found[0], width_px or found[1], height_px or found[2])
+        expected = self._picture
         if found != expected:
             raise MediaError(
                 f"{self.name}: frame {index} is {found[0]} {found[1]}x{found[2]} where "
                 f"{expected[0]} {expected[1]}x{expected[2]} is expected: store the file anew."
+            )
+        matrix: Any = frame.side_data.get("DISPLAYMATRIX")
+        if matrix is not None and not _is_upright(bytes(matrix)):
+            raise MediaError(
+                f"{self.name}: frame {index} is tagged to be turned or mirrored when it is shown "
+                f"(rotation {frame.rotation} degrees), and the cameras are those of the stored "
+                f"picture: store it as it is to be seen, without the tag."
             )
 
     def _drop_decoder(self) -> None:
         if self._decoder is not None:
             self._decoder.close()
             self._decoder = None
+
+
+def require_pixel_aspect(told: float, rig: Rig, *, name: str) -> None:
+    """Refuse a video whose header tells pixels of another shape than the rig's sensor has.
+
+    Args:
+        told: Width of a pixel in heights of one; 0 where the header does not tell. Square pixels
+            are what many writers tell of all videos, so 1 is let pass.
+        rig: Whose sensor and picture size tell the pixels' shape.
+        name: What messages call the file.
+
+    Raises:
+        MediaError: If so.
+    """
+    width_mm = rig.sensor_width_mm / rig.image_width_px
+    height_mm = rig.sensor_height_mm / rig.image_height_px
+    if told not in (0, 1) and abs(told * height_mm / width_mm - 1) > _ASPECT_SHARE:
+        raise MediaError(
+            f"{name}: is tagged to have pixels {told:.4g} times as wide as high, and those of the "
+            f"rig's sensor are {width_mm / height_mm:.4g} times as wide as high. It was stretched "
+            f"for another shape: fetch it again, or store it without that tag."
+        )
+
+
+def _is_upright(matrix: bytes) -> bool:
+    """Return whether FFmpeg's display matrix shows a picture as it is stored."""
+    x_x, x_y, _, y_x, y_y, *_ = np.frombuffer(matrix, "=i4")
+    return bool(x_x > 0 and y_y > 0 and x_y == 0 and y_x == 0)
 
 
 def read_rgb(

@@ -21,7 +21,7 @@ from jaxtyping import UInt8, UInt16
 
 from stereogenbench_data.errors import MediaError, StorageError
 from stereogenbench_data.media.depth import open_depth, read_depth_units
-from stereogenbench_data.media.video import VideoReader, read_rgb
+from stereogenbench_data.media.video import VideoReader, read_rgb, require_pixel_aspect
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
 from stereogenbench_data.storage.ranged_file import MemberFile, RangedFile
@@ -69,11 +69,12 @@ class Streams:
 
         Raises:
             StorageError: If the video cannot be read.
-            MediaError: If it does not decode to the scene's number of frames.
+            MediaError: If it does not decode to the scene's number of colour pictures.
         """
         with self._stream(scene, name) as stream:
             key = (index, size)
             if key not in stream.last:
+                stream.reader.colour_frame(index)
                 room = _unused(stream.last, height_width=size)
                 stream.last = {}
                 stream.last[key] = _read_only(read_rgb(stream.reader, index, size=size, out=room))
@@ -89,9 +90,10 @@ class Streams:
 
         Raises:
             StorageError: If the video cannot be read.
-            MediaError: If it does not decode to the scene's number of frames.
+            MediaError: If it does not decode to the scene's number of colour pictures.
         """
         with self._stream(scene, name) as stream:
+            stream.reader.colour_frame(index)
             read_rgb(stream.reader, index, size=(out.shape[-2], out.shape[-1]), out=out)
 
     def depth_units(
@@ -156,7 +158,11 @@ class Streams:
                     label = self._source.label(scene, name)
                     kind = open_depth if name in PACKED_DEPTH_NAMES.values() else VideoReader
                     reader = kind(file, name=label, frames=scene.frames)
-                    _require_size(reader, scene, name=label)
+                    try:
+                        _require_size(reader, scene, name=label)
+                    except MediaError:
+                        reader.close()
+                        raise
                 self._open[place] = _Stream(reader, file)
             self._open.move_to_end(place)
             stream = self._open[place]
@@ -180,19 +186,20 @@ class Streams:
 
 
 def _require_size(reader: Any, scene: Scene, *, name: str) -> None:
-    """Refuse a video whose pictures have not the size that the index says, if its header tells."""
-    if isinstance(reader, VideoReader):
+    """Refuse a video whose pictures or pixels have not the size that the index says."""
+    if isinstance(reader, VideoReader) and all(reader.size_px):
         found = reader.size_px
     else:
         found = (reader.facts.width_px, reader.facts.height_px)
     told = (scene.rig.image_width_px, scene.rig.image_height_px)
-    if all(found) and found != told:
-        reader.close()
+    if found != told:
         raise MediaError(
             f"{name}: holds pictures of {found[0]}x{found[1]} pixels where the index says "
             f"{told[0]}x{told[1]}. The video or the index was replaced or altered: fetch them "
             f"again, or run `stereogenbench index` again."
         )
+    if isinstance(reader, VideoReader):
+        require_pixel_aspect(reader.pixel_aspect, scene.rig, name=name)
 
 
 def _read_only(picture: Any) -> Any:

@@ -8,7 +8,7 @@ can be formed before anything is rounded.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
@@ -25,7 +25,7 @@ from stereogenbench_data.schema.release import (
 RotationKind = Literal["rotator_deg", "quaternion_xyzw", "matrix"]
 DepthKind = Literal["planar", "ray"]
 DepthForm = Literal["depth", "inverse"]
-DepthRisk = Literal["8-bit", "lossy", "chroma"]
+DepthRisk = Literal["8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma"]
 DepthUnitSource = Literal["tag", "default", "unreadable"]
 
 
@@ -133,8 +133,9 @@ class DepthEncoding:
         frame_lag: A whole number: RGB frame t shows what depth frame t + frame_lag measured.
             Where that frame does not exist, depth counts as not measured.
         no_depth: Stored numbers that mean "not measured"; "max" is the pixel format's largest.
-        accept: Streams that are refused unless named here: "8-bit", "lossy" (a codec that
-            does not return what it was given) or "chroma" (only the luma plane is read).
+        accept: Streams that are refused unless named here: of fewer than 16 bits ("8-bit",
+            "9-bit", "10-bit", "12-bit", "14-bit"), "lossy" (a codec that does not return what it
+            was given) or "chroma" (only the luma plane is read).
         source: Where ``unit_m`` comes from: a tag of the file, the release's default, the user.
 
     Raises:
@@ -167,11 +168,9 @@ class DepthEncoding:
         ):
             if value not in choices:
                 raise SchemaError(f"{name} must be one of {choices}, got {value!r}.")
-        unknown = set(self.accept) - {"8-bit", "lossy", "chroma"}
+        unknown = set(self.accept) - set(get_args(DepthRisk))
         if unknown:
-            raise SchemaError(
-                f"accept may hold '8-bit', 'lossy' and 'chroma', got {sorted(unknown)}."
-            )
+            raise SchemaError(f"accept may hold {get_args(DepthRisk)}, got {sorted(unknown)}.")
 
     @property
     def known_unit_m(self) -> float:

@@ -25,12 +25,14 @@ from stereogenbench_data.geometry.rig import (
 )
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import (
+    ANY_DEPTH,
     measured,
     open_depth,
     read_depth_units,
+    require_depth_stream,
     resolve_encoding,
 )
-from stereogenbench_data.media.video import probe
+from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.document import parse_text
 from stereogenbench_data.schema.parse import (
     parse_complete,
@@ -112,6 +114,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     facts = {name: _probed(folder, key, _held(files, name)) for name in VIDEO_FILES}
     frames = _common_frames(key, facts, trajectory)
     rig = _sized_as_videos(key, rig, facts)
+    _require_kinds(key, rig, facts)
     poses = CameraPoses.from_trajectory(trajectory)
     _require_recorded_baselines(key, rig, poses)
     lateral_m = lateral_offsets_m(poses)
@@ -143,13 +146,13 @@ def _held(files: Mapping[str, object], name: str) -> str:
 
 
 def _probed(folder: SceneFiles, key: str, name: str) -> StreamFacts:
-    video = folder.video(name)
+    video, told = folder.video(name), f"{key}/{name}"
     try:
-        return probe(
-            video,
-            name=f"{key}/{name}",
-            pixel_format="later" if name.endswith(".mp4") else "needed",
-        )
+        if name.endswith(".mp4"):
+            facts = probe(video, name=told, pixel_format="later")
+            if facts.is_colour is not None:
+                return facts
+        return probe(video, name=told)
     finally:
         if isinstance(video, MemberFile):
             video.close()
@@ -234,6 +237,32 @@ def _sized_as_videos(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> Ri
             f"and image_height, or fetch the videos again."
         )
     return replace(rig, image_width_px=width_px, image_height_px=height_px)
+
+
+def _require_kinds(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> None:
+    """Refuse views that are no colours, and depth that is none or unlike the other cameras'.
+
+    Depth that lost something is let pass: a user's own `DepthEncoding` may accept it.
+    """
+    for name, fact in facts.items():
+        told = f"{key}/{name}"
+        require_pixel_aspect(fact.pixel_aspect, rig, name=told)
+        if name.endswith("_rgb.mp4") and not fact.is_colour:
+            stored = fact.pixel_format or "grey"
+            raise MediaError(f"{told}: is stored by codec {fact.codec} as {stored}{NO_COLOUR}")
+        if name.endswith("_depth.mkv"):
+            require_depth_stream(
+                codec=fact.codec, pixel_format=fact.pixel_format, encoding=ANY_DEPTH, name=told
+            )
+    depths = {name: fact for name, fact in facts.items() if name.endswith("_depth.mkv")}
+    grey = sum(not fact.is_colour for fact in depths.values())
+    for name, fact in depths.items():
+        if fact.is_colour and (grey or "matroska" not in fact.container):
+            raise MediaError(
+                f"{key}/{name}: holds colours (codec {fact.codec}, {fact.pixel_format}, container "
+                f"{fact.container}), and depth is one number a pixel, as in {grey} other depth "
+                f"videos of the scene. Another video stands under this name: fetch it again."
+            )
 
 
 def _require_recorded_baselines(key: str, rig: Rig, poses: CameraPoses) -> None:

@@ -8,7 +8,7 @@ from stereogenbench_data.errors import MediaError, cure_of
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import require_depth_stream, resolve_encoding
 from stereogenbench_data.media.depth_frames import DepthFrames
-from stereogenbench_data.media.video import VideoReader, probe
+from stereogenbench_data.media.video import VideoReader, probe, require_pixel_aspect
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES, depth_name
 from stereogenbench_data.storage.pool import AfterBytes
@@ -86,7 +86,7 @@ def _decode(task: DecodeTask, name: str) -> None:
     _require_indexed(scene, name, probe(file, name=name))
     with VideoReader(file, name=name, frames=scene.frames) as reader:
         for index in range(scene.frames):
-            reader.frame(index)
+            _ = reader.colour_frame(index) if name.endswith("_rgb.mp4") else reader.frame(index)
 
 
 def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
@@ -97,6 +97,7 @@ def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
             f"{name}: has {facts.frames} frames of {facts.width_px}x{facts.height_px} pixels, and "
             f"by the index {scene.frames} of {size[0]}x{size[1]}."
         )
+    require_pixel_aspect(facts.pixel_aspect, scene.rig, name=name)
     depth_names = [scene.held_name(depth_name(camera)) for camera in range(CAMERA_COUNT)]
     if name not in depth_names:
         return

@@ -1,15 +1,17 @@
 """From a released tree to its scenes: all described, in parallel, none left out in silence."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.errors import StereoGenBenchError, StorageError
+from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
+from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.problems import counted
-from stereogenbench_data.schema.records import Scene, SceneId
-from stereogenbench_data.schema.release import TRAIN_MAPS
+from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
+from stereogenbench_data.schema.release import TRAIN_MAPS, depth_name
 from stereogenbench_data.storage.journal import Journal
 from stereogenbench_data.storage.location import is_remote, shown
 from stereogenbench_data.storage.pool import AfterBytes, run_tasks
@@ -180,7 +182,7 @@ def _report(root: str | Path, folders: SceneFolders, outcomes: list[_Outcome]) -
         scenes=scenes,
         incomplete={out.key: out.reason for out in outcomes if out.kind == "incomplete"},
         broken=dict(sorted((folders.refused | broken).items())),
-        notes=(*_subset_notes(found), *_label_notes(found)),
+        notes=(*_subset_notes(found), *_label_notes(found), *_depth_notes(found)),
     )
 
 
@@ -196,6 +198,31 @@ def _subset_notes(scenes: list[Scene]) -> list[str]:
         f"eval/{folder} names no subset; a scene there counts as seen_map if its map occurs in "
         f"train, of this tree or of the release, else as unseen_map"
         for folder in sorted(set(unnamed))
+    ]
+
+
+def _depth_notes(scenes: list[Scene]) -> list[str]:
+    """Tell of depth that loading refuses unless the user's contract accepts it."""
+    first: dict[tuple[str, str], str] = {}
+    others: Counter[tuple[str, str]] = Counter()
+    for scene in scenes:
+        stored = zip(scene.depth_codec, scene.depth_pixel_format, strict=True)
+        for camera, (codec, pixel_format) in enumerate(stored):
+            if (codec, pixel_format) in first:
+                others[codec, pixel_format] += 1
+                continue
+            try:
+                require_depth_stream(
+                    codec=codec,
+                    pixel_format=pixel_format,
+                    encoding=DepthEncoding(),
+                    name=f"{scene.id.key}/{depth_name(camera)}",
+                )
+            except MediaError as error:
+                first[codec, pixel_format] = str(error)
+    return [
+        f"{told} ({counted(others[kind], 'other video')} likewise.)" if others[kind] else told
+        for kind, told in first.items()
     ]
 
 

@@ -38,7 +38,8 @@ class ExportContract:
         depth_tag: Container tag that tells the unit; None writes no tag.
         depth_kind: Depth along the optical axis, or along the ray.
         depth_format: FFV1's pixel format. Depth beyond its largest number is stored as that
-            number, which means "no depth", as it is for the sky.
+            number, which means "no depth", as it is for the sky. Fewer than 16 bits are read
+            back only by who accepts them, such as ``DepthEncoding(accept={"10-bit"})``.
         frame_lag: Depth frame t + frame_lag is of the moment that RGB frame t shows.
         sensor_mm: Width and height of the sensor.
         principal_point_px: Where the optical axis meets the picture, None for its centre.

@@ -309,14 +309,15 @@ def test_a_principal_point_outside_the_picture_is_refused(scene, point):
 
 
 @pytest.mark.parametrize("depth_format", ["gray16le", "gray12le", "gray10le"])
-def test_ten_and_twelve_bit_depth_is_read_in_its_own_numbers(tmp_path, depth_format):
+def test_accepted_ten_and_twelve_bit_depth_is_read_in_its_own_numbers(tmp_path, depth_format):
+    meant = DepthEncoding(accept=frozenset({"10-bit", "12-bit"}))
     contract = ExportContract(depth_format=depth_format, depth_unit_m=0.1, depth_tag=None)
     reference = ExportContract(depth_unit_m=0.1, depth_tag=None)
     found = []
     for name, written in (("as asked", contract), ("reference", reference)):
         request = SynthRequest(size_px=32, frames=2, seed=8, contract=written)
         synthesise(tmp_path / name, request, workers=1)
-        found.append(StereoPairs(tmp_path / name, fields=("depth", "valid"))[0])
+        found.append(StereoPairs(tmp_path / name, fields=("depth", "valid"), depth=meant)[0])
 
     both = found[0]["valid"] & found[1]["valid"]
     assert both.float().mean() > 0.5

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.depth import read_depth_units, require_depth_stream
+from stereogenbench_data.media.depth import ANY_DEPTH, read_depth_units, require_depth_stream
 from stereogenbench_data.media.planes import plane_numbers
 from stereogenbench_data.media.video import StreamFacts, VideoReader, probe
 from stereogenbench_data.schema.records import DepthEncoding
@@ -40,7 +40,8 @@ def test_every_number_survives(clips, case):
     )
 
     with VideoReader(path, name="clip", frames=3) as reader:
-        units = [read_depth_units(reader, index, encoding=DepthEncoding()) for index in (2, 0, 1)]
+        meant = DepthEncoding(accept=frozenset({f"{bits}-bit"} if bits < 16 else ()))
+        units = [read_depth_units(reader, index, encoding=meant) for index in (2, 0, 1)]
         assert reader.facts.pixel_format == case.split()[0]
 
     assert all(frame.dtype == np.uint16 and not frame.flags.writeable for frame in units)
@@ -80,11 +81,19 @@ REFUSED = {
     "8-bit": ("ffv1.mkv", ("-c:v", "ffv1"), "ffv1 as gray", ["8-bit"]),
     "lossy": (
         "x264.mkv", ("-c:v", "libx265", "-pix_fmt", "gray10le", "-x265-params", "log-level=0"),
-        "hevc as gray10le", ["lossy"],
+        "hevc as gray10le", ["10-bit", "lossy"],
     ),
     "chroma": (
-        "yuv.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p10le"), "ffv1 as yuv420p10le", ["chroma"],
+        "yuv.mkv", ("-c:v", "ffv1", "-pix_fmt", "yuv420p10le"), "ffv1 as yuv420p10le",
+        ["10-bit", "chroma"],
     ),
+    **{
+        f"{bits}-bit": (
+            f"{bits}.mkv", ("-c:v", "ffv1", "-pix_fmt", f"gray{bits}le"), f"ffv1 as gray{bits}le",
+            [f"{bits}-bit"],
+        )
+        for bits in (9, 10, 12, 14)
+    },
     "all three": (
         "mp4v.mp4", ("-c:v", "mpeg4"), "mpeg4 as yuv420p", ["8-bit", "lossy", "chroma"],
     ),
@@ -135,9 +144,10 @@ def test_the_luma_plane_is_read_where_chroma_is_accepted(clips):
     path = encoded(clips, "luma.mkv", "-c:v", "ffv1", "-pix_fmt", "yuv420p12le", bits=12)
     raw = clips.ffmpeg("-i", path, "-f", "rawvideo", "-pix_fmt", "yuv420p12le", "-")
     luma = np.frombuffer(raw, "<u2").reshape(3, -1)[:, : HEIGHT * WIDTH]
+    accept = frozenset({"12-bit", "chroma"})
 
     with VideoReader(path, name="clip", frames=3) as reader:
-        units = read_depth_units(reader, 1, encoding=DepthEncoding(accept=frozenset({"chroma"})))
+        units = read_depth_units(reader, 1, encoding=DepthEncoding(accept=accept))
 
     np.testing.assert_array_equal(units.ravel(), luma[1])
 
@@ -151,13 +161,12 @@ def test_colours_are_refused_whatever_is_accepted(pixel_format):
         codec="ffv1", pixel_format=pixel_format, width_px=8, height_px=8, frames=1,
         frame_rate_hz=15.0, tags={},
     )  # fmt: skip
-    everything = DepthEncoding(accept=frozenset({"8-bit", "lossy", "chroma"}))
 
     with pytest.raises(
         MediaError, match=f"clip: depth is stored by codec ffv1 as {pixel_format}, w"
     ):
         require_depth_stream(
-            codec=facts.codec, pixel_format=facts.pixel_format, encoding=everything, name="clip"
+            codec=facts.codec, pixel_format=facts.pixel_format, encoding=ANY_DEPTH, name="clip"
         )
 
 

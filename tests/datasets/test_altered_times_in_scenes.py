@@ -1,0 +1,116 @@
+"""A bit that flips in a time of depth never brings another moment's: folder, shard, blosc2."""
+
+import random
+import shutil
+
+import numpy as np
+import pytest
+
+from stereogenbench_data import SceneIndex, StereoGenBenchError, StereoPairs
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.storage.pack import pack
+from stereogenbench_data.storage.scene_folder import describe_scene
+from stereogenbench_data.synthesis import SynthRequest, synthesise
+from tests.media.test_altered_times import flipped, matroska_times
+
+FRAMES = 17
+DEPTH = "cam_00_depth.mkv"
+SHUFFLED = random.Random(3).sample(range(FRAMES), FRAMES)
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    root = tmp_path_factory.mktemp("drawn") / "scenes"
+    synthesise(root, SynthRequest(size_px=32, frames=FRAMES, seed=5), workers=1)
+    return root
+
+
+@pytest.fixture(scope="module")
+def truth(drawn):
+    pairs = StereoPairs(drawn, frames="all", fields=("depth",))
+    depths = [pairs[frame]["depth"].numpy() for frame in range(FRAMES)]
+    assert all((a != b).any() for a in depths for b in depths if a is not b)
+    return depths
+
+
+def block_times(content):
+    """Return (place, bit) of some bits of the times, each of two bytes, of some blocks."""
+    places = matroska_times(content)[-2 * FRAMES :]
+    return [
+        (places[2 * block + low], bit)
+        for block in (0, 1, 11, 12, 13, 16)
+        for low, bit in ((0, 1), (1, 0), (1, 3), (1, 6))
+    ]
+
+
+def wrong_frames(index, truth, *, check):
+    """Return (frame asked for, frame given) wherever another one is given."""
+    wrong = []
+    for frames, order in ((12, (0,)), ("all", range(FRAMES)), ("all", SHUFFLED)):
+        pairs = StereoPairs(index, frames=frames, fields=("depth",), check=check)
+        for place in order:
+            try:
+                found = pairs[place]["depth"].numpy()
+            except StereoGenBenchError:
+                continue
+            asked = 12 if frames == 12 else place
+            if not np.array_equal(found, truth[asked]):
+                wrong.append((asked, [np.array_equal(found, each) for each in truth].index(True)))
+    return wrong
+
+
+def test_an_altered_time_in_a_folder_brings_no_other_frame_and_no_index(drawn, truth, tmp_path):
+    index = SceneIndex.open(drawn)
+    root = tmp_path / "scenes"
+    shutil.copytree(drawn, root)
+    key = index.scene(0).id.key
+    content = (root / key / DEPTH).read_bytes()
+    moved = SceneIndex.from_scenes([index.scene(0)], root)
+    wrong, indexed = [], []
+    for place, bit in block_times(content):
+        (root / key / DEPTH).write_bytes(flipped(content, place, bit))
+        wrong += wrong_frames(moved, truth, check="read")
+        try:
+            describe_scene(root, key)
+        except MediaError as error:
+            assert f"{DEPTH}: its frame number " in str(error)  # noqa: PT017 - most are refused
+        else:
+            indexed.append(bit)
+
+    assert wrong == []
+    assert set(indexed) <= {0}, "a tick is what rounding leaves open; more is refused"
+
+
+@pytest.mark.parametrize("check", ["metadata", "read", "opened"])
+def test_an_altered_time_in_a_shard_brings_no_other_frame(drawn, truth, tmp_path, check):
+    pack(drawn, tmp_path / "shards", workers=1)
+    index = SceneIndex.open(tmp_path / "shards")
+    member = index.scene(0).member(DEPTH)
+    shard = tmp_path / "shards" / member.path
+    whole = shard.read_bytes()
+    content = whole[member.offset : member.offset + member.size]
+    wrong = []
+    for place, bit in block_times(content)[:: 1 if check == "metadata" else 5]:
+        shard.write_bytes(flipped(whole, member.offset + place, bit))
+        wrong += wrong_frames(index, truth, check=check)
+
+    assert wrong == []
+
+
+def test_an_altered_header_of_packed_depth_brings_no_other_frame(drawn, truth, tmp_path):
+    pytest.importorskip("blosc2")
+    pack(drawn, tmp_path / "shards", workers=1, depth_codec="blosc2")
+    index = SceneIndex.open(tmp_path / "shards")
+    scene = index.scene(0)
+    member = scene.member(DEPTH)
+    shard = tmp_path / "shards" / member.path
+    whole = shard.read_bytes()
+    start = whole.index(b'"pts":[', member.offset)
+    end = whole.index(b"]", start)
+    wrong = []
+    for place in range(start, end, 2):
+        shard.write_bytes(flipped(whole, place, place % 7))
+        wrong += wrong_frames(index, truth, check="metadata")
+
+    assert start < member.offset + member.size
+    assert wrong == []

@@ -1,0 +1,217 @@
+"""A video that is another than its name says is refused by name, and never read as pictures."""
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import imageio_ffmpeg
+import pytest
+
+from stereogenbench_data import MediaError, SceneIndex, StereoPairs
+from stereogenbench_data.errors import StereoGenBenchError
+from stereogenbench_data.storage.pack import pack
+from stereogenbench_data.storage.scene_folder import describe_scene
+from stereogenbench_data.storage.verify import verify
+from stereogenbench_data.storage.walk import walk
+from stereogenbench_data.synthesis import SynthRequest, synthesise
+
+FRAMES = 17
+RGB, DEPTH = "cam_00_rgb.mp4", "cam_00_depth.mkv"
+
+
+def ffmpeg(*arguments):
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", *map(str, arguments)]
+    subprocess.run(command, check=True, capture_output=True)
+
+
+def written(name, *codec, source=None, suffix=None, before=()):
+    """Return what writes a video of a scene anew, from itself or from another one."""
+
+    def alter(folder):
+        aside = folder / f"aside.{suffix or name[-3:]}"
+        ffmpeg(*before, "-i", folder / (source or name), *codec, aside)
+        aside.replace(folder / name)
+
+    return alter
+
+
+def copied(source, name):
+    return lambda folder: shutil.copy(folder / source, folder / name)
+
+
+def of_two_sizes(folder):
+    """Write H.264 that changes to 48x48 after nine frames."""
+    parts = [folder / "first.h264", folder / "second.h264"]
+    ffmpeg("-i", folder / RGB, "-frames:v", 9, "-c:v", "libx264", "-g", 1, parts[0])
+    ffmpeg(
+        "-i", folder / RGB, "-vf", r"select=gte(n\,9),scale=48:48", "-fps_mode", "passthrough",
+        "-c:v", "libx264", "-g", 1, parts[1],
+    )  # fmt: skip
+    parts[0].write_bytes(parts[0].read_bytes() + parts[1].read_bytes())
+    ffmpeg("-r", 15, "-i", parts[0], "-c", "copy", folder / RGB)
+    for part in parts:
+        part.unlink()
+
+
+QUIET_HEVC = ("-c:v", "libx265", "-x265-params", "log-level=none")
+OTHERS = {
+    "depth over colour": (copied(DEPTH, RGB), RGB, "gray16le, and"),
+    "depth in an MP4": (
+        written(RGB, "-c", "copy", source=DEPTH, suffix="mov"), RGB, "gray16le, and",
+    ),
+    "colour over depth": (copied(RGB, DEPTH), DEPTH, "holds colours|lossy, chroma"),
+    "colour over all depths": (
+        lambda folder: [
+            shutil.copy(folder / RGB, folder / f"cam_{camera:02d}_depth.mkv") for camera in range(6)
+        ],
+        DEPTH, "holds colours|lossy, chroma",
+    ),
+    "colour in a Matroska file": (
+        written(DEPTH, "-c", "copy", source=RGB), DEPTH, "holds colours|lossy, chroma",
+    ),
+    "sound alone": (
+        lambda folder: ffmpeg("-f", "lavfi", "-i", "sine=d=1", folder / RGB), RGB, "holds audio",
+    ),
+    "a still picture": (
+        written(RGB, "-frames:v", "1", "-update", "1", suffix="png"), RGB, "cannot be opened",
+    ),
+    "one picture": (written(RGB, "-frames:v", "1"), RGB, "has 1|holds 1 frames"),
+    "grey H.264": (written(RGB, "-c:v", "libx264", "-pix_fmt", "gray"), RGB, "grey, and"),
+    "grey HEVC": (written(RGB, *QUIET_HEVC, "-pix_fmt", "gray"), RGB, "gre?a?y, and"),
+    "alpha": (written(RGB, "-c:v", "png", "-pix_fmt", "rgba"), RGB, "rgba, and"),
+    "a palette": (
+        written(RGB, "-c:v", "png", "-pix_fmt", "pal8", suffix="mov"), RGB, "pal8, and",
+    ),
+    "pixels that are not square": (
+        written(RGB, "-vf", "setsar=2/1"), RGB, "pixels 2 times as wide as high",
+    ),
+    "another size": (written(RGB, "-vf", "scale=48:48"), RGB, "48x48"),
+    "colours as depth": (
+        written(DEPTH, "-c:v", "ffv1", "-pix_fmt", "gbrp16le"), DEPTH, "not one number",
+    ),
+    "depth with alpha": (
+        written(DEPTH, "-c:v", "png", "-pix_fmt", "ya16be"), DEPTH, "not one number",
+    ),
+}  # fmt: skip
+SEEN_IN_PICTURES = {
+    "another size later": (of_two_sizes, RGB, r"frame \d+ is yuv420p 48x48 where yuv420p 72x72"),
+    "a turned picture": (
+        written(RGB, "-c", "copy", before=("-display_rotation", "90")), RGB, "to be turned",
+    ),
+    "a mirrored picture": (
+        written(RGB, "-c", "copy", before=("-display_hflip",)), RGB, "to be turned or mirrored",
+    ),
+    "ten bits of depth": (
+        written(DEPTH, "-c:v", "ffv1", "-pix_fmt", "gray10le"), DEPTH, "gray10le .10-bit.",
+    ),
+    "twelve bits of depth": (
+        written(DEPTH, "-c:v", "ffv1", "-pix_fmt", "gray12le"), DEPTH, "gray12le .12-bit.",
+    ),
+}  # fmt: skip
+FITTING = {
+    "HEVC of 10 bits": written(RGB, *QUIET_HEVC, "-pix_fmt", "yuv420p10le"),
+    "H.264 without subsampling": written(RGB, "-c:v", "libx264", "-pix_fmt", "yuv444p"),
+    "H.264 of red, green and blue": written(RGB, "-c:v", "libx264rgb", "-pix_fmt", "rgb24"),
+    "MPEG-4": written(RGB, "-c:v", "mpeg4"),
+    "square pixels": written(RGB, "-vf", "setsar=1/1"),
+    "a rotation by nothing": written(RGB, "-c", "copy", before=("-display_rotation", "0")),
+}
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    root = tmp_path_factory.mktemp("drawn") / "scenes"
+    synthesise(root, SynthRequest(size_px=72, frames=FRAMES, seed=3), workers=1)
+    return root
+
+
+@pytest.fixture
+def scene(drawn, tmp_path):
+    """The folder of a scene that may be altered, in a tree of its own."""
+    shutil.copytree(drawn, tmp_path / "scenes")
+    (found,) = (tmp_path / "scenes").glob("*/*/*/scene_*")
+    return found
+
+
+def root_of(scene):
+    return scene.parents[3]
+
+
+def key_of(scene):
+    return str(scene.relative_to(root_of(scene)))
+
+
+def index_of_the_unaltered(drawn, scene):
+    """Return an index that was made before a scene was altered, but for the sizes of files."""
+    row = describe_scene(drawn, key_of(scene))
+    members = {
+        name: replace(member, size=(scene / name).stat().st_size)
+        for name, member in row.members.items()
+    }
+    return SceneIndex.from_scenes([replace(row, members=members)], root_of(scene))
+
+
+def frames_of(index, order, *, fields):
+    pairs = StereoPairs(index, frames="all", fields=fields)
+    return [pairs[frame] for frame in order]
+
+
+def require_refused(index, name, found):
+    """Every frame of an altered scene is read, in order and each afresh, and is refused by name."""
+    fields = ("left",) if name == RGB else ("depth",)
+    for order in (range(FRAMES), (12,), (16, 11)):
+        with pytest.raises(MediaError, match=rf"{name}: .*({found})"):
+            frames_of(index, order, fields=fields)
+
+
+@pytest.mark.parametrize("case", OTHERS)
+def test_another_video_is_refused_by_index_and_by_loading(drawn, scene, case):
+    alter, name, found = OTHERS[case]
+    alter(scene)
+
+    with pytest.raises(StereoGenBenchError, match=rf"{name}\b.*({found})"):
+        describe_scene(root_of(scene), key_of(scene))
+    require_refused(index_of_the_unaltered(drawn, scene), name, found)
+
+
+@pytest.mark.parametrize("case", SEEN_IN_PICTURES)
+def test_what_no_header_refuses_is_refused_when_it_is_read(drawn, scene, case):
+    alter, name, found = SEEN_IN_PICTURES[case]
+    alter(scene)
+
+    require_refused(index_of_the_unaltered(drawn, scene), name, found)
+
+
+@pytest.mark.parametrize(
+    "case", ["another size later", "a turned picture", "ten bits of depth", "twelve bits of depth"]
+)
+def test_loading_from_a_shard_and_a_deep_check_refuse_it_too(scene, tmp_path, case):
+    alter, name, found = SEEN_IN_PICTURES[case]
+    alter(scene)
+    pack(root_of(scene), tmp_path / "shards", workers=1)
+
+    require_refused(SceneIndex.open(tmp_path / "shards"), name, found)
+    report = verify(tmp_path / "shards", mode="decode", workers=1)
+    assert {(each.member, bool(re.search(found, each.found))) for each in report.problems} == {
+        (name, True)
+    }
+
+
+def test_the_index_tells_of_depth_that_loading_refuses(scene):
+    for camera in (0, 1, 5):
+        written(f"cam_{camera:02d}_depth.mkv", "-c:v", "ffv1", "-pix_fmt", "gray10le")(scene)
+
+    (note,) = walk(root_of(scene)).notes
+
+    assert f"{DEPTH}: depth is stored by codec ffv1 as gray10le (10-bit), which" in note
+    assert note.endswith("(2 other videos likewise.)")
+
+
+@pytest.mark.parametrize("case", FITTING)
+def test_colours_in_any_codec_are_read(scene, case):
+    FITTING[case](scene)
+
+    pairs = StereoPairs(root_of(scene), frames="all", fields=("left",))
+
+    assert pairs[12]["left"].float().std() > 5
