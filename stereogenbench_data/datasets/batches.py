@@ -177,6 +177,7 @@ class EpochBatches(Sampler[list[int]]):
         self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
         self._follows_the_group = "rank" not in options
         self._resumed = (0, 0)
+        self.completed: tuple[int, tuple[int, ...]] | None = None
         self._order: EpochOrder | None = None
         self._latest: BatchPass | None = None
         if self.end() == 0:
@@ -249,6 +250,24 @@ class EpochBatches(Sampler[list[int]]):
         self._resumed = (0, 0)
         self._latest = latest
 
+    def complete(self, epoch: int) -> None:
+        """Take note that a pass over an epoch gave its last batch."""
+        self.completed = (epoch, self.dataset.epoch_version)
+
+    def require_no_other_reader(self) -> None:
+        """Require that no `DataLoader` of another's making is in the middle of these batches.
+
+        Raises:
+            StateError: If one is: workers read ahead, so what its loop has taken is not known.
+        """
+        if self._latest is not None and not self._latest.is_complete:
+            raise StateError(
+                "these batches are read by another DataLoader than the loader that is asked for "
+                "its position, as after skip_first_batches of Accelerate, and nobody counts what "
+                "its loop takes. Go on from a saved state with load_state_dict (Accelerate: "
+                "load_state), without skip_first_batches."
+            )
+
     def end(self, start: int = 0) -> int:
         """Return the global number at which an epoch ends for ranks that go on from ``start``."""
         return last_batch(
@@ -280,7 +299,8 @@ class EpochBatches(Sampler[list[int]]):
             raise SelectionError(
                 f"these batches were made for rank {self.rank} of {self.world_size}, and this "
                 f"process is rank {rank} of {world_size} now. Make them after init_process_group "
-                "(or Accelerator()), or give rank= and world_size=."
+                "(Accelerate: after Accelerator(); Lightning: in train_dataloader() of a module or "
+                "data module), or give rank= and world_size=."
             )
 
     def batch(self, number: int, *, epoch: int) -> EpochBatch:
@@ -382,7 +402,14 @@ class BatchPass(Iterator[list[int]]):
         self._batches.begin(self)
         number = next(self._left)
         self._given += 1
+        if self.is_complete:
+            self._batches.complete(self._epoch)
         return self._batches.batch(number, epoch=self._epoch)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the last batch was given out."""
+        return self._given >= self._count
 
     def state_dict(self) -> State:
         """Return the position after the last batch that this pass gave out."""
@@ -399,7 +426,8 @@ class BatchPass(Iterator[list[int]]):
     def _go_to(self, epoch: int, start: int) -> None:
         self._epoch, self._start, self._given = epoch, start, 0
         self._end = self._batches.end(start)
-        self._left = iter(self._batches.share(start))
+        share = self._batches.share(start)
+        self._left, self._count = iter(share), len(share)
 
 
 def require_count(state: Mapping[str, Any], name: str, *, most: int | None = None) -> int:

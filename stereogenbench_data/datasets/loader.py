@@ -2,6 +2,7 @@
 
 import os
 import sys
+import threading
 from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any, Final, Protocol, runtime_checkable
@@ -76,7 +77,9 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     A pass owns its workers and their memory: the loader can be iterated while another iteration of
     it goes on. Workers that persist serve one pass at a time: a new one ends the one before, which
-    then raises `PassError`. Where a worker dies, the loop ends with `WorkerError`.
+    then raises `PassError`. Where a worker dies, the loop ends with `WorkerError`, or with torch's
+    own `RuntimeError` if it dies while the body of the loop runs: catch `RuntimeError`, of which
+    `WorkerError` is one. Threads that share a pass take turns.
 
     Its epoch is its own from the first `set_epoch` or `load_state_dict` on, and until then goes
     with the dataset that it was made from; its open videos are its own. So loaders of one dataset,
@@ -93,20 +96,35 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
     batches: EpochBatches
 
     def __init__(
-        self, dataset: Keeping, batches: EpochBatches, *, num_workers: int, **options: Any
+        self,
+        dataset: Keeping,
+        batches: EpochBatches,
+        *,
+        num_workers: int = 0,
+        batch_sampler: Any = None,
+        **options: Any,
     ) -> None:
-        """Load batches of a dataset; ``options`` are those of `DataLoader`."""
-        options.setdefault("collate_fn", dataset.buffers.collate)
+        """Load batches of a dataset.
+
+        Args:
+            dataset: The samples.
+            batches: Their batches.
+            num_workers: How many processes load; 0 loads in this one.
+            batch_sampler: What gives the batches on their way to the workers, such as what
+                Lightning puts around them to learn what it predicts; ``batches`` itself if None.
+            **options: Those of `DataLoader`.
+        """
+        if options.get("collate_fn") is None:
+            options["collate_fn"] = dataset.buffers.collate
         super().__init__(
             dataset,  # type: ignore[arg-type]  # a protocol: torch asks for len and [] alone
-            batch_sampler=batches,
+            batch_sampler=batch_sampler or batches,
             num_workers=num_workers,
             **options,
         )
         self.batches = batches
         self._keeping = dataset
         self._position = batches.next_position()
-        self._completed: tuple[int, tuple[int, ...]] | None = None
         self._unfinished: WeakSet[LoaderPass] = WeakSet()
         self._running = 0
         self._clock = 0
@@ -141,7 +159,12 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         return LoaderPass(self)
 
     def state_dict(self) -> State:
-        """Return the position after the last batch that the loop has taken."""
+        """Return the position after the last batch that the loop has taken.
+
+        Raises:
+            StateError: If the loop runs over another DataLoader, made of this one's parts.
+        """
+        self.batches.require_no_other_reader()
         epoch, consumed = self._position
         return self.batches.state_at(self.epoch, consumed if epoch == self.epoch else 0)
 
@@ -184,7 +207,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
     def _next_position(self) -> tuple[int, int]:
         """Return the epoch and the global batch at which a pass begins now."""
         epoch, start = self.batches.next_position()
-        if start == 0 and self._completed == (epoch, self._keeping.epoch_version):
+        if start == 0 and self.batches.completed == (epoch, self._keeping.epoch_version):
             epoch += 1
         return epoch, start
 
@@ -208,7 +231,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         self._clock += 1
         by.last_taken = self._clock
         if by.is_complete:
-            self._completed = (by.epoch, self._keeping.epoch_version)
+            self.batches.complete(by.epoch)
             self._unfinished.discard(by)
 
     def _ended(self, ended: "LoaderPass") -> None:
@@ -247,6 +270,8 @@ class LoaderPass(Iterator[Any]):
         self._pid = os.getpid()
         self._over: str | None = None
         self._loaded: Any = _NOTHING
+        # Threads that share a pass take turns.
+        self._lock = threading.RLock()
 
     def _begin(self) -> None:
         """Begin at the position that the loader is at now."""
@@ -255,9 +280,12 @@ class LoaderPass(Iterator[Any]):
         self._end = batches.end(start)
         share = batches.share(start)
         # No reference to this pass in it: without a cycle, a pass that is left ends at once.
-        numbers = map(partial(batches.batch, epoch=self.epoch), share)
+        numbers: Iterator[Any] = map(partial(batches.batch, epoch=self.epoch), share)
+        if loader.batch_sampler is not batches:
+            numbers = iter(loader.batch_sampler or ())
         if loader.persistent_workers:
-            loader._persistent = loader._persistent or _Workers(loader)
+            if loader._persistent is None or not loader._persistent.is_of_this_process:
+                loader._persistent = _Workers(loader)
             self._workers = loader._persistent
         else:
             self._workers = _Workers(loader)
@@ -289,9 +317,13 @@ class LoaderPass(Iterator[Any]):
                 an error ended it.
             WorkerError: If a worker process died.
         """
+        self._require_own_process()
+        with self._lock:
+            return self._next()
+
+    def _next(self) -> Any:
         if self._over is not None:
             raise PassError(self._over)
-        self._require_own_process()
         if self._share is None:
             self._begin()
         workers = self._workers
@@ -382,7 +414,12 @@ class _Workers:
             persistent_workers=loader.persistent_workers,
         )
 
-    def begin(self, numbers: Iterator[EpochBatch]) -> Iterator[Any]:
+    @property
+    def is_of_this_process(self) -> bool:
+        """Whether this process started them, and not one that it was forked from."""
+        return self._context is None or self._context.is_of_this_process
+
+    def begin(self, numbers: Iterator[Any]) -> Iterator[Any]:
         """Return the batches of a pass; the pass that these workers served before has ended."""
         if self._torch is None:
             raise PassError("these workers have ended: call iter(loader) again.")
@@ -411,9 +448,14 @@ class _Workers:
             _inherited.append((loader, batches))
             return
         self._context.stop()
-        # Now, and not when the last traceback is gone that knows the iterator.
-        batches._shutdown_workers()  # type: ignore[attr-defined]  # Lightning ends workers so, too
+        # Now, and not when the last traceback is gone that knows the iterator. Lightning ends
+        # workers in this way, too; where none could be started there is nothing to end.
+        getattr(batches, "_shutdown_workers", _pass)()
         forget_slots(self._context.pids)
+
+
+def _pass() -> None:
+    """Do nothing."""
 
 
 class _Numbers(Sampler[list[int]]):

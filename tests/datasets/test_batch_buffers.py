@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, default_collate
 
-from stereogenbench_data import PAIR_FIELDS, SelectionError, StereoPairs, collate
+from stereogenbench_data import PAIR_FIELDS, SelectionError, StateError, StereoPairs, collate
 from stereogenbench_data.datasets.batch_buffers import KEPT_BUFFERS, SLOTS
 
 FIELDS = ("left", "disparity", "valid", "baseline_m", "frame_index", "__key__")
@@ -212,3 +212,19 @@ def test_the_loaders_parts_serve_another_loader(pairs):
     )  # fmt: skip
 
     assert all(same(one, two) for one, two in zip(other, pairs.loader(9), strict=True))
+
+
+def test_a_position_is_not_guessed_where_another_loader_reads_the_batches(pairs):
+    loader = pairs.loader(9)
+    other = iter(
+        DataLoader(loader.dataset, batch_sampler=loader.batch_sampler, collate_fn=loader.collate_fn)
+    )
+    next(other)
+    with pytest.raises(StateError, match=r"read by another DataLoader .* skip_first_batches"):
+        loader.state_dict()
+    assert len(list(other)) == 14
+
+    assert loader.state_dict()["batches_consumed"] == 0
+    next(iter(loader))
+    assert loader.epoch == 1
+    assert loader.state_dict()["batches_consumed"] == 1

@@ -214,6 +214,55 @@ def test_a_pass_is_refused_in_a_fork_of_its_process(pairs):
     assert len(list(batches)) == 14
 
 
+@pytest.mark.parametrize("persistent", [False, True])
+def test_a_fork_may_begin_a_pass_of_its_own(pairs, truth, persistent):
+    loader = pairs.loader(9, num_workers=1, persistent_workers=persistent)
+    found = []
+    for number, batch in enumerate(loader):
+        found.append(batch)
+        if number == 3:
+            assert fork_and(lambda: sum(wrong(other, truth) for other in loader) and 1 / 0) == 0
+
+    assert keys_of(found) == keys_of(pairs.loader(9))
+    loader.close()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_threads_that_share_a_pass_take_turns(pairs, workers):
+    batches = iter(pairs.loader(9, num_workers=workers))
+    found, errors = [], []
+
+    def take():
+        try:
+            found.extend(batch["__key__"] for batch in batches)
+        except RuntimeError as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=take) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert errors == []
+    assert sorted(map(tuple, found)) == sorted(map(tuple, keys_of(pairs.loader(9))))
+
+
+@pytest.mark.filterwarnings("ignore:Got pickle error when attempting to start a worker")
+def test_workers_that_could_not_start_leave_nothing_to_end(pairs):
+    loader = pairs.loader(
+        9,
+        num_workers=1,
+        persistent_workers=True,
+        multiprocessing_context="spawn",
+        worker_init_fn=lambda number: None,
+    )
+    with pytest.raises((AttributeError, pickle.PicklingError), match="pickle"):
+        next(iter(loader))
+
+    loader.close()
+
+
 def test_a_fork_that_lets_go_of_a_pass_does_not_end_its_workers(pairs):
     kept = [iter(pairs.loader(9, num_workers=2))]
     next(kept[0])

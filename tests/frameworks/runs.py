@@ -75,6 +75,20 @@ def lightning(loader, folder, *, stop_at=None, resume=False, devices=1):
     return module.network.steps
 
 
+def predicted(loader):
+    """Return the keys that Lightning's predict goes through."""
+
+    class Keys(_Module):
+        def predict_step(self, batch, number):
+            return batch["__key__"]
+
+    trainer = LightningTrainer(
+        accelerator="cpu", devices=1, logger=False, enable_checkpointing=False,
+        enable_model_summary=False, enable_progress_bar=False,
+    )  # fmt: skip
+    return [key for keys in trainer.predict(Keys(), loader) for key in keys]
+
+
 class _Model(_Scalar):
     def forward(self, **batch):
         return {"loss": self.loss(batch)}

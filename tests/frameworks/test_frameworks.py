@@ -9,8 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from accelerate import skip_first_batches
 
-from tests.datasets.conftest import flat
+from tests.datasets.conftest import flat, keys_of
 from tests.frameworks import runs
 
 pytestmark = [
@@ -117,3 +118,21 @@ def test_hugging_faces_trainer_goes_on_as_if_it_had_not_stopped(
     assert len({tuple(sorted(keys)) for keys in of_epochs(whole, epochs=3)}) == 3
     assert len(before) == stop
     assert before + after == whole
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_lightning_predicts_each_sample_once(small_release, workers):
+    pairs = runs.random_frames(small_release)
+    keys = runs.predicted(pairs.loader(8, num_workers=workers, tail="uneven"))
+
+    assert len(keys) == len(set(keys)) == 60
+
+
+def test_accelerates_skipped_batches_are_followed_by_the_next_epoch(small_release):
+    pairs = runs.random_frames(small_release)
+    loader = pairs.loader(4, num_workers=1)
+    expected = [pairs.set_epoch(epoch) or keys_of(pairs.loader(4)) for epoch in (0, 1)]
+    pairs.set_epoch(0)
+
+    assert keys_of(skip_first_batches(loader, 5)) == expected[0][5:]
+    assert keys_of(loader) == expected[1]
