@@ -26,7 +26,6 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from stereogenbench_data.audit.audit_records import Alignment, Estimate, PairFit
-from stereogenbench_data.audit.contract_views import band_passed
 from stereogenbench_data.audit.reprojection import MeasuredDepth
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
@@ -40,7 +39,9 @@ ALIGNED_PAIRS: Final = tuple(
 )
 """Directed pairs that are compared: neighbours, those one further on, and the outermost."""
 
-_POINTS: Final = 2500
+_POINTS: Final = 1600
+_FEW_FRAMES: Final = 4
+"""Fewer frames than that are compared both ways; of more, each takes half of the directions."""
 _FEWEST_POINTS: Final = 100
 _CELLS: Final = 4
 _TOLERANCE: Final = 0.005
@@ -57,6 +58,8 @@ CERTAIN: Final = 6.0
 """Standard errors that an estimate must be away from 0; 4 or 5 occur by chance among the 30
 parameters of each of 8,000 scenes, and parts of a picture are not quite independent."""
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+_BLUR: Final = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
+_MEAN_PX: Final = 13
 LEAST_CONTRAST: Final = 2.0
 """Standard deviation in grey levels of the band-passed points of a picture with texture."""
 _NOTED: Final = {
@@ -320,9 +323,10 @@ class _Fit:
 class AlignmentCheck:
     """Takes a scene's frames one after another; `result` is what they say together."""
 
-    def __init__(self, intrinsics: Intrinsics) -> None:
-        """Prepare for the pictures of one rig."""
+    def __init__(self, intrinsics: Intrinsics, *, frames: int) -> None:
+        """Prepare for so many frames of one rig."""
         self.intrinsics = intrinsics
+        self._is_both_ways = frames < _FEW_FRAMES
         self._depth = {pair: _Sums() for pair in ALIGNED_PAIRS}
         self._motion = {(camera, camera): _Sums() for camera in range(CAMERA_COUNT)}
         self._pictures = {pair: _Sums() for pair in ALIGNED_PAIRS}
@@ -330,7 +334,8 @@ class AlignmentCheck:
         self._contrast: dict[tuple[int, int], list[float]] = {}
         self._lags: dict[tuple[int, int], list[float]] = {}
         self._factor = 1.0
-        self._disparity_px: list[float] = []
+        self._disparity_px: dict[tuple[int, int], list[float]] = {}
+        self._moved_px: list[float] = []
         self._frames = 0
         self._last: tuple[int, dict[int, MeasuredDepth]] | None = None
 
@@ -350,7 +355,8 @@ class AlignmentCheck:
             poses: Of all frames.
         """
         for source, target in ALIGNED_PAIRS:
-            if source in depths and target in depths:
+            is_turn = self._is_both_ways or (source < target) == (self._frames % 2 == 0)
+            if is_turn and source in depths and target in depths:
                 motion = poses.cam_from_cam(frame, target=target, source=source)
                 landed = _landed(
                     depths[source], depths[target], intrinsics=self.intrinsics, motion=motion
@@ -372,13 +378,19 @@ class AlignmentCheck:
         after: tuple[int, MeasuredDepth],
         poses: CameraPoses,
     ) -> None:
-        for (here, source), (there, target) in ((before, after), (after, before)):
+        ways = ((before, after), (after, before))
+        turn = (self._frames + camera) % 2
+        for (here, source), (there, target) in ways if self._is_both_ways else ways[turn:][:1]:
             motion = np.linalg.inv(poses.world_from_cam(there, camera)) @ poses.world_from_cam(
                 here, camera
             )
             landed = _landed(source, target, intrinsics=self.intrinsics, motion=motion)
             if landed is not None:
                 self._add_depth(self._motion[camera, camera], landed, check="motion")
+                away_px = np.hypot(
+                    landed.u_px - landed.columns - 0.5, landed.v_px - landed.rows - 0.5
+                )
+                self._moved_px.append(float(np.median(away_px)))
 
     def _add_depth(self, sums: _Sums, landed: _Landed, *, check: str) -> None:
         smooth = landed.smooth
@@ -429,10 +441,12 @@ class AlignmentCheck:
         if contrast < LEAST_CONTRAST:
             return
         self._fits.setdefault(pair, []).append(_correlation(first, second))
+        disparity_px = float(np.abs(landed.by_depth[0][seen]).mean()) / factor
+        self._disparity_px.setdefault(pair, []).append(disparity_px)
         for lag in (-1, 1):
             beside = bands.get((source, frame + lag)), bands.get((target, frame + lag))
-            early = None if beside[0] is None else _sampled(beside[0], *from_px)[0]
-            late = None if beside[1] is None else _sampled(beside[1], *to_px)[0]
+            early = None if beside[0] is None else _value(beside[0], *from_px)
+            late = None if beside[1] is None else _value(beside[1], *to_px)
             for camera, one, two in (
                 (source, early, second), (target, first, late), (_OF_ALL, early, late),
             ):  # fmt: skip
@@ -445,7 +459,6 @@ class AlignmentCheck:
         # A picture that is aside by a pixel differs by its slope: that counts in full.
         cut = max(6 * spread, 3 * float(np.sqrt((slope_x**2 + slope_y**2).mean())))
         weight = np.clip(1 - (off / cut) ** 2, 0, None) ** 2 / max(spread, 1.0) ** 2
-        self._disparity_px.append(float(np.abs(landed.by_depth[0][seen]).mean()) / factor)
         by_depth_x, by_depth_y = landed.by_depth[0][seen], landed.by_depth[1][seen]
         by_scale = slope_x * by_depth_x / factor + slope_y * by_depth_y / factor_y
         columns = {
@@ -465,6 +478,7 @@ class AlignmentCheck:
                 through=sum(self._depth[pair].through for pair in both),
                 contrast=_mean(self._contrast.get(pair, []) for pair in both),
                 correlation=_mean(self._fits.get(pair, []) for pair in both),
+                disparity_px=_mean(self._disparity_px.get(pair, []) for pair in both),
             )
             for left, right in ALIGNED_PAIRS
             if left < right
@@ -496,7 +510,9 @@ class AlignmentCheck:
             moved_smooth=smooth,
             moved_through=through,
             picture_px=self._factor,
-            disparity_px=_mean([self._disparity_px]),
+            width_px=self.intrinsics.width_px / self._factor,
+            moved_px=_mean([self._moved_px]),
+            disparity_px=_mean(self._disparity_px.values()),
         )
 
 
@@ -535,8 +551,17 @@ def _explained(
 
 
 def band(picture: Any) -> Float[np.ndarray, "h w"]:
-    """Return the band-passed grey levels of a (3, h, w) picture."""
-    return band_passed(np.tensordot(_LUMA, picture.astype(np.float32), axes=1))
+    """Return the grey levels of a (3, h, w) picture, blurred a little, less their local mean."""
+    blurred = mean = np.tensordot(_LUMA, picture.astype(np.float32), axes=1)
+    for _ in range(2):
+        # Each turn works down the columns, and puts rows in their place.
+        size = len(blurred)
+        padded = np.pad(blurred, ((2, 2), (0, 0)), mode="edge")
+        blurred = sum(tap * padded[start : start + size] for start, tap in enumerate(_BLUR)).T
+        reach = np.pad(mean, ((_MEAN_PX // 2 + 1, _MEAN_PX // 2), (0, 0)), mode="edge")
+        sums = np.cumsum(reach, axis=0)
+        mean = ((sums[_MEAN_PX:] - sums[:-_MEAN_PX]) / _MEAN_PX).T
+    return np.ascontiguousarray(blurred - mean)
 
 
 def _sampled(picture: Any, u_px: Points, v_px: Points) -> tuple[Points, Points, Points]:
@@ -552,6 +577,16 @@ def _sampled(picture: Any, u_px: Points, v_px: Points) -> tuple[Points, Points, 
         _between(patch[1:3, 2:] - patch[1:3, :2], part_x, part_y) / 2,
         _between(patch[2:, 1:3] - patch[:2, 1:3], part_x, part_y) / 2,
     )
+
+
+def _value(picture: Any, u_px: Points, v_px: Points) -> Points:
+    """Return a picture's values between its pixels."""
+    height, width = picture.shape
+    x, y = np.clip(u_px - 0.5, 0, width - 1.001), np.clip(v_px - 0.5, 0, height - 1.001)
+    left, top = x.astype(np.intp), y.astype(np.intp)
+    inner = [[picture[top + down, left + across] for across in (0, 1)] for down in (0, 1)]
+    value: Points = _between(np.array(inner), x - left, y - top)
+    return value
 
 
 def _correlation(first: Points, second: Points) -> float:
