@@ -4,7 +4,8 @@ Points of a smooth surface are taken from one camera to another, or from one mom
 their depth and the recorded poses. On a plane 1 / depth is linear in the pixel, so the inverse
 depth that the target stores there, interpolated, equals the expected one but for rounding. What is
 left over is explained by one parameter at a time (least squares, Tukey's weights): depth of one
-camera shifted, scaled or along the ray; a focal length off. In the same way the difference of two
+camera shifted, scaled or along the ray; a focal length off, which shifts the depth of every camera
+by its disparity. In the same way the difference of two
 pictures is explained by one of them being shifted (Lucas and Kanade, 1981), or by every disparity
 being off by a factor. The parameter that explains most is kept, its camera is left out, and the
 rest is fitted again.
@@ -400,13 +401,14 @@ class AlignmentCheck:
         window = _WINDOW[check]
         keep = smooth & (np.abs(landed.off) < window + 2 * landed.steps)
         columns = {name: (a[keep], b[keep]) for name, (a, b) in landed.depth_columns().items()}
+        across, down = (column[keep] for column in landed.focal_columns())
+        none = np.zeros_like(across)
+        columns["focal"] = (across + down, none)
         if check == "motion":
-            across, down = (column[keep] for column in landed.focal_columns())
-            none = np.zeros_like(across)
             columns = {
                 "scale": columns["scale"],
                 "ray": columns["ray"],
-                "focal": (across + down, none),
+                "focal": columns["focal"],
                 "focal_x": (across, none),
                 "focal_y": (down, none),
             }
@@ -486,7 +488,7 @@ class AlignmentCheck:
         )
         depth = _explained(
             self._depth, "depth", of_cameras=("scale", "ray", "shift_x", "shift_y"),
-            of_all=("ray",),
+            of_all=("ray", "focal"),
         )  # fmt: skip
         motion = _explained(
             self._motion, "motion", of_all=("scale", "ray", "focal", "focal_x", "focal_y")

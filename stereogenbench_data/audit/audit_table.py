@@ -156,6 +156,8 @@ _SIZES: Final = (
     ("depth fit", "depth", "of one camera against the others: factor", ("scale",), "depth_scale"),
     ("depth fit", "depth", "of one camera: shift, px", ("shift_x", "shift_y"), "depth_shift_px"),
     ("depth fit", "depth", "share of the way to depth along the ray", ("ray",), "depth_ray"),
+    ("depth fit", "depth", "focal length or all baselines between cameras: factor", ("focal",),
+     "focal"),
     ("motion fit", "motion", "focal length or unit of depth from frame to frame: factor",
      ("scale", "focal", "focal_x", "focal_y"), "focal"),
     ("pictures fit", "pictures", "of one camera: shift, px", ("shift_x", "shift_y"),

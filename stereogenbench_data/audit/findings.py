@@ -111,7 +111,7 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
         )
         yield Finding(scene.key, "", "motion", text)
     has_wrong_depth = bool(through) or any(
-        each.is_first and each.check == "depth" for each in found.estimates
+        each.is_first and each.check == "depth" and each.what != "focal" for each in found.estimates
     )
     for each in found.estimates:
         # Depth that contradicts itself tells nothing of focal lengths.
@@ -172,7 +172,9 @@ def _correlated_less(scene: SceneAudit, camera: int) -> float:
 def limit_of(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> float:
     """Return beyond which size an estimate is a finding."""
     if each.check == "depth":
-        by_name = {"scale": limits.depth_scale, "ray": limits.depth_ray}
+        by_name = {
+            "scale": limits.depth_scale, "ray": limits.depth_ray, "focal": limits.focal,
+        }  # fmt: skip
         return by_name.get(each.what, limits.depth_shift_px)
     if each.check == "motion":
         return limits.depth_ray if each.what == "ray" else limits.focal
@@ -268,6 +270,11 @@ def _estimate_findings(scene: SceneAudit, each: Estimate, limits: AuditLimits) -
             f"is {each.value:+.2f} px {_SHIFTS.get(each.what, '')} of where the others see it",
         )
         text = f"depth of {of} {what}"
+        if each.what == "focal":
+            text = (
+                f"between cameras, depth fits if the focal length, or all baselines, are corrected "
+                f"{-each.value:+.2%}"
+            )
     elif each.check == "motion":
         name = ""
         what = {
