@@ -59,8 +59,6 @@ CERTAIN: Final = 6.0
 """Standard errors that an estimate must be away from 0; 4 or 5 occur by chance among the 30
 parameters of each of 8,000 scenes, and parts of a picture are not quite independent."""
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
-_BLUR: Final = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
-_MEAN_PX: Final = 13
 LEAST_CONTRAST: Final = 2.0
 """Standard deviation in grey levels of the band-passed points of a picture with texture."""
 _NOTED: Final = {
@@ -553,17 +551,20 @@ def _explained(
 
 
 def band(picture: Any) -> Float[np.ndarray, "h w"]:
-    """Return the grey levels of a (3, h, w) picture, blurred a little, less their local mean."""
+    """Return grey levels of a (3, h, w) picture, blurred a little, less their mean over 13 px."""
     blurred = mean = np.tensordot(_LUMA, picture.astype(np.float32), axes=1)
     for _ in range(2):
         # Each turn works down the columns, and puts rows in their place.
         size = len(blurred)
         padded = np.pad(blurred, ((2, 2), (0, 0)), mode="edge")
-        blurred = sum(tap * padded[start : start + size] for start, tap in enumerate(_BLUR)).T
-        reach = np.pad(mean, ((_MEAN_PX // 2 + 1, _MEAN_PX // 2), (0, 0)), mode="edge")
-        sums = np.cumsum(reach, axis=0)
-        mean = ((sums[_MEAN_PX:] - sums[:-_MEAN_PX]) / _MEAN_PX).T
-    return np.ascontiguousarray(blurred - mean)
+        near, far = padded[1:-3] + padded[3:-1], padded[:-4] + padded[4:]
+        blurred = np.ascontiguousarray((padded[2:-2] * 6 + near * 4 + far).T)
+        ones = np.pad(mean, ((6, 6), (0, 0)), mode="edge")
+        twos = ones[:-1] + ones[1:]
+        fours = twos[:-2] + twos[2:]
+        eights = fours[:-4] + fours[4:]
+        mean = np.ascontiguousarray((eights[:size] + fours[8 : 8 + size] + ones[12:]).T)
+    return blurred / np.float32(16**2) - mean / np.float32(13**2)
 
 
 def _sampled(picture: Any, u_px: Points, v_px: Points) -> tuple[Points, Points, Points]:
