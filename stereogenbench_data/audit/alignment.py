@@ -14,9 +14,9 @@ What lies behind what is expected is seen through a surface. An occluder hides w
 and so never causes that, whatever else the target sees: with right data the share is 0 to 0.1 %
 between cameras of one moment. Things that move cause it between two moments.
 
-Errors are those of sums over 16 parts of the picture in each frame, which differ in content
-(sandwich estimate). What would not be seen if it were there, because its error is as large as
-what is looked for, is not testable.
+Errors are those of sums over 16 parts of the picture in each of at most 5 moments, which differ
+in content (sandwich estimate). What would not be seen if it were there, because its error is as
+large as what is looked for, is not testable.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -45,6 +45,9 @@ _FEW_FRAMES: Final = 4
 """Fewer frames than that are compared both ways; of more, each takes half of the directions."""
 _FEWEST_POINTS: Final = 100
 _CELLS: Final = 4
+_MOMENTS: Final = 5
+"""Into so many moments a scene's frames are put: those of one show the same things, and so err
+alike."""
 _TOLERANCE: Final = 0.005
 """Share of the depth, beside two stored steps, beyond which a point counts as seen through; a
 surface that passes as smooth bends by less between pixels."""
@@ -326,6 +329,7 @@ class AlignmentCheck:
         """Prepare for so many frames of one rig."""
         self.intrinsics = intrinsics
         self._is_both_ways = frames < _FEW_FRAMES
+        self._frames_a_moment = -(-frames // _MOMENTS)
         self._depth = {pair: _Sums() for pair in ALIGNED_PAIRS}
         self._motion = {(camera, camera): _Sums() for camera in range(CAMERA_COUNT)}
         self._pictures = {pair: _Sums() for pair in ALIGNED_PAIRS}
@@ -410,7 +414,7 @@ class AlignmentCheck:
                 "focal_x": (across, none),
                 "focal_y": (down, none),
             }
-        cells = landed.cell[keep] + _CELLS**2 * self._frames
+        cells = landed.cell[keep] + _CELLS**2 * (self._frames // self._frames_a_moment)
         # Coarse steps make a point count less; rounding moves it by 0.3 of one.
         weight = 1 / (1 + (landed.steps[keep] / _TOLERANCE) ** 2)
         sums.add(landed.off[keep], weight, cells, columns)
@@ -466,7 +470,12 @@ class AlignmentCheck:
             "shift_y": (slope_y, -slope_y),
             "scale": (-by_scale, np.zeros_like(by_scale)),
         }
-        self._pictures[pair].add(off, weight, landed.cell[seen] + _CELLS**2 * self._frames, columns)
+        self._pictures[pair].add(
+            off,
+            weight,
+            landed.cell[seen] + _CELLS**2 * (self._frames // self._frames_a_moment),
+            columns,
+        )
 
     def result(self) -> Alignment:
         """Return what all frames say together."""

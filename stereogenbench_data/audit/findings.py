@@ -87,6 +87,7 @@ _NARROW_PX: Final = 128
 """Narrower pictures have more of their pixels at edges."""
 _SHARP_PX: Final = 256
 """In narrower pictures, what is sampled between pixels is aside by more of them."""
+_OWN_MOTION_PX: Final = 0.03
 _SHIFTS: Final = {"shift_x": "to the right", "shift_y": "down"}
 
 
@@ -177,7 +178,10 @@ def limit_of(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> float:
         }  # fmt: skip
         return by_name.get(each.what, limits.depth_shift_px)
     if each.check == "motion":
-        return limits.depth_ray if each.what == "ray" else limits.focal
+        if each.what == "ray":
+            return limits.depth_ray
+        # Things that move by themselves are mistaken for more, the less the camera moves.
+        return max(limits.focal, _OWN_MOTION_PX / max(scene.alignment.moved_px, 1e-6))
     if each.what == "shift_y":
         return limits.picture_shift_px
     shift_px = limits.picture_shift_px * max(1.0, _SHARP_PX / scene.alignment.width_px)
@@ -229,6 +233,8 @@ def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str
             limit = least = limit_of(scene, Estimate(check, what, -1), limits)
             if (check, what) == ("pictures", "scale"):
                 limit = limits.picture_scale
+            if check == "motion":
+                limit = limits.focal
             seen = {
                 each.camera: max(least, CERTAIN * each.error)
                 for each in of_check if each.what == what and not math.isnan(each.error)
