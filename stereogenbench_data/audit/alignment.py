@@ -4,7 +4,8 @@ Points of a smooth surface are taken from one camera to another, or from one mom
 their depth and the recorded poses. On a plane 1 / depth is linear in the pixel, so the inverse
 depth that the target stores there, interpolated, equals the expected one but for rounding. What is
 left over is explained by one parameter at a time (least squares, Tukey's weights): depth of one
-camera shifted, scaled or along the ray; a focal length off. In the same way the difference of two
+camera shifted, scaled or along the ray; a focal length off, which shifts the depth of every camera
+by its disparity. In the same way the difference of two
 pictures is explained by one of them being shifted (Lucas and Kanade, 1981), or by every disparity
 being off by a factor. The parameter that explains most is kept, its camera is left out, and the
 rest is fitted again.
@@ -13,9 +14,9 @@ What lies behind what is expected is seen through a surface. An occluder hides w
 and so never causes that, whatever else the target sees: with right data the share is 0 to 0.1 %
 between cameras of one moment. Things that move cause it between two moments.
 
-Errors are those of sums over 16 parts of the picture in each frame, which differ in content
-(sandwich estimate). What would not be seen if it were there, because its error is as large as
-what is looked for, is not testable.
+Errors are those of sums over 16 parts of the picture in each of at most 5 moments, which differ
+in content (sandwich estimate). What would not be seen if it were there, because its error is as
+large as what is looked for, is not testable.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -26,7 +27,6 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from stereogenbench_data.audit.audit_records import Alignment, Estimate, PairFit
-from stereogenbench_data.audit.contract_views import band_passed
 from stereogenbench_data.audit.reprojection import MeasuredDepth
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
@@ -40,9 +40,14 @@ ALIGNED_PAIRS: Final = tuple(
 )
 """Directed pairs that are compared: neighbours, those one further on, and the outermost."""
 
-_POINTS: Final = 2500
+_POINTS: Final = 1600
+_FEW_FRAMES: Final = 4
+"""Fewer frames than that are compared both ways; of more, each takes half of the directions."""
 _FEWEST_POINTS: Final = 100
 _CELLS: Final = 4
+_MOMENTS: Final = 5
+"""Into so many moments a scene's frames are put: those of one show the same things, and so err
+alike."""
 _TOLERANCE: Final = 0.005
 """Share of the depth, beside two stored steps, beyond which a point counts as seen through; a
 surface that passes as smooth bends by less between pixels."""
@@ -320,9 +325,11 @@ class _Fit:
 class AlignmentCheck:
     """Takes a scene's frames one after another; `result` is what they say together."""
 
-    def __init__(self, intrinsics: Intrinsics) -> None:
-        """Prepare for the pictures of one rig."""
+    def __init__(self, intrinsics: Intrinsics, *, frames: int) -> None:
+        """Prepare for so many frames of one rig."""
         self.intrinsics = intrinsics
+        self._is_both_ways = frames < _FEW_FRAMES
+        self._frames_a_moment = -(-frames // _MOMENTS)
         self._depth = {pair: _Sums() for pair in ALIGNED_PAIRS}
         self._motion = {(camera, camera): _Sums() for camera in range(CAMERA_COUNT)}
         self._pictures = {pair: _Sums() for pair in ALIGNED_PAIRS}
@@ -330,7 +337,8 @@ class AlignmentCheck:
         self._contrast: dict[tuple[int, int], list[float]] = {}
         self._lags: dict[tuple[int, int], list[float]] = {}
         self._factor = 1.0
-        self._disparity_px: list[float] = []
+        self._disparity_px: dict[tuple[int, int], list[float]] = {}
+        self._moved_px: list[float] = []
         self._frames = 0
         self._last: tuple[int, dict[int, MeasuredDepth]] | None = None
 
@@ -350,7 +358,8 @@ class AlignmentCheck:
             poses: Of all frames.
         """
         for source, target in ALIGNED_PAIRS:
-            if source in depths and target in depths:
+            is_turn = self._is_both_ways or (source < target) == (self._frames % 2 == 0)
+            if is_turn and source in depths and target in depths:
                 motion = poses.cam_from_cam(frame, target=target, source=source)
                 landed = _landed(
                     depths[source], depths[target], intrinsics=self.intrinsics, motion=motion
@@ -372,13 +381,19 @@ class AlignmentCheck:
         after: tuple[int, MeasuredDepth],
         poses: CameraPoses,
     ) -> None:
-        for (here, source), (there, target) in ((before, after), (after, before)):
+        ways = ((before, after), (after, before))
+        turn = (self._frames + camera) % 2
+        for (here, source), (there, target) in ways if self._is_both_ways else ways[turn:][:1]:
             motion = np.linalg.inv(poses.world_from_cam(there, camera)) @ poses.world_from_cam(
                 here, camera
             )
             landed = _landed(source, target, intrinsics=self.intrinsics, motion=motion)
             if landed is not None:
                 self._add_depth(self._motion[camera, camera], landed, check="motion")
+                away_px = np.hypot(
+                    landed.u_px - landed.columns - 0.5, landed.v_px - landed.rows - 0.5
+                )
+                self._moved_px.append(float(np.median(away_px)))
 
     def _add_depth(self, sums: _Sums, landed: _Landed, *, check: str) -> None:
         smooth = landed.smooth
@@ -388,17 +403,18 @@ class AlignmentCheck:
         window = _WINDOW[check]
         keep = smooth & (np.abs(landed.off) < window + 2 * landed.steps)
         columns = {name: (a[keep], b[keep]) for name, (a, b) in landed.depth_columns().items()}
+        across, down = (column[keep] for column in landed.focal_columns())
+        none = np.zeros_like(across)
+        columns["focal"] = (across + down, none)
         if check == "motion":
-            across, down = (column[keep] for column in landed.focal_columns())
-            none = np.zeros_like(across)
             columns = {
                 "scale": columns["scale"],
                 "ray": columns["ray"],
-                "focal": (across + down, none),
+                "focal": columns["focal"],
                 "focal_x": (across, none),
                 "focal_y": (down, none),
             }
-        cells = landed.cell[keep] + _CELLS**2 * self._frames
+        cells = landed.cell[keep] + _CELLS**2 * (self._frames // self._frames_a_moment)
         # Coarse steps make a point count less; rounding moves it by 0.3 of one.
         weight = 1 / (1 + (landed.steps[keep] / _TOLERANCE) ** 2)
         sums.add(landed.off[keep], weight, cells, columns)
@@ -429,10 +445,12 @@ class AlignmentCheck:
         if contrast < LEAST_CONTRAST:
             return
         self._fits.setdefault(pair, []).append(_correlation(first, second))
+        disparity_px = float(np.abs(landed.by_depth[0][seen]).mean()) / factor
+        self._disparity_px.setdefault(pair, []).append(disparity_px)
         for lag in (-1, 1):
             beside = bands.get((source, frame + lag)), bands.get((target, frame + lag))
-            early = None if beside[0] is None else _sampled(beside[0], *from_px)[0]
-            late = None if beside[1] is None else _sampled(beside[1], *to_px)[0]
+            early = None if beside[0] is None else _value(beside[0], *from_px)
+            late = None if beside[1] is None else _value(beside[1], *to_px)
             for camera, one, two in (
                 (source, early, second), (target, first, late), (_OF_ALL, early, late),
             ):  # fmt: skip
@@ -445,7 +463,6 @@ class AlignmentCheck:
         # A picture that is aside by a pixel differs by its slope: that counts in full.
         cut = max(6 * spread, 3 * float(np.sqrt((slope_x**2 + slope_y**2).mean())))
         weight = np.clip(1 - (off / cut) ** 2, 0, None) ** 2 / max(spread, 1.0) ** 2
-        self._disparity_px.append(float(np.abs(landed.by_depth[0][seen]).mean()) / factor)
         by_depth_x, by_depth_y = landed.by_depth[0][seen], landed.by_depth[1][seen]
         by_scale = slope_x * by_depth_x / factor + slope_y * by_depth_y / factor_y
         columns = {
@@ -453,7 +470,12 @@ class AlignmentCheck:
             "shift_y": (slope_y, -slope_y),
             "scale": (-by_scale, np.zeros_like(by_scale)),
         }
-        self._pictures[pair].add(off, weight, landed.cell[seen] + _CELLS**2 * self._frames, columns)
+        self._pictures[pair].add(
+            off,
+            weight,
+            landed.cell[seen] + _CELLS**2 * (self._frames // self._frames_a_moment),
+            columns,
+        )
 
     def result(self) -> Alignment:
         """Return what all frames say together."""
@@ -465,6 +487,7 @@ class AlignmentCheck:
                 through=sum(self._depth[pair].through for pair in both),
                 contrast=_mean(self._contrast.get(pair, []) for pair in both),
                 correlation=_mean(self._fits.get(pair, []) for pair in both),
+                disparity_px=_mean(self._disparity_px.get(pair, []) for pair in both),
             )
             for left, right in ALIGNED_PAIRS
             if left < right
@@ -472,7 +495,7 @@ class AlignmentCheck:
         )
         depth = _explained(
             self._depth, "depth", of_cameras=("scale", "ray", "shift_x", "shift_y"),
-            of_all=("ray",),
+            of_all=("ray", "focal"),
         )  # fmt: skip
         motion = _explained(
             self._motion, "motion", of_all=("scale", "ray", "focal", "focal_x", "focal_y")
@@ -496,7 +519,9 @@ class AlignmentCheck:
             moved_smooth=smooth,
             moved_through=through,
             picture_px=self._factor,
-            disparity_px=_mean([self._disparity_px]),
+            width_px=self.intrinsics.width_px / self._factor,
+            moved_px=_mean([self._moved_px]),
+            disparity_px=_mean(self._disparity_px.values()),
         )
 
 
@@ -535,8 +560,20 @@ def _explained(
 
 
 def band(picture: Any) -> Float[np.ndarray, "h w"]:
-    """Return the band-passed grey levels of a (3, h, w) picture."""
-    return band_passed(np.tensordot(_LUMA, picture.astype(np.float32), axes=1))
+    """Return grey levels of a (3, h, w) picture, blurred a little, less their mean over 13 px."""
+    blurred = mean = np.tensordot(_LUMA, picture.astype(np.float32), axes=1)
+    for _ in range(2):
+        # Each turn works down the columns, and puts rows in their place.
+        size = len(blurred)
+        padded = np.pad(blurred, ((2, 2), (0, 0)), mode="edge")
+        near, far = padded[1:-3] + padded[3:-1], padded[:-4] + padded[4:]
+        blurred = np.ascontiguousarray((padded[2:-2] * 6 + near * 4 + far).T)
+        ones = np.pad(mean, ((6, 6), (0, 0)), mode="edge")
+        twos = ones[:-1] + ones[1:]
+        fours = twos[:-2] + twos[2:]
+        eights = fours[:-4] + fours[4:]
+        mean = np.ascontiguousarray((eights[:size] + fours[8 : 8 + size] + ones[12:]).T)
+    return blurred / np.float32(16**2) - mean / np.float32(13**2)
 
 
 def _sampled(picture: Any, u_px: Points, v_px: Points) -> tuple[Points, Points, Points]:
@@ -552,6 +589,16 @@ def _sampled(picture: Any, u_px: Points, v_px: Points) -> tuple[Points, Points, 
         _between(patch[1:3, 2:] - patch[1:3, :2], part_x, part_y) / 2,
         _between(patch[2:, 1:3] - patch[:2, 1:3], part_x, part_y) / 2,
     )
+
+
+def _value(picture: Any, u_px: Points, v_px: Points) -> Points:
+    """Return a picture's values between its pixels."""
+    height, width = picture.shape
+    x, y = np.clip(u_px - 0.5, 0, width - 1.001), np.clip(v_px - 0.5, 0, height - 1.001)
+    left, top = x.astype(np.intp), y.astype(np.intp)
+    inner = [[picture[top + down, left + across] for across in (0, 1)] for down in (0, 1)]
+    value: Points = _between(np.array(inner), x - left, y - top)
+    return value
 
 
 def _correlation(first: Points, second: Points) -> float:

@@ -26,6 +26,8 @@ class AuditLimits:
         reprojection_px: Largest median error of the primary pair, at the widest tolerance.
         agreement: Least share of unhidden pixels whose depths agree, of the primary pair and of
             any adjacent one.
+        agreement_long: The same of cameras 0 and 5; in pictures narrower than 128 px the share
+            that may disagree grows as they shrink, as more pixels lie at edges.
         frames: Frames that every video must have; 0 for as many as the scene has poses.
         valid_depth: Least share of measured pixels in any depth picture.
         depth_levels: Least number of different depths in a camera's pictures.
@@ -46,10 +48,13 @@ class AuditLimits:
         focal: Largest factor, less 1, by which a focal length, or the unit of depth, differs from
             what depth says while the cameras move.
         picture_shift_px: Largest shift of one camera's pictures against the others, in pixels of
-            the picture that is looked at, which is at most 320 a side.
+            the picture that is looked at, which is at most 320 a side. Along the rows, where
+            disparity is, more is allowed of pictures narrower than 256 px: 0.3 px at 128.
         picture_scale: Largest factor, less 1, between disparity in the pictures and by depth.
         picture_fit: Least correlation of a camera's pictures with those of the camera that they
             fit best, taken there by depth.
+        picture_odd: By how much that of each of a camera's pairs may be less than that of the
+            other cameras' pairs of as much disparity.
         picture_lag: By how much that may grow if another frame's pictures are taken.
     """
 
@@ -58,6 +63,7 @@ class AuditLimits:
     rectified_px: float = 0.05
     reprojection_px: float = 0.5
     agreement: float = 0.85
+    agreement_long: float = 0.7
     frames: float = 0
     valid_depth: float = 0.1
     depth_levels: float = 8
@@ -75,7 +81,8 @@ class AuditLimits:
     picture_shift_px: float = 0.15
     picture_scale: float = 0.01
     picture_fit: float = 0.5
-    picture_lag: float = 0.01
+    picture_odd: float = 0.15
+    picture_lag: float = 0.02
 
     @classmethod
     def parse(cls, settings: list[str]) -> "AuditLimits":
@@ -278,6 +285,7 @@ class PairFit:
         through: Those of them that lie before what the other camera sees there.
         contrast: Standard deviation of compared pictures, grey levels; nan where none was.
         correlation: Of the pictures at the same points; nan where they have no texture.
+        disparity_px: Mean disparity of those points, in pixels of the pictures compared.
     """
 
     left: int
@@ -286,6 +294,7 @@ class PairFit:
     through: int
     contrast: float
     correlation: float
+    disparity_px: float
 
     @property
     def see_through(self) -> float:
@@ -304,7 +313,9 @@ class Alignment:
             (-1: all cameras') pictures of frame t + lag are taken.
         moved_smooth: Points of smooth surfaces taken from one audited frame to the next.
         moved_through: Those of them that are seen through there.
+        moved_px: How far those points move, the mean of the frames' medians.
         picture_px: Pixels of the scene's pictures to one of those compared.
+        width_px: Width of the pictures compared; nan where none was.
         disparity_px: Mean disparity of compared points, in pixels of the pictures compared.
     """
 
@@ -313,7 +324,9 @@ class Alignment:
     lags: tuple[tuple[int, int, float], ...] = ()
     moved_smooth: int = 0
     moved_through: int = 0
+    moved_px: float = math.nan
     picture_px: float = 1.0
+    width_px: float = math.nan
     disparity_px: float = math.nan
 
     @classmethod
@@ -392,6 +405,42 @@ class Finding:
         return f"{where}: {self.check}: {found}"
 
 
+QUANTITIES: Final = {
+    "scale": "a factor", "ray": "along the ray", "shift_x": "a shift to the side",
+    "shift_y": "a shift up or down", "focal": "a factor of the focal length",
+    "focal_x": "the sensor's width", "focal_y": "the sensor's height",
+}  # fmt: skip
+"""What an `Estimate` is of, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Untested:
+    """A check that the content of a scene did not allow.
+
+    Attributes:
+        scene: The scene's key.
+        check: The check.
+        quantity: Which of `QUANTITIES` could not be told; empty for the whole check.
+        of: Of which cameras; empty for all.
+        why: Why, or from which size on it is seen.
+    """
+
+    scene: str
+    check: str
+    quantity: str
+    of: str
+    why: str
+
+    @property
+    def what(self) -> str:
+        """What was not tested, of which cameras."""
+        return " of ".join(part for part in (self.quantity, self.of) if part) or "all cameras"
+
+    def __str__(self) -> str:
+        """Return it as one line."""
+        return f"{self.scene}: {self.check}: {self.what}: {self.why}"
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
     """A line of the audit's table: texts, in the paper's words where it has the line."""
@@ -416,6 +465,7 @@ class AuditReport:
         limits: Beyond which figures a scene is a finding.
         rows: The table.
         findings: What is beyond a limit, in the order of scenes.
+        untested: Checks that the content of a scene did not allow.
         notes: What is no finding and should be known.
         scenes: Each scene's figures.
     """
@@ -428,6 +478,7 @@ class AuditReport:
     limits: AuditLimits
     rows: tuple[Row, ...]
     findings: tuple[Finding, ...]
+    untested: tuple[Untested, ...]
     notes: tuple[str, ...]
     scenes: tuple[SceneAudit, ...]
 

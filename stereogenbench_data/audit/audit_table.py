@@ -6,8 +6,10 @@ from typing import Final
 
 import numpy as np
 
+from stereogenbench_data.audit.alignment import CERTAIN
 from stereogenbench_data.audit.audit_records import (
     QUANTILES,
+    QUANTITIES,
     AuditLimits,
     AuditReport,
     CameraAudit,
@@ -16,6 +18,7 @@ from stereogenbench_data.audit.audit_records import (
     Row,
     SceneAudit,
     ToleranceAudit,
+    Untested,
 )
 from stereogenbench_data.audit.paper_figures import AUDIT, AUDIT_TABLE, FRAMES_A_SCENE
 from stereogenbench_data.audit.reprojection import TOLERANCES
@@ -31,13 +34,18 @@ _CHECKS: Final = (
 
 
 def table_rows(
-    scenes: Sequence[SceneAudit], limits: AuditLimits, *, findings: Sequence[Finding]
+    scenes: Sequence[SceneAudit],
+    limits: AuditLimits,
+    *,
+    findings: Sequence[Finding],
+    untested: Sequence[Untested],
 ) -> tuple[Row, ...]:
     """Return the table of an audit over scenes."""
     return (
         *_rig_rows(scenes, limits),
         *_depth_rows(scenes, limits),
         *_reprojection_rows(scenes, limits),
+        *_alignment_rows(scenes, limits, untested),
         *_frame_rows(scenes, limits),
         *_picture_rows(scenes, limits),
         *_finding_rows(findings),
@@ -134,7 +142,7 @@ def _reprojection_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Ite
             f"{name}: pixels that nothing hides whose two depths agree (least of a scene)",
             f"{_percent(agreement)} ({_percent(_least(p.agreement for p in pairs))})",
             "",
-            "" if pairs is long else _percent(limits.agreement),
+            _percent(limits.agreement_long if pairs is long else limits.agreement),
         )
 
 
@@ -142,6 +150,66 @@ def _named_pairs(
     scenes: Sequence[SceneAudit], cameras: Sequence[tuple[int, int]]
 ) -> list[PairAudit]:
     return [pair for scene in scenes for pair in scene.pairs if (pair.left, pair.right) in cameras]
+
+
+_SIZES: Final = (
+    ("depth fit", "depth", "of one camera against the others: factor", ("scale",), "depth_scale"),
+    ("depth fit", "depth", "of one camera: shift, px", ("shift_x", "shift_y"), "depth_shift_px"),
+    ("depth fit", "depth", "share of the way to depth along the ray", ("ray",), "depth_ray"),
+    ("depth fit", "depth", "focal length or all baselines between cameras: factor", ("focal",),
+     "focal"),
+    ("motion fit", "motion", "focal length or unit of depth from frame to frame: factor",
+     ("scale", "focal", "focal_x", "focal_y"), "focal"),
+    ("pictures fit", "pictures", "of one camera: shift, px", ("shift_x", "shift_y"),
+     "picture_shift_px"),
+    ("pictures fit", "pictures", "disparity of pictures against that of depth: factor",
+     ("scale",), "picture_scale"),
+)  # fmt: skip
+
+
+def _alignment_rows(
+    scenes: Sequence[SceneAudit], limits: AuditLimits, untested: Sequence[Untested]
+) -> Iterator[Row]:
+    found = [scene.alignment for scene in scenes]
+    pairs = [pair for each in found for pair in each.pairs]
+    moved = [_ratio(each.moved_through, each.moved_smooth) for each in found]
+    gains = [gain for each in found for _, _, gain in each.lags]
+
+    def row(check: str, quantity: str, ours: str, limit: str, whats: Sequence[str] = ()) -> Row:
+        names = {QUANTITIES[what] for what in whats} or {""}
+        blind = [each for each in untested if each.check == check and each.quantity in names]
+        if blind and len(scenes) == 1:
+            ours = f"{ours}; not testable: {', '.join(each.what for each in blind)}"
+        elif blind:
+            keys = {each.scene for each in blind}
+            ours = f"{ours}; not testable in {len(keys)} of {counted(len(scenes), 'scene')}"
+        return Row(check, quantity, ours, "", limit)
+
+    yield row(
+        "depth consistency", "points of smooth surfaces that another camera sees through, most",
+        _percent(_largest(pair.see_through for pair in pairs)), _percent(limits.see_through),
+    )  # fmt: skip
+    for check, kind, quantity, whats, name in _SIZES:
+        sizes = [
+            abs(each.value) for of_scene in found for each in of_scene.estimates
+            if each.check == kind and each.what in whats and abs(each.value) > CERTAIN * each.error
+        ]  # fmt: skip
+        ours = f"{max(sizes, default=0.0):.2g}"
+        limit = f"{getattr(limits, name):g}"
+        yield row(check, f"{quantity}, largest that is certain", ours, limit, whats)
+    yield row(
+        "motion", "the same share from one audited frame to the next, most",
+        _percent(_largest(moved)), _percent(limits.moved_through),
+    )  # fmt: skip
+    yield row(
+        "picture time", "gain of correlation by pictures of a frame beside, most",
+        _number(_largest(gains)), f"{limits.picture_lag:g}",
+    )  # fmt: skip
+    yield row(
+        "picture content", "correlation of two cameras' pictures, taken there by depth, least",
+        _number(_least(pair.correlation for pair in pairs)),
+        f"{limits.picture_fit:g} of a camera's best",
+    )  # fmt: skip
 
 
 def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
@@ -254,6 +322,7 @@ def audit_markdown(report: AuditReport) -> str:
         "count as occluded. The paper does not tell its tolerance.",
     ]
     lines += _listed("Findings", [str(finding) for finding in report.findings])
+    lines += _listed("Not testable", [str(each) for each in report.untested])
     lines += _listed("Notes", list(report.notes))
     return "\n".join(lines) + "\n"
 

@@ -2,15 +2,21 @@
 
 import math
 from collections.abc import Iterator
+from statistics import median
 from typing import Final
 
+from stereogenbench_data.audit.alignment import CERTAIN
 from stereogenbench_data.audit.audit_records import (
+    QUANTITIES,
     At,
     AuditLimits,
     CameraAudit,
     Estimate,
     Finding,
+    PairAudit,
+    PairFit,
     SceneAudit,
+    Untested,
 )
 from stereogenbench_data.audit.picture_check import ENOUGH_LEVELS
 from stereogenbench_data.schema.release import ADJACENT_PAIRS, CAMERA_COUNT, depth_name, rgb_name
@@ -60,17 +66,28 @@ def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
             text = f"{what} {value:.3g} {unit} (limit {limit:g})"
             yield Finding(scene.key, "", check, text)
     for pair in scene.pairs:
-        is_limited = pair is primary or (pair.left, pair.right) in ADJACENT_PAIRS
-        if is_limited and pair.agreement < limits.agreement:
+        limit = _least_agreement(scene, pair, limits)
+        if pair.agreement < limit:
             text = (
                 f"of the pixels of camera {pair.left} that nothing hides from camera "
                 f"{pair.right}, the two depths agree at {pair.agreement:.1%} "
-                f"(limit {limits.agreement:.0%})"
+                f"(limit {limit:.0%})"
             )
             yield Finding(scene.key, "", "agreement", text)
 
 
-_CERTAIN: Final = 6.0
+def _least_agreement(scene: SceneAudit, pair: PairAudit, limits: AuditLimits) -> float:
+    if pair is scene.pairs[0] or (pair.left, pair.right) in ADJACENT_PAIRS:
+        return limits.agreement
+    narrow = max(1.0, _NARROW_PX / scene.alignment.width_px)
+    return 1 - (1 - limits.agreement_long) * narrow
+
+
+_NARROW_PX: Final = 128
+"""Narrower pictures have more of their pixels at edges."""
+_SHARP_PX: Final = 256
+"""In narrower pictures, what is sampled between pixels is aside by more of them."""
+_OWN_MOTION_PX: Final = 0.03
 _SHIFTS: Final = {"shift_x": "to the right", "shift_y": "down"}
 
 
@@ -95,7 +112,7 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
         )
         yield Finding(scene.key, "", "motion", text)
     has_wrong_depth = bool(through) or any(
-        each.is_first and each.check == "depth" for each in found.estimates
+        each.is_first and each.check == "depth" and each.what != "focal" for each in found.estimates
     )
     for each in found.estimates:
         # Depth that contradicts itself tells nothing of focal lengths.
@@ -111,6 +128,12 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
             )
             name = "" if camera < 0 else rgb_name(camera)
             yield Finding(scene.key, name, "picture time", text)
+    yield from _content_findings(scene, limits)
+
+
+def _content_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
+    """Yield the cameras whose pictures show something else than those of the others."""
+    found = scene.alignment
     for camera in range(CAMERA_COUNT):
         fits = [pair.correlation for pair in found.pairs if camera in (pair.left, pair.right)
                 and not math.isnan(pair.correlation)]  # fmt: skip
@@ -120,15 +143,130 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
                 f"its pictures at {max(fits):.2f} or less (limit {limits.picture_fit:g})"
             )
             yield Finding(scene.key, rgb_name(camera), "picture content", text)
+        elif (less := _correlated_less(scene, camera)) > limits.picture_odd:
+            text = (
+                f"pictures of camera {camera}, taken to the others by depth, correlate with theirs "
+                f"by {less:.2f} less than the others with each other, or more "
+                f"(limit {limits.picture_odd:g})"
+            )
+            yield Finding(scene.key, rgb_name(camera), "picture content", text)
+
+
+def _correlated_less(scene: SceneAudit, camera: int) -> float:
+    """Return by how much each of a camera's pairs correlates less than other pairs, at least.
+
+    Only pairs of as much disparity are compared, since pictures differ the more, the wider a pair;
+    0 where fewer than two of the camera's pairs can be.
+    """
+    pairs = [pair for pair in scene.alignment.pairs if not math.isnan(pair.correlation)]
+    less = []
+    for pair in pairs:
+        others = [
+            each.correlation for each in pairs
+            if camera not in (each.left, each.right) and each.disparity_px >= pair.disparity_px
+        ]  # fmt: skip
+        if camera in (pair.left, pair.right) and others:
+            less.append(median(others) - pair.correlation)
+    return min(less) if len(less) > 1 else 0.0
+
+
+def limit_of(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> float:
+    """Return beyond which size an estimate is a finding."""
+    if each.check == "depth":
+        by_name = {
+            "scale": limits.depth_scale, "ray": limits.depth_ray, "focal": limits.focal,
+        }  # fmt: skip
+        return by_name.get(each.what, limits.depth_shift_px)
+    if each.check == "motion":
+        if each.what == "ray":
+            return limits.depth_ray
+        # Things that move by themselves are mistaken for more, the less the camera moves.
+        return max(limits.focal, _OWN_MOTION_PX / max(scene.alignment.moved_px, 1e-6))
+    if each.what == "shift_y":
+        return limits.picture_shift_px
+    shift_px = limits.picture_shift_px * max(1.0, _SHARP_PX / scene.alignment.width_px)
+    # A factor is told no better than the shift that it causes.
+    least = shift_px / max(scene.alignment.disparity_px, 1e-6)
+    return shift_px if each.what == "shift_x" else max(limits.picture_scale, least)
+
+
+_STILL_PX: Final = 1.0
+_ENOUGH: Final = 1000
+
+
+def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Untested]:
+    """Return the checks of `alignment` that the content of a scene did not allow."""
+    found = scene.alignment
+    told: list[tuple[str, str, str, str]] = []
+    blind = _cameras_without(found.pairs, "see_through")
+    if blind:
+        told.append(("depth consistency", "", _cameras(blind), "too few points of smooth surfaces"))
+    if found.moved_smooth < _ENOUGH:
+        told.append(("motion", "", "", "too few points of smooth surfaces, or one frame"))
+    elif found.moved_px < _STILL_PX:
+        why = f"points move by {found.moved_px:.2f} px from one audited frame to the next"
+        told.append(("motion", "", "", why))
+    blind = _cameras_without(found.pairs, "correlation")
+    if blind:
+        told.append(("picture content", "", _cameras(blind), "no texture, or no depth"))
+    late = [
+        camera for camera in range(CAMERA_COUNT)
+        if min((gain for of, _, gain in found.lags if of == camera), default=0.0)
+        > -limits.picture_lag
+    ]  # fmt: skip
+    if late:
+        why = "pictures of the frames beside fit as well, or there are none"
+        told.append(("picture time", "", _cameras(late), why))
+    told += _untested_fits(scene, limits)
+    return [Untested(scene.key, *each) for each in told]
+
+
+def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str, str, str, str]]:
+    """Yield the quantities of which less than what would be a finding cannot be told from 0."""
+    for check, whats in (
+        ("depth", ("scale", "ray", "shift_x", "shift_y")),
+        ("motion", ("scale", "focal", "focal_x", "focal_y")),
+        ("pictures", ("scale", "shift_x", "shift_y")),
+    ):
+        of_check = [each for each in scene.alignment.estimates if each.check == check]
+        for what in whats:
+            limit = least = limit_of(scene, Estimate(check, what, -1), limits)
+            if (check, what) == ("pictures", "scale"):
+                limit = limits.picture_scale
+            if check == "motion":
+                limit = limits.focal
+            seen = {
+                each.camera: max(least, CERTAIN * each.error)
+                for each in of_check if each.what == what and not math.isnan(each.error)
+            }  # fmt: skip
+            wanted = {each.camera for each in of_check if each.what == what} or {-1}
+            blind = sorted(camera for camera in wanted if not seen.get(camera, math.inf) <= limit)
+            if blind:
+                from_on = max(seen.get(camera, math.inf) for camera in blind)
+                why = "nothing tells" if math.isinf(from_on) else f"seen from {from_on:.2g} on"
+                of = _cameras([camera for camera in blind if camera >= 0])
+                yield f"{check} fit", QUANTITIES[what], of, f"{why} (limit {limit:.2g})"
+
+
+def _cameras_without(pairs: tuple[PairFit, ...], figure: str) -> list[int]:
+    known = {
+        camera for pair in pairs for camera in (pair.left, pair.right)
+        if not math.isnan(getattr(pair, figure))
+    }  # fmt: skip
+    return [camera for camera in range(CAMERA_COUNT) if camera not in known]
+
+
+def _cameras(numbers: list[int]) -> str:
+    if len(numbers) == CAMERA_COUNT:
+        return ""
+    return f"camera {', '.join(map(str, numbers))}" if numbers else ""
 
 
 def _estimate_findings(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> Iterator[Finding]:
     of = "all cameras" if each.camera < 0 else f"camera {each.camera}"
     size = abs(each.value)
+    limit = limit_of(scene, each, limits)
     if each.check == "depth":
-        limit = {"scale": limits.depth_scale, "ray": limits.depth_ray}.get(
-            each.what, limits.depth_shift_px
-        )
         name = "" if each.camera < 0 else depth_name(each.camera)
         what = {
             "scale": f"differs from that of the others by {each.value:+.2%}",
@@ -138,8 +276,13 @@ def _estimate_findings(scene: SceneAudit, each: Estimate, limits: AuditLimits) -
             f"is {each.value:+.2f} px {_SHIFTS.get(each.what, '')} of where the others see it",
         )
         text = f"depth of {of} {what}"
+        if each.what == "focal":
+            text = (
+                f"between cameras, depth fits if the focal length, or all baselines, are corrected "
+                f"{-each.value:+.2%}"
+            )
     elif each.check == "motion":
-        limit, name = (limits.depth_ray if each.what == "ray" else limits.focal), ""
+        name = ""
         what = {
             "scale": "the unit of depth or of poses",
             "ray": "depth along the ray, by",
@@ -149,19 +292,15 @@ def _estimate_findings(scene: SceneAudit, each: Estimate, limits: AuditLimits) -
         }[each.what]
         text = f"from frame to frame, depth and poses fit if {what} is corrected {-each.value:+.2%}"
     else:
-        shift = each.what in _SHIFTS
-        # A factor is told no better than the shift that it causes.
-        least = limits.picture_shift_px / max(scene.alignment.disparity_px, 1e-6)
-        limit = limits.picture_shift_px if shift else max(limits.picture_scale, least)
         name = "" if each.camera < 0 else rgb_name(each.camera)
         text = (
             f"pictures of {of} are {each.value * scene.alignment.picture_px:+.2f} px "
             f"{_SHIFTS[each.what]} of where depth and the others put them"
-            if shift
+            if each.what in _SHIFTS
             else f"disparity of the pictures differs from that of depth by {each.value:+.2%}"
         )
-    if size > limit and size > _CERTAIN * each.error:
-        yield Finding(scene.key, name, f"{each.check} fit", f"{text} (limit {limit:g})")
+    if size > limit and size > CERTAIN * each.error:
+        yield Finding(scene.key, name, f"{each.check} fit", f"{text} (limit {limit:.3g})")
 
 
 def _expected_frames(scene: SceneAudit, limits: AuditLimits) -> int:

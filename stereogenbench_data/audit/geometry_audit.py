@@ -18,7 +18,7 @@ from stereogenbench_data.audit.audit_records import (
     plain,
 )
 from stereogenbench_data.audit.audit_table import table_rows
-from stereogenbench_data.audit.findings import broken_finding, findings_of
+from stereogenbench_data.audit.findings import broken_finding, findings_of, untested_of
 from stereogenbench_data.audit.scene_audit import SceneTask, audit_scene, spread_frames
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.schema.parse import parse_scene_key
@@ -37,7 +37,7 @@ from stereogenbench_data.storage.walk import walk
 Progress = Callable[[int, int], None]
 
 DEFAULT_FRAMES: Final = 5
-_FORMAT: Final = 2
+_FORMAT: Final = 3
 _KEY_FILTERS: Final = {"split": "split", "subset": "subset", "family": "family",
                        "map": "map_name", "scenes": "key"}  # fmt: skip
 
@@ -165,6 +165,7 @@ def audit(
     findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
     for scene in audited:
         findings += findings_of(scene, request.limits)
+    untested = [each for scene in audited for each in untested_of(scene, request.limits)]
     return AuditReport(
         root=index.where,
         scenes_there=len(index) + len(index.broken) + len(index.incomplete),
@@ -172,8 +173,9 @@ def audit(
         frames=request.frames,
         seed=request.seed,
         limits=request.limits,
-        rows=table_rows(audited, request.limits, findings=findings),
+        rows=table_rows(audited, request.limits, findings=findings, untested=untested),
         findings=tuple(findings),
+        untested=tuple(untested),
         notes=tuple(f"incomplete, not audited: {text}" for text in incomplete.values()),
         scenes=tuple(audited),
     )

@@ -115,7 +115,7 @@ class _SceneCheck:
         self.measured_pairs = (task.scene.rig.primary_pair, LONG_PAIR)
         pairs = dict.fromkeys([*self.measured_pairs, *ADJACENT_PAIRS])
         self.errors: dict[tuple[int, int], list[PairErrors]] = {pair: [] for pair in pairs}
-        self.alignment = AlignmentCheck(self.intrinsics)
+        self.alignment = AlignmentCheck(self.intrinsics, frames=len(self.frames))
         self.seen: dict[tuple[int, int], tuple[Any, Any]] = {}
 
     def run(self, after_bytes: AfterBytes) -> SceneAudit:
@@ -195,7 +195,10 @@ class _SceneCheck:
 
     def _seen(self, camera: int, frame: int) -> Any:
         """Return a picture, None where it cannot be read; those beside it are kept with it."""
-        near = range(max(0, frame - 1), min(frame + 2, self.scene.frames))
+        near = [
+            at for at in range(max(0, frame - 1), min(frame + 2, self.scene.frames))
+            if at in self.frames or frame in self.frames[1::max(2, len(self.frames) - 3)]
+        ]  # fmt: skip
         kept = {at: self.seen.get((camera, at)) for at in near}
         self.seen = {place: each for place, each in self.seen.items() if place[0] != camera}
         for at in near:

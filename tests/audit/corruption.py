@@ -53,12 +53,13 @@ def rewrite_one_depth(folder: Path, camera: int, change, *, unit_factor: float =
     write_depth(folder, camera, change(units), kept)
 
 
-def rewrite_rgb(folder: Path, camera: int, change) -> None:
-    """Replace a camera's pictures (t, h, w, 3) by change(pictures)."""
+def rewrite_rgb(folder: Path, camera: int, change, *, crf: int = 18) -> None:
+    """Replace a camera's pictures (t, h, w, 3) by change(pictures); 0 is without loss."""
     path = folder / f"cam_{camera:02d}_rgb.mp4"
     with av.open(str(path)) as container:
         pictures = np.stack([f.to_ndarray(format="rgb24") for f in container.decode(video=0)])
-    _write(path, change(pictures), codec="libx264", pixel_format="yuv420p", tags={})
+    pixels = change(pictures)
+    _write(path, pixels, codec="libx264", pixel_format="yuv420p", tags={}, crf=crf)
 
 
 def edit_baseline(folder: Path, change) -> None:
@@ -170,8 +171,8 @@ def _luma(frame) -> np.ndarray:
     return rows[:, : plane.width].copy()
 
 
-def _write(path: Path, frames: np.ndarray, *, codec, pixel_format, tags) -> None:
-    options = {"level": "3", "slicecrc": "1"} if codec == "ffv1" else {"crf": "18"}
+def _write(path: Path, frames: np.ndarray, *, codec, pixel_format, tags, crf=18) -> None:
+    options = {"level": "3", "slicecrc": "1"} if codec == "ffv1" else {"crf": f"{crf}"}
     with av.open(str(path), "w") as container:
         container.metadata.update(tags)
         stream = container.add_stream(codec, rate=15, options=options)

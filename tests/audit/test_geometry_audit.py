@@ -187,6 +187,10 @@ def late_pictures(folder):
     rewrite_rgb(folder, 1, lambda pictures: pictures[[0, 0, 1, 2, 3, 4, 5]])
 
 
+def reversed_pictures(folder):
+    rewrite_rgb(folder, 4, lambda pictures: pictures[::-1])
+
+
 def scaled(units):
     return np.where(units < 65535, np.minimum(np.rint(units * 1.02), 65534), units)
 
@@ -264,6 +268,8 @@ def contradicting(folder):
         (changed_depth(5, hidden), "cam_05_depth.mkv", "occluder", "31% of the picture, from the"),
         (higher_pictures, "cam_02_rgb.mp4", "pictures fit", "pictures of camera 2 are "),
         (late_pictures, "cam_01_rgb.mp4", "picture time", "frame after are taken"),
+        (reversed_pictures, "cam_04_rgb.mp4", "picture content",
+         "pictures of camera 4, taken to "),
         (changed_depth(0, lambda units: np.roll(units, 1, 2)), "cam_00_depth.mkv", "depth fit",
          "depth of camera 0 is +"),
         (changed_depth(4, scaled), "cam_04_depth.mkv", "depth fit",
@@ -288,6 +294,62 @@ def test_what_is_wrong_is_a_finding(small_release, tmp_path, change, where, chec
     assert report.scenes_audited == 1
     assert any(check in row.ours for row in report.rows if row.check == "findings")
     assert f"## Findings ({len(report.findings)})" in audit_markdown(report)
+
+
+def without_texture(folder):
+    for camera in range(6):
+        rewrite_rgb(folder, camera, lambda pictures: pictures * 0 + 128)
+
+
+def standing_still(folder):
+    for camera in range(6):
+        rewrite_rgb(folder, camera, lambda pictures: pictures[[0] * 7])
+        changed_depth(camera, lambda units: units[[0] * 7])(folder)
+    path = folder / "trajectory.json"
+    document = json.loads(path.read_text())
+    for frame in document["frames"]:
+        frame["cameras"] = document["frames"][0]["cameras"]
+    path.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    ("change", "checks"),
+    [
+        (without_texture, {"picture time", "picture content", "pictures fit"}),
+        (standing_still, {"picture time", "motion", "motion fit"}),
+    ],
+    ids=lambda value: getattr(value, "__name__", None),
+)
+def test_what_the_content_does_not_tell_is_said_to_be_not_testable(
+    small_release, tmp_path, change, checks
+):
+    report = made_wrong(small_release, tmp_path, change)
+
+    told = {each["check"] for each in report.to_json()["untested"] if each["of"] == ""}
+    rows = {row.check for row in report.rows if "not testable" in row.ours}
+    assert checks <= told
+    assert checks <= rows
+    assert f"## Not testable ({len(report.untested)})" in audit_markdown(report)
+
+
+def test_one_frame_tells_nothing_of_motion(small_release):
+    report = audit(small_release, AuditRequest(frames=1), workers=1, scenes=SCENE)
+
+    untested = {each.check for each in report.untested}
+    assert report.findings == ()
+    assert {"motion", "motion fit"} <= untested
+    assert not {"depth consistency", "picture content"} & untested
+
+
+def test_agreement_of_the_outermost_cameras_has_a_limit(small_release):
+    strict = AuditLimits(agreement_long=1.0)
+
+    report = audit(small_release, AuditRequest(frames=1, limits=strict), workers=1, scenes=SCENE)
+
+    (row,) = [row for row in report.rows if row.quantity.startswith("0-5: pixels that")]
+    assert row.limit == "100 %"
+    assert [each.check for each in report.findings] == ["agreement"]
+    assert "hides from camera 5" in report.findings[0].found
 
 
 def test_8_bit_depth_is_a_finding_unless_it_is_meant(small_release, tmp_path):
