@@ -41,7 +41,7 @@ def _depth(reader: Any, *_: Any) -> str:
 
 
 _SPANS: Final[tuple[tuple[str, str, str | Label], ...]] = (
-    ("stereogenbench_data.samples.streams", "VideoReader", "opening"),
+    ("stereogenbench_data.media.video", "VideoReader.__init__", "opening"),
     ("stereogenbench_data.storage.ranged_file", "FileSlice.read", "reading"),
     ("stereogenbench_data.media.decoder", "Decoder._pull", "demuxing"),
     ("stereogenbench_data.media.decoder", "Decoder._feed", _decoding),
@@ -49,7 +49,7 @@ _SPANS: Final[tuple[tuple[str, str, str | Label], ...]] = (
     ("stereogenbench_data.samples.streams", "read_rgb", "colour conversion"),
     ("stereogenbench_data.samples.streams", "read_depth_units", _depth),
     ("stereogenbench_data.samples.load", "SampleLoader._write_fields", "geometry"),
-    ("stereogenbench_data.datasets.loader", "collate", "collation"),
+    ("stereogenbench_data.datasets.batch_buffers", "collate", "collation"),
     ("torch.utils.data._utils.fetch", "_MapDatasetFetcher.fetch", "glue"),
 )
 """Module, name, and what its time is called: what is replaced."""

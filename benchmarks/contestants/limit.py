@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import av
+import av.filter
 import numpy as np
 from av.video.reformatter import Interpolation, VideoReformatter
 
@@ -37,19 +38,39 @@ class Stream:
         self._at = -1
         self._size = size
         self._scaler = VideoReformatter()
+        self._graph: Any = None
         self._kept: Any = None
 
     def colours(self, index: int) -> list[np.ndarray]:
         """Return the red, green and blue planes of a frame."""
         if index != self._at:
-            frame, (height, width) = self._frame(index), self._size
-            shrinks = self._size != (frame.height, frame.width)
-            picture = self._scaler.reformat(
-                frame, width=width, height=height, format="gbrp", threads=1,
-                interpolation=Interpolation.AREA if shrinks else Interpolation.BICUBIC,
-            )  # fmt: skip
+            frame = self._frame(index)
+            if self._size == (frame.height, frame.width):
+                picture = self._scaler.reformat(
+                    frame, format="gbrp", threads=1, interpolation=Interpolation.BICUBIC
+                )
+            else:
+                picture = self._scaled(frame)
             self._kept = [_plane(picture, number, "u1") for number in _RED_GREEN_BLUE]
         return self._kept
+
+    def _scaled(self, frame: Any) -> Any:
+        """Return a frame at the size wanted, with colour where brightness is."""
+        if self._graph is None:
+            self._graph = av.filter.Graph()
+            self._graph.threads = 1
+            first = self._graph.add_buffer(template=self.container.streams.video[0])
+            height, width = self._size
+            scale = self._graph.add(
+                "scale", f"w={width}:h={height}:flags=area:in_chroma_loc=center"
+            )
+            last = self._graph.add("buffersink")
+            self._graph.link_nodes(
+                first, scale, self._graph.add("format", "gbrp"), last
+            ).configure()
+            self._ends = first, last
+        self._ends[0].push(frame)
+        return self._ends[1].pull()
 
     def units(self, index: int) -> np.ndarray:
         """Return the stored depth of a frame."""

@@ -227,7 +227,14 @@ class VideoReader:
         Raises:
             MediaError: If it cannot be read, or is no colour picture.
         """
-        frame = self.frame(index)
+        return self.require_colour(self.frame(index), index)
+
+    def require_colour(self, frame: VideoFrame, index: int) -> VideoFrame:
+        """Return a frame of this video, if it is a colour picture.
+
+        Raises:
+            MediaError: If it is none.
+        """
         if self._is_coded_grey or not is_colour_format(frame.format.name):
             found = "coded as grey" if self._is_coded_grey else f"stored as {frame.format.name}"
             raise MediaError(f"{self.name}: frame {index} is {found}{NO_COLOUR}")
@@ -368,6 +375,7 @@ def read_rgb(
     *,
     size: tuple[int, int] | None = None,
     out: UInt8[np.ndarray, "3 h w"] | None = None,
+    content: Literal["any", "colour"] = "any",
 ) -> UInt8[np.ndarray, "3 h w"]:
     """Return a frame as red, green and blue planes.
 
@@ -384,14 +392,18 @@ def read_rgb(
         index: Which frame, from 0.
         size: (height, width) to scale to; None for the stored size.
         out: Where to write, uint8 (3, h, w); None for a new array.
+        content: Whether the video must hold colour pictures, as views do.
 
     Returns:
         uint8 (3, h, w), C-contiguous where ``out`` is; ``out`` itself if given.
 
     Raises:
-        MediaError: If the frame cannot be decoded, or size or ``out`` does not fit.
+        MediaError: If the frame cannot be decoded or is not what it must be, or size or ``out``
+            does not fit.
     """
     frame = reader.frame(index)
+    if content == "colour":
+        reader.require_colour(frame, index)
     height, width = size or (frame.height, frame.width)
     if height < 1 or width < 1:
         raise MediaError(

@@ -74,12 +74,12 @@ class Streams:
         with self._stream(scene, name) as stream:
             key = (index, size)
             if key not in stream.last:
-                stream.reader.colour_frame(index)
                 room = _unused(stream.last, height_width=size)
                 stream.last = {}
-                stream.last[key] = _read_only(read_rgb(stream.reader, index, size=size, out=room))
-            picture: UInt8[np.ndarray, "3 h w"] = stream.last[key]
-            return picture
+                picture = read_rgb(stream.reader, index, size=size, out=room, content="colour")
+                stream.last[key] = _read_only(picture)
+            kept: UInt8[np.ndarray, "3 h w"] = stream.last[key]
+            return kept
 
     def write_rgb(
         self, scene: Scene, name: str, index: int, *, out: UInt8[np.ndarray, "3 h w"]
@@ -93,8 +93,8 @@ class Streams:
             MediaError: If it does not decode to the scene's number of colour pictures.
         """
         with self._stream(scene, name) as stream:
-            stream.reader.colour_frame(index)
-            read_rgb(stream.reader, index, size=(out.shape[-2], out.shape[-1]), out=out)
+            size = (out.shape[-2], out.shape[-1])
+            read_rgb(stream.reader, index, size=size, out=out, content="colour")
 
     def depth_units(
         self, scene: Scene, name: str, index: int, *, encoding: DepthEncoding

@@ -261,12 +261,20 @@ class SceneIndex:
             )
         return index
 
+    def _folders(self) -> list[str]:
+        """Return the folder of each scene's first file, below the root."""
+        members = self._table.column("members").combine_chunks()
+        first = pc.struct_field(members.values, "path").take(members.offsets[:-1])
+        return [path.rpartition("/")[0] for path in first.to_pylist()]
+
     def _look_around(self, path: Path) -> None:
         """Compare what is indexed with what its folder holds now, by names."""
         if is_remote(self.root):
             return
+        # Of scenes in folders, the folders that their files are in, which may have other names.
+        keys = self.column("key").tolist() if self.shards else self._folders()
         indexed = Indexed(
-            keys=self.column("key").tolist(),
+            keys=keys,
             passed_over={*self.incomplete, *self.broken, *self.passed_over},
             unfinished=self.incomplete.keys(),
             shards=self.shards.keys(),
