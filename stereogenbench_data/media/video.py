@@ -165,6 +165,7 @@ class VideoReader:
         self._is_closed = False
         self._facts: StreamFacts | None = None
         self._decoder: Decoder | None = None
+        self._is_seen = False
         container = open_container(file, name=name, pixel_format="later")
         try:
             require_whole_payload(container, name=name)
@@ -327,6 +328,11 @@ class VideoReader:
                 f"{self.name}: frame {index} is {found[0]} {found[1]}x{found[2]} where "
                 f"{expected[0]} {expected[1]}x{expected[2]} is expected: store the file anew."
             )
+        if self._is_seen and not frame.rotation:
+            return
+        # Once a video, and where it is turned: PyAV's side data and their frame hold each other, so
+        # that the memory of every frame would have to wait for the garbage collector.
+        self._is_seen = True
         matrix: Any = frame.side_data.get("DISPLAYMATRIX")
         if matrix is not None and not _is_upright(bytes(matrix)):
             raise MediaError(
