@@ -330,10 +330,11 @@ class VideoReader:
             )
         if self._is_seen and not frame.rotation:
             return
-        # Once a video, and where it is turned: PyAV's side data and their frame hold each other, so
-        # that the memory of every frame would have to wait for the garbage collector.
+        # Once a video, and where it is turned, and of a tiny copy, which has the same tags: PyAV's
+        # side data and their frame hold each other, so that only the garbage collector frees it.
         self._is_seen = True
-        matrix: Any = frame.side_data.get("DISPLAYMATRIX")
+        tiny = frame.reformat(16, 16, format="gray", interpolation=Interpolation.POINT)
+        matrix: Any = tiny.side_data.get("DISPLAYMATRIX")
         if matrix is not None and not _is_upright(bytes(matrix)):
             raise MediaError(
                 f"{self.name}: frame {index} is tagged to be turned or mirrored when it is shown "
