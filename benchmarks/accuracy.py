@@ -45,16 +45,20 @@ def hard_pairs(count: int = CASES) -> Iterator[tuple[Pair, np.ndarray]]:
         nearest, farthest = max(0.1 / unit_m, 1), min(65534.0, 6553.0 / unit_m)
         depth = np.exp(rng.uniform(np.log(nearest), np.log(farthest), PIXELS))
         units = np.clip(np.rint(depth), 1, 65534).astype(np.uint16)
+        focal_px = float(rng.uniform(970, 4580))
+        baseline_m = float(np.exp(rng.uniform(np.log(0.01), np.log(7.5)))) * (-1) ** number
+        rotator_deg = (
+            float(rng.choice([-90.0, 90.0, 89.9999, 0.0, rng.uniform(-90, 90)])),
+            float(rng.uniform(-180, 180)),
+            float(rng.uniform(-180, 180)),
+        )
+        x_cm, y_cm, z_cm = rng.choice([-1e6, 1e6, 1e5, 0.0], 3).tolist()
         pair = Pair(
-            focal_px=float(rng.uniform(970, 4580)),
-            baseline_m=float(np.exp(rng.uniform(np.log(0.01), np.log(7.5)))) * (-1) ** number,
+            focal_px=focal_px,
+            baseline_m=baseline_m,
             unit_m=unit_m,
-            rotator_deg=(
-                float(rng.choice([-90.0, 90.0, 89.9999, 0.0, rng.uniform(-90, 90)])),
-                float(rng.uniform(-180, 180)),
-                float(rng.uniform(-180, 180)),
-            ),
-            offset_cm=tuple(rng.choice([-1e6, 1e6, 1e5, 0.0], 3).tolist()),  # type: ignore[arg-type]  # three numbers
+            rotator_deg=rotator_deg,
+            offset_cm=(x_cm, y_cm, z_cm),
         )
         yield pair, units
 

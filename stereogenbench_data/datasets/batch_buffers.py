@@ -173,7 +173,8 @@ def fresh_bytes(name: str, size_bytes: int) -> torch.Tensor:
     del name
     if get_worker_info() is None:
         return torch.empty(size_bytes, dtype=torch.uint8)
-    storage = torch.UntypedStorage._new_shared(size_bytes)  # type: ignore[no-untyped-call]  # as torch's own collate does
+    # As torch's own collate does.
+    storage = torch.UntypedStorage._new_shared(size_bytes)
     return torch.empty(0, dtype=torch.uint8).set_(storage)
 
 

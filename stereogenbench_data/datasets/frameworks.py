@@ -61,11 +61,9 @@ class ShareSampler(DistributedSampler[Any]):
 
     def __init__(self, batches: RankBatches) -> None:
         """Stand for the samples of these batches."""
-        super().__init__(
-            range(batches.samples_of_epoch),  # type: ignore[arg-type]  # only its length is asked for
-            num_replicas=batches.world_size,
-            rank=batches.rank,
-        )
+        # torch asks a sampler's dataset for its length alone.
+        samples: Any = range(batches.samples_of_epoch)
+        super().__init__(samples, num_replicas=batches.world_size, rank=batches.rank)
         self._batches = batches
 
     def __iter__(self) -> Iterator[int]:

@@ -5,11 +5,11 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, cast, runtime_checkable
 from weakref import WeakSet
 
 import torch
-from torch.utils.data import DataLoader, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from stereogenbench_data.datasets.batch_buffers import BatchBuffers, forget_slots
 from stereogenbench_data.datasets.batches import (
@@ -117,7 +117,8 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         if options.get("collate_fn") is None:
             options["collate_fn"] = dataset.buffers.collate
         super().__init__(
-            dataset,  # type: ignore[arg-type]  # a protocol: torch asks for len and [] alone
+            # A protocol: torch asks for len and [] alone.
+            cast("Dataset[Any]", dataset),
             batch_sampler=batch_sampler or batches,
             num_workers=num_workers,
             **options,
@@ -504,6 +505,6 @@ def require_options(options: Mapping[str, Any]) -> None:
 def split_options(options: Mapping[str, Any]) -> tuple[EpochOptions, dict[str, Any]]:
     """Return the options that order an epoch, and the others."""
     names = EpochOptions.__annotations__
-    ordering = {name: value for name, value in options.items() if name in names}
+    ordering = cast("EpochOptions", {name: options[name] for name in options if name in names})
     others = {name: value for name, value in options.items() if name not in names}
-    return EpochOptions(**ordering), others  # type: ignore[typeddict-item]  # keys are its own
+    return ordering, others

@@ -20,7 +20,7 @@ _rows: Final[WeakKeyDictionary[SceneIndex, torch.Tensor]] = WeakKeyDictionary()
 def shared_full(size: tuple[int, ...], value: int) -> torch.Tensor:
     """Return an int64 tensor of which workers see every change."""
     numbers = torch.full(size, value, dtype=torch.int64)
-    numbers.share_memory_()  # type: ignore[no-untyped-call]  # torch does not annotate it
+    numbers.share_memory_()
     return numbers
 
 
@@ -30,7 +30,7 @@ def _shared_rows(index: SceneIndex, table: pa.Table) -> torch.Tensor:
         with pa.ipc.new_stream(sink, table.schema) as stream:
             stream.write_table(table)
         rows = torch.frombuffer(bytearray(sink.getvalue()), dtype=torch.uint8)
-        rows.share_memory_()  # type: ignore[no-untyped-call]  # torch does not annotate it
+        rows.share_memory_()
         _rows[index] = rows
     return _rows[index]
 

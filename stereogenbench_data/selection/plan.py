@@ -8,7 +8,7 @@ import hashlib
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypedDict, Unpack
+from typing import Any, Literal, NamedTuple, TypedDict, Unpack, cast
 
 import numpy as np
 from jaxtyping import Int64
@@ -140,7 +140,8 @@ def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selectio
     chosen = {
         name: options.pop(name) for name in ("pairs", "direction", "baseline_cm") if name in options
     }
-    rows = filter_scenes(index, SceneFilters(**options))  # type: ignore[typeddict-item]  # checked inside
+    # What is left are filters, whose names and values are checked there.
+    rows = filter_scenes(index, cast("SceneFilters", options))
     pairs = choose_pairs(index, rows, **chosen)
     if balance is not None:
         if pairs.targets.shape[1] != 1:

@@ -194,7 +194,7 @@ class Catalogue:
             pairs = choose_pairs(
                 self.index,
                 rows,
-                pairs=choice.pairs,  # type: ignore[arg-type]  # one of PAIR_KINDS
+                pairs=choice.pairs,
                 baseline_cm=choice.baseline_cm,
             )
         except SelectionError as error:

@@ -3,14 +3,18 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.release import BASELINE_BINS
 
 FACETS: Final = {"split": "split", "subset": "subset", "family": "family", "map": "map_name"}
 """The filters of which the page lists every value, and the columns that have them."""
-PAIR_KINDS: Final = ("primary", "adjacent", "all")
+PairKind = Literal["primary", "adjacent", "all"]
+PAIR_KINDS: Final[dict[str, PairKind]] = {
+    "primary": "primary", "adjacent": "adjacent", "all": "all"
+}  # fmt: skip
+"""The pairs that can be chosen, by their names in a query."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,14 +26,14 @@ class Choice:
         focal_mm: A closed range in mm, or None.
         baseline_cm: A closed range in cm, names of bins, or None.
         caption: Words that must all be in the caption.
-        pairs: One of `PAIR_KINDS`.
+        pairs: Which pairs of the scenes.
     """
 
     texts: tuple[tuple[str, tuple[str, ...]], ...] = ()
     focal_mm: tuple[float, float] | None = None
     baseline_cm: tuple[float, float] | tuple[str, ...] | None = None
     caption: str = ""
-    pairs: str = "all"
+    pairs: PairKind = "all"
 
     def filters(self) -> dict[str, Any]:
         """Return the filters of scenes that are set, by their names in `SceneFilters`."""
@@ -65,7 +69,7 @@ def parse_choice(query: Mapping[str, list[str]]) -> Choice:
         focal_mm=_range(query, "focal"),
         baseline_cm=bins or _range(query, "baseline"),
         caption=query.get("caption", [""])[0],
-        pairs=pairs,
+        pairs=PAIR_KINDS[pairs],
     )
 
 
