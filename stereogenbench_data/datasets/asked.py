@@ -1,7 +1,7 @@
 """What a user asks for, checked before anything is read."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, cast, get_args
 
 import numpy as np
 
@@ -81,11 +81,7 @@ def require_check(check: Any) -> Check:
     Raises:
         SelectionError: If it is something else.
     """
-    known: tuple[Check, ...] = get_args(Check)
-    for each in known:
-        if check == each:
-            return each
-    raise SelectionError(f"check must be one of {', '.join(map(repr, known))}, got {check!r}.")
+    return cast("Check", _one_of("check", check, get_args(Check)))
 
 
 def require_buffers(buffers: Any) -> Buffers:
@@ -94,11 +90,14 @@ def require_buffers(buffers: Any) -> Buffers:
     Raises:
         SelectionError: If it is something else.
     """
-    known: tuple[Buffers, ...] = get_args(Buffers)
+    return cast("Buffers", _one_of("buffers", buffers, get_args(Buffers)))
+
+
+def _one_of(name: str, value: Any, known: tuple[str, ...]) -> str:
     for each in known:
-        if buffers == each:
+        if value == each:
             return each
-    raise SelectionError(f"buffers must be one of {', '.join(map(repr, known))}, got {buffers!r}.")
+    raise SelectionError(f"{name} must be one of {', '.join(map(repr, known))}, got {value!r}.")
 
 
 def require_depth(depth: Any) -> DepthEncoding | None:
