@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from stereogenbench_data.cli import progress
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.cli.writing import write_report, writing
+from tests.servers.tools import small_disk
 
 COMMAND = (sys.executable, "-m", "stereogenbench_data")
 
@@ -80,14 +81,7 @@ def test_a_file_that_cannot_be_written_is_named_and_not_left_half(
 
 
 def test_a_full_disk_leaves_no_empty_picture_and_keeps_the_one_before(small_shards, tmp_path):
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", tmp_path],
-        check=False, capture_output=True, text=True,
-    )  # fmt: skip
-    if mounted.returncode:
-        reason = f"a small disk cannot be mounted: {mounted.stderr.strip()}"
-        pytest.fail(reason) if os.environ.get("CI") else pytest.skip(reason)
-    try:
+    with small_disk(tmp_path, size="16k"):
         before = tmp_path / "before.png"
         before.write_bytes(b"a picture")
         with suppress(OSError), (tmp_path / "full").open("wb", buffering=0) as filling:
@@ -97,8 +91,6 @@ def test_a_full_disk_leaves_no_empty_picture_and_keeps_the_one_before(small_shar
 
         assert {path.name for path in tmp_path.iterdir()} == {"before.png", "full"}
         assert before.read_bytes() == b"a picture"
-    finally:
-        subprocess.run(["umount", tmp_path], check=True)
     assert [new.exit_code, again.exit_code] == [2, 2]
     assert "No space left on device. Make room, or choose another place." in new.stderr
 

@@ -3,6 +3,10 @@
 import importlib
 import os
 import shutil
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -23,6 +27,23 @@ def require_module(name: str) -> ModuleType:
     except ImportError:
         _missing(f"needs the Python module {name}")
         raise
+
+
+@contextmanager
+def small_disk(place: Path, *, size: str) -> Iterator[Path]:
+    """Mount a disk of so many bytes ("600k") at a folder; where that fails, skip, or fail in CI."""
+    place.mkdir(exist_ok=True)
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", place],
+        check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    if mounted.returncode:
+        reason = f"a small disk cannot be mounted: {mounted.stderr.strip()}"
+        pytest.fail(reason) if os.environ.get("CI") else pytest.skip(reason)
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", place], check=True)
 
 
 def _missing(reason: str) -> None:

@@ -19,6 +19,7 @@ from stereogenbench_data.storage import cache as cache_module
 from stereogenbench_data.storage.cache import FOLDER_NAME, ShardCache, require_limit
 from stereogenbench_data.storage.remote import RemoteObject
 from tests.servers.fault import Answer
+from tests.servers.tools import small_disk
 
 DATA = bytes(number * 7 % 256 for number in range(100_000))
 
@@ -419,17 +420,8 @@ def test_a_process_that_is_killed_while_it_fills_leaves_no_lock_and_no_half(fill
 @pytest.fixture
 def disk(tmp_path):
     """A small disk that can be made read-only."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=1M", "tmpfs", place],
-        check=False, capture_output=True, text=True,
-    )  # fmt: skip
-    if mounted.returncode:
-        reason = f"a disk cannot be mounted: {mounted.stderr.strip()}"
-        pytest.fail(reason) if os.environ.get("CI") else pytest.skip(reason)
-    yield place
-    subprocess.run(["umount", place], check=True)
+    with small_disk(tmp_path / "disk", size="1M") as place:
+        yield place
 
 
 def test_a_cache_that_may_only_be_read_serves_what_it_holds(disk, shelf):

@@ -29,6 +29,7 @@ from stereogenbench_data.storage.shard_note import ShardTask
 from stereogenbench_data.storage.shard_plan import PlannedMember, PlannedShard, plan_shards
 from stereogenbench_data.storage.shard_writer import pack_shard, pack_task
 from stereogenbench_data.storage.verify import verify
+from tests.servers.tools import small_disk
 
 ONE_EACH = 250_000
 """A target that holds one of the small release's scenes, not two."""
@@ -709,20 +710,11 @@ def test_a_place_that_is_no_folder_is_refused(release, tmp_path):
         pack(release, tmp_path / "file")
 
 
-@pytest.fixture
-def small_disk(tmp_path):
+@pytest.fixture(name="small_disk")
+def small_disk_of_600_kb(tmp_path):
     """A disk of 600 kB."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", disk],
-        check=False, capture_output=True, text=True,
-    )  # fmt: skip
-    if mounted.returncode:
-        reason = f"a small disk cannot be mounted: {mounted.stderr.strip()}"
-        pytest.fail(reason) if os.environ.get("CI") else pytest.skip(reason)
-    yield disk
-    subprocess.run(["umount", disk], check=True)
+    with small_disk(tmp_path / "disk", size="600k") as place:
+        yield place
 
 
 @pytest.mark.parametrize("workers", [1, 2])
