@@ -83,7 +83,7 @@ class SampleLoader:
         self._shares_frames = frames == "shared"
         # A transform may write into what it is given.
         self._is_changed = request.transform is not None
-        self._scenes: dict[int, Scene] = {}
+        self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._depths: OrderedDict[tuple[int, int], tuple[int, StoredDepth]] = OrderedDict()
         self._videos = OPEN_STREAMS
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
@@ -143,7 +143,7 @@ class SampleLoader:
         """Return a loader of the same samples with open videos of its own."""
         apart = copy(self)
         apart._streams = Streams(self._source)
-        apart._scenes, apart._depths, apart._poses = {}, OrderedDict(), OrderedDict()
+        apart._scenes, apart._depths, apart._poses = OrderedDict(), OrderedDict(), OrderedDict()
         return apart
 
     def keep_open(self, videos: int) -> None:
@@ -166,11 +166,12 @@ class SampleLoader:
 
     def _scene(self, row: int) -> Scene:
         """Return a scene of the index; those of the last rows asked for are kept."""
-        if row not in self._scenes:
-            self._scenes[row] = self._index.scene(row)
+        scene = self._scenes.get(row)
+        if scene is None:
+            scene = self._scenes[row] = self._index.scene(row)
             if len(self._scenes) > KEPT_SCENES:
-                del self._scenes[next(iter(self._scenes))]
-        return self._scenes[row]
+                self._scenes.popitem(last=False)
+        return scene
 
     def _decode_or_again(
         self, scene: Scene, address: Address, places: Places
@@ -278,13 +279,14 @@ class SampleLoader:
                 measured=np.concatenate([part.measured for part in parts]),
             )
         key, frame = (address.row, camera), address.frames[0]
-        if key not in self._depths or self._depths[key][0] != frame:
-            stored = self._stored(scene, camera, frame, encoding=encoding)
-            self._depths[key] = (frame, stored)
-            if len(self._depths) > self._videos:
-                self._depths.popitem(last=False)
-        self._depths.move_to_end(key)
-        stored = self._depths[key][1]
+        # Taken out and put back: another thread may ask for another frame of this camera.
+        kept = self._depths.pop(key, None)
+        if kept is None or kept[0] != frame:
+            kept = (frame, self._stored(scene, camera, frame, encoding=encoding))
+        self._depths[key] = kept
+        if len(self._depths) > self._videos:
+            self._depths.popitem(last=False)
+        stored = kept[1]
         if self._is_changed:
             return StoredDepth(stored.units.copy(), stored.measured.copy())
         return stored
@@ -312,14 +314,15 @@ class SampleLoader:
         rectified = scene.rig_residual_px <= RECTIFIED_PX
         if "always" not in needs and (rectified or "unless rectified" not in needs):
             return None
-        if scene.id.key not in self._poses:
+        poses = self._poses.get(scene.id.key)
+        if poses is None:
             text = self._source.read(scene, TRAJECTORY_JSON)
             where = self._source.label(scene, TRAJECTORY_JSON)
-            trajectory = parse_trajectory(text, where=where)
-            self._poses[scene.id.key] = CameraPoses.from_trajectory(trajectory)
-            while len(self._poses) > KEPT_POSES:
+            poses = CameraPoses.from_trajectory(parse_trajectory(text, where=where))
+            self._poses[scene.id.key] = poses
+            if len(self._poses) > KEPT_POSES:
                 self._poses.popitem(last=False)
-        return self._poses[scene.id.key]
+        return poses
 
     def _write_fields(self, views: Views, facts: SceneFacts, places: Places) -> None:
         targets = views.targets

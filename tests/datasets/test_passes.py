@@ -1,6 +1,7 @@
 """A pass over a loader owns its state: within another pass, in a fork, and broken off."""
 
 import copy
+import faulthandler
 import gc
 import itertools
 import multiprocessing
@@ -136,6 +137,8 @@ def fork_and(act):
     """Run a function in a fork of this process, which then ends; return its exit status."""
     child = os.fork()
     if child == 0:
+        # A fork that hangs says where, and ends.
+        faulthandler.dump_traceback_later(60, exit=True)
         status = 1
         try:
             act()
