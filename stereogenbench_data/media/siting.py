@@ -100,7 +100,7 @@ def picture_siting(frame: VideoFrame) -> str:
     PyAV does not show the tag, but its reformatter follows it. So a small picture that is given
     the same tag is converted by it, and compared with conversions by each place.
     """
-    small = frame.reformat(width=16, height=16, format="yuv420p")
+    small = frame.reformat(width=16, height=16, format="yuv420p", threads=1)
     ramp = np.arange(64, dtype=np.uint8).reshape(8, 8)
     for number, plane in enumerate(small.planes):
         rows = np.full((plane.height, plane.line_size), 128, dtype=np.uint8)
@@ -108,7 +108,7 @@ def picture_siting(frame: VideoFrame) -> str:
             rows[:, :8] = 64 + 2 * ramp
         plane.update(rows.tobytes())
     tagged = small.reformat(
-        width=32, height=32, format="yuv444p", interpolation=Interpolation.BILINEAR
+        width=32, height=32, format="yuv444p", interpolation=Interpolation.BILINEAR, threads=1
     ).to_ndarray()
     for siting in _SITINGS:
         told = Converter().convert(

@@ -134,7 +134,8 @@ class VideoReader:
         name: What messages call the file.
         frames: How many frames it has.
         scaler: The scaler of pictures whose chroma lies where FFmpeg takes it to be.
-        converter: The scaler of all others; both keep their tables from frame to frame.
+        converter: The scaler of all others; both keep their tables from frame to frame. Neither
+            has threads of its own: freed in a fork, FFmpeg would wait for them for ever.
     """
 
     def __init__(self, file: VideoFile, *, name: str, frames: int, threads: int = 1) -> None:
@@ -333,7 +334,9 @@ class VideoReader:
         # Once a video, and where it is turned, and of a tiny copy, which has the same tags: PyAV's
         # side data and their frame hold each other, so that only the garbage collector frees it.
         self._is_seen = True
-        tiny = frame.reformat(16, 16, format="gray", interpolation=Interpolation.POINT)
+        tiny = self.scaler.reformat(
+            frame, 16, 16, format="gray", interpolation=Interpolation.POINT, threads=1
+        )
         matrix: Any = tiny.side_data.get("DISPLAYMATRIX")
         if matrix is not None and not _is_upright(bytes(matrix)):
             raise MediaError(

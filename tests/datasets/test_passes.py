@@ -1,7 +1,6 @@
 """A pass over a loader owns its state: within another pass, in a fork, and broken off."""
 
 import copy
-import faulthandler
 import gc
 import itertools
 import multiprocessing
@@ -23,6 +22,7 @@ from tests.datasets.conftest import keys_of
 pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
 
 OPEN_FILES = Path("/proc/self/fd")
+THREADS = Path("/proc/self/task")
 FIELDS = ("left", "frame_index", "__key__")
 
 
@@ -137,8 +137,8 @@ def fork_and(act):
     """Run a function in a fork of this process, which then ends; return its exit status."""
     child = os.fork()
     if child == 0:
-        # A fork that hangs says where, and ends.
-        faulthandler.dump_traceback_later(60, exit=True)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(60)  # ends a fork that hangs
         status = 1
         try:
             act()
@@ -215,6 +215,17 @@ def test_a_pass_is_refused_in_a_fork_of_its_process(pairs):
 
     assert fork_and(take) == 0
     assert len(list(batches)) == 14
+
+
+@pytest.mark.parametrize("size", [None, (40, 56)])
+def test_reading_starts_no_thread_that_a_fork_would_wait_for(small_index, size):
+    """FFmpeg waits for the threads of what it frees, and a fork has none of them."""
+    threads = len(list(THREADS.iterdir()))
+    held = [StereoPairs(small_index, fields=("left", "right", "disparity"), size=size)]
+    assert held[0][0]["left"].shape[-2:] == (size or (64, 64))
+
+    assert len(list(THREADS.iterdir())) == threads
+    assert fork_and(lambda: [held.clear(), gc.collect()]) == 0
 
 
 @pytest.mark.parametrize("persistent", [False, True])
