@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import StorageError, cure_of
 from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.storage.arrow_arrays import as_numpy
 from stereogenbench_data.storage.location import (
     is_remote,
     local_path,
@@ -250,30 +251,32 @@ def require_sound(table: pa.Table, *, where: str) -> None:
 def _require_texts(table: pa.Table, *, where: str) -> None:
     for name, known in _KNOWN.items():
         texts = table.column(name) if name in _PLAIN_TEXTS else pc.list_flatten(table.column(name))
-        odd = texts.filter(pc.invert(pc.is_in(texts, value_set=pa.array(known, pa.string()))))
-        if len(odd):
+        odd = [text for text in pc.unique(texts).to_pylist() if text not in known]
+        if odd:
             options = ", ".join(str(each) for each in known)
-            raise _odd(where, name, odd, f"none of {options}")
+            raise _odd(where, name, odd[0], f"none of {options}")
     for name in ("family", "map_name"):
         texts = table.column(name)
         odd = texts.filter(pc.match_substring_regex(texts, r"^$|[/\\\x00-\x1f]"))
         if len(odd):
-            raise _odd(where, name, odd, "no name of a folder")
+            raise _odd(where, name, odd[0].as_py(), "no name of a folder")
 
 
 def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
-    sound_units = pc.not_equal(pc.list_flatten(table.column("depth_unit_source")), "unreadable")
-    for name, numbers, (least, most) in (
-        ("offset", pc.struct_field(members, "offset"), _OF_BYTES),
-        ("size", pc.struct_field(members, "size"), _OF_BYTES),
-        ("depth_unit_m", pc.list_flatten(table.column("depth_unit_m")).filter(sound_units), _ABOVE),
-        *((name, table.column(name), bounds) for name, bounds in _BOUNDS.items()),
-    ):
-        flat = pc.list_flatten(numbers) if name in ("baselines_cm", "lateral_m") else numbers
-        within = pc.and_(pc.greater_equal(flat, least), pc.less_equal(flat, most))
-        odd = flat.filter(pc.invert(within))
+    # In numpy: compared with a number, Arrow would import pandas.
+    columns = {name: table.column(name) for name in _BOUNDS}
+    columns |= {name: pc.struct_field(members, name) for name in ("offset", "size")}
+    numbers = {
+        name: as_numpy(column.combine_chunks().drop_null()) for name, column in columns.items()
+    }
+    units = as_numpy(table.column("depth_unit_m").combine_chunks())
+    sources = as_numpy(table.column("depth_unit_source").combine_chunks())
+    numbers["depth_unit_m"] = units[sources != "unreadable"]
+    for name, (least, most) in (_BOUNDS | _MEMBER_BOUNDS).items():
+        flat = numbers[name].ravel()
+        odd = flat[~((flat >= least) & (flat <= most))]
         if len(odd):
-            raise _odd(where, name, odd, f"not {least:g} to {most:g}")
+            raise _odd(where, name, odd[0].item(), f"not {least:g} to {most:g}")
     if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
         raise StorageError(f"{where}: a primary pair has one camera twice. {made_again(where)}")
     halves = [pc.is_null(table.column(f"principal_{axis}_px")) for axis in "xy"]
@@ -283,8 +286,7 @@ def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
 
 def _odd(where: str, name: str, found: Any, why: str) -> StorageError:
     return StorageError(
-        f"{where}: {name} is {found[0].as_py()!r}, {why}. The index was altered. "
-        f"{made_again(where)}"
+        f"{where}: {name} is {found!r}, {why}. The index was altered. {made_again(where)}"
     )
 
 
@@ -316,3 +318,4 @@ _BOUNDS: Final = {
     "valid_depth_ratio": (0, 1),
 }
 """The least and the greatest number of a column; nan is not between, what is unknown is null."""
+_MEMBER_BOUNDS: Final = {"offset": _OF_BYTES, "size": _OF_BYTES, "depth_unit_m": _ABOVE}

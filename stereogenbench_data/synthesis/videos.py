@@ -94,9 +94,7 @@ def open_depth(folder: Path, *, camera: int, view: View, contract: ExportContrac
 
 def rgb_frame(picture: UInt8[np.ndarray, "h w 3"]) -> av.VideoFrame:
     """Return a picture as a frame that the encoder takes."""
-    return av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(
-        format="yuv420p", threads=1
-    )
+    return av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p", threads=1)
 
 
 def depth_frame(

@@ -3,6 +3,8 @@
 import os
 import pickle
 import signal
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 
@@ -351,3 +353,12 @@ def _copied(root, target):
 
     shutil.copytree(root, target / "copy")
     return target / "copy"
+
+
+def test_reading_samples_does_not_import_pandas(small_shards):
+    """Arrow imports it for a comparison with a number: longer than opening a whole release."""
+    code = (
+        "import sys; from stereogenbench_data import StereoPairs; "
+        "StereoPairs(sys.argv[1])[0]; sys.exit('pandas' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code, small_shards], check=False).returncode == 0
