@@ -18,8 +18,8 @@ from benchmarks.ways import (
     visible_by_left,
 )
 from stereogenbench_data.geometry.disparity import disparity_error_px
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import resized_nearest
-from stereogenbench_data.storage.index import SceneIndex
 
 CASES: Final = 240
 PIXELS: Final = (8, 256)

@@ -35,7 +35,7 @@ from stereogenbench_data.samples.load import resized_nearest
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import depth_name, rgb_name
-from stereogenbench_data.storage.source import MemberSource
+from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 
 LIMIT = 3.0

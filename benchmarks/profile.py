@@ -42,7 +42,7 @@ def _depth(reader: Any, *_: Any) -> str:
 
 _SPANS: Final[tuple[tuple[str, str, str | Label], ...]] = (
     ("stereogenbench_data.media.video", "VideoReader.__init__", "opening"),
-    ("stereogenbench_data.storage.ranged_file", "FileSlice.read", "reading"),
+    ("stereogenbench_data.sources.ranged_file", "FileSlice.read", "reading"),
     ("stereogenbench_data.media.decoder", "Decoder._pull", "demuxing"),
     ("stereogenbench_data.media.decoder", "Decoder._feed", _decoding),
     ("stereogenbench_data.media.decoder", "Decoder._register", "checking"),

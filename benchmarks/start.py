@@ -16,7 +16,7 @@ from benchmarks.material import Material
 from benchmarks.results import Spread
 from benchmarks.workloads import WORKLOADS, Job, Wanted
 from stereogenbench_data import StereoPairs
-from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.index.table import SceneIndex
 
 Say = Callable[[str], None]
 

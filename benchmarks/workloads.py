@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.material import EIGHT, Material
 from benchmarks.reencoded import DRAWN_CRF, OTHER_CRFS
 from stereogenbench_data import StereoPairs
-from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.index.table import SceneIndex
 
 Reading = Literal["forwards", "anywhere"]
 

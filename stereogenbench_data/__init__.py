@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from stereogenbench_data.evaluation.protocol import EvaluationProtocol
     from stereogenbench_data.evaluation.report import write_report
     from stereogenbench_data.evaluation.tables import tables_of
+    from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS
     from stereogenbench_data.samples.transforms import (
         ColorJitter,
@@ -54,9 +55,8 @@ if TYPE_CHECKING:
     )
     from stereogenbench_data.schema.records import DepthEncoding
     from stereogenbench_data.selection.quality import order_quality
-    from stereogenbench_data.storage.cache import ShardCache
-    from stereogenbench_data.storage.index import SceneIndex
-    from stereogenbench_data.storage.retry import Patience
+    from stereogenbench_data.sources.cache import ShardCache
+    from stereogenbench_data.sources.retry import Patience
 
 _HOMES = {
     "datasets.adapters": ("to_raft_stereo", "to_torchvision"),
@@ -102,9 +102,9 @@ _HOMES = {
     ),
     "schema.records": ("DepthEncoding",),
     "selection.quality": ("order_quality",),
-    "storage.cache": ("ShardCache",),
-    "storage.index": ("SceneIndex",),
-    "storage.retry": ("Patience",),
+    "sources.cache": ("ShardCache",),
+    "index.table": ("SceneIndex",),
+    "sources.retry": ("Patience",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

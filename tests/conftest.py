@@ -12,7 +12,7 @@ import pytest
 
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 
-pytest_plugins = ("tests.servers.fixtures",)
+pytest_plugins = ("tests.servers.fixtures", "tests.servers.scene_fixtures")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

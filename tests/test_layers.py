@@ -11,8 +11,8 @@ import stereogenbench_data
 
 PACKAGE = Path(stereogenbench_data.__file__).parent
 LAYERS = (
-    "errors", "schema", "geometry", "media", "storage", "selection", "samples", "datasets",
-    "bridges", "audit", "evaluation", "synthesis", "cli",
+    "errors", "schema", "geometry", "media", "engine", "sources", "index", "shards",
+    "selection", "samples", "datasets", "bridges", "audit", "evaluation", "synthesis", "cli",
     "__main__",
 )  # fmt: skip
 ENTRANCES = (Path("__init__.py"), Path("__main__.py"))
@@ -69,7 +69,7 @@ def test_the_imports_have_no_cycle():
         "stereogenbench_data.geometry.camera",
         "stereogenbench_data.geometry.visibility",
         "stereogenbench_data.media.depth",
-        "stereogenbench_data.storage.index",
+        "stereogenbench_data.index.table",
         "stereogenbench_data.selection.plan",
         "stereogenbench_data.cli.commands",
     ],

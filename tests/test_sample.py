@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.pack import pack
-from stereogenbench_data.storage.shard_plan import parse_size
-from stereogenbench_data.storage.verify import verify
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.shards.pack import pack
+from stereogenbench_data.shards.plan import parse_size
+from stereogenbench_data.shards.verify import verify
 from tests.servers.tools import require_tool
 
 PROJECT = Path(__file__).resolve().parents[1]

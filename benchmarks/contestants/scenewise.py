@@ -22,7 +22,7 @@ from benchmarks.contestants.rig import (
     unit_m_of,
 )
 from benchmarks.workloads import Job, Wanted
-from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.index.table import SceneIndex
 
 
 def urls(job: Job) -> list[str]:

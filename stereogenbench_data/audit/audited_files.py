@@ -15,7 +15,7 @@ from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import depth_name, rgb_name
-from stereogenbench_data.storage.source import MemberSource
+from stereogenbench_data.sources.members import MemberSource
 
 Answer = TypeVar("Answer")
 Arguments = ParamSpec("Arguments")

@@ -21,14 +21,14 @@ from stereogenbench_data.audit.contract_diagnosis import SceneDiagnosis
 from stereogenbench_data.audit.contract_search import diagnose_scene
 from stereogenbench_data.audit.contract_verdict import Verdict, grouped, judge
 from stereogenbench_data.audit.contract_views import SceneViews
+from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.pool import AfterBytes, run_tasks
-from stereogenbench_data.storage.retry import Patience
-from stereogenbench_data.storage.source import MemberSource
+from stereogenbench_data.sources.members import MemberSource
+from stereogenbench_data.sources.retry import Patience
 
 MOST_RESIDUAL_PX: Final = 0.5
 """Rigs that are further from rectified are left out: disparity alone does not explain them."""

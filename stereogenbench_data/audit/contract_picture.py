@@ -15,8 +15,8 @@ from stereogenbench_data.audit.contract_hypotheses import Structure
 from stereogenbench_data.audit.contract_scoring import scored
 from stereogenbench_data.audit.contract_views import SceneViews, Shot
 from stereogenbench_data.errors import ExtraError, SelectionError
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.unfinished import writing_output
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.sources.atomic_write import writing_output
 
 _ENDINGS: Final = (".png", ".pdf", ".svg", ".jpg")
 _NOT_KNOWN: Final = 255

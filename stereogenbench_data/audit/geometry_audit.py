@@ -20,19 +20,19 @@ from stereogenbench_data.audit.audit_records import (
 from stereogenbench_data.audit.audit_table import table_rows
 from stereogenbench_data.audit.findings import broken_finding, findings_of, untested_of
 from stereogenbench_data.audit.scene_audit import SceneTask, audit_scene, spread_frames
+from stereogenbench_data.engine.process_pool import run_tasks
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
+from stereogenbench_data.index.build import walk
+from stereogenbench_data.index.journal import RecordJournal
+from stereogenbench_data.index.rows import row_of
+from stereogenbench_data.index.scene_files import files_of
+from stereogenbench_data.index.table import INDEX_NAME, IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
-from stereogenbench_data.storage.filesystems import MissingObject
-from stereogenbench_data.storage.index import INDEX_NAME, IncompleteSceneWarning, SceneIndex
-from stereogenbench_data.storage.journal import RecordJournal
-from stereogenbench_data.storage.location import is_remote, joined, local_path
-from stereogenbench_data.storage.pool import run_tasks
-from stereogenbench_data.storage.remote import RemoteObject
-from stereogenbench_data.storage.rows import row_of
-from stereogenbench_data.storage.scene_files import files_of
-from stereogenbench_data.storage.walk import walk
+from stereogenbench_data.sources.filesystems import MissingObject
+from stereogenbench_data.sources.location import is_remote, joined, local_path
+from stereogenbench_data.sources.remote import RemoteObject
 
 Progress = Callable[[int, int], None]
 

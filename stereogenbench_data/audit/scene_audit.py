@@ -28,6 +28,7 @@ from stereogenbench_data.audit.reprojection import (
     reproject,
 )
 from stereogenbench_data.audit.rig_check import motion_px, rig_audit
+from stereogenbench_data.engine.process_pool import AfterBytes
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.schema.document import parse_object
@@ -41,9 +42,8 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
-from stereogenbench_data.storage.pool import AfterBytes
-from stereogenbench_data.storage.retry import Patience
-from stereogenbench_data.storage.source import MemberSource
+from stereogenbench_data.sources.members import MemberSource
+from stereogenbench_data.sources.retry import Patience
 
 LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
 """The non-adjacent pair that the paper audits beside the primary one."""

@@ -24,7 +24,7 @@ from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.samples.load import Sample
 from stereogenbench_data.samples.picture import Picture, anaglyph
 from stereogenbench_data.schema.records import Scene
-from stereogenbench_data.storage.unfinished import writing_output
+from stereogenbench_data.sources.atomic_write import writing_output
 
 CLIP_FIELDS: Final = ("left", "right", "disparity", "valid", "baseline_m")
 CLIP_SUFFIXES: Final = (".mp4", ".gif")

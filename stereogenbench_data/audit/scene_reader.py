@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Request, Sample, SampleLoader
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.pairs import require_pairs
 from stereogenbench_data.selection.plan import Address
-from stereogenbench_data.storage.cache import ShardCache
-from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.sources.cache import ShardCache
 
 OPEN_VIDEOS: Final = 6
 """How many videos each kind of reading keeps open: a scene's, of one kind."""

@@ -9,6 +9,7 @@ from jaxtyping import Float64, Int64
 
 from stereogenbench_data.audit.audit_records import plain
 from stereogenbench_data.audit.paper_figures import SHORT_PAIRS
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     BASELINE_BINS,
@@ -18,7 +19,6 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.pairs import PAIR_NUMBER
-from stereogenbench_data.storage.index import SceneIndex
 
 ADJACENT: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
 FOCAL_EDGES_MM: Final = np.arange(15.0, 86.0, 5.0)

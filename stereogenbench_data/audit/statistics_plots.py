@@ -9,9 +9,9 @@ from jaxtyping import Float64
 
 from stereogenbench_data.audit.statistics import ADJACENT, FOCAL_EDGES_MM, branch_rows
 from stereogenbench_data.errors import ExtraError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.unfinished import writing_whole
+from stereogenbench_data.sources.atomic_write import writing_whole
 
 _BINS: Final = 40
 _COLOURS: Final = {"IPD_Gaussian": "#4477aa", "Uniform": "#ee6677", "Pairwise_Uniform": "#228833"}

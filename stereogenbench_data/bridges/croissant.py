@@ -20,9 +20,9 @@ from stereogenbench_data.bridges.croissant_packed import packed_nodes
 from stereogenbench_data.bridges.croissant_tables import write_tables
 from stereogenbench_data.bridges.croissant_terms import CONTEXT, CROISSANT, RAI, Node
 from stereogenbench_data.errors import DescriptorError, cure_of
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.location import shown
-from stereogenbench_data.storage.unfinished import write_whole
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.sources.atomic_write import write_whole
+from stereogenbench_data.sources.location import shown
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from stereogenbench_data.bridges.croissant_terms import PARQUET, TAR, TEXT, Node
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.storage.tar import read_members
+from stereogenbench_data.shards.tar import read_members
 
 _SHA256: Final = re.compile(r"[0-9a-f]{64}")
 _MOVING: Final = re.compile(r"/(?:resolve|raw|blob|tree)/(?:main|master|HEAD)(?:/|$)")

@@ -3,8 +3,8 @@
 from typing import Final
 
 from stereogenbench_data.bridges.croissant_terms import Node, enumeration
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import FAMILIES, TRAIN_MAPS, UNSEEN_MAPS
-from stereogenbench_data.storage.index import SceneIndex
 
 
 def enumerations(index: SceneIndex | None) -> list[Node]:

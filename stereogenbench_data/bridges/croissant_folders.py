@@ -25,13 +25,13 @@ from stereogenbench_data.bridges.croissant_terms import (
     of_file,
     record_set,
 )
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
     COMPLETE_JSON,
     DESCRIPTION_TXT,
     TRAJECTORY_JSON,
 )
-from stereogenbench_data.storage.index import SceneIndex
 
 REPOSITORY: Final = "repository"
 _KEY: Final = r"^.*?((?:train|eval)/.+?/[^/.]+?)(?:/[^/]*\.[^/]*)?$"

@@ -9,8 +9,8 @@ from stereogenbench_data.bridges.croissant_terms import (
     record_set,
     refers_to,
 )
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON
-from stereogenbench_data.storage.index import SceneIndex
 
 RELEASED_SUFFIXES: Final = {"rgb": "mp4", "depth": "mkv"}
 ENCODINGS: Final = {"mp4": "video/mp4", "mkv": "video/x-matroska"}

@@ -37,8 +37,8 @@ from stereogenbench_data.bridges.croissant_terms import (
     record_set,
     refers_to,
 )
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON
-from stereogenbench_data.storage.index import SceneIndex
 
 MOST_MEDIA_BYTES: Final = 1_000_000_000
 """Beyond so many bytes of shards, record sets of files are bound to the smallest of each family."""

@@ -14,9 +14,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import DescriptorError, cure_of
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import CAMERA_PAIRS, baseline_bin
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.unfinished import write_whole, writing_whole
+from stereogenbench_data.sources.atomic_write import write_whole, writing_whole
 
 SCENES: Final = "scenes.parquet"
 PAIRS: Final = "pairs.parquet"

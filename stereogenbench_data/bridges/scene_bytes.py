@@ -14,13 +14,13 @@ from typing import Any, Final, TypedDict
 
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.errors import SelectionError, StorageError
+from stereogenbench_data.index.scene_folder import describe_scene
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Sample
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import METADATA_FILES, PACKED_DEPTH_NAMES, VIDEO_FILES
 from stereogenbench_data.selection.pairs import PairsSpec
 from stereogenbench_data.selection.windows import FramesSpec
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.scene_folder import describe_scene
 
 VIDEOS: Final = (*VIDEO_FILES, *PACKED_DEPTH_NAMES.values())
 FILES: Final = (*METADATA_FILES, *VIDEOS)

@@ -11,11 +11,11 @@ from stereogenbench_data.bridges import about
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant import Publication, write_descriptor
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
+from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
 from stereogenbench_data.schema.problems import counted
-from stereogenbench_data.storage.filesystems import network_errors
-from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
-from stereogenbench_data.storage.location import local_path
-from stereogenbench_data.storage.source import require_own_files
+from stereogenbench_data.sources.filesystems import network_errors
+from stereogenbench_data.sources.location import local_path
+from stereogenbench_data.sources.members import require_own_files
 
 DESCRIPTOR_NAME: Final = "croissant.json"
 _COMPANIONS: Final = (INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "croissant/*.parquet")

@@ -163,7 +163,7 @@ def _contract(unit_m: float | None, kind: Any, accept: Any) -> Any:
 
 
 def _journal(out: Path | None, data: str, request: Any) -> Path:
-    from stereogenbench_data.storage.location import is_remote, shown
+    from stereogenbench_data.sources.location import is_remote, shown
 
     if out is not None:
         return out.with_name(f"{out.name}.journal")

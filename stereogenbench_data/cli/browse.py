@@ -34,7 +34,7 @@ def browse(
     from stereogenbench_data.audit.browser.service import Service
     from stereogenbench_data.audit.scene_reader import SceneReader
     from stereogenbench_data.schema.records import DepthEncoding
-    from stereogenbench_data.storage.location import is_remote, shown
+    from stereogenbench_data.sources.location import is_remote, shown
 
     index = open_data(data, root=data_root)
     shown_data = shown(data) if is_remote(data) else str(Path(data).expanduser().resolve())

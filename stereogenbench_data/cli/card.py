@@ -20,7 +20,7 @@ def card(
     """Write the dataset card of shards: what the Hub shows, and how `datasets` finds the shards."""
     from stereogenbench_data.bridges.card import card as card_text
     from stereogenbench_data.bridges.card import write_card
-    from stereogenbench_data.storage.index import SceneIndex
+    from stereogenbench_data.index.table import SceneIndex
 
     index = SceneIndex.open(data, root=data_root)
     if out is None:

@@ -67,7 +67,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         raise typer.BadParameter("name the descriptor to write: -o FILE", param_hint="--out")
     from stereogenbench_data.bridges import about
     from stereogenbench_data.bridges.croissant import Publication, write_descriptor
-    from stereogenbench_data.storage.index import SceneIndex
+    from stereogenbench_data.index.table import SceneIndex
 
     index = None if data is None else SceneIndex.open(data, root=data_root)
     publication = Publication(

@@ -55,10 +55,10 @@ def download(  # noqa: PLR0913 - one parameter an option
     Every file is checked as it comes; a run that was stopped goes on if it is run again. The folder
     then opens with `StereoPairs(DEST)`, for the cameras that were fetched.
     """
+    from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.selection.filters import filter_scenes
-    from stereogenbench_data.storage.download import download as fetched
-    from stereogenbench_data.storage.download import plan_download
-    from stereogenbench_data.storage.index import SceneIndex
+    from stereogenbench_data.shards.download import download as fetched
+    from stereogenbench_data.shards.download import plan_download
 
     numbers = _cameras(cameras)
     index = SceneIndex.open(data, root=data_root)

@@ -53,11 +53,11 @@ def index(  # noqa: PLR0913 - one parameter an option
     are listed and left out. Broken ones too, and then the exit status is 1. With --split,
     --family or --map only such scenes are read.
     """
-    from stereogenbench_data.storage.index import SceneIndex
-    from stereogenbench_data.storage.index_file import root_told
-    from stereogenbench_data.storage.journal import Journal
-    from stereogenbench_data.storage.location import is_remote, local_path, shown
-    from stereogenbench_data.storage.walk import walk
+    from stereogenbench_data.index.build import walk
+    from stereogenbench_data.index.journal import Journal
+    from stereogenbench_data.index.parquet import root_told
+    from stereogenbench_data.index.table import SceneIndex
+    from stereogenbench_data.sources.location import is_remote, local_path, shown
 
     console = Console(stderr=True)
     place = "." if is_remote(root) else root
@@ -123,7 +123,7 @@ def index(  # noqa: PLR0913 - one parameter an option
 
 
 def _whole(root: str) -> str:
-    from stereogenbench_data.storage.location import is_remote, local_path, shown
+    from stereogenbench_data.sources.location import is_remote, local_path, shown
 
     return shown(root) if is_remote(root) else str(local_path(root).resolve())
 

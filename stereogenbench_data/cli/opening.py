@@ -10,8 +10,8 @@ from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.problems import counted, plain_line
 
 if TYPE_CHECKING:
-    from stereogenbench_data.storage.index import SceneIndex
-    from stereogenbench_data.storage.walk import TreeReport
+    from stereogenbench_data.index.build import TreeReport
+    from stereogenbench_data.index.table import SceneIndex
 
 
 def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
@@ -25,9 +25,9 @@ def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
         StorageError: If there is no such data, or no scene of it is whole.
     """
     from stereogenbench_data.errors import StorageError
-    from stereogenbench_data.storage.index import INDEX_NAME, SceneIndex
-    from stereogenbench_data.storage.location import is_remote, local_path
-    from stereogenbench_data.storage.walk import walk
+    from stereogenbench_data.index.build import walk
+    from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
+    from stereogenbench_data.sources.location import is_remote, local_path
 
     folder = None if is_remote(data) else local_path(data)
     if folder is None or root is not None or not folder.is_dir():
@@ -49,8 +49,8 @@ def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
 
 def _opened(data: str, root: str | None) -> "SceneIndex":
     """Return an index that exists; its warnings are said as a command says things."""
-    from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
-    from stereogenbench_data.storage.stale_index import StaleIndexWarning
+    from stereogenbench_data.index.stale import StaleIndexWarning
+    from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
 
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", IncompleteSceneWarning)

@@ -53,12 +53,12 @@ def pack(  # noqa: PLR0913 - one parameter an option
     sizes and times of change and reads metadata again; `stereogenbench verify` reads every byte.
     With --part, run the same command once for each I; whichever is finished last writes the index.
     """
+    from stereogenbench_data.index.stale import StaleIndexWarning
+    from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
     from stereogenbench_data.schema.problems import counted, plain_line
-    from stereogenbench_data.storage.index import IncompleteSceneWarning, SceneIndex
-    from stereogenbench_data.storage.pack import pack as pack_locally
-    from stereogenbench_data.storage.ray_pack import pack_on_ray
-    from stereogenbench_data.storage.shard_plan import parse_size
-    from stereogenbench_data.storage.stale_index import StaleIndexWarning
+    from stereogenbench_data.shards.pack import pack as pack_locally
+    from stereogenbench_data.shards.plan import parse_size
+    from stereogenbench_data.shards.ray_pack import pack_on_ray
 
     target_bytes, wanted = parse_size(shard_size), _part(part)
     try:

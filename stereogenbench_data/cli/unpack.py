@@ -28,7 +28,7 @@ def unpack(
     are there are kept, so a run that was stopped goes on if it is run again.
     """
     from stereogenbench_data.schema.problems import counted
-    from stereogenbench_data.storage.unpack import unpack as unpacked
+    from stereogenbench_data.shards.unpack import unpack as unpacked
 
     try:
         with progress_bar("unpacking", unit="MB") as bar:

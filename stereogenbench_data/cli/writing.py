@@ -29,7 +29,7 @@ def write_report(path: Path, text: str) -> None:
         OSError: If it cannot be written; then the file that was there is as before, unless it is
             a device or a pipe.
     """
-    from stereogenbench_data.storage.unfinished import writing_output
+    from stereogenbench_data.sources.atomic_write import writing_output
 
     content = text.encode(errors="replace")
     with writing(path):

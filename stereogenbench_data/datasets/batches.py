@@ -11,6 +11,7 @@ from torch.utils.data import Sampler
 
 from stereogenbench_data.datasets.frameworks import require_shared_once
 from stereogenbench_data.errors import SelectionError, StateError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.order import (
     LANES,
     LANES_OF_LARGE,
@@ -24,7 +25,6 @@ from stereogenbench_data.selection.order import (
     rank_share,
 )
 from stereogenbench_data.selection.plan import Plan
-from stereogenbench_data.storage.index import SceneIndex
 
 State = dict[str, Any]
 """A position: a flat dict of numbers and texts, which JSON and `torch.save` take."""

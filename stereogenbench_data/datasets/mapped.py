@@ -32,6 +32,7 @@ from stereogenbench_data.datasets.open_videos import scenes_at_once, videos_to_k
 from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import FieldError, SelectionError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.derive import RECTIFIED_PX
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,
@@ -50,8 +51,7 @@ from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.plan import Plan, Selection, plan_pairs, plan_views
 from stereogenbench_data.selection.windows import FramesSpec
-from stereogenbench_data.storage.cache import ShardCache
-from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.sources.cache import ShardCache
 
 Data = str | Path | SceneIndex
 _FOLLOWS: Final = -1

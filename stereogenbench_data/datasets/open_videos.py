@@ -8,12 +8,12 @@ from typing import Final
 import numpy as np
 
 from stereogenbench_data.datasets.batches import EpochBatches
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Stream
 from stereogenbench_data.samples.streams import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.order import Numbers
 from stereogenbench_data.selection.plan import Plan
-from stereogenbench_data.storage.index import SceneIndex
 
 SPARE_FILES = 128
 """Open files that are left to everything else."""

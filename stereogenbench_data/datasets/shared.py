@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 import pyarrow as pa
 import torch
 
-from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.index.table import SceneIndex
 
 _rows: Final[WeakKeyDictionary[SceneIndex, torch.Tensor]] = WeakKeyDictionary()
 """The rows of each index that was sent to other processes, laid out once."""

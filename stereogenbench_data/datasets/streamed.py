@@ -22,7 +22,7 @@ from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.load import Sample, Transform
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Selection
-from stereogenbench_data.storage.cache import ShardCache
+from stereogenbench_data.sources.cache import ShardCache
 
 MOST_WORKERS = 4096
 

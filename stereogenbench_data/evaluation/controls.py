@@ -19,10 +19,10 @@ from stereogenbench_data.evaluation.predictions import Wanted
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.evaluation.results import CONTROL, Scores
 from stereogenbench_data.evaluation.running import Run
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Request, Sample, SampleLoader
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.plan import Address
-from stereogenbench_data.storage.index import SceneIndex
 
 TARGET: Final = "rendered target"
 COPIED_LEFT: Final = "copied left"

@@ -24,18 +24,18 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.datasets.mapped import Data
+from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
 from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
 from stereogenbench_data.evaluation.evaluate import selected
 from stereogenbench_data.evaluation.predictions import Wanted, frame_name, item_name
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
 from stereogenbench_data.evaluation.running import Progress, no_progress
 from stereogenbench_data.evaluation.tiers import Tier, require_tier
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Request, SampleLoader
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Address, Selection
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.pool import AfterBytes, run_tasks
-from stereogenbench_data.storage.unfinished import write_whole
+from stereogenbench_data.sources.atomic_write import write_whole
 
 INPUTS_JSON: Final = "inputs.json"
 CAMERA_JSON: Final = "camera.json"

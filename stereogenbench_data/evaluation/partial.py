@@ -19,7 +19,7 @@ from stereogenbench_data.evaluation.frame_scores import PairScores
 from stereogenbench_data.evaluation.frechet import Spread
 from stereogenbench_data.evaluation.predictions import Pair, pair_name
 from stereogenbench_data.evaluation.scoring import SceneScores
-from stereogenbench_data.storage.unfinished import write_whole
+from stereogenbench_data.sources.atomic_write import write_whole
 
 Stamps = Mapping[tuple[str, Pair], str]
 

@@ -13,7 +13,7 @@ from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS, HEAVY
 from stereogenbench_data.evaluation.reference import reference_rows
 from stereogenbench_data.evaluation.results import CONTROL, Scores, require_comparable
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
-from stereogenbench_data.storage.unfinished import writing_whole
+from stereogenbench_data.sources.atomic_write import writing_whole
 
 _SIZE_IN: Final = (9.0, 4.2)
 _DPI: Final = 120

@@ -8,7 +8,7 @@ from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.aggregate import PairMeans
 from stereogenbench_data.evaluation.frechet import FrechetDistance
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.index.table import SceneIndex
 
 Labels = tuple[str, ...]
 

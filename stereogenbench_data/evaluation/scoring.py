@@ -12,17 +12,17 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
+from stereogenbench_data.engine.process_pool import AfterBytes
 from stereogenbench_data.evaluation.candidates import Candidate, Views
 from stereogenbench_data.evaluation.frame_scores import PairScorer, PairScores, TargetFrame
 from stereogenbench_data.evaluation.one_thread import one_thread
 from stereogenbench_data.evaluation.predictions import Pair, PredictionFault, Wanted
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools, tools_of
 from stereogenbench_data.evaluation.protocols import KeypointMatcher, Keypoints, Settings
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import PAIR_FIELDS
 from stereogenbench_data.samples.load import Request, Sample, SampleLoader
 from stereogenbench_data.selection.plan import Address
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.pool import AfterBytes
 
 Faults = Literal["raise", "count"]
 

@@ -11,6 +11,7 @@ from jaxtyping import Shaped
 from stereogenbench_data.errors import MediaError, SchemaError, ShardError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import (
     depth_frame_index,
     measured,
@@ -35,9 +36,8 @@ from stereogenbench_data.schema.release import (
     rgb_name,
 )
 from stereogenbench_data.selection.plan import Address
-from stereogenbench_data.storage.cache import ShardCache
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.source import MemberSource
+from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.members import MemberSource
 
 __all__ = ["Clip", "Request", "Sample", "SampleLoader", "Transform", "resized_nearest"]
 

@@ -3,10 +3,10 @@
 import numpy as np
 
 from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Request
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.plan import Plan
-from stereogenbench_data.storage.index import SceneIndex
 
 
 def require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from stereogenbench_data.errors import FieldError
 from stereogenbench_data.samples.load import Sample
-from stereogenbench_data.storage.unfinished import writing_output
+from stereogenbench_data.sources.atomic_write import writing_output
 
 Picture = UInt8[np.ndarray, "h w 3"]
 

@@ -24,8 +24,8 @@ from stereogenbench_data.media.depth import open_depth, read_depth_units
 from stereogenbench_data.media.video import VideoReader, read_rgb, require_pixel_aspect
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
-from stereogenbench_data.storage.ranged_file import MemberFile, RangedFile
-from stereogenbench_data.storage.source import MemberSource
+from stereogenbench_data.sources.members import MemberSource
+from stereogenbench_data.sources.ranged_file import MemberFile, RangedFile
 
 OPEN_STREAMS: Final = 24
 """How many videos a process keeps open: two scenes with all their cameras' colour and depth."""

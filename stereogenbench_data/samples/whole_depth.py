@@ -6,12 +6,12 @@ from typing import NoReturn
 import numpy as np
 
 from stereogenbench_data.errors import MediaError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import depth_name
 from stereogenbench_data.selection.plan import Plan
-from stereogenbench_data.storage.index import SceneIndex
 
 
 def require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.problems import counted
-from stereogenbench_data.storage.index import SceneIndex
 
 Range = tuple[float, float]
 

@@ -4,9 +4,9 @@ import difflib
 from typing import Final
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.selection.filters import told_stale
-from stereogenbench_data.storage.index import SceneIndex
 
 _SHOWN: Final = 6
 

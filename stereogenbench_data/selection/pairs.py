@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
@@ -18,7 +19,6 @@ from stereogenbench_data.schema.release import (
     baseline_bin,
 )
 from stereogenbench_data.selection.filters import Range, require_range
-from stereogenbench_data.storage.index import SceneIndex
 
 PairsSpec = Literal["primary", "adjacent", "all", "sweep"] | Sequence[tuple[int, int]]
 Direction = Literal["left_to_right", "right_to_left"]

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.balance import Balance, balanced
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
@@ -26,7 +27,6 @@ from stereogenbench_data.selection.pairs import (
     choose_pairs,
 )
 from stereogenbench_data.selection.windows import FramesSpec, Windows, parse_frames
-from stereogenbench_data.storage.index import SceneIndex
 
 
 class PairOptions(TypedDict, total=False):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
+from stereogenbench_data.engine.process_pool import run_tasks
 from stereogenbench_data.errors import StorageError, SynthesisError, cure_of
-from stereogenbench_data.storage.pool import run_tasks
 from stereogenbench_data.synthesis.filming import film_camera
 from stereogenbench_data.synthesis.plan import plan_scene
 from stereogenbench_data.synthesis.request import SynthRequest

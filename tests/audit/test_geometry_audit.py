@@ -20,7 +20,7 @@ from stereogenbench_data.audit.geometry_audit import (
 from stereogenbench_data.audit.scene_audit import spread_frames
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.storage.pack import pack
+from stereogenbench_data.shards.pack import pack
 from tests.audit.corruption import (
     as_ray,
     copied,

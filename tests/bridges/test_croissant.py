@@ -14,8 +14,8 @@ from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.croissant import Publication, write_descriptor
 from stereogenbench_data.bridges.croissant_check import check_descriptor
 from stereogenbench_data.errors import DescriptorError
-from stereogenbench_data.storage.download import download, plan_download
-from stereogenbench_data.storage.pack import pack
+from stereogenbench_data.shards.download import download, plan_download
+from stereogenbench_data.shards.pack import pack
 from tests.servers.tools import require_module
 
 HOME = Path(__file__).resolve().parents[2]

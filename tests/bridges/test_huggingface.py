@@ -14,7 +14,7 @@ from torchdata.stateful_dataloader import StatefulDataLoader
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.bridges import huggingface
 from stereogenbench_data.errors import SelectionError, StorageError
-from stereogenbench_data.storage.pack import pack
+from stereogenbench_data.shards.pack import pack
 from tests.servers.tools import require_module
 
 FIELDS = ("left", "right", "disparity", "valid", "intrinsics", "pair", "scene", "__key__")

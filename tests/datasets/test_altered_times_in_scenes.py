@@ -8,8 +8,8 @@ import pytest
 
 from stereogenbench_data import SceneIndex, StereoGenBenchError, StereoPairs
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.storage.pack import pack
-from stereogenbench_data.storage.scene_folder import describe_scene
+from stereogenbench_data.index.scene_folder import describe_scene
+from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 from tests.media.test_altered_times import flipped, matroska_times
 

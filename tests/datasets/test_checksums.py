@@ -10,7 +10,7 @@ from torch.utils.data import DataLoader
 from stereogenbench_data import SceneViews, SelectionError, StereoPairs
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.schema.release import rgb_name
-from stereogenbench_data.storage.cache import ShardCache
+from stereogenbench_data.sources.cache import ShardCache
 
 SCENE = "train/IPD_Gaussian/SynthStage/scene_000000"
 SHARD = "train-IPD_Gaussian-000000.tar"

@@ -10,10 +10,10 @@ import pytest
 
 from stereogenbench_data import MediaError, SceneIndex, StereoPairs
 from stereogenbench_data.errors import StereoGenBenchError
-from stereogenbench_data.storage.pack import pack
-from stereogenbench_data.storage.scene_folder import describe_scene
-from stereogenbench_data.storage.verify import verify
-from stereogenbench_data.storage.walk import walk
+from stereogenbench_data.index.build import walk
+from stereogenbench_data.index.scene_folder import describe_scene
+from stereogenbench_data.shards.pack import pack
+from stereogenbench_data.shards.verify import verify
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 
 FRAMES = 17

@@ -11,9 +11,9 @@ from torch.utils.data import DataLoader
 from stereogenbench_data import PAIR_FIELDS, SceneIndex, SceneViews, StereoPairs
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.release import depth_name, rgb_name
-from stereogenbench_data.storage import remote
-from stereogenbench_data.storage.cache import ShardCache
-from stereogenbench_data.storage.retry import Patience
+from stereogenbench_data.sources import remote
+from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.retry import Patience
 from tests.servers.fault import Answer, serving
 from tests.servers.hub import REPOSITORY
 from tests.servers.nginx import nginx_serving

@@ -17,7 +17,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from stereogenbench_data import EvaluationError, EvaluationProtocol, evaluate
 from stereogenbench_data.evaluation.predictions import PredictionFault, frame_name, item_name
 from stereogenbench_data.schema.release import rgb_name
-from stereogenbench_data.storage.pack import pack
+from stereogenbench_data.shards.pack import pack
 from tests.evaluation.conftest import FRAMES, SIZE, rendered, write_pngs
 from tests.servers.fault import serving
 from tests.servers.tools import require_module
@@ -243,7 +243,7 @@ def test_an_evaluation_that_was_killed_goes_on_with_what_it_has(scored_index, pr
     script = f"""
 import os, signal
 from stereogenbench_data import EvaluationProtocol, evaluate
-from stereogenbench_data.storage.index import SceneIndex
+from stereogenbench_data.index.table import SceneIndex
 
 batches = []
 

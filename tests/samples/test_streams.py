@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.errors import MediaError
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.storage.index import SceneIndex
-from stereogenbench_data.storage.source import MemberSource
+from stereogenbench_data.sources.members import MemberSource
 
 RGB = [f"cam_{camera:02d}_rgb.mp4" for camera in range(6)]
 DEPTH = "cam_00_depth.mkv"

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Rig, Scene, SceneId, SceneLabels
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.storage.index import SceneIndex
 
 
 def made_scene(key, *, gaps_cm=(6.0,) * 5, frames=81, primary=(0, 1), **labels):

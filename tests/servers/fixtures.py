@@ -10,7 +10,7 @@ import fsspec
 import numpy as np
 import pytest
 
-from stereogenbench_data.storage.pack import pack
+from stereogenbench_data.shards.pack import pack
 from tests.servers.fault import FaultServer, serving
 from tests.servers.hub import HubHandler
 from tests.servers.nginx import Nginx, nginx_serving

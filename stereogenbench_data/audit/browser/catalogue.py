@@ -12,11 +12,11 @@ from jaxtyping import Bool, Int64
 from stereogenbench_data.audit.browser.choice import FACETS, Choice
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
 from stereogenbench_data.selection.filters import filter_scenes
 from stereogenbench_data.selection.pairs import PairList, baselines_cm, choose_pairs
-from stereogenbench_data.storage.index import SceneIndex
 
 MOST_ROWS: Final = 200
 """How many scenes one answer lists at most."""

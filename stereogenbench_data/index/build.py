@@ -1,0 +1,235 @@
+"""From a released tree to its scenes: all described, in parallel, none left out in silence."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, Literal
+
+from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
+from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
+from stereogenbench_data.index.journal import Journal
+from stereogenbench_data.index.release_tree import SceneFolders, find_scene_folders
+from stereogenbench_data.index.remote_tree import find_remote_scenes
+from stereogenbench_data.index.scene_files import files_of
+from stereogenbench_data.index.scene_folder import (
+    IncompleteScene,
+    ValidDepth,
+    describe_scene,
+    stamp_of,
+)
+from stereogenbench_data.media.depth import require_depth_stream
+from stereogenbench_data.schema.parse import parse_scene_key
+from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
+from stereogenbench_data.schema.release import TRAIN_MAPS, depth_name
+from stereogenbench_data.sources.location import is_remote, shown
+
+Progress = Callable[[int, int], None]
+
+_NAMED: Final = 6
+POOL_FROM: Final = 64
+"""How many scenes there must be for worker processes to be worth their start."""
+
+
+@dataclass(frozen=True, slots=True)
+class TreeReport:
+    """What a walk found.
+
+    Attributes:
+        root: The folder that was walked.
+        scenes: Every whole scene, by key.
+        incomplete: Key to reason, for scenes without their mark or without any video.
+        broken: Key (or path below the root) to what is wrong and what to do.
+        notes: What was decided where the tree does not say.
+        is_part: Whether only scenes that were asked for were described.
+    """
+
+    root: str
+    scenes: tuple[Scene, ...]
+    incomplete: dict[str, str]
+    broken: dict[str, str]
+    notes: tuple[str, ...]
+    is_part: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """What became of one scene's folder: a scene and the stamp of its files, or why not."""
+
+    key: str
+    kind: Literal["whole", "incomplete", "broken"]
+    scene: Scene | None = None
+    stamp: str = ""
+    reason: str = ""
+
+
+def walk(
+    root: str | Path,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    journal: Journal | None = None,
+    valid_depth: ValidDepth = "skip",
+    wanted: Callable[[SceneId], bool] | None = None,
+) -> TreeReport:
+    """Return every scene of a tree in the released layout, and what is wrong with the others.
+
+    Args:
+        root: The folder that holds ``train`` and ``eval``, or its URL, of which folders can be
+            listed (``hf://datasets/...``, ``s3://...``).
+        workers: Processes that read at the same time; None is one a core. With few scenes this
+            process reads them all.
+        progress: Called with the number of scenes done and that of all, after each.
+        journal: Where described scenes are kept, and found again by a later walk.
+        valid_depth: "sample" decodes some depth pictures of each scene, to tell the share of
+            pixels that have a depth.
+        wanted: Which scenes to describe, by what their paths say; None is all.
+
+    Raises:
+        StorageError: If there is no such scene below the root, or a worker process died.
+    """
+    if workers is not None and workers < 1:
+        raise StorageError(f"workers must be at least 1, got {workers}.")
+    folders = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
+    if wanted is not None:
+        folders = _chosen(root, folders, wanted)
+    outcomes = _reused(root, folders.keys, journal)
+    total = len(folders.keys)
+    if progress is not None:
+        progress(len(outcomes), total)
+    pending = [key for key in folders.keys if key not in outcomes]
+    task = _Task(str(root), valid_depth)
+    for outcome in _described(task, pending, workers):
+        outcomes[outcome.key] = outcome
+        if journal is not None and outcome.scene is not None:
+            journal.add(outcome.scene, stamp=outcome.stamp)
+        if progress is not None:
+            progress(len(outcomes), total)
+    report = _report(root, folders, [outcomes[key] for key in folders.keys])
+    return replace(report, is_part=wanted is not None)
+
+
+def _chosen(
+    root: str | Path, folders: SceneFolders, wanted: Callable[[SceneId], bool]
+) -> SceneFolders:
+    keys = tuple(key for key in folders.keys if wanted(parse_scene_key(key)))
+    if not keys:
+        there = sorted({key.rpartition("/")[0] for key in folders.keys})
+        more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
+        raise StorageError(
+            f"{shown(str(root))}: none of its {counted(len(folders.keys), 'scene')} is asked for; "
+            f"there are scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
+        )
+    return SceneFolders(keys, folders.refused)
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Describes a scene by its key; travels to worker processes."""
+
+    root: str
+    valid_depth: ValidDepth
+
+    def __call__(self, key: str) -> _Outcome:
+        try:
+            stamp = stamp_of(files_of(self.root, key).stamps())
+            scene = describe_scene(self.root, key, valid_depth=self.valid_depth)
+        except IncompleteScene as error:
+            return _Outcome(key, "incomplete", reason=str(error))
+        except StereoGenBenchError as error:
+            return _Outcome(key, "broken", reason=str(error))
+        return _Outcome(key, "whole", scene, stamp)
+
+
+def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> dict[str, _Outcome]:
+    outcomes: dict[str, _Outcome] = {}
+    for key in keys if journal is not None and len(journal) else ():
+        try:
+            stamp = stamp_of(files_of(root, key).stamps())
+        except StorageError:
+            continue
+        scene = journal.find(key, stamp=stamp) if journal is not None else None
+        if scene is not None:
+            outcomes[key] = _Outcome(key, "whole", scene, stamp)
+    return outcomes
+
+
+def _described(task: _Task, keys: list[str], workers: int | None) -> Iterator[_Outcome]:
+    items = [(task, key) for key in keys]
+    few = len(keys) < POOL_FROM
+    return run_tasks(_describe, items, workers=1 if few else workers, after_bytes=_ignore)
+
+
+def _describe(item: tuple[_Task, str], after_bytes: AfterBytes) -> _Outcome:
+    task, key = item
+    after_bytes(0)
+    return task(key)
+
+
+def _ignore(count: int) -> None:
+    """Take no note of bytes: scenes are counted."""
+
+
+def _report(root: str | Path, folders: SceneFolders, outcomes: list[_Outcome]) -> TreeReport:
+    ids = [parse_scene_key(key) for key in folders.keys]
+    maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
+    found = [outcome.scene for outcome in outcomes if outcome.scene is not None]
+    scenes = tuple(replace(scene, id=_with_subset(scene.id, maps)) for scene in found)
+    broken = {out.key: out.reason for out in outcomes if out.kind == "broken"}
+    return TreeReport(
+        root=str(root),
+        scenes=scenes,
+        incomplete={out.key: out.reason for out in outcomes if out.kind == "incomplete"},
+        broken=dict(sorted((folders.refused | broken).items())),
+        notes=(*_subset_notes(found), *_label_notes(found), *_depth_notes(found)),
+    )
+
+
+def _with_subset(scene: SceneId, train_maps: frozenset[str] | set[str]) -> SceneId:
+    if scene.split == "train" or scene.subset is not None:
+        return scene
+    return replace(scene, subset="seen_map" if scene.map_name in train_maps else "unseen_map")
+
+
+def _subset_notes(scenes: list[Scene]) -> list[str]:
+    unnamed = [s.id.key.split("/")[1] for s in scenes if s.id.split == "eval" and not s.id.subset]
+    return [
+        f"eval/{folder} names no subset; a scene there counts as seen_map if its map occurs in "
+        f"train, of this tree or of the release, else as unseen_map"
+        for folder in sorted(set(unnamed))
+    ]
+
+
+def _depth_notes(scenes: list[Scene]) -> list[str]:
+    """Tell of depth that loading refuses unless the user's contract accepts it."""
+    first: dict[tuple[str, str], str] = {}
+    others: Counter[tuple[str, str]] = Counter()
+    for scene in scenes:
+        stored = zip(scene.depth_codec, scene.depth_pixel_format, strict=True)
+        for camera, (codec, pixel_format) in enumerate(stored):
+            if (codec, pixel_format) in first:
+                others[codec, pixel_format] += 1
+                continue
+            try:
+                require_depth_stream(
+                    codec=codec,
+                    pixel_format=pixel_format,
+                    encoding=DepthEncoding(),
+                    name=f"{scene.id.key}/{depth_name(camera)}",
+                )
+            except MediaError as error:
+                first[codec, pixel_format] = str(error)
+    return [
+        f"{told} ({counted(others[kind], 'other video')} likewise.)" if others[kind] else told
+        for kind, told in first.items()
+    ]
+
+
+def _label_notes(scenes: list[Scene]) -> list[str]:
+    return [
+        f"{scene.id.key}: its files call the map {scene.labels.map_name!r}; the folder's name is "
+        f"used"
+        for scene in scenes
+        if scene.labels.map_name not in (None, scene.id.map_name)
+    ]

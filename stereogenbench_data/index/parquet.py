@@ -1,0 +1,321 @@
+"""The index file: Parquet rows with a description of themselves, checked before they are believed.
+
+It is read from untrusted places: rows that are not the index's columns, or whose paths would lead
+out of the data's root, are refused.
+"""
+
+import itertools
+import json
+import math
+import os
+import re
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from stereogenbench_data.errors import StorageError, cure_of
+from stereogenbench_data.index.arrow_arrays import as_numpy
+from stereogenbench_data.index.rows import SCHEMA
+from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.sources.atomic_write import writing_whole
+from stereogenbench_data.sources.location import (
+    is_remote,
+    local_path,
+    shown,
+    why_not_from_a_file,
+)
+from stereogenbench_data.sources.members import UNSAFE_PATH
+
+_OF_RELEASE: Final = "Run `stereogenbench index ROOT` again."
+_OF_SHARDS: Final = (
+    "It is the index of shards: fetch it again or, where they were packed, run the same "
+    "`stereogenbench pack` again, which keeps finished shards."
+)
+
+_FORMAT: Final = 1
+_LONGEST_ROOT: Final = 300
+_LARGEST: Final = 2**63
+_UNSAFE: Final = re.compile(UNSAFE_PATH)
+_METADATA_KEY: Final = b"stereogenbench_data.index"
+
+
+def made_again(where: str) -> str:
+    """Return what to do about an index, found there, that cannot be used."""
+    if is_remote(where):
+        return "Fetch it again; if it is damaged there, too, tell who published it."
+    shards = local_path(where).parent.glob("*.tar")
+    return _OF_RELEASE if next(shards, None) is None else _OF_SHARDS
+
+
+def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Table, dict[str, Any]]:
+    """Return an index file's rows, and what it says of itself.
+
+    Raises:
+        StorageError: If it is no index of this version, or was altered.
+    """
+    try:
+        with pq.ParquetFile(file) as parquet:
+            metadata = (parquet.schema_arrow.metadata or {}).get(_METADATA_KEY)
+            head = _require_head(metadata, where=where)
+            table = parquet.read().replace_schema_metadata().combine_chunks()
+        table.validate(full=True)
+    except StorageError:
+        raise
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        if isinstance(error, OSError) and error.errno and cure_of(error):
+            raise StorageError(
+                f"{where}: cannot be read ({os.strerror(error.errno)}). {cure_of(error)}"
+            ) from error
+        raise StorageError(
+            f"{where}: is no Parquet file that can be read ({error}). It was cut short or is "
+            f"something else. {made_again(where)}"
+        ) from error
+    require_sound(table, where=where)
+    return table, head
+
+
+def write_index_file(path: Path, table: pa.Table, description: Mapping[str, Any]) -> None:
+    """Write an index file, whole or not at all.
+
+    Raises:
+        StorageError: If it cannot be written.
+    """
+    head = json.dumps({"format": _FORMAT} | dict(description))
+    described = table.replace_schema_metadata({_METADATA_KEY: head})
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with writing_whole(path) as file:
+            pq.write_table(described, file, compression="zstd")
+    except OSError as error:
+        raise StorageError(
+            f"{path}: the index cannot be written ({error.strerror or error}). "
+            + cure_of(error, "Choose another place with --out.")
+        ) from error
+
+
+def root_told(root: str, *, beside: Path) -> str:
+    """Return the root as an index in a folder remembers it.
+
+    Raises:
+        StorageError: If it is a URL with something secret in it, which no file shall keep.
+    """
+    if not is_remote(root):
+        whole = local_path(root).resolve()
+        return "." if beside.resolve() == whole else str(whole)
+    if shown(root) != root:
+        raise StorageError(
+            f"{shown(root)}: the URL has a login or a query, which an index file does not keep: "
+            f"copy the index that lies beside the data."
+        )
+    return root
+
+
+def root_of(path: Path, head: Mapping[str, Any], table: pa.Table) -> str | Path:
+    """Return the data's root: the index's own folder if the data are there, else the recorded.
+
+    The file may be another's, so what it records is opened only where that can do no harm: below
+    the index's own folder, or at a URL of which `why_not_from_a_file` has nothing to say.
+
+    Raises:
+        StorageError: If the recorded root needs the user's word, or is no folder.
+    """
+    beside, recorded = path.parent, str(head["root"])
+    if recorded == "." or not table.num_rows or _are_beside(table, beside):
+        return beside
+    if is_remote(recorded):
+        reason = why_not_from_a_file(recorded)
+        if reason:
+            raise _needs_word(path, recorded, reason)
+        return recorded
+    folder = _folder_told(recorded, beside)
+    if folder is None or not folder.is_relative_to(beside.resolve()):
+        raise _needs_word(path, recorded, "it is outside the index's own folder")
+    if not folder.is_dir():
+        raise StorageError(
+            f"{path}: its data were at {folder}, which is no folder now. Move the index into "
+            f"the data's root, or run `stereogenbench index` again."
+        )
+    return folder
+
+
+def _are_beside(table: pa.Table, folder: Path) -> bool:
+    """Return whether a file of the first scene lies below a folder."""
+    members = table.column("members")[0].as_py()
+    return any((folder / member["path"]).exists() for member in members)
+
+
+def _folder_told(recorded: str, beside: Path) -> Path | None:
+    """Return the folder that a recorded path means, links followed; None if there is none."""
+    try:
+        told = local_path(recorded) if recorded[:5].lower() == "file:" else Path(recorded)
+        return (beside / told).resolve()
+    except (OSError, ValueError, RuntimeError):
+        return None
+
+
+def _needs_word(path: Path, recorded: str, reason: str) -> StorageError:
+    told = shown(recorded)
+    is_plain = told.isprintable() and len(told) <= _LONGEST_ROOT
+    place = told if is_plain else repr(told[:_LONGEST_ROOT])
+    return StorageError(
+        f"{path}: its data are not beside it, and it records their root as {place}. A file may not "
+        f"choose such a place ({reason}). If you trust it, name the root yourself: "
+        f"SceneIndex.open({str(path)!r}, root=...), or --root with a command. Or move the index "
+        f"into that root."
+    )
+
+
+def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
+    """Return what an index says of itself, once it is known to be one of this version."""
+    try:
+        head = json.loads(metadata or b"null")
+    except (ValueError, RecursionError):
+        head = None
+    if not isinstance(head, dict):
+        raise StorageError(
+            f"{where}: is a Parquet file, but no index of this package. Pass another file, or "
+            f"make one with `stereogenbench index ROOT`."
+        )
+    if head.get("format") != _FORMAT:
+        raise StorageError(
+            f"{where}: is an index of format {head.get('format')!r}, and this version of the "
+            f"package reads format {_FORMAT}. {made_again(where)}"
+        )
+    reasons = [head.get("incomplete"), head.get("broken")]
+    if (
+        not all(map(_are_texts, reasons))
+        or not isinstance(head.get("shards"), dict)
+        or not isinstance(head.get("root"), str)
+        or not all(map(_are_shard_facts, head["shards"].values()))
+        or any(map(_UNSAFE.search, head["shards"]))
+        or not isinstance(head.get("passed_over", []), list)
+    ):
+        raise StorageError(f"{where}: its description of itself was altered. {made_again(where)}")
+    return head
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
+
+
+def _are_shard_facts(value: Any) -> bool:
+    kinds = {"size": int, "sha256": str, "members": int}
+    return (
+        isinstance(value, dict)
+        and {name: type(each) for name, each in value.items()} == kinds
+        and 0 <= value["size"] < _LARGEST
+        and 0 <= value["members"] < _LARGEST
+    )
+
+
+def require_sound(table: pa.Table, *, where: str) -> None:
+    """Refuse a table that is no index, or whose rows could lead out of the root."""
+    if not table.schema.equals(SCHEMA):
+        odd = [
+            field.name
+            for field in SCHEMA
+            if field.name not in table.schema.names
+            or not table.schema.field(field.name).equals(field)
+        ]
+        raise StorageError(
+            f"{where}: its columns are not those of an index (see {', '.join(odd) or 'order'}). "
+            f"{made_again(where)}"
+        )
+    keys = table.column("key").to_pylist()
+    for key, following in itertools.pairwise(keys):
+        if key >= following:
+            raise StorageError(
+                f"{where}: scene {following!r} is there twice or out of order. {made_again(where)}"
+            )
+    members = pc.list_flatten(table.column("members"))
+    for paths, unfit in (
+        (table.column("key"), UNSAFE_PATH),
+        (pc.struct_field(members, "path"), UNSAFE_PATH),
+        (pc.struct_field(members, "name"), f"{UNSAFE_PATH}|/"),
+    ):
+        unsafe = paths.filter(pc.match_substring_regex(paths, unfit))
+        if len(unsafe):
+            raise StorageError(
+                f"{where}: {unsafe[0].as_py()!r} is no path inside the data's root. The index "
+                f"was altered. {made_again(where)}"
+            )
+    _require_texts(table, where=where)
+    _require_numbers(table, members, where=where)
+
+
+def _require_texts(table: pa.Table, *, where: str) -> None:
+    for name, known in _KNOWN.items():
+        texts = table.column(name) if name in _PLAIN_TEXTS else pc.list_flatten(table.column(name))
+        odd = [text for text in pc.unique(texts).to_pylist() if text not in known]
+        if odd:
+            options = ", ".join(str(each) for each in known)
+            raise _odd(where, name, odd[0], f"none of {options}")
+    for name in ("family", "map_name"):
+        texts = table.column(name)
+        odd = texts.filter(pc.match_substring_regex(texts, r"^$|[/\\\x00-\x1f]"))
+        if len(odd):
+            raise _odd(where, name, odd[0].as_py(), "no name of a folder")
+
+
+def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
+    # In numpy: compared with a number, Arrow would import pandas.
+    columns = {name: table.column(name) for name in _BOUNDS}
+    columns |= {name: pc.struct_field(members, name) for name in ("offset", "size")}
+    numbers = {
+        name: as_numpy(column.combine_chunks().drop_null()) for name, column in columns.items()
+    }
+    units = as_numpy(table.column("depth_unit_m").combine_chunks())
+    sources = as_numpy(table.column("depth_unit_source").combine_chunks())
+    numbers["depth_unit_m"] = units[sources != "unreadable"]
+    for name, (least, most) in (_BOUNDS | _MEMBER_BOUNDS).items():
+        flat = numbers[name].ravel()
+        odd = flat[~((flat >= least) & (flat <= most))]
+        if len(odd):
+            raise _odd(where, name, odd[0].item(), f"not {least:g} to {most:g}")
+    if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
+        raise StorageError(f"{where}: a primary pair has one camera twice. {made_again(where)}")
+    halves = [pc.is_null(table.column(f"principal_{axis}_px")) for axis in "xy"]
+    if pc.any(pc.not_equal(*halves)).as_py():
+        raise StorageError(f"{where}: a principal point has one number. {made_again(where)}")
+
+
+def _odd(where: str, name: str, found: Any, why: str) -> StorageError:
+    return StorageError(
+        f"{where}: {name} is {found!r}, {why}. The index was altered. {made_again(where)}"
+    )
+
+
+_PLAIN_TEXTS: Final = ("split", "subset", "image_size_source")
+_KNOWN: Final = {
+    "split": ("train", "eval"),
+    "subset": ("seen_map", "unseen_map", None),
+    "image_size_source": ("recorded", "default"),
+    "depth_unit_source": ("tag", "default", "unreadable"),
+}
+_OF_BYTES: Final = (0, 2**61)
+_ABOVE: Final = (sys.float_info.min, sys.float_info.max)
+_FINITE: Final = (-sys.float_info.max, sys.float_info.max)
+_BOUNDS: Final = {
+    "focal_mm": _ABOVE,
+    "sensor_width_mm": _ABOVE,
+    "sensor_height_mm": _ABOVE,
+    "image_width_px": (1, 2**16),
+    "image_height_px": (1, 2**16),
+    "baselines_cm": _ABOVE,
+    "primary_left": (0, CAMERA_COUNT - 1),
+    "primary_right": (0, CAMERA_COUNT - 1),
+    "frames": (1, 2**31),
+    "frame_rate_hz": (0, sys.float_info.max),
+    "lateral_m": _FINITE,
+    "rig_residual_px": (0, math.inf),
+    "principal_x_px": _FINITE,
+    "principal_y_px": _FINITE,
+    "valid_depth_ratio": (0, 1),
+}
+"""The least and the greatest number of a column; nan is not between, what is unknown is null."""
+_MEMBER_BOUNDS: Final = {"offset": _OF_BYTES, "size": _OF_BYTES, "depth_unit_m": _ABOVE}

@@ -1,0 +1,273 @@
+"""Plain tar, the strict subset that shards are made of: POSIX ustar, regular files, ascii names.
+
+Packing writes these bytes itself, so that they depend on names, sizes and contents alone. Reading
+takes in nothing else: whatever a tar can hold beyond files is refused, and nothing is extracted.
+
+A member is a header of one block of 512 bytes, its bytes, and zeros up to a whole block. The
+archive ends with two blocks of zeros; tar pads further, to 10,240 bytes, which is read and not
+written.
+
+Source: POSIX.1-2017, pax, "ustar Interchange Format".
+"""
+
+import hashlib
+import re
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from stereogenbench_data.errors import ShardError
+from stereogenbench_data.media.container import BinaryFile
+from stereogenbench_data.sources.members import UNSAFE_PATH
+
+BLOCK_BYTES: Final = 512
+END_OF_ARCHIVE: Final = bytes(2 * BLOCK_BYTES)
+
+LARGEST_MEMBER_BYTES: Final = 8**11 - 1
+"""Eleven octal digits: 8 GiB less one byte."""
+
+CODE_SUFFIXES: Final = frozenset(
+    {"pickle", "pkl", "pk", "pyd", "pyc", "py", "so", "dill", "joblib"}
+    | {"pt", "pth", "ckpt", "npy", "npz"}
+)
+"""Suffixes of files that loaders unpickle, load or may be made to: no shard holds such a member."""
+
+_CHUNK_BYTES: Final = 4 * 1024 * 1024
+_NAME_BYTES: Final = 100
+_PREFIX_BYTES: Final = 155
+_CHECKSUM: Final = slice(148, 156)
+_UNSAFE_NAME: Final = re.compile(rf"{UNSAFE_PATH}|[^ -~]")
+_OCTAL: Final = re.compile(rb"([0-7]+)[ \0]*")
+_AGAIN: Final = "Fetch the shard again, or pack it again."
+_REFUSED_KINDS: Final = {
+    "\0": "a file of the kind before POSIX",
+    "1": "a hard link",
+    "2": "a symbolic link",
+    "3": "a character device",
+    "4": "a block device",
+    "5": "a directory",
+    "6": "a FIFO",
+    "7": "a contiguous file",
+    "x": "a PAX header",
+    "g": "a global PAX header",
+    "L": "a GNU long name",
+    "K": "a GNU long link name",
+    "S": "a GNU sparse file",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TarMember:
+    """A file in a tar: ``size`` bytes from byte ``offset`` of the tar on."""
+
+    name: str
+    offset: int
+    size: int
+
+
+def padded(size: int) -> int:
+    """Return a size rounded up to whole blocks."""
+    return -(-size // BLOCK_BYTES) * BLOCK_BYTES
+
+
+def member_header(name: str, size: int) -> bytes:
+    """Return the block that stands before a member: mode 0644, owner 0, time 0.
+
+    Raises:
+        ShardError: If ustar cannot hold such a member.
+    """
+    unfit = _unfit_name(name)
+    if unfit:
+        raise ShardError(f"member {name!r}: {unfit}. Rename it.")
+    if not 0 <= size <= LARGEST_MEMBER_BYTES:
+        raise ShardError(
+            f"member {name!r}: has {size} bytes, and ustar holds 0 to {LARGEST_MEMBER_BYTES}. "
+            f"Split the file."
+        )
+    prefix, base = _split_name(name)
+    header = b"".join(
+        (
+            base.ljust(_NAME_BYTES, b"\0"),
+            b"0000644\0" + b"0000000\0" * 2,
+            b"%011o\0" % size,
+            b"%011o\0" % 0,
+            b" " * 8,
+            b"0".ljust(1 + _NAME_BYTES, b"\0"),
+            b"ustar\x0000".ljust(8 + 2 * 32, b"\0"),
+            b"0000000\0" * 2,
+            prefix.ljust(BLOCK_BYTES - 345, b"\0"),
+        )
+    )
+    return header[:148] + b"%06o\0 " % sum(header) + header[156:]
+
+
+def _split_name(name: str) -> tuple[bytes, bytes]:
+    """Return ustar's two fields of a name, of which the first is empty for short names."""
+    if len(name) <= _NAME_BYTES:
+        return b"", name.encode("ascii")
+    for cut in (place for place, letter in enumerate(name) if letter == "/"):
+        if cut <= _PREFIX_BYTES and len(name) - cut - 1 <= _NAME_BYTES:
+            return name[:cut].encode("ascii"), name[cut + 1 :].encode("ascii")
+    raise ShardError(
+        f"member {name!r}: has {len(name)} letters, and ustar holds {_NAME_BYTES} or, divided at "
+        f"a slash, {_PREFIX_BYTES} and {_NAME_BYTES}. Shorten its folders' names."
+    )
+
+
+def _unfit_name(name: str) -> str:
+    """Return why a member may not have such a name, nothing if it may."""
+    if _UNSAFE_NAME.search(name):
+        return "its name is no relative path of plain ascii that stays inside its folder"
+    code = sorted(CODE_SUFFIXES & set(name.rpartition("/")[2].lower().split(".")[1:]))
+    return f"may hold code that runs when it is loaded (.{code[0]})" if code else ""
+
+
+def read_members(file: BinaryFile, size: int, *, where: str) -> list[TarMember]:
+    """Return what an open tar of a known size holds, having read its headers and its end.
+
+    Args:
+        file: Open for reading, seekable.
+        size: How many bytes it has.
+        where: What messages call it.
+
+    Raises:
+        ShardError: If it is cut short or damaged, or holds anything but regular files with plain
+            names. The message tells the member, the byte and the cure.
+    """
+    members: dict[str, TarMember] = {}
+    last, at = "its start", 0
+    while True:
+        place = f"{where}: at byte {at}, after {last},"
+        file.seek(at)
+        block = file.read(min(BLOCK_BYTES, size - at))
+        if len(block) < BLOCK_BYTES:
+            what = f"only {len(block)} of the {BLOCK_BYTES} bytes" if block else "nothing"
+            raise ShardError(
+                f"{place} {what} of a header or of the end of the archive is there: the shard is "
+                f"cut short. {_AGAIN}"
+            )
+        if not any(block):
+            _require_end(file, size - at, place=place)
+            return list(members.values())
+        name, length = _parse_header(block, place=place)
+        member = TarMember(name, at + BLOCK_BYTES, length)
+        if name in members:
+            raise ShardError(f"{place} member {name!r} is there a second time. {_AGAIN}")
+        following = member.offset + padded(length)
+        if following > size:
+            raise ShardError(
+                f"{place} member {name!r} claims {length} bytes, which with padding end at byte "
+                f"{following}, and the shard has {size}: it is cut short, or the size is false. "
+                f"{_AGAIN}"
+            )
+        members[name] = member
+        last, at = repr(name), following
+
+
+def _require_end(file: BinaryFile, left: int, *, place: str) -> None:
+    if left < len(END_OF_ARCHIVE):
+        raise ShardError(
+            f"{place} only {left} of the {len(END_OF_ARCHIVE)} zeros are there that end the "
+            f"archive: the shard is cut short. {_AGAIN}"
+        )
+    for chunk in _chunks(file, left - BLOCK_BYTES):
+        if chunk.strip(b"\0"):
+            raise ShardError(
+                f"{place} zeros end the archive and other bytes follow them: a header was wiped "
+                f"out, or something was appended. {_AGAIN}"
+            )
+
+
+def _parse_header(block: bytes, *, place: str) -> tuple[str, int]:
+    """Return name and size of the regular file that a header announces."""
+    told = _OCTAL.fullmatch(block[_CHECKSUM])
+    real = sum(block) - sum(block[_CHECKSUM]) + 8 * ord(" ")
+    if told is None or int(told[1], 8) != real:
+        raise ShardError(
+            f"{place} the header is damaged: its checksum is {block[_CHECKSUM]!r}, and its bytes "
+            f"sum up to {real:06o}. {_AGAIN}"
+        )
+    parts = (block[345:500].rstrip(b"\0"), block[:_NAME_BYTES].rstrip(b"\0"))
+    name = b"/".join(part for part in parts if part).decode("latin-1")
+    refused = f"{place} member {name!r}"
+    kind = chr(block[156])
+    if kind != "0":
+        raise ShardError(
+            f"{refused} is {_REFUSED_KINDS.get(kind, f'of the unknown kind {kind!r}')}, and a "
+            f"shard holds regular files only. Use a shard that this package packed."
+        )
+    if block[257:265] != b"ustar\x0000":
+        raise ShardError(
+            f"{refused} has the mark {block[257:265]!r}, not that of POSIX ustar. Use a shard "
+            f"that this package packed."
+        )
+    unfit = _unfit_name(name)
+    if unfit:
+        raise ShardError(f"{refused}: {unfit}. Do not use this shard.")
+    length = _OCTAL.fullmatch(block[124:136])
+    if length is None:
+        raise ShardError(
+            f"{refused} has the size {block[124:136]!r}, which is no octal number as in POSIX "
+            f"ustar. Do not use this shard."
+        )
+    return name, int(length[1], 8)
+
+
+@dataclass(frozen=True, slots=True)
+class Checksums:
+    """sha256 of a whole file in hex, and zlib's crc32 of parts of it, in the order asked for."""
+
+    sha256: str
+    crc32s: tuple[int, ...]
+
+
+def read_checksums(
+    file: BinaryFile,
+    size: int,
+    *,
+    parts: Sequence[tuple[int, int]],
+    after_bytes: Callable[[int], None],
+) -> Checksums:
+    """Return the checksums of an open file, read once from start to end.
+
+    Args:
+        file: Open for reading, seekable.
+        size: How many bytes it has.
+        parts: (offset, size) of each part; ascending, inside the file, none over another.
+        after_bytes: Called with the number of bytes, after each few megabytes.
+
+    Raises:
+        ShardError: If the file ends before its size.
+    """
+    whole = hashlib.sha256()
+    crc32s, at = [], 0
+    file.seek(0)
+
+    def feed(length: int) -> int:
+        crc32 = 0
+        for chunk in _chunks(file, length):
+            whole.update(chunk)
+            crc32 = zlib.crc32(chunk, crc32)
+            after_bytes(len(chunk))
+        return crc32
+
+    for offset, length in parts:
+        feed(offset - at)
+        crc32s.append(feed(length))
+        at = offset + length
+    feed(size - at)
+    return Checksums(whole.hexdigest(), tuple(crc32s))
+
+
+def _chunks(file: BinaryFile, length: int) -> Iterator[bytes]:
+    """Yield so many bytes of a file, from where it stands."""
+    while length > 0:
+        chunk = file.read(min(length, _CHUNK_BYTES))
+        if not chunk:
+            raise ShardError(
+                f"{getattr(file, 'name', 'the shard')}: ends {length} bytes before its size. It "
+                f"is being changed: wait until that is over, then try again."
+            )
+        length -= len(chunk)
+        yield chunk

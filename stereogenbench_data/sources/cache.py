@@ -1,0 +1,330 @@
+"""A cache of members on a local disk, shared by the processes of a machine.
+
+An item is one member, stored whole under a name made of the dataset's revision, the shard's path
+and the member's place, size and checksum. It is written beside its place and moved there, so that
+no reader meets half of one; a lock lets one process fetch it while others wait. When the limit is
+reached, items that were not used for longest go. A reader keeps what it has opened even then: its
+open file stays whole until it is closed. A cache that may only be read serves what it holds.
+
+A stored item bears a time of change that follows from its name. Whatever is written into it later
+changes that time: then its checksum decides whether it is still what was fetched. When it was used
+last is its time of access.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import re
+import time
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final
+
+from stereogenbench_data.errors import ShardError, StorageError, cure_of
+from stereogenbench_data.schema.records import Member
+from stereogenbench_data.sources.atomic_write import write_whole
+from stereogenbench_data.sources.locks import locked
+from stereogenbench_data.sources.ranged_file import FileSlice
+from stereogenbench_data.sources.remote import RemoteObject
+
+FOLDER_NAME: Final = "stereogenbench-members"
+_TAG: Final = "CACHEDIR.TAG"
+_SIGNATURE: Final = b"Signature: 8a477f597d28d172789f06886806bc55\n"
+_TAG_TEXT: Final = _SIGNATURE + (
+    b"# Members of StereoGenBench shards, kept by stereogenbench-data. The folder may be deleted.\n"
+)
+_OWN_FILE: Final = re.compile(r"([0-9a-f]{64})\.(member|part)")
+_FULL: Final = 0.9
+"""The share of the limit to which a full cache is emptied, so that not every item empties it."""
+
+_READ_ONLY: Final = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
+_FIRST_STAMP_S: Final = 1_000_000_000
+
+
+class ShardCache:
+    """Keeps the members of remote shards that were read once.
+
+    Any number of processes may use one folder, each with its own `ShardCache`; the smallest of
+    their limits counts. Members that others fetch at that moment may come on top of it. Only files
+    that a cache wrote are ever deleted.
+    """
+
+    def __init__(self, folder: str | Path, *, limit_bytes: int) -> None:
+        """Use a folder, in which the cache makes one of its own.
+
+        Args:
+            folder: Where to keep members; made if it is not there.
+            limit_bytes: The bytes that all members together may take.
+
+        Raises:
+            StorageError: If there is no folder or no limit, the folder holds shards or cannot be
+                written, or what has the cache's name in it was not made by one.
+        """
+        if not str(folder):
+            raise StorageError("a cache needs a folder, got '': name one, such as 'cache/'.")
+        require_limit(limit_bytes, folder=folder)
+        self.folder = Path(folder, FOLDER_NAME)
+        self.limit_bytes = limit_bytes
+        self._items = self.folder / "items"
+        self._locks = self.folder / "locks"
+        with _named_errors(self.folder):
+            self._make()
+
+    def open(self, member: Member, *, remote: RemoteObject, revision: str) -> FileSlice:
+        """Return a member, fetched if it is not here; it is the caller's to close.
+
+        Args:
+            member: What to open.
+            remote: The shard or file that holds it.
+            revision: What tells the dataset from its other versions.
+
+        Raises:
+            ShardError: If what is fetched has not the member's checksum, twice.
+            StorageError: If it cannot be fetched or stored, or the limit is below its size.
+        """
+        key = _key(member, where=remote.where, revision=revision)
+        with _named_errors(self.folder):
+            found = self._find(key, member)
+            if found is not None:
+                return found
+            self._require_room(member, where=remote.where)
+            with self._locked(key[:2]):
+                # Another process may have fetched it meanwhile.
+                found = self._find(key, member)
+                return found or self._fill(key, member, remote=remote)
+
+    def drop_damaged(self, member: Member, *, where: str, revision: str) -> bool:
+        """Drop a member whose bytes are not those that were stored; say whether it was one."""
+        key = _key(member, where=where, revision=revision)
+        with _named_errors(self.folder), _where_writable(), self._locked(key[:2]):
+            place = self._place(key)
+            if member.crc32 is None or not place.is_file():
+                return False
+            with FileSlice(place, Member(key, 0, place.stat().st_size)) as file:
+                if file.crc32() == member.crc32:
+                    return False
+            self._drop(place)
+            return True
+        return False
+
+    def used_bytes(self) -> int:
+        """Return the bytes of all members stored."""
+        return sum(size for _, size, _ in self._own_files())
+
+    def _make(self) -> None:
+        shard = next(self.folder.parent.glob("*.tar"), None)
+        if shard is not None:
+            raise StorageError(
+                f"{self.folder.parent}: holds shards ({shard.name}), which are read where they "
+                f"are. A cache keeps what comes from a URL: give it a folder of its own."
+            )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        tag = self.folder / _TAG
+        begun = f".{_TAG}."  # by another process, or by one that was killed
+        names = sorted(
+            each.name for each in self.folder.iterdir() if not each.name.startswith(begun)
+        )
+        if names and _TAG not in names:
+            raise StorageError(
+                f"{self.folder}: holds {names[0]} and is no cache of this package. Choose another "
+                f"folder, or delete it."
+            )
+        if not names:
+            write_whole(tag, _TAG_TEXT)
+        if not tag.read_bytes().startswith(_SIGNATURE):
+            raise StorageError(
+                f"{tag}: was not written by this package. Choose another folder, or delete it."
+            )
+        self._items.mkdir(exist_ok=True)
+        self._locks.mkdir(exist_ok=True)
+
+    def _find(self, key: str, member: Member) -> FileSlice | None:
+        """Return an item that is stored and is what was fetched; it counts as used now."""
+        place = self._place(key)
+        try:
+            found = FileSlice(place, Member(key, 0, member.size))
+        except FileNotFoundError:
+            return None
+        except IsADirectoryError:
+            with suppress(FileNotFoundError):  # another process may have met it too
+                place.rename(place.with_suffix(f".not-a-member.{os.getpid()}"))
+            return None
+        status = found.status()
+        if status.st_size == member.size and (
+            status.st_mtime_ns == _stamp_ns(key) or found.crc32() == member.crc32
+        ):
+            _mark_used(place, key)
+            return found
+        found.close()
+        return None
+
+    def _fill(self, key: str, member: Member, *, remote: RemoteObject) -> FileSlice:
+        """Fetch a member, store it and open it; a wrong checksum is given a second try."""
+        part = self._items / f"{key}.part"
+        self._drop(self._place(key))
+        self._make_room(member.size, part=part)
+        try:
+            crc32 = _fetch(part, member, remote=remote)
+            if member.crc32 not in (None, crc32):
+                crc32 = _fetch(part, member, remote=remote)
+            if member.crc32 not in (None, crc32):
+                raise ShardError(
+                    f"{remote.where}: the {member.size} bytes from {member.offset} on have crc32 "
+                    f"{crc32:08x}, and the index says {member.crc32:08x}, twice. The shard was "
+                    f"damaged or replaced: use the index that was made with it."
+                )
+            _mark_used(part, key)
+            # Opened before others may see it, for they may evict it at once.
+            found = FileSlice(part, Member(key, 0, member.size))
+            with self._locked("size"):
+                # So that who counts meets it under one name.
+                part.replace(self._place(key))
+            return found
+        finally:
+            self._drop(part)
+
+    def _require_room(self, member: Member, *, where: str) -> None:
+        if member.size > self.limit_bytes:
+            raise StorageError(
+                f"{self.folder}: its limit of {self.limit_bytes} bytes is below the "
+                f"{member.size} bytes of a member of {where}. Give the cache a larger limit."
+            )
+
+    def _make_room(self, size: int, *, part: Path) -> None:
+        """Count an item in, once others have made way for it where they must.
+
+        Its part is made at full size at once, so that all who count see it.
+        """
+        with self._locked("size") as ledger:
+            told = ledger.read_bytes()
+            used = int(told) if told.isdigit() else self.used_bytes()
+            if used + size > self.limit_bytes:
+                used = self._evict(down_to=max(0, int(_FULL * self.limit_bytes) - size))
+            ledger.write_text(str(used + size))
+            part.touch()
+            os.truncate(part, size)
+
+    def _drop(self, path: Path) -> None:
+        """Delete an item or a part, if it is there; all are counted anew the next time."""
+        if path.exists():
+            with self._locked("size") as ledger:
+                path.unlink(missing_ok=True)
+                ledger.write_bytes(b"")
+
+    def _evict(self, *, down_to: int) -> int:
+        """Delete what was not used for longest until so many bytes are left; return how many."""
+        files = sorted(self._own_files())
+        used = sum(size for _, size, _ in files)
+        for _, size, path in files:
+            if used <= down_to:
+                break
+            if path.suffix == ".member":
+                path.unlink(missing_ok=True)
+                used -= size
+                continue
+            # A part is left alone while someone writes it, that is while its lock is taken.
+            with locked(self._locks / path.name[:2], when_taken="skip") as is_held:
+                if is_held:
+                    path.unlink(missing_ok=True)
+                    used -= size
+        return used
+
+    def _own_files(self) -> Iterator[tuple[int, int, Path]]:
+        """Yield time of last use, size and path of every file that a cache wrote."""
+        with os.scandir(self._items) as entries:
+            for entry in entries:
+                if _OWN_FILE.fullmatch(entry.name):
+                    try:
+                        status = entry.stat(follow_symlinks=False)
+                    except FileNotFoundError:
+                        continue
+                    yield status.st_atime_ns, status.st_size, Path(entry.path)
+
+    def _place(self, key: str) -> Path:
+        return self._items / f"{key}.member"
+
+    @contextmanager
+    def _locked(self, name: str) -> Iterator[Path]:
+        path = self._locks / name
+        with locked(path):
+            yield path
+
+
+def require_limit(limit_bytes: Any, *, folder: str | Path) -> None:
+    """Refuse what is no number of bytes.
+
+    Raises:
+        StorageError: If it is not a whole number above 0.
+    """
+    whole = isinstance(limit_bytes, int) and not isinstance(limit_bytes, bool)
+    if not whole or limit_bytes < 1:
+        raise StorageError(
+            f"{folder}: a cache needs a limit in whole bytes above 0, got {limit_bytes!r}: give a "
+            f"number, such as limit_bytes=50_000_000_000."
+        )
+
+
+def _stamp_ns(key: str) -> int:
+    """Return an item's time of change: even seconds, which every file system can keep."""
+    return (_FIRST_STAMP_S + 2 * int(key[:6], 16)) * 1_000_000_000
+
+
+def _mark_used(path: Path, key: str) -> None:
+    """Set when an item was used last, and its own time of change."""
+    # Of another user's item, or on a disk that is read-only now, neither can be set: it goes as if
+    # it had not been used.
+    with _where_writable():
+        os.utime(path, ns=(time.time_ns(), _stamp_ns(key)))
+
+
+@contextmanager
+def _where_writable() -> Iterator[None]:
+    """Pass over what a cache that may only be read cannot do."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _READ_ONLY:
+            raise
+
+
+def _key(member: Member, *, where: str, revision: str) -> str:
+    """Return what an item is stored under: equal only for equal bytes.
+
+    Where no checksum is known, that takes the address too.
+    """
+    where = where if member.crc32 is None else ""
+    parts = [revision, where, member.path, member.offset, member.size, member.crc32]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def _fetch(part: Path, member: Member, *, remote: RemoteObject) -> int:
+    """Write a member's bytes to the disk and return their crc32."""
+    crc32 = 0
+    with part.open("r+b") as file:
+        for data in remote.chunks(member.offset, member.offset + member.size):
+            file.write(data)
+            crc32 = zlib.crc32(data, crc32)
+        file.flush()
+        os.fsync(file.fileno())
+    return crc32
+
+
+@contextmanager
+def _named_errors(folder: Path) -> Iterator[None]:
+    """Turn what the disk raises into an error that names the cache."""
+    try:
+        yield
+    except StorageError:
+        raise
+    except OSError as error:
+        cure = (
+            "Free space, or give the cache a smaller limit."
+            if error.errno in (errno.ENOSPC, errno.EDQUOT)
+            else cure_of(error, "Choose another folder for the cache.")
+        )
+        raise StorageError(
+            f"{folder}: the cache cannot be read or written ({error.strerror or error}). {cure}"
+        ) from error

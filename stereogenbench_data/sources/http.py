@@ -1,0 +1,374 @@
+"""Ranges over http and https, with urllib3; every answer is checked to be the part asked for.
+
+Errors do not chain urllib3's own: their messages hold the whole URL, with what is secret in it.
+"""
+
+import atexit
+import http.client
+import io
+import os
+import re
+import socket
+from collections.abc import Generator, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from email.utils import parsedate_to_datetime
+from typing import Any, Final
+from urllib.parse import unquote, urljoin, urlunsplit
+from urllib.request import getproxies, proxy_bypass
+
+import urllib3
+import urllib3.connection
+from urllib3.exceptions import HTTPError, LocationValueError
+
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.sources.location import WEB_SCHEMES, is_inside, shown, split_url
+from stereogenbench_data.sources.retry import Fault, Pace, TooSlow
+
+_REDIRECTS: Final = frozenset({301, 302, 303, 307, 308})
+_MOST_REDIRECTS: Final = 5
+_PASSING: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
+"""Answers that may be others in a while."""
+
+_FETCH: Final = "or fetch the data and pass the folder"
+_CURES: Final = {
+    401: f"It asks for a login: use hf:// or s3://, which know yours, {_FETCH}.",
+    403: f"It may not be read with what the URL says: check access, {_FETCH}.",
+    404: "Check the URL, and that the index and its shards lie in one folder.",
+    410: "Check the URL, and that the index and its shards lie in one folder.",
+}
+_NUMBER: Final = re.compile(r"[0-9]{1,18}")
+_PART: Final = re.compile(r"bytes (?:([0-9]{1,18})-([0-9]{1,18})|\*)/([0-9]{1,18}|\*)")
+_STRONG_TAG: Final = re.compile(r'"[!#-~]{0,256}"')
+_DATE: Final = re.compile(r"[A-Za-z0-9,: +-]{1,64}")
+_CHUNK: Final = 64 * 1024
+
+_pools: Final[dict[tuple[int, str], urllib3.PoolManager]] = {}
+"""Connections by process and proxy. Those that came over a fork are left alone: their sockets
+belong to the parent."""
+
+_current_pace: Final[ContextVar[Pace | None]] = ContextVar("_current_pace", default=None)
+"""The pace of the request that this thread makes."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Version:
+    """What a server tells of an object that changes when the object does; "" is not told."""
+
+    etag: str
+    modified: str
+    size: str
+
+    def changes(self, now: "_Version") -> str:
+        """Return what another answer tells otherwise, "" if the object is the same."""
+        compared = [("ETag", self.etag.removeprefix("W/"), now.etag.removeprefix("W/"))]
+        if not (self.etag and now.etag):
+            compared.append(("Last-Modified", self.modified, now.modified))
+        compared.append(("size", self.size, now.size))
+        return ", ".join(
+            f"its {name} was {then[:80]} and is {here[:80]}"
+            for name, then, here in compared
+            if then and here and then != here
+        )
+
+
+class WebTransport:
+    """One object of a web server."""
+
+    def __init__(self, url: str) -> None:
+        """Name an object; a user and password in its URL are sent as a login, never shown.
+
+        Raises:
+            StorageError: If it is no URL.
+        """
+        parts = split_url(url)
+        login, _, host = parts.netloc.rpartition("@")
+        self._where = shown(url)
+        self._url = urlunsplit(parts._replace(netloc=host, fragment=""))
+        self._headers = {"Accept-Encoding": "identity"}
+        if login:
+            self._headers |= urllib3.make_headers(basic_auth=unquote(login))
+        self._seen: dict[str, _Version] = {}
+
+    def size(self, pace: Pace) -> int:
+        """Return how many bytes the object has, as told with its first byte."""
+        response = self._get(0, 1, pace)
+        response.close()
+        told = self._size_told(response)
+        if not _NUMBER.fullmatch(told):
+            raise StorageError(
+                f"{self._where}: its server does not tell how large it is ({told[:80]!r}): fetch "
+                f"the data and pass the folder."
+            )
+        return int(told)
+
+    def part(self, start: int, stop: int, pace: Pace) -> Generator[bytes, None, None]:
+        """Yield the bytes from start to stop, or the first of them."""
+        response = self._get(start, stop, pace)
+        try:
+            self._require_part(response, start, stop)
+            pace.begin_body()
+            while data := response.read1(_CHUNK):
+                yield data
+        except HTTPError as error:
+            raise Fault(_reason(error)) from None
+        finally:
+            # What was read to its end has gone back to the pool already, and is not closed.
+            response.close()
+
+    def _get(self, start: int, stop: int, pace: Pace) -> urllib3.BaseHTTPResponse:
+        headers = self._headers | {"Range": f"bytes={start}-{stop - 1}"} | self._condition()
+        url = self._url
+        for _ in range(_MOST_REDIRECTS + 1):
+            response = self._ask(url, headers, pace)
+            if response.status not in _REDIRECTS:
+                break
+            there = self._redirected(url, response)
+            if split_url(there)[:2] != split_url(url)[:2]:
+                headers.pop("authorization", None)
+            url = there
+        else:
+            raise StorageError(
+                f"{self._where}: is redirected more than {_MOST_REDIRECTS} times: check the URL."
+            )
+        if response.status not in (200, 206, 416):
+            response.close()
+            self._refuse(response)
+        if response.status != 416:
+            self._require_same(response)
+        return response
+
+    def _ask(self, url: str, headers: Mapping[str, str], pace: Pace) -> urllib3.BaseHTTPResponse:
+        """Return a server's answer, or the first of several."""
+        token = _current_pace.set(pace)
+        try:
+            allowed_s = pace.allowed_s()
+            return _pool(url).request(
+                "GET",
+                url,
+                headers=headers,
+                timeout=urllib3.Timeout(connect=allowed_s, read=allowed_s),
+                retries=False,
+                redirect=False,
+                preload_content=False,
+            )
+        except TooSlow as error:
+            raise Fault(str(error)) from None
+        except (LocationValueError, UnicodeError):
+            sent = "" if url == self._url else f"is redirected to {shown(url)[:200]}, which "
+            raise StorageError(f"{self._where}: {sent}is no URL: correct it.") from None
+        except HTTPError as error:
+            raise Fault(_reason(error)) from None
+        finally:
+            _current_pace.reset(token)
+
+    def _redirected(self, url: str, response: urllib3.BaseHTTPResponse) -> str:
+        """Return where an answer sends its reader, if that is a place to go to."""
+        told = response.headers.get("Location", "").strip()
+        length = response.headers.get("Content-Length", "")
+        if _NUMBER.fullmatch(length) and int(length) <= _CHUNK:
+            response.drain_conn()  # so that the connection can be used again
+        response.close()
+        try:
+            there = urljoin(url, told)
+        except ValueError:
+            there = told
+        try:
+            parts = split_url(there)
+        except StorageError:
+            parts = split_url("")
+        reason = ""
+        if not told:
+            reason = "names no place to go to"
+        elif parts.scheme not in WEB_SCHEMES or not parts.hostname:
+            reason = f"sends on to {shown(there)[:200]!r}, which is no URL of a web server"
+        elif (split_url(url).scheme, parts.scheme) == ("https", "http"):
+            reason = f"sends on from https to {shown(there)[:200]}, which nothing protects"
+        elif parts.hostname != split_url(url).hostname and (
+            is_inside(parts.hostname) and not is_inside(split_url(url).hostname or "")
+        ):
+            reason = f"sends on to {shown(there)[:200]}, inside this machine's own network"
+        if reason:
+            raise StorageError(
+                f"{self._where}: the server answers {response.status} and {reason}. Check the URL "
+                f"and the server, {_FETCH}."
+            )
+        host = parts.netloc.rpartition("@")[2]
+        return urlunsplit(parts._replace(netloc=host, fragment=""))
+
+    def _condition(self) -> dict[str, str]:
+        """Return the header that asks for a part only while the object is what it was."""
+        seen = self._seen.get("first")
+        if seen is not None and _STRONG_TAG.fullmatch(seen.etag):
+            return {"If-Range": seen.etag}
+        if seen is not None and not seen.etag and _DATE.fullmatch(seen.modified):
+            return {"If-Range": seen.modified}
+        return {}
+
+    def _require_same(self, response: urllib3.BaseHTTPResponse) -> None:
+        """Refuse an answer from another object than the one that was read from before."""
+        size = self._size_told(response)
+        now = _Version(
+            etag=response.headers.get("ETag", "").strip(),
+            modified=response.headers.get("Last-Modified", "").strip(),
+            size=size if _NUMBER.fullmatch(size) else "",
+        )
+        changes = self._seen.setdefault("first", now).changes(now)
+        if changes:
+            response.close()
+            raise ShardError(
+                f"{self._where}: was replaced on its server while it was read: {changes}. What was "
+                f"read before is of the old file: open the data again, with the index that was "
+                f"made with the new one."
+            )
+
+    def _refuse(self, response: urllib3.BaseHTTPResponse) -> None:
+        reason = re.sub(r"[^ -~]", "?", response.reason or "")[:60]
+        answer = f"{response.status} {reason}".rstrip()
+        if response.status in _PASSING:
+            wait_s = _retry_after_s(response.headers.get("Retry-After", ""))
+            raise Fault(f"the server answers {answer}", wait_s=wait_s)
+        cure = _CURES.get(response.status, f"Check the URL and the server, {_FETCH}.")
+        raise StorageError(f"{self._where}: the server answers {answer}. {cure}")
+
+    def _require_part(self, response: urllib3.BaseHTTPResponse, start: int, stop: int) -> None:
+        """Refuse an answer that is not the part asked for, or its beginning."""
+        if response.status == 200:
+            size = response.headers.get("Content-Length", "")[:20]
+            if start == 0 and size == str(stop):
+                return
+            raise StorageError(
+                f"{self._where}: the server sends the whole file ({size or 'unknown'} bytes) when "
+                f"asked for bytes {start} to {stop}. Members are read in parts: use a server that "
+                f"honours ranges, as nginx does, {_FETCH}."
+            )
+        first, last, size = self._content_range(response)
+        if not first or response.status == 416:
+            raise StorageError(
+                f"{self._where}: has {size} bytes, and byte {stop - 1} is asked for. It was cut "
+                f"short or replaced: use the index that was made with it."
+            )
+        if int(first) != start or not start <= int(last) < stop:
+            raise StorageError(
+                f"{self._where}: the server sends bytes {first} to {last} when asked for {start} "
+                f"to {stop - 1}. It does not honour ranges: use another, {_FETCH}."
+            )
+
+    def _size_told(self, response: urllib3.BaseHTTPResponse) -> str:
+        """Return the whole object's size as an answer tells it: a number, or whatever it is."""
+        if response.status == 200:
+            return response.headers.get("Content-Length", "")
+        return self._content_range(response)[2]
+
+    def _content_range(self, response: urllib3.BaseHTTPResponse) -> tuple[str, str, str]:
+        """Return first and last byte (empty where there are none) and size, as told."""
+        told = response.headers.get("Content-Range", "")
+        found = _PART.fullmatch(told)
+        if found is None:
+            response.close()
+            raise StorageError(
+                f"{self._where}: the server answers {response.status} and does not tell which "
+                f"part it sends (Content-Range: {told[:80]!r}): use another, {_FETCH}."
+            )
+        first, last, size = found.groups(default="")
+        return first, last, size
+
+
+class _PacedStream(io.RawIOBase):
+    """A connection's bytes, of which none is waited for longer than its pace allows."""
+
+    def __init__(self, stream: io.RawIOBase, connection: socket.socket, pace: Pace) -> None:
+        super().__init__()
+        self._stream = stream
+        self._connection = connection
+        self._pace = pace
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any, /) -> int | None:
+        self._connection.settimeout(self._pace.allowed_s())
+        began_s, count = self._pace.clock(), 0
+        try:
+            count = self._stream.readinto(buffer) or 0
+        except TooSlow:
+            raise
+        except TimeoutError:
+            self._pace.add(self._pace.clock() - began_s, 0)
+            raise self._pace.broken() from None
+        self._pace.add(self._pace.clock() - began_s, count)
+        return count
+
+    def close(self) -> None:
+        self._stream.close()
+        super().close()
+
+
+class _PacedResponse(http.client.HTTPResponse):
+    """An answer whose head and body are read at the pace of the request."""
+
+    def __init__(self, sock: socket.socket, *args: Any, **how: Any) -> None:
+        super().__init__(sock, *args, **how)
+        pace = _current_pace.get()
+        if pace is not None:
+            self.fp = io.BufferedReader(_PacedStream(self.fp.detach(), sock, pace))
+
+
+class _Connection(urllib3.connection.HTTPConnection):
+    response_class = _PacedResponse
+
+
+class _SecureConnection(urllib3.connection.HTTPSConnection):
+    response_class = _PacedResponse
+
+
+class _Pool(urllib3.HTTPConnectionPool):
+    ConnectionCls = _Connection
+
+
+class _SecurePool(urllib3.HTTPSConnectionPool):
+    ConnectionCls = _SecureConnection
+
+
+def _pool(url: str) -> urllib3.PoolManager:
+    """Return the connections of this process, through the machine's proxy where it has one."""
+    parts = split_url(url)
+    proxy = "" if proxy_bypass(parts.netloc) else getproxies().get(parts.scheme, "")
+    key = (os.getpid(), proxy)
+    if key not in _pools:
+        pool = urllib3.ProxyManager(proxy) if proxy else urllib3.PoolManager(maxsize=16)
+        pool.pool_classes_by_scheme = {"http": _Pool, "https": _SecurePool}
+        _pools.setdefault(key, pool)
+    return _pools[key]
+
+
+@atexit.register
+def close_connections() -> None:
+    """Close the connections that this process keeps open; reading opens new ones."""
+    for key in [key for key in _pools if key[0] == os.getpid()]:
+        _pools.pop(key).clear()
+
+
+def _reason(error: BaseException) -> str:
+    """Return what happened without the URL, which urllib3 puts into its messages."""
+    reason = getattr(error, "reason", None)
+    inner = reason if isinstance(reason, BaseException) else error
+    cause = inner.__cause__ or inner.__context__
+    if isinstance(cause, TooSlow):
+        return str(cause)
+    if isinstance(cause, OSError) and cause.strerror:
+        return f"{type(inner).__name__}: {cause.strerror}"
+    return type(inner).__name__
+
+
+def _retry_after_s(told: str) -> float:
+    """Return how many seconds a Retry-After header asks to wait, 0 where it does not."""
+    if re.fullmatch("[0-9]+", told):
+        return float(told)
+    try:
+        until = parsedate_to_datetime(told)
+        until = until if until.tzinfo else until.replace(tzinfo=UTC)
+        return max(0.0, (until - datetime.now(UTC)).total_seconds())
+    except (ValueError, TypeError, IndexError, OverflowError):
+        return 0.0

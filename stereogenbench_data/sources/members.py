@@ -1,0 +1,334 @@
+"""Where a scene's bytes are, and how they are opened: files, members of shards, URLs, the cache."""
+
+import os
+import re
+import stat
+import zlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from stereogenbench_data.errors import ShardError, StorageError, cure_of
+from stereogenbench_data.schema.document import require_text_size
+from stereogenbench_data.schema.records import Member, Scene, ShardFacts
+from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.location import is_remote, joined, local_path, shown
+from stereogenbench_data.sources.ranged_file import (
+    FileSlice,
+    MemberFile,
+    RangedFile,
+    require_crc32,
+)
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import Patience
+
+UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
+"""What no member's path may hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
+
+_UNSAFE_PATH: Final = re.compile(UNSAFE_PATH)
+
+
+def size_of(location: str | Path) -> int:
+    """Return how many bytes a file has, local or by URL.
+
+    Raises:
+        StorageError: If it is not there or cannot be read.
+    """
+    if is_remote(location):
+        return RemoteObject(str(location)).size()
+    path = local_path(location)
+    try:
+        return path.stat().st_size
+    except OSError as error:
+        raise StorageError(
+            f"{path}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
+        ) from error
+
+
+def read_range(location: str | Path, start: int, stop: int) -> bytes:
+    """Return the bytes from start to stop of a file, local or by URL.
+
+    Raises:
+        StorageError: If they cannot be had.
+    """
+    if is_remote(location):
+        return RemoteObject(str(location)).read(start, stop)
+    path = local_path(location)
+    try:
+        with FileSlice(path, Member(path.name, start, stop - start)) as file:
+            return file.read()
+    except StorageError:
+        raise
+    except OSError as error:
+        raise StorageError(
+            f"{path}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
+        ) from error
+
+
+class MemberSource:
+    """Opens the files of an index's scenes, wherever they lie.
+
+    A file of a released folder is given by its path. A member of a local shard is an open file
+    over its part of the shard. What lies behind a URL is fetched by ranges as it is read or,
+    with a cache, as a whole once.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        shards: Mapping[str, ShardFacts],
+        revision: str = "",
+        cache: ShardCache | None = None,
+        check: Literal["opened", "metadata"] = "metadata",
+        patience: Patience | None = None,
+    ) -> None:
+        """Prepare to read; nothing is opened yet.
+
+        Args:
+            root: The folder or URL that members' paths are relative to.
+            shards: What the index knows of each shard, by path.
+            revision: The index's digest, by which a cache tells data apart.
+            cache: Where to keep members that come from a URL, or None.
+            check: What is compared with its checksum. "opened": each member of a shard or of the
+                cache when this process first opens it, and one from a URL when its last byte
+                comes. "metadata": metadata files alone.
+            patience: How often to try a server, and how slow it may be; None for the defaults.
+        """
+        self._root = str(root)
+        self._shards = shards
+        self._revision = revision
+        self._cache = cache
+        self._check = check
+        self._patience = patience
+        self._sound: set[tuple[str, int]] = set()
+        self._objects: dict[str, RemoteObject] = {}
+
+    def open(self, scene: Scene, name: str) -> Path | MemberFile:
+        """Return one of a scene's files: its path, or an open file that is the caller's to close.
+
+        Raises:
+            StorageError: If it is missing, unreadable or not the one that was indexed.
+        """
+        member, name = scene.member(name), scene.held_name(name)
+        if not is_remote(self._root):
+            found = open_local(self._root, member, shard=self._shards.get(member.path))
+            return found if isinstance(found, Path) else self._checked(found, scene, name)
+        _require_safe(member)
+        remote = self._object(member)
+        if self._cache is not None:
+            stored = self._cache.open(member, remote=remote, revision=self._revision)
+            return self._checked(stored, scene, name)
+        offset = member.offset
+        return RangedFile(
+            lambda start, stop: remote.read(offset + start, offset + stop),
+            size=member.size,
+            name=self.label(scene, name),
+            crc32=member.crc32 if self._check == "opened" else None,
+        )
+
+    def _checked(self, file: FileSlice, scene: Scene, name: str) -> FileSlice:
+        """Return an open file whose bytes were compared with their checksum once, if asked for."""
+        member = scene.members[name]
+        place = (member.path, member.offset)
+        if self._check == "opened" and member.crc32 is not None and place not in self._sound:
+            try:
+                require_crc32(file.crc32(), expected=member.crc32, name=self.label(scene, name))
+            except StorageError:
+                file.close()
+                raise
+            self._sound.add(place)
+        return file
+
+    def read(self, scene: Scene, name: str) -> bytes:
+        """Return one of a scene's metadata files, whole and as its checksum says.
+
+        Raises:
+            StorageError: If it is missing, unreadable or not the one that was indexed.
+            SchemaError: If it is too large for a metadata file.
+        """
+        where, member = self.label(scene, name), scene.members[name]
+        require_text_size(member.size, where=where)
+        opened = self.open(scene, name)
+        if isinstance(opened, Path):
+            return read_text_file(opened, where=where)
+        with opened:
+            text = opened.read()
+        require_crc32(zlib.crc32(text), expected=member.crc32, name=where)
+        return text
+
+    def label(self, scene: Scene, name: str) -> str:
+        """Return what messages call one of a scene's files: where it lies, and its name."""
+        name = scene.held_name(name)
+        place = self._shown(scene.members[name].path)
+        return place if place.endswith(name) else f"{place}: {name}"
+
+    def url(self, scene: Scene, name: str) -> str:
+        """Return what holds a scene's file: its shard, or the scene's own folder."""
+        place = scene.members[name].path
+        return self._shown(place if place in self._shards else scene.id.key)
+
+    def drop_damaged(self, scene: Scene, names: Iterable[str]) -> bool:
+        """Drop files of a scene from the cache that are not as they were stored.
+
+        Returns:
+            Whether there were any, so that reading again may help.
+        """
+        if self._cache is None or not is_remote(self._root):
+            return False
+        dropped = [
+            self._cache.drop_damaged(
+                member, where=self._object(member).where, revision=self._revision
+            )
+            for member in (scene.members[name] for name in names)
+        ]
+        return any(dropped)
+
+    def _shown(self, path: str) -> str:
+        if is_remote(self._root):
+            return shown(joined(self._root, path))
+        return str(local_path(self._root) / path)
+
+    def _object(self, member: Member) -> RemoteObject:
+        """Return what holds a member; it is kept, so that its size is checked once."""
+        if member.path not in self._objects:
+            shard = self._shards.get(member.path)
+            self._objects[member.path] = RemoteObject(
+                joined(self._root, member.path),
+                expected_size=member.offset + member.size if shard is None else shard.size,
+                patience=self._patience,
+            )
+        return self._objects[member.path]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy in another process needs; it checks sizes for itself."""
+        return self.__dict__ | {"_objects": {}}
+
+
+def open_local(
+    root: str | Path, member: Member, *, shard: ShardFacts | None = None
+) -> Path | FileSlice:
+    """Return a member's path where it is a whole file, else an open file over its part.
+
+    Args:
+        root: The folder that the member's path is relative to.
+        member: What to open.
+        shard: What the index knows of the file that holds the member, where that is a shard.
+
+    Raises:
+        StorageError: If the file is missing, unreadable or not the one that was indexed.
+    """
+    if shard is None and member.offset == 0:
+        return member_path(root, member)
+    _require_safe(member)
+    path = local_path(root) / member.path
+    again = "Fetch the shard again, or use the index that was made with it."
+    try:
+        file = FileSlice(path, member)
+    except OSError as error:
+        raise ShardError(
+            f"{path}: cannot be read ({error.strerror}). {cure_of(error, again)}"
+        ) from error
+    found, end = file.status().st_size, member.offset + member.size
+    if found < end or (shard is not None and found != shard.size):
+        file.close()
+        says = f"at least {end}" if shard is None else shard.size
+        raise ShardError(
+            f"{path}: has {found} bytes, and the index says {says}. The index is of another pack, "
+            f"or the shard was replaced or cut short. {again}"
+        )
+    return file
+
+
+def member_path(root: str | Path, member: Member) -> Path:
+    """Return where a member's file lies, having checked that it is the one that was indexed.
+
+    Raises:
+        StorageError: If the path leaves the root, or the file is missing, unreadable or has
+            another size than the index says.
+    """
+    _require_safe(member)
+    path = local_path(root) / member.path
+    try:
+        size_bytes = path.stat().st_size
+    except OSError as error:
+        raise StorageError(
+            f"{path}: cannot be read ({error.strerror}), and the index says that it has "
+            f"{member.size} bytes. "
+            + cure_of(error, "Fetch it again, or run `stereogenbench index` again.")
+        ) from error
+    if size_bytes != member.offset + member.size:
+        raise StorageError(
+            f"{path}: has {size_bytes} bytes, and the index says "
+            f"{member.offset + member.size}. The file was cut short or changed after its index: "
+            f"fetch it again, or run `stereogenbench index` again."
+        )
+    return path
+
+
+def require_own_files(root: str | Path, paths: Iterable[str]) -> None:
+    """Refuse files of a folder that are to be passed on and that links lead out of it to.
+
+    Such a link in a stranger's folder would carry any file of this machine into what is published.
+    Links to other files of the folder are as good as copies; so are those of the Hub's cache, which
+    keeps the files of a snapshot in ``blobs`` beside it. Reading for oneself follows all links.
+
+    Args:
+        root: The folder, on this machine.
+        paths: Of the files, below it.
+
+    Raises:
+        StorageError: Naming the first such file, where it leads and what to do.
+    """
+    root = local_path(root)
+    real = os.path.realpath(root)
+    own = [real, *_hub_blobs(Path(real))]
+    folders: dict[str, str] = {}
+    for path in paths:
+        folder, _, name = path.rpartition("/")
+        if folder not in folders:
+            folders[folder] = os.path.realpath(root / folder)
+        place = f"{folders[folder]}/{name}"
+        place = os.path.realpath(place) if Path(place).is_symlink() else place
+        if not any(place.startswith(f"{each.rstrip('/')}/") for each in own):
+            raise StorageError(
+                f"{root / path}: leads out of {root} by a link, to {place}, and would be passed on "
+                f"with the data. Copy the file into the folder if it may be (`cp -rL` copies what "
+                f"links lead to); else remove the link."
+            )
+
+
+def _hub_blobs(real: Path) -> list[str]:
+    """Return where the Hub's cache keeps the files of the snapshot that a folder lies in."""
+    return [
+        str(each.parent.parent / "blobs")
+        for each in (real, *real.parents)
+        if each.parent.name == "snapshots" and each.parent.parent.name.startswith("datasets--")
+    ]
+
+
+def _require_safe(member: Member) -> None:
+    if _UNSAFE_PATH.search(member.path):
+        raise StorageError(
+            f"{member.path!r}: a member's path is relative to the data's root and stays inside "
+            f"it. The index was not made by this package: run `stereogenbench index` again."
+        )
+
+
+def read_text_file(path: Path, *, where: str) -> bytes:
+    """Return the bytes of a metadata file, of which the size is checked before it is read.
+
+    Raises:
+        StorageError: If the file is missing or unreadable.
+        SchemaError: If it is too large for a metadata file.
+    """
+    try:
+        status = path.stat()
+        if stat.S_ISREG(status.st_mode):
+            require_text_size(status.st_size, where=where)
+            return path.read_bytes()
+    except OSError as error:
+        raise StorageError(
+            f"{where}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
+        ) from error
+    raise StorageError(f"{where}: is no file. Put the release's own file in its place.")

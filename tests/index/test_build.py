@@ -1,0 +1,208 @@
+"""The walk over a tree: nothing is lost, and a second walk goes on where the first stopped."""
+
+import multiprocessing
+import os
+import shutil
+
+import pytest
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index import build as walk_module
+from stereogenbench_data.index.build import walk
+from stereogenbench_data.index.journal import Journal
+
+KEY = "train/Uniform/Car_Dealer/scene_{:06d}"
+
+
+@pytest.fixture
+def linked_scenes(make_scene, root):
+    """Write scenes that share one scene's files, and return their keys."""
+
+    def make(count):
+        first = make_scene(KEY.format(0))
+        keys = [KEY.format(number) for number in range(count)]
+        for key in keys[1:]:
+            shutil.copytree(first, root / key, copy_function=os.link)
+        return keys
+
+    return make
+
+
+def test_every_scene_is_whole_incomplete_or_broken(linked_scenes, root):
+    keys = linked_scenes(4)
+    (root / keys[1] / "_scene_complete.json").unlink()
+    (root / keys[2] / "cam_00_rgb.mp4").unlink()
+    (root / "train/Uniform/scene.7").mkdir()
+    (root / "train/Uniform/scene.7/baseline.json").write_text("{}")
+
+    report = walk(root)
+
+    assert [scene.id.key for scene in report.scenes] == [keys[0], keys[3]]
+    assert list(report.incomplete) == [keys[1]]
+    assert list(report.broken) == [keys[2], "train/Uniform/scene.7"]
+    assert "has no cam_00_rgb.mp4" in report.broken[keys[2]]
+
+
+def test_worker_processes_find_what_one_process_finds(linked_scenes, root, monkeypatch):
+    keys = linked_scenes(5)
+    (root / keys[3] / "trajectory.json").unlink()
+    alone = walk(root, workers=1)
+    monkeypatch.setattr(walk_module, "POOL_FROM", 1)
+
+    together = walk(root, workers=2)
+
+    assert together == alone
+    assert len(alone.scenes) == 4
+
+
+def test_a_worker_that_dies_is_an_error_and_no_hang(linked_scenes, root, monkeypatch):
+    linked_scenes(40)
+    monkeypatch.setattr(walk_module, "POOL_FROM", 1)
+
+    def kill(done, total):
+        if 0 < done < total:
+            for child in multiprocessing.active_children():
+                child.kill()
+
+    with pytest.raises(StorageError, match=r"a worker process died"):
+        walk(root, workers=2, progress=kill)
+
+
+def test_progress_is_told_after_each_scene(linked_scenes, root):
+    linked_scenes(3)
+    told = []
+
+    walk(root, progress=lambda done, total: told.append((done, total)))
+
+    assert told == [(0, 3), (1, 3), (2, 3), (3, 3)]
+
+
+def test_a_number_of_workers_below_one_is_refused(linked_scenes, root):
+    linked_scenes(1)
+
+    with pytest.raises(StorageError, match="workers must be at least 1, got 0"):
+        walk(root, workers=0)
+
+
+def stopped_walk(root, journal_path, *, after):
+    def stop(done, total):
+        if done == after:
+            raise KeyboardInterrupt
+
+    with Journal(journal_path, walk="w") as journal, pytest.raises(KeyboardInterrupt, match=r"^$"):
+        walk(root, journal=journal, progress=stop)
+
+
+def resumed_walk(root, journal_path, *, name="w"):
+    """The number of scenes that were known at the start, and the report."""
+    told = []
+    with Journal(journal_path, walk=name) as journal:
+        report = walk(root, journal=journal, progress=lambda done, total: told.append(done))
+    return told[0], report
+
+
+def test_a_walk_that_was_stopped_goes_on_where_it_was(linked_scenes, root, tmp_path):
+    linked_scenes(4)
+    stopped_walk(root, tmp_path / "journal", after=2)
+
+    known, report = resumed_walk(root, tmp_path / "journal")
+
+    assert known == 2
+    assert report == walk(root)
+
+
+def test_a_journal_line_that_was_cut_short_is_read_again(linked_scenes, root, tmp_path):
+    linked_scenes(4)
+    journal = tmp_path / "journal"
+    stopped_walk(root, journal, after=3)
+    os.truncate(journal, journal.stat().st_size - 100)
+
+    known, report = resumed_walk(root, journal)
+    again, _ = resumed_walk(root, journal)
+
+    assert known == 2
+    assert len(report.scenes) == 4
+    assert again == 4
+
+
+def test_a_scene_that_changed_since_is_read_again(linked_scenes, root, tmp_path):
+    keys = linked_scenes(3)
+    resumed_walk(root, tmp_path / "journal")
+    path = root / keys[1] / "scene_description_qwen_dataset_level.json"
+    path.unlink()
+    path.write_text('{"detailed_caption": "Another."}')
+
+    known, report = resumed_walk(root, tmp_path / "journal")
+
+    assert known == 2
+    assert [scene.caption for scene in report.scenes] == [
+        "Cars behind glass.",
+        "Another.",
+        "Cars behind glass.",
+    ]
+
+
+def test_the_journal_of_another_walk_is_begun_anew(linked_scenes, root, tmp_path):
+    linked_scenes(2)
+    resumed_walk(root, tmp_path / "journal")
+
+    known, _ = resumed_walk(root, tmp_path / "journal", name="other")
+
+    assert known == 0
+
+
+def test_a_journal_that_cannot_be_written_is_named(linked_scenes, root, tmp_path):
+    linked_scenes(1)
+    (tmp_path / "file").write_text("")
+
+    with (
+        Journal(tmp_path / "file" / "journal", walk="w") as journal,
+        pytest.raises(StorageError, match="file/journal: the journal cannot be written"),
+    ):
+        walk(root, journal=journal)
+
+
+def test_a_journal_that_cannot_be_read_is_named(tmp_path):
+    with pytest.raises(StorageError, match="the journal of an earlier run cannot be read"):
+        Journal(tmp_path, walk="w")
+
+
+@pytest.mark.parametrize(
+    ("folder", "map_name", "subset", "notes"),
+    [
+        ("MapSeenInTrain", "Elsewhere", "seen_map", 0),
+        ("MapUnseenInTrain", "Car_Dealer", "unseen_map", 0),
+        ("Other", "Car_Dealer", "seen_map", 1),
+        ("Other", "OnlyHere", "seen_map", 1),
+        ("Other", "STF_TestMap", "unseen_map", 1),
+    ],
+)
+def test_an_eval_subset_is_told_by_its_folder_else_by_its_map(
+    make_scene, root, rewrite, folder, map_name, subset, notes
+):
+    rewrite(
+        make_scene("train/Uniform/OnlyHere/scene_000000") / "baseline.json",
+        lambda document: document.update(map_name="OnlyHere"),
+    )
+    rewrite(
+        make_scene(f"eval/{folder}/Uniform/{map_name}/scene_000000") / "baseline.json",
+        lambda document: document.update(map_name=map_name),
+    )
+
+    report = walk(root)
+
+    assert [scene.id.subset for scene in report.scenes] == [subset, None]
+    assert len(report.notes) == notes
+    assert all("eval/Other names no subset" in note for note in report.notes)
+
+
+def test_a_map_that_the_files_call_otherwise_is_noted(make_scene, root):
+    make_scene("train/Uniform/Downtown_West/scene_000000")
+
+    report = walk(root)
+
+    assert report.scenes[0].id.map_name == "Downtown_West"
+    assert report.notes == (
+        "train/Uniform/Downtown_West/scene_000000: its files call the map 'Car_Dealer'; the "
+        "folder's name is used",
+    )

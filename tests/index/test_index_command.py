@@ -1,0 +1,148 @@
+"""``stereogenbench index``: what it writes, lists and returns."""
+
+import json
+
+import pyarrow.parquet as pq
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.cli.index import index
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index import build as walk_module
+from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
+
+
+@pytest.fixture
+def run():
+    """Run the command; several commands in one app, as the real one has."""
+    alone = typer.Typer()
+    alone.command()(index)
+    alone.command("other")(lambda: None)
+    return lambda *words: CliRunner().invoke(alone, ["index", *map(str, words)])
+
+
+def test_a_whole_tree_is_indexed_in_its_root(make_scene, root, run):
+    make_scene()
+
+    result = run(root)
+
+    assert result.exit_code == 0
+    assert result.stdout == f"{root / 'index.parquet'}: 1 scene\n"
+    assert len(SceneIndex.open(root)) == 1
+    assert sorted(path.name for path in root.iterdir()) == ["index.parquet", "train"]
+
+
+def test_an_index_may_lie_elsewhere(make_scene, root, run, tmp_path):
+    make_scene()
+
+    result = run(root, "-o", tmp_path / "made" / "a.parquet", "--workers", "1", "--valid-depth")
+
+    opened = SceneIndex.open(tmp_path / "made" / "a.parquet", root=root)
+    assert f"root='{root}'), or with --root {root}" in result.stderr
+    assert result.exit_code == 0
+    assert opened.root == str(root)
+    assert opened.column("valid_depth_ratio")[0] == pytest.approx(23 / 24)
+    assert [path.name for path in (tmp_path / "made").iterdir()] == ["a.parquet"]
+
+
+def test_an_address_with_a_login_is_not_indexed(run, tmp_path):
+    result = run("s3://key:word@bucket/data", "-o", tmp_path / "a.parquet")
+
+    assert isinstance(result.exception, StorageError)
+    assert "s3://bucket/data: the URL has a login or a query" in str(result.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_commands_take_the_root_of_an_index_elsewhere(small_release, tmp_path):
+    kept = tmp_path / "kept.parquet"
+    SceneIndex.open(small_release).write(kept)
+    told = ["stats", str(kept), "--json"]
+
+    refused = CliRunner().invoke(app, told)
+    taken = CliRunner().invoke(app, [*told, "--root", str(small_release)])
+
+    assert refused.exit_code == 2
+    assert "or --root with a command" in refused.stderr
+    assert taken.exit_code == 0
+    assert json.loads(taken.stdout)["root"] == str(small_release)
+
+
+def test_incomplete_scenes_are_listed_and_not_fatal(make_scene, root, run):
+    make_scene()
+    (make_scene("train/Uniform/Car_Dealer/scene_000002") / "_scene_complete.json").unlink()
+
+    result = run(root)
+
+    assert result.exit_code == 0
+    assert "1 incomplete, left out:" in result.stderr
+    assert "scene_000002: has no _scene_complete.json" in result.stderr
+    with pytest.warns(IncompleteSceneWarning, match="scene_000002"):
+        SceneIndex.open(root)
+
+
+def test_broken_scenes_are_listed_and_the_others_indexed(make_scene, root, run):
+    make_scene()
+    (make_scene("train/Uniform/Car_Dealer/scene_000002") / "trajectory.json").unlink()
+
+    result = run(root)
+
+    assert result.exit_code == 1
+    assert "1 broken, left out:" in result.stderr
+    head = json.loads(pq.read_schema(root / "index.parquet").metadata[b"stereogenbench_data.index"])
+    assert list(head["broken"]) == ["train/Uniform/Car_Dealer/scene_000002"]
+
+
+def test_a_tree_of_which_nothing_is_whole_makes_no_index(make_scene, root, run):
+    (make_scene() / "_scene_complete.json").unlink()
+
+    result = run(root)
+
+    assert result.exit_code == 1
+    assert "nothing to index" in result.stderr
+    assert not (root / "index.parquet").exists()
+
+
+def test_a_folder_without_scenes_is_an_error_without_a_trace(tmp_path, run):
+    result = run(tmp_path)
+
+    assert isinstance(result.exception, StorageError)
+    assert f"{tmp_path}: holds no scene; looked for folders train/" in str(result.exception)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_contradiction_that_is_not_fatal_is_told(make_scene, root, run):
+    make_scene("train/Uniform/Downtown_West/scene_000000")
+
+    result = run(root)
+
+    assert result.exit_code == 0
+    assert "1 to know:" in result.stderr
+    assert "its files call the map 'Car_Dealer'" in result.stderr
+
+
+def test_a_stopped_run_keeps_its_journal_and_a_second_one_uses_it(
+    make_scene, root, run, monkeypatch
+):
+    for number in range(3):
+        make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
+    describe = walk_module.describe_scene
+    described = []
+
+    def stopping(folder, key, **how):
+        if key.endswith("2") and len(described) == 2:
+            described.append("stopped")
+            raise KeyboardInterrupt
+        described.append(key)
+        return describe(folder, key, **how)
+
+    monkeypatch.setattr(walk_module, "describe_scene", stopping)
+
+    first, second = run(root), run(root)
+
+    assert first.exit_code == 130
+    assert "run the same command again" in first.stderr
+    assert second.exit_code == 0
+    assert described[-2:] == ["stopped", "train/Uniform/Car_Dealer/scene_000002"]
+    assert not (root / "index.parquet.journal").exists()

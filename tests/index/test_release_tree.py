@@ -1,0 +1,168 @@
+"""The search for scenes: which folders are scenes, and what is said of the others."""
+
+import os
+
+import pytest
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index.release_tree import find_scene_folders, root_of
+
+KEYS = (
+    "eval/MapSeenInTrain/Uniform/Car_Dealer/scene_000000",
+    "train/IPD_Gaussian/Car_Dealer/scene_000000",
+    "train/Uniform/Car_Dealer/scene_000000",
+    "train/Uniform/Car_Dealer/scene_000001",
+)
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """Scenes that hold nothing but their baseline.json."""
+    root = tmp_path / "release"
+    for key in KEYS:
+        add(root, key)
+    return root
+
+
+def add(root, key):
+    (root / key).mkdir(parents=True)
+    (root / key / "baseline.json").write_text("{}")
+
+
+def test_scenes_are_found_by_their_place_and_sorted(tree):
+    folders = find_scene_folders(tree)
+
+    assert folders.keys == KEYS
+    assert folders.refused == {}
+
+
+def test_other_folders_and_hidden_ones_are_passed_over(tree):
+    (tree / "metadata").mkdir()
+    (tree / "metadata" / "manifest.jsonl").write_text("{}")
+    add(tree, ".cache/train/Uniform/Car_Dealer/scene_000000")
+
+    assert find_scene_folders(tree).keys == KEYS
+
+
+def test_an_empty_folder_where_a_scene_should_be_is_one(tree):
+    (tree / "train/Uniform/Car_Dealer/scene_000002").mkdir()
+
+    assert "train/Uniform/Car_Dealer/scene_000002" in find_scene_folders(tree).keys
+
+
+def test_a_misplaced_scene_is_listed_with_the_root_to_point_at(tree):
+    add(tree, "copy/train/Uniform/Car_Dealer/scene_000000")
+
+    folders = find_scene_folders(tree)
+
+    assert folders.keys == KEYS
+    assert list(folders.refused) == ["copy/train/Uniform/Car_Dealer/scene_000000"]
+    assert folders.refused.popitem()[1].endswith(f"Move it, or point at {tree / 'copy'} instead.")
+
+
+def test_a_scene_too_deep_is_listed(tree):
+    add(tree, "train/more/Uniform/Car_Dealer/scene_000000")
+
+    refused = find_scene_folders(tree).refused
+
+    assert list(refused) == ["train/more/Uniform/Car_Dealer/scene_000000"]
+    assert "found 5 folders" in refused.popitem()[1]
+
+
+def test_a_dot_in_a_folders_name_is_listed(tree):
+    add(tree, "train/Uniform/Car_Dealer/scene_1.5")
+
+    refused = find_scene_folders(tree).refused
+
+    assert "holds a dot" in refused["train/Uniform/Car_Dealer/scene_1.5"]
+
+
+@pytest.mark.parametrize(
+    "below", ["train", "train/Uniform", "eval/MapSeenInTrain", KEYS[0], KEYS[3]]
+)
+def test_a_root_inside_the_release_is_told_the_right_one(tree, below):
+    with pytest.raises(StorageError, match=f"holds no scene; .* Point at {tree} instead"):
+        find_scene_folders(tree / below)
+
+
+def test_a_root_above_the_release_is_told_the_right_one(tree):
+    with pytest.raises(StorageError, match=f"Point at {tree} instead"):
+        find_scene_folders(tree.parent)
+
+
+def test_a_folder_without_scenes_says_what_was_looked_for(tmp_path):
+    (tmp_path / "pictures").mkdir()
+
+    with pytest.raises(
+        StorageError,
+        match=r"looked for folders train/<family>/<map>/<scene> or eval/.*found pictures in it",
+    ):
+        find_scene_folders(tmp_path)
+
+
+def test_scenes_of_no_release_are_told_with_an_example(tmp_path):
+    add(tmp_path, "mine/scene_000000")
+
+    with pytest.raises(StorageError, match="found 1 elsewhere, such as mine/scene_000000: "):
+        find_scene_folders(tmp_path)
+
+
+def test_a_root_that_is_not_there_or_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(StorageError, match="nowhere: does not exist; expected a folder"):
+        find_scene_folders(tmp_path / "nowhere")
+    with pytest.raises(StorageError, match="file: is a file; expected a folder"):
+        find_scene_folders(tmp_path / "file")
+
+
+def test_links_to_folders_are_followed(tree, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("disk")
+    add(elsewhere, "Pairwise_Uniform/Car_Dealer/scene_000000")
+    (tree / "train/Pairwise_Uniform").symlink_to(elsewhere / "Pairwise_Uniform")
+
+    assert "train/Pairwise_Uniform/Car_Dealer/scene_000000" in find_scene_folders(tree).keys
+
+
+def test_a_link_to_a_folder_above_itself_is_listed_and_not_followed(tree):
+    (tree / "train/Uniform/loop").symlink_to(tree / "train")
+
+    folders = find_scene_folders(tree)
+
+    assert folders.keys == KEYS
+    assert folders.refused == {
+        "train/Uniform/loop": "is a link to a folder above itself. Remove the link."
+    }
+
+
+def test_a_link_to_itself_is_listed(tree):
+    (tree / "train/Uniform/self").symlink_to(tree / "train/Uniform/self")
+
+    refused = find_scene_folders(tree).refused
+
+    assert refused["train/Uniform/self"].startswith("cannot be searched (Too many levels")
+
+
+def test_a_folder_that_may_not_be_read_is_listed(tree, monkeypatch):
+    scandir = os.scandir
+
+    def forbidding(path):
+        if str(path).endswith("IPD_Gaussian"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", forbidding)
+
+    folders = find_scene_folders(tree)
+
+    assert len(folders.keys) == 3
+    assert folders.refused == {
+        "train/IPD_Gaussian": "cannot be searched (Permission denied). Give permission, or choose "
+        "another place."
+    }
+
+
+def test_the_root_of_a_scenes_folder_is_found_from_its_path(tree):
+    assert root_of(tree / KEYS[0]) == tree
+    assert root_of(tree / KEYS[1]) == tree
+    assert root_of(tree / "mine/scene") is None

@@ -1,0 +1,96 @@
+"""A tree in the released layout behind a URL: found, indexed and read like one on this machine."""
+
+import fsspec
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index import table as index_module
+from stereogenbench_data.index.remote_tree import find_remote_scenes
+from tests.servers.fault import serving
+from tests.servers.hub import REPOSITORY, HubHandler
+from tests.servers.tools import require_module
+
+HUB = f"hf://datasets/{REPOSITORY}@main"
+
+
+@pytest.fixture
+def hub_tree(small_release, monkeypatch):
+    """A Hub whose data set is `small_release`."""
+    require_module("huggingface_hub")
+    with serving(small_release, handler=HubHandler) as server:
+        conf = {"endpoint": server.url, "token": False}
+        monkeypatch.setitem(fsspec.config.conf, "hf", conf)
+        yield server
+
+
+@pytest.mark.usefixtures("hub_tree")
+def test_a_repository_of_folders_opens_like_the_folder(small_release):
+    local = StereoPairs(small_release, pairs="all", frames=[0, 6])
+    remote = StereoPairs(HUB, pairs="all", frames=[0, 6])
+
+    assert len(remote) == len(local)
+    for number in (0, 31, 119):
+        a, b = local[number], remote[number]
+        assert a["__key__"] == b["__key__"]
+        np.testing.assert_array_equal(a["left"], b["left"])
+        np.testing.assert_array_equal(a["disparity"], b["disparity"])
+
+
+def test_the_index_of_a_repository_is_that_of_the_folder(hub_tree, small_release):
+    local, remote = SceneIndex.open(small_release), SceneIndex.open(HUB)
+
+    assert remote.digest == local.digest
+    sizes = sum(path.stat().st_size for path in small_release.rglob("*.mkv"))
+    sent = sum(asked.sent for asked in hub_tree.asked if asked.path.endswith(".mkv"))
+    assert sent <= sizes
+
+
+@pytest.mark.usefixtures("hub_tree")
+def test_the_command_indexes_a_part_of_a_repository(tmp_path, small_release):
+    out = tmp_path / "part.parquet"
+
+    done = CliRunner().invoke(app, ["index", HUB, "--split", "eval", "-o", str(out)])
+
+    assert done.exit_code == 0, done.output
+    index = SceneIndex.open(out)
+    assert index.root == HUB
+    assert set(index.column("split")) == {"eval"}
+    key = index.scene(0).id.key
+    folder = StereoPairs(small_release, split="eval", fields=("left",))
+    np.testing.assert_array_equal(StereoPairs(out, fields=("left",))[0]["left"], folder[0]["left"])
+    assert key == folder.index.column("key")[folder.plan.scene_rows[0]]
+
+
+def test_a_part_is_indexed_under_a_name_of_its_own(small_release):
+    done = CliRunner().invoke(app, ["index", str(small_release), "--split", "eval"])
+
+    assert done.exit_code == 2
+    assert "named by you: --out FILE" in done.output
+    assert not (small_release / "index.parquet").exists()
+
+
+@pytest.mark.usefixtures("hub_tree")
+def test_too_many_scenes_are_not_described_each_time(monkeypatch):
+    monkeypatch.setattr(index_module, "MOST_REMOTE_SCENES", 3)
+
+    with pytest.raises(
+        StorageError, match=r"of 4 scenes are too many .*`stereogenbench index hf://"
+    ):
+        SceneIndex.open(HUB)
+
+
+@pytest.mark.usefixtures("hub")
+def test_a_repository_without_a_scene_says_what_was_looked_for():
+    with pytest.raises(StorageError, match=r"holds no scene and no index\.parquet; looked for"):
+        find_remote_scenes(HUB)
+
+
+def test_a_plain_web_server_cannot_be_listed(web):
+    (web.folder / "train").mkdir()
+
+    with pytest.raises(StorageError, match=r"a web server does not list its folders"):
+        find_remote_scenes(web.url)

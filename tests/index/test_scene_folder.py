@@ -1,0 +1,229 @@
+"""One scene's folder: what its row says, and each way in which it can be wrong."""
+
+import os
+import shutil
+
+import pytest
+
+from stereogenbench_data.errors import MediaError, SchemaError, StorageError
+from stereogenbench_data.index.scene_files import files_of
+from stereogenbench_data.index.scene_folder import (
+    IncompleteScene,
+    describe_scene,
+    stamp_of,
+)
+from stereogenbench_data.schema.records import Member
+
+KEY = "train/Uniform/Car_Dealer/scene_000001"
+
+
+def test_a_row_says_what_the_files_say(make_scene, root):
+    folder = make_scene()
+
+    scene = describe_scene(root, KEY)
+
+    assert scene.id.key == KEY
+    assert (scene.labels.character, scene.labels.map_path) == ("SK_Ch13", "/Game/Car_Dealer")
+    assert scene.caption == "Cars behind glass."
+    assert (scene.frames, scene.frame_rate_hz) == (4, 15.0)
+    assert scene.lateral_m == pytest.approx((0.0, 0.1, 0.25, 0.31, 0.6, 0.725), abs=1e-12)
+    assert scene.rig_residual_px < 1e-9
+    assert scene.depth_unit_m == (0.001,) * 6
+    assert scene.depth_unit_source == ("tag",) * 6
+    assert scene.depth_codec == ("ffv1",) * 6
+    assert scene.depth_pixel_format == ("gray16le",) * 6
+    assert scene.valid_depth_ratio is None
+    assert len(scene.members) == 16
+    size = (folder / "cam_03_depth.mkv").stat().st_size
+    assert scene.members["cam_03_depth.mkv"] == Member(f"{KEY}/cam_03_depth.mkv", 0, size)
+
+
+def test_the_scene_rendered_elsewhere_is_described(shared_scenes):
+    scene = describe_scene(shared_scenes, "train/Pairwise_Uniform/SeyeonjeongPavilion/scene_000003")
+
+    assert scene.frames == 81
+    assert scene.lateral_m == pytest.approx((0, 0.185, 0.515, 0.6125, 1.225, 1.63), abs=1e-9)
+    assert scene.rig_residual_px < 1e-4
+    assert scene.caption.startswith("A courtyard of textured solids")
+    assert len(scene.members) == 17
+
+
+def test_depth_without_a_tag_has_the_releases_unit(make_scene, root, video):
+    shutil.copy(video("depth.mkv", tags={}), make_scene() / "cam_02_depth.mkv")
+
+    scene = describe_scene(root, KEY)
+
+    assert scene.depth_unit_m[1:4] == (0.001, 0.1, 0.001)
+    assert scene.depth_unit_source[1:4] == ("tag", "default", "tag")
+
+
+def test_any_common_number_of_frames_is_recorded(make_scene, root):
+    make_scene(frames=7)
+
+    assert describe_scene(root, KEY).frames == 7
+
+
+def test_the_share_of_measured_depth_is_known_where_it_is_asked_for(make_scene, root):
+    make_scene()
+
+    scene = describe_scene(root, KEY, valid_depth="sample")
+
+    assert scene.valid_depth_ratio == pytest.approx(23 / 24)
+
+
+@pytest.mark.parametrize(
+    ("keep", "match"),
+    [
+        (lambda name: False, "the folder is empty"),
+        (lambda name: name != "_scene_complete.json", "has no _scene_complete.json, so it was nev"),
+        (lambda name: not name.startswith("cam_"), "has metadata only, and none of its 12 videos"),
+    ],
+)
+def test_an_unfinished_scene_says_why(make_scene, root, keep, match):
+    folder = make_scene()
+    for path in folder.iterdir():
+        if not keep(path.name):
+            path.unlink()
+
+    with pytest.raises(IncompleteScene, match=f"{KEY}: {match}"):
+        describe_scene(root, KEY)
+
+
+def test_a_finished_scene_without_a_file_names_it(make_scene, root):
+    folder = make_scene()
+    (folder / "cam_04_rgb.mp4").unlink()
+    (folder / "trajectory.json").unlink()
+
+    with pytest.raises(StorageError, match=r"and has no trajectory.json, cam_04_rgb.mp4 \(it has"):
+        describe_scene(root, KEY)
+
+
+def test_descriptions_may_be_absent(make_scene, root):
+    (make_scene() / "scene_description_qwen_dataset_level.json").unlink()
+
+    assert describe_scene(root, KEY).caption == ""
+
+
+def test_the_text_file_stands_in_for_the_description(make_scene, root):
+    folder = make_scene()
+    (folder / "scene_description_qwen_dataset_level.json").unlink()
+    (folder / "scene_description_qwen_dataset_level.txt").write_text("Cars.\n")
+
+    assert describe_scene(root, KEY).caption == "Cars."
+
+
+def test_a_video_with_another_number_of_frames_is_named(make_scene, root, video):
+    shutil.copy(video("depth.mkv", frames=3), make_scene() / "cam_05_depth.mkv")
+
+    with pytest.raises(StorageError, match=r"12 have 4 frames, but cam_05_depth.mkv has 3. Fetch"):
+        describe_scene(root, KEY)
+
+
+def test_a_trajectory_with_another_number_of_frames_is_named(make_scene, root, rewrite):
+    rewrite(make_scene() / "trajectory.json", lambda document: document["frames"].pop())
+
+    with pytest.raises(StorageError, match=r"12 have 4 frames, but trajectory.json has 3"):
+        describe_scene(root, KEY)
+
+
+def test_a_video_of_another_size_is_named(make_scene, root, video):
+    shutil.copy(video("rgb.mp4", size=(48, 64)), make_scene() / "cam_01_rgb.mp4")
+
+    with pytest.raises(StorageError, match=r"11 have 32x24 pixels, but cam_01_rgb.mp4 has 64x48"):
+        describe_scene(root, KEY)
+
+
+def test_videos_of_another_size_than_is_recorded_are_refused(make_scene, root, rewrite):
+    rewrite(make_scene() / "baseline.json", lambda document: document.update(image_width=1280))
+
+    with pytest.raises(StorageError, match="pictures of 1280x24 pixels, and all videos have 32x24"):
+        describe_scene(root, KEY)
+
+
+def test_where_no_size_is_recorded_the_rig_is_for_the_videos(make_scene, root, rewrite):
+    def forget_size(document):
+        del document["image_width"], document["image_height"]
+
+    rewrite(make_scene() / "baseline.json", forget_size)
+
+    rig = describe_scene(root, KEY).rig
+
+    assert (rig.image_width_px, rig.image_height_px) == (32, 24)
+
+
+def test_a_baseline_that_the_poses_contradict_is_told_with_both_numbers(make_scene, root, rewrite):
+    def widen(document):
+        document["pairwise_pairs"][7]["baseline_cm"] = 51.0
+
+    rewrite(make_scene() / "baseline.json", widen)
+
+    with pytest.raises(
+        StorageError, match=r"cameras 1 and 4 are 51 cm apart.* 50 cm apart in frame 0 .*0.151 cm"
+    ):
+        describe_scene(root, KEY)
+
+
+def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth(make_scene, root, rewrite):
+    def widen(document):
+        document["pairwise_pairs"][7]["baseline_cm"] = 50.14
+
+    rewrite(make_scene() / "baseline.json", widen)
+
+    assert describe_scene(root, KEY).rig.baselines_cm[7] == 50.14
+
+
+def test_a_wrong_unit_shows_as_a_contradiction(make_scene, root, rewrite):
+    rewrite(make_scene() / "trajectory.json", lambda document: document.update(unit="m"))
+
+    with pytest.raises(StorageError, match=r"10 cm apart, and by the poses.*1000 cm apart"):
+        describe_scene(root, KEY)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "error", "match"),
+    [
+        ("baseline.json", b"{", SchemaError, f"{KEY}/baseline.json: not JSON"),
+        ("trajectory.json", b"[]", SchemaError, f"{KEY}/trajectory.json: .* must be an object"),
+        ("_scene_complete.json", b"", SchemaError, f"{KEY}/_scene_complete.json: .* empty"),
+        ("cam_00_rgb.mp4", b"", MediaError, f"{KEY}/cam_00_rgb.mp4: is empty"),
+        ("cam_00_depth.mkv", b"\x1aE\xdf\xa3", MediaError, f"{KEY}/cam_00_depth.mkv: cannot"),
+    ],
+)
+def test_a_damaged_file_is_named(make_scene, root, name, content, error, match):
+    (make_scene() / name).write_bytes(content)
+
+    with pytest.raises(error, match=match):
+        describe_scene(root, KEY)
+
+
+def test_a_huge_metadata_file_is_refused_by_its_size(make_scene, root):
+    path = make_scene() / "baseline.json"
+    os.truncate(path, 200 * 2**20)
+
+    with pytest.raises(SchemaError, match=r"baseline.json: .*this one has 209,715,200. It was not"):
+        describe_scene(root, KEY)
+
+
+def test_a_truncated_video_is_named(make_scene, root):
+    path = make_scene() / "cam_00_rgb.mp4"
+    os.truncate(path, path.stat().st_size // 2)
+
+    with pytest.raises(MediaError, match=f"{KEY}/cam_00_rgb.mp4: "):
+        describe_scene(root, KEY)
+
+
+def test_a_folder_that_is_gone_is_named(root):
+    with pytest.raises(StorageError, match=r"scene_000001: cannot be read .No such file"):
+        describe_scene(root, KEY)
+
+
+def test_the_stamp_changes_with_a_files_size_and_time(make_scene, root):
+    path = make_scene() / "trajectory.json"
+    first = stamp_of(files_of(root, KEY).stamps())
+
+    os.utime(path, (1, 1))
+    second = stamp_of(files_of(root, KEY).stamps())
+    path.unlink()
+    third = stamp_of(files_of(root, KEY).stamps())
+
+    assert len({first, second, third}) == 3

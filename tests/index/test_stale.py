@@ -1,0 +1,256 @@
+"""An index beside a folder that has changed: said at once, and never of a mere copy."""
+
+import os
+import shutil
+import subprocess
+import tarfile
+import warnings
+
+import pytest
+from typer.testing import CliRunner
+
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.errors import SelectionError, ShardError
+from stereogenbench_data.index.stale import StaleIndexWarning
+from stereogenbench_data.index.table import INDEX_NAME, IncompleteSceneWarning, SceneIndex
+from stereogenbench_data.schema.release import COMPLETE_JSON
+from stereogenbench_data.selection.filters import filter_scenes
+from stereogenbench_data.selection.lookup import find_scene
+from stereogenbench_data.shards.pack import pack
+from stereogenbench_data.shards.unpack import unpack
+from stereogenbench_data.synthesis import SynthRequest, synthesise
+
+MAP = "train/Uniform/SynthStage"
+OLD = r"index\.parquet: is older than the folder "
+CURE = r"Run `stereogenbench index /\S+`\."
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+@pytest.fixture
+def tree(small_release, tmp_path):
+    """A tree with its index: scenes 0 and 1 of Uniform in train, and others."""
+    root = shutil.copytree(small_release, tmp_path / "tree")
+    SceneIndex.open(root).write(root / INDEX_NAME)
+    return root
+
+
+@pytest.fixture
+def shards(small_release, tmp_path):
+    """The same scenes, each in a shard of its own."""
+    pack(small_release, tmp_path / "shards", target_bytes=250_000, workers=1)
+    return tmp_path / "shards"
+
+
+def add_scene(tree, key=f"{MAP}/scene_000009"):
+    return shutil.copytree(tree / MAP / "scene_000000", tree / key)
+
+
+@pytest.mark.parametrize("key", [f"{MAP}/scene_000009", "eval/new/Other/New_Map/scene_000000"])
+def test_an_added_scene_is_named_wherever_data_are_opened(tree, key):
+    add_scene(tree, key)
+    told = rf"{OLD}.*: 1 scene not in the index \({key}\)\. {CURE}"
+
+    with pytest.warns(StaleIndexWarning, match=told):
+        assert len(SceneIndex.open(tree)) == 4
+    with pytest.warns(StaleIndexWarning, match=told):
+        StereoPairs(tree)
+    with pytest.warns(StaleIndexWarning, match=told):
+        SceneIndex.open(tree / INDEX_NAME)
+
+
+@pytest.mark.parametrize(
+    "words", [("stats",), ("show",), ("download", "--dry-run", "--dest", "to")], ids=lambda w: w[0]
+)
+def test_commands_say_so_on_stderr(tree, tmp_path, words):
+    add_scene(tree)
+    out = ("-o", tmp_path / "sheet.png") if words[0] == "show" else ()
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        shown = invoke(words[0], tree, *words[1:], *out)
+
+    assert shown.exit_code == 0, shown.stderr
+    said = shown.stderr + "".join(str(each.message) for each in caught)
+    assert f"1 scene not in the index ({MAP}/scene_000009). Run `stereogenbench index" in said
+
+
+def test_a_removed_scene_is_named(tree):
+    shutil.rmtree(tree / MAP / "scene_000001")
+
+    with pytest.warns(StaleIndexWarning, match=rf"1 scene of the index, and not there \({MAP}/sc"):
+        SceneIndex.open(tree)
+
+
+def test_a_scene_that_was_finished_since_is_named(tree):
+    marker = tree / MAP / "scene_000001" / COMPLETE_JSON
+    text = marker.read_bytes()
+    marker.unlink()
+    assert invoke("index", tree).exit_code == 0
+    marker.write_bytes(text)
+
+    with pytest.warns(match="cannot be used|is older than") as told:
+        SceneIndex.open(tree)
+
+    assert [each.category for each in told] == [IncompleteSceneWarning, StaleIndexWarning]
+    assert f"1 scene not in the index ({MAP}/scene_000001)" in str(told[1].message)
+
+
+def test_a_filter_that_matches_nothing_says_that_the_index_is_old(tree):
+    add_scene(tree, "train/New_Family/SynthStage/scene_000000")
+    with pytest.warns(StaleIndexWarning, match=OLD):
+        index = SceneIndex.open(tree)
+
+    told = rf"matches none of 4 scenes; .*'Uniform'\. /.*{OLD}.*New_Family.*{CURE}"
+    with pytest.raises(SelectionError, match=told):
+        filter_scenes(index, {"family": "New_Family"})
+    with pytest.raises(SelectionError, match=rf"is no key of 4 scenes.*{OLD}"):
+        find_scene(index, "New_Family")
+
+
+def test_indexing_again_is_the_cure(tree):
+    add_scene(tree)
+
+    assert invoke("index", tree).exit_code == 0
+    assert len(SceneIndex.open(tree)) == 5
+
+
+@pytest.mark.parametrize("found", ["empty", "unfinished", "hidden", "a file", "bad name"])
+def test_what_is_no_finished_scene_is_not_missed(tree, found):
+    place = tree / MAP / "scene_000009"
+    if found == "a file":
+        place.write_text("")
+    elif found == "empty":
+        place.mkdir()
+    elif found == "unfinished":
+        add_scene(tree)
+        (place / COMPLETE_JSON).unlink()
+    else:
+        add_scene(tree, f"{MAP}/{'.scene_9' if found == 'hidden' else 'scene.9'}")
+
+    assert SceneIndex.open(tree).stale == ""
+
+
+def touch_all(root):
+    """Give files and folders times of change in an order of their own, the index the oldest."""
+    for number, path in enumerate(sorted(root.rglob("*"), key=lambda each: each.name)):
+        os.utime(path, (1_600_000_000 + number, 1_600_000_000 + number))
+    os.utime(root / INDEX_NAME, (1, 1))
+
+
+@pytest.mark.parametrize("kind", ["tree", "shards"])
+@pytest.mark.parametrize("how", ["copied", "touched", "archived", "moved", "cp -r"])
+def test_a_copy_is_not_taken_for_changed(kind, how, tree, shards, tmp_path):
+    data, copy = tree if kind == "tree" else shards, tmp_path / "copy"
+    if how == "archived":
+        with tarfile.open(tmp_path / "all.tar", "w") as tar:
+            tar.add(data, arcname="copy")
+        with tarfile.open(tmp_path / "all.tar") as tar:
+            tar.extractall(tmp_path, filter="data")
+    elif how == "moved":
+        data.rename(copy)
+    elif how == "cp -r":
+        subprocess.run(["cp", "-r", data, copy], check=True)
+    else:
+        shutil.copytree(data, copy)
+        if how == "touched":
+            touch_all(copy)
+
+    assert SceneIndex.open(copy).stale == ""
+
+
+def test_an_index_alone_and_one_of_a_part_are_not_old(tree, tmp_path):
+    (tmp_path / "alone").mkdir()
+    shutil.copy(tree / INDEX_NAME, tmp_path / "alone")
+    part = tmp_path / "part.parquet"
+    assert invoke("index", tree, "-o", part, "--family", "Uniform").exit_code == 0
+
+    assert SceneIndex.open(tmp_path / "alone").stale == ""
+    assert SceneIndex.open(part).stale == ""
+    shutil.rmtree(tree / MAP / "scene_000001")
+    with pytest.warns(StaleIndexWarning, match="is of a part of the folder: make it again"):
+        SceneIndex.open(part)
+
+
+def test_an_index_that_lies_elsewhere_names_itself_in_the_cure(tree, tmp_path):
+    SceneIndex.open(tree).write(tmp_path / "all.parquet")
+    add_scene(tree)
+
+    cure = rf"Run `stereogenbench index {tree} --out {tmp_path}/all\.parquet`"
+    with pytest.warns(StaleIndexWarning, match=cure):
+        SceneIndex.open(tmp_path / "all.parquet")
+
+
+def test_scenes_of_an_earlier_download_are_known_and_later_ones_are_not(tree, tmp_path):
+    there = tmp_path / "there"
+    for family in ("Uniform", "IPD_Gaussian"):
+        done = invoke("download", tree, "--dest", there, "--split", "train", "--family", family)
+        assert done.exit_code == 0
+
+    assert len(SceneIndex.open(there)) == 1
+    add_scene(there)
+    with pytest.warns(StaleIndexWarning, match=rf"1 scene not in the index \({MAP}/scene_000009"):
+        SceneIndex.open(there)
+
+
+def test_a_shard_beside_an_old_index_is_named_and_one_that_is_gone(shards):
+    (shards / "train-Uniform-000001.tar").rename(shards / "train-Uniform-000007.tar")
+
+    told = (
+        r"1 shard not in the index \(train-Uniform-000007\.tar\); 1 shard of the index, and not "
+        r"there \(train-Uniform-000001\.tar\)\. Fetch the index that belongs"
+    )
+    with pytest.warns(StaleIndexWarning, match=told):
+        SceneIndex.open(shards)
+
+
+def test_synth_into_an_indexed_tree_says_so(tree):
+    request = SynthRequest(family="IPD_Gaussian", scenes=2, size_px=64, frames=7, seed=1)
+
+    with pytest.warns(StaleIndexWarning, match=r"IPD_Gaussian/SynthStage/scene_000001\).*index"):
+        synthesise(tree, request)
+
+
+def test_unpack_into_an_indexed_tree_says_so(tree, shards):
+    shutil.rmtree(tree / MAP)
+    assert invoke("index", tree).exit_code == 0
+
+    with pytest.warns(StaleIndexWarning, match=rf"2 scenes not in the index \({MAP}/scene_000000"):
+        unpack(shards, tree, workers=1)
+
+
+def test_pack_into_a_tree_of_scenes_says_that_its_index_hides_them(tree, small_release, tmp_path):
+    shutil.copytree(tree / MAP, tmp_path / "out" / "train" / "Other" / "SynthStage")
+
+    with pytest.warns(StaleIndexWarning, match=r"2 scenes not in the index \(train/Other/.*shards"):
+        pack(small_release, tmp_path / "out", workers=1)
+
+
+def test_pack_into_a_tree_with_an_index_is_refused(tree, small_release):
+    with pytest.raises(ShardError, match=r"index\.parquet: is there, and was not packed here"):
+        pack(small_release / "train" / "..", tree, workers=1)
+
+
+def test_pack_of_a_tree_with_an_old_index_says_what_is_left_out(tree, tmp_path):
+    add_scene(tree)
+
+    packed = invoke("pack", tree, tmp_path / "out", "--workers", "1")
+
+    assert packed.exit_code == 0
+    assert f"1 scene not in the index ({MAP}/scene_000009)" in packed.stderr
+
+
+def test_a_map_that_may_not_be_listed_is_passed_over(tree, monkeypatch):
+    scandir = os.scandir
+
+    def forbidding(path):
+        if str(path).endswith(MAP):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", forbidding)
+
+    assert SceneIndex.open(tree).stale == ""

@@ -1,0 +1,642 @@
+"""The index: the same rows in memory, on disk and in another process."""
+
+import base64
+import contextlib
+import dataclasses
+import json
+import pickle
+import random
+import shutil
+import warnings
+
+import fsspec.core
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index import table as index_module
+from stereogenbench_data.index.digest import table_digest
+from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
+from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
+from stereogenbench_data.sources.members import MemberSource
+
+METADATA = b"stereogenbench_data.index"
+
+
+def scene_of(number, *, seed=0):
+    """A scene whose every number comes from a seed."""
+    rng = random.Random(f"{seed} {number}")
+    key = f"train/Uniform/Car_Dealer/scene_{number:06d}"
+    size = rng.choice([64, 1280])
+    return Scene(
+        id=SceneId(key, "train", rng.choice([None, "seen_map"]), "Uniform", "Car_Dealer"),
+        labels=SceneLabels(
+            scene_label=rng.choice([None, f"label {number}"]),
+            scene_index=rng.choice([None, number]),
+            character=rng.choice([None, "SK_\u00c4"]),
+            aperture_fstop=rng.choice([None, 2.8]),
+        ),
+        caption=rng.choice(["", 'A caf\u00e9 "in" Vienna.']),
+        rig=Rig(
+            focal_mm=rng.uniform(18, 85),
+            sensor_width_mm=23.76,
+            sensor_height_mm=rng.uniform(10, 30),
+            image_width_px=size,
+            image_height_px=size,
+            principal_point_px=rng.choice([None, (31.5, 32.25)]),
+            baselines_cm=tuple(rng.uniform(1, 200) for _ in range(15)),
+            primary_pair=rng.choice([(0, 1), (2, 5)]),
+            image_size_source=rng.choice(["recorded", "default"]),
+        ),
+        frames=rng.randint(1, 100),
+        frame_rate_hz=15.0,
+        lateral_m=tuple(rng.uniform(0, 2) for _ in range(6)),
+        rig_residual_px=rng.choice([1e-9, float("inf")]),
+        depth_unit_m=tuple(rng.choice([0.1, 0.001]) for _ in range(6)),
+        depth_unit_source=tuple(rng.choice(["tag", "default"]) for _ in range(6)),
+        depth_codec=("ffv1",) * 6,
+        depth_pixel_format=tuple(rng.choice(["gray16le", "gray12le"]) for _ in range(6)),
+        valid_depth_ratio=rng.choice([None, 0.9459]),
+        members={
+            name: Member(f"{key}/{name}", 0, rng.randint(0, 2**40))
+            for name in ["baseline.json", "cam_00_rgb.mp4", "cam_00_depth.mkv"]
+        },
+    )
+
+
+@pytest.fixture
+def scenes():
+    return [scene_of(number) for number in range(5)]
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32), count=st.integers(1, 6))
+def test_a_scene_comes_back_from_the_file_as_it_was(tmp_path_factory, seed, count):
+    root = tmp_path_factory.mktemp("root")
+    scenes = [scene_of(number, seed=seed) for number in range(count)]
+    SceneIndex.from_scenes(scenes, root).write(root / "index.parquet")
+
+    index = SceneIndex.open(root)
+
+    assert len(index) == count
+    assert [index.scene(row) for row in range(count)] == scenes
+
+
+def test_rows_are_in_the_order_of_their_keys_whatever_order_they_came_in(scenes, tmp_path):
+    forth = SceneIndex.from_scenes(scenes, tmp_path)
+    back = SceneIndex.from_scenes(reversed(scenes), tmp_path)
+
+    assert back.column("key").tolist() == sorted(scene.id.key for scene in scenes)
+    assert back.digest == forth.digest
+
+
+def test_the_digest_is_the_same_after_writing_and_in_parts_of_a_table(scenes, tmp_path):
+    index = SceneIndex.from_scenes(scenes, tmp_path)
+    index.write(tmp_path / "index.parquet")
+    table = pq.read_table(tmp_path / "index.parquet")
+    pq.write_table(table, tmp_path / "parts.parquet", row_group_size=2)
+
+    assert SceneIndex.open(tmp_path / "index.parquet").digest == index.digest
+    assert SceneIndex.open(tmp_path / "parts.parquet").digest == index.digest
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"frames": 7},
+        {"caption": "Other."},
+        {"valid_depth_ratio": 0.5},
+        {"lateral_m": (0.0, 0.1, 0.2, 0.3, 0.4, 0.6)},
+        {"members": {"a.mp4": Member("a.mp4", 0, 1)}},
+    ],
+)
+def test_the_digest_changes_with_a_scene(scenes, tmp_path, change):
+    changed = [*scenes[:-1], dataclasses.replace(scenes[-1], **change)]
+
+    before = SceneIndex.from_scenes(scenes, tmp_path).digest
+
+    assert SceneIndex.from_scenes(changed, tmp_path).digest != before
+
+
+def test_the_digest_is_pinned(tmp_path):
+    index = SceneIndex.from_scenes([scene_of(3)], tmp_path)
+
+    assert index.digest == "d8430dfdc4393c312ed3befc674b33d0ef5319ab286f9ec702ce0f210d3bddd4"
+
+
+def test_columns_are_arrays_that_cannot_be_changed(scenes, tmp_path):
+    index = SceneIndex.from_scenes(scenes, tmp_path)
+
+    baselines_cm = index.column("baselines_cm")
+
+    assert (baselines_cm.shape, baselines_cm.dtype) == ((5, 15), np.float64)
+    np.testing.assert_array_equal(baselines_cm[2], scenes[2].rig.baselines_cm)
+    np.testing.assert_array_equal(index.column("lateral_m")[4], scenes[4].lateral_m)
+    assert index.column("frames").dtype == np.int64
+    assert index.column("character").tolist() == [scene.labels.character for scene in scenes]
+    assert index.column("depth_unit_source")[1].tolist() == list(scenes[1].depth_unit_source)
+    ratios = [scene.valid_depth_ratio or np.nan for scene in scenes]
+    np.testing.assert_array_equal(index.column("valid_depth_ratio"), ratios)
+    for name in ("baselines_cm", "frames", "key", "valid_depth_ratio"):
+        with pytest.raises(ValueError, match="read-only"):
+            index.column(name)[0] = 0
+
+
+@pytest.mark.parametrize("name", ["nothing", "members"])
+def test_a_column_that_is_not_there_is_named_with_those_that_are(scenes, tmp_path, name):
+    with pytest.raises(StorageError, match=f"has no column '{name}'; it has key, split, family"):
+        SceneIndex.from_scenes(scenes, tmp_path).column(name)
+
+
+@pytest.mark.parametrize("row", [-1, 5])
+def test_a_row_that_is_not_there_is_named(scenes, tmp_path, row):
+    with pytest.raises(StorageError, match=f"there is no row {row}; the index has 5"):
+        SceneIndex.from_scenes(scenes, tmp_path).scene(row)
+
+
+def test_an_index_goes_to_another_process_whole(scenes, tmp_path):
+    index = SceneIndex.from_scenes(scenes, tmp_path)
+    index.column("frames")
+
+    copy = pickle.loads(pickle.dumps(index))
+
+    assert (copy.root, copy.digest, len(copy)) == (index.root, index.digest, 5)
+    assert copy.scene(3) == scenes[3]
+
+
+def test_two_scenes_of_one_key_are_refused(scenes, tmp_path):
+    with pytest.raises(StorageError, match="scene_000001' is there twice"):
+        SceneIndex.from_scenes([*scenes, scenes[1]], tmp_path)
+
+
+@pytest.mark.parametrize("path", ["../x", "/etc/passwd", "a/../../b", "a\\b", ""])
+def test_a_path_that_could_leave_the_root_is_refused(scenes, tmp_path, path):
+    bad = dataclasses.replace(scenes[0], members={"a": Member(path, 0, 1)})
+
+    with pytest.raises(StorageError, match="is no path inside the data's root"):
+        SceneIndex.from_scenes([bad], tmp_path)
+
+
+@pytest.mark.parametrize("name", ["../x", "/etc/passwd", "a/b", "..", ""])
+def test_a_file_name_that_could_leave_its_scene_is_refused(scenes, tmp_path, name):
+    bad = dataclasses.replace(scenes[0], members={name: Member("train/a.tar", 0, 1)})
+
+    with pytest.raises(StorageError, match="is no path inside the data's root"):
+        SceneIndex.from_scenes([bad], tmp_path)
+
+
+def written(scenes, root):
+    SceneIndex.from_scenes(scenes, root).write(root / "index.parquet")
+    return root / "index.parquet"
+
+
+def altered(path, edit):
+    """Rewrite an index with another table or another description of itself."""
+    table = pq.read_table(path)
+    head = json.loads(table.schema.metadata[METADATA])
+    table = edit(table, head) or table
+    pq.write_table(table.replace_schema_metadata({METADATA: json.dumps(head)}), path)
+
+
+def with_path(path):
+    def edit(table, head):
+        rows = table.to_pylist()
+        rows[2]["members"][1]["path"] = path
+        return pa.Table.from_pylist(rows, schema=table.schema)
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("edit", "match"),
+    [
+        (lambda table, head: head.update(format=2), "of format 2, and this version .* reads fo"),
+        (lambda table, head: head.update(broken=3), "description of itself was altered"),
+        (lambda table, head: head.update(root=3), "description of itself was altered"),
+        (lambda table, head: head["shards"].update(x=3), "description of itself was altered"),
+        (
+            lambda table, head: head["shards"].update(x={"size": "1", "sha256": "", "members": 1}),
+            "description of itself was altered",
+        ),
+        (
+            lambda table, head: head["shards"].update(
+                {"../x.tar": {"size": 1, "sha256": "", "members": 1}}
+            ),
+            "description of itself was altered",
+        ),
+        (lambda table, head: table.drop_columns(["frames"]), r"not those of an index \(see frames"),
+        (
+            lambda table, head: table.set_column(0, "key", pa.array([1, 2, 3, 4, 5])),
+            r"not those of an index \(see key",
+        ),
+        (lambda table, head: table.take([1, 0, 2, 3, 4]), "is there twice or out of order"),
+        (with_path("train/other"), "its rows are not those that were written"),
+        (with_path("../../etc/passwd"), "'../../etc/passwd' is no path inside the data's root"),
+        (with_path("/etc/passwd"), "'/etc/passwd' is no path inside the data's root"),
+    ],
+)
+def test_an_altered_index_is_refused(scenes, tmp_path, edit, match):
+    path = written(scenes, tmp_path)
+    altered(path, edit)
+
+    with pytest.raises(StorageError, match=match):
+        SceneIndex.open(path)
+
+
+def test_a_foreign_parquet_file_is_refused(tmp_path):
+    pq.write_table(pa.table({"a": [1]}), tmp_path / "other.parquet")
+
+    with pytest.raises(StorageError, match="is a Parquet file, but no index of this package"):
+        SceneIndex.open(tmp_path / "other.parquet")
+
+
+@pytest.mark.parametrize("keep", [0, 3, 200, 0.5, 0.99])
+def test_a_truncated_index_is_refused(scenes, tmp_path, keep):
+    path = written(scenes, tmp_path)
+    content = path.read_bytes()
+    path.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
+
+    with pytest.raises(StorageError, match=r"no Parquet file that can be read .* cut short"):
+        SceneIndex.open(path)
+
+
+def test_bytes_that_changed_inside_an_index_never_change_a_scene(scenes, tmp_path):
+    path = written(scenes, tmp_path)
+    content = path.read_bytes()
+    rng = random.Random(0)
+    for _ in range(80):
+        damaged = bytearray(content)
+        damaged[rng.randrange(len(content))] ^= rng.randrange(1, 256)
+        path.write_bytes(damaged)
+        with contextlib.suppress(StorageError):
+            assert SceneIndex.open(path).scene(0) == scenes[0]
+
+
+def test_data_that_do_not_exist_are_named(tmp_path):
+    with pytest.raises(StorageError, match=r"nowhere: does not exist; expected an index file"):
+        SceneIndex.open(tmp_path / "nowhere")
+
+
+def test_an_index_behind_a_url_is_fetched_and_its_data_lie_beside_it(scenes, web):
+    SceneIndex.from_scenes(scenes, web.folder).write(web.folder / "index.parquet")
+    for url in (web.url, f"{web.url}/", f"{web.url}/index.parquet"):
+        web.asked.clear()
+        index = SceneIndex.open(url)
+
+        assert index.root == web.url
+        assert index.digest == SceneIndex.open(web.folder).digest
+        assert {asked.path for asked in web.asked} == {"index.parquet"}
+
+
+def test_a_url_without_an_index_is_named(web):
+    with pytest.raises(StorageError, match=r"/data/index.parquet: the server answers 404 Not Fou"):
+        SceneIndex.open(f"{web.url}/data?key=secret")
+
+
+def test_a_damaged_index_behind_a_url_is_named(web):
+    (web.folder / "index.parquet").write_bytes(b"PAR1 and no more")
+
+    with pytest.raises(StorageError, match=r"/index.parquet: is no Parquet file that can be read"):
+        SceneIndex.open(f"{web.url}?key=secret")
+
+
+def test_an_index_behind_a_url_that_is_far_too_large_is_not_fetched(web, monkeypatch):
+    monkeypatch.setattr(index_module, "MAX_INDEX_BYTES", 99)
+    (web.folder / "index.parquet").write_bytes(bytes(100))
+
+    with pytest.raises(StorageError, match=r"an index may have 99 bytes, this one has 100. It was"):
+        SceneIndex.open(web.url)
+    assert web.sent == 1
+
+
+def test_an_index_kept_elsewhere_remembers_a_url(scenes, tmp_path, web):
+    SceneIndex.from_scenes(scenes, "s3://bucket/data").write(tmp_path / "kept.parquet")
+
+    assert SceneIndex.open(tmp_path / "kept.parquet").root == "s3://bucket/data"
+    assert SceneIndex.open(tmp_path / "kept.parquet", root=web.url).root == web.url
+
+
+def test_an_index_behind_a_url_cannot_send_its_readers_elsewhere(scenes, web):
+    SceneIndex.from_scenes(scenes, "https://elsewhere").write(web.folder / "index.parquet")
+
+    assert SceneIndex.open(web.url).root == web.url
+
+
+def test_no_secret_is_written_into_an_index(scenes, tmp_path):
+    for root, told in (
+        ("https://me:word@host/data?key=secret", "https://host/data"),
+        ("s3://key:word@bucket/data", "s3://bucket/data"),
+        ("zip://data::http://me:word@host/a.zip", "zip://data::http://host/a.zip"),
+    ):
+        index = SceneIndex.from_scenes(scenes, root)
+
+        assert index.where == told
+        with pytest.raises(StorageError, match=f"{told}: the URL has a login or a query"):
+            index.write(tmp_path / "kept.parquet")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_index_in_its_root_moves_with_it(scenes, tmp_path):
+    (tmp_path / "old").mkdir()
+    written(scenes, tmp_path / "old")
+    (tmp_path / "old").rename(tmp_path / "new")
+
+    assert SceneIndex.open(tmp_path / "new").root == str(tmp_path / "new")
+
+
+def test_an_index_above_its_data_remembers_where_they_are(scenes, tmp_path):
+    (tmp_path / "data").mkdir()
+    SceneIndex.from_scenes(scenes, tmp_path / "data").write(tmp_path / "index.parquet")
+
+    assert SceneIndex.open(tmp_path / "index.parquet").root == str(tmp_path / "data")
+
+
+def test_an_index_elsewhere_opens_once_the_user_says_where_its_data_are(scenes, tmp_path):
+    (tmp_path / "data").mkdir()
+    kept = tmp_path / "a" / "index.parquet"
+    SceneIndex.from_scenes(scenes, tmp_path / "data").write(kept)
+
+    with pytest.raises(
+        StorageError,
+        match=rf"{kept}: its data are not beside it, and it records their root as {tmp_path}/data. "
+        r"A file may not choose such a place \(it is outside the index's own folder\). If you "
+        rf"trust it, name the root yourself: SceneIndex.open\('{kept}', root=...\), or --root",
+    ):
+        SceneIndex.open(kept)
+    for root in (tmp_path / "data", str(tmp_path / "data"), (tmp_path / "data").as_uri()):
+        assert SceneIndex.open(kept, root=root).root == str(tmp_path / "data")
+    kept.rename(tmp_path / "data" / "index.parquet")
+    assert SceneIndex.open(tmp_path / "data", root=tmp_path / "a").root == str(tmp_path / "a")
+
+
+def test_a_root_that_is_no_folder_is_refused(scenes, tmp_path):
+    path = written(scenes, tmp_path)
+    (tmp_path / "tree").mkdir()
+
+    for root in (tmp_path / "gone", path, ""):
+        with pytest.raises(StorageError, match=r"is no folder, and was named as the root"):
+            SceneIndex.open(path, root=root)
+    with pytest.raises(StorageError, match=r"tree: has no index.parquet, and a root was named"):
+        SceneIndex.open(tmp_path / "tree", root=tmp_path)
+
+
+def recording(scenes, path, root):
+    """Write an index that records a root, whatever it is."""
+    path.parent.mkdir(exist_ok=True)
+    SceneIndex.from_scenes(scenes, path.parent).write(path)
+    altered(path, lambda table, head: head.update(root=root))
+    return path
+
+
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.stale.StaleIndexWarning")
+@pytest.mark.parametrize(
+    ("root", "reason"),
+    [
+        ("reference://x::data:application/json;base64,e30=", "it is a chain of file systems"),
+        ("hf://datasets/a/b::https://example.org", "it is a chain of file systems"),
+        ("hf://a[::http://127.0.0.1/x]", "it is a chain of file systems"),
+        ("simplecache::https://example.org/x", "it is a chain of file systems"),
+        ("local:///etc", "it is none of https://, http://, hf://, s3://"),
+        ("memory://x", "it is none of https://, http://, hf://, s3://"),
+        ("ssh://example.org/x", "it is none of https://, http://, hf://, s3://"),
+        ("file:///etc", "it is outside the index's own folder"),
+        ("FILE:///etc", "it is outside the index's own folder"),
+        ("/etc", "it is outside the index's own folder"),
+        ("../other", "it is outside the index's own folder"),
+        ("link", "it is outside the index's own folder"),
+        ("a\0b", "it is outside the index's own folder"),
+        ("https://me:word@example.org/x", "it holds a login, a query, or"),
+        ("s3://key:word@bucket/x", "it holds a login, a query, or"),
+        ("https://example.org/x?key=word", "it holds a login, a query, or"),
+        ("https://example.org\\@127.0.0.1/x", "it holds a login, a query, or"),
+        ("https://example.org/\x1b[31m", "it holds a login, a query, or"),
+        ("http://[::1", "it is no URL"),
+        ("http://127.0.0.1/x", "it is on this machine or in its own network"),
+        ("HTTPS://127.0.0.1/x", "it is on this machine or in its own network"),
+        ("http://localhost:8000/x", "it is on this machine or in its own network"),
+        ("http://2130706433/x", "it is on this machine or in its own network"),
+        ("http://0x7f.1/x", "it is on this machine or in its own network"),
+        ("http://127%2e0.0.1/x", "it is on this machine or in its own network"),
+        ("http://[::1]/x", "it is on this machine or in its own network"),
+        ("http://[::ffff:10.1.2.3]/x", "it is on this machine or in its own network"),
+        ("http://[64:ff9b::7f00:1]/x", "it is on this machine or in its own network"),
+        ("https://10.1.2.3/x", "it is on this machine or in its own network"),
+        ("http://169.254.169.254/latest", "it is on this machine or in its own network"),
+    ],
+)
+def test_a_file_may_not_choose_what_is_opened(scenes, tmp_path, monkeypatch, root, reason):
+    monkeypatch.setattr(fsspec.core, "url_to_fs", None)
+    (tmp_path / "other").mkdir()
+    path = recording(scenes, tmp_path / "a" / "index.parquet", root)
+    (tmp_path / "a" / "link").symlink_to(tmp_path / "other")
+
+    with pytest.raises(StorageError, match=r"A file may not choose such a place \(") as caught:
+        SceneIndex.open(path)
+    message = str(caught.value)
+    assert f"({reason}" in message
+    assert not any(secret in message for secret in ("word", "\x1b", "\0"))
+
+    # Data beside the index come first, whatever it records.
+    place = tmp_path / "a" / scenes[0].members["baseline.json"].path
+    place.parent.mkdir(parents=True)
+    place.write_bytes(b"")
+    assert SceneIndex.open(path).root == str(tmp_path / "a")
+
+
+@pytest.mark.parametrize("address", ["10.1.2.3", "127.0.0.1", "fd00::1", "::ffff:192.168.0.1"])
+def test_a_name_of_the_own_network_is_not_opened_on_a_files_word(
+    scenes, tmp_path, monkeypatch, address
+):
+    found = [(0, 0, 0, "", ("8.8.8.8", 0)), (0, 0, 0, "", (address, 0))]
+    monkeypatch.setattr("socket.getaddrinfo", lambda *asked, **how: found)
+    path = recording(scenes, tmp_path / "index.parquet", "https://files.example.org/x")
+
+    with pytest.raises(StorageError, match=r"it is on this machine or in its own network"):
+        SceneIndex.open(path)
+
+
+@pytest.mark.parametrize(
+    "root",
+    ["https://8.8.8.8/x", "hf://datasets/a/b@main/x", "s3://bucket/a", "https://[2606:4700::1]/x"],
+)
+def test_a_plain_url_of_a_store_is_opened_on_a_files_word(scenes, tmp_path, root):
+    assert SceneIndex.open(recording(scenes, tmp_path / "index.parquet", root)).root == root
+
+
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.index.stale.StaleIndexWarning")
+def test_a_chain_that_runs_commands_is_not_opened(scenes, tmp_path, monkeypatch):
+    template = "{{ cycler.__init__.__globals__.os.system('touch RAN') }}"
+    members = [member.path for member in scenes[0].members.values()]
+    references = {"version": 1, "templates": {"u": template}, "refs": {}}
+    references["refs"] = {path: ["{{u}}", 0, 1] for path in members}
+    coded = base64.b64encode(json.dumps(references).encode()).decode()
+    root = f"reference://x::data:application/json;base64,{coded}"
+    monkeypatch.chdir(tmp_path)
+    path = recording(scenes, tmp_path / "index.parquet", root)
+    for member in members:
+        (tmp_path / member).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / member).write_bytes(b"")
+
+    index = SceneIndex.open(path)
+    source = MemberSource(index.root, shards=index.shards)
+    with pytest.raises(StorageError, match=r"has 0 bytes, and the index says"):
+        source.open(index.scene(0), "cam_00_rgb.mp4")
+    assert not (tmp_path / "RAN").exists()
+
+
+def with_row(**values):
+    def change(rows):
+        rows[2].update(values)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        (with_row(image_height_px=0), "image_height_px is 0, not 1 to 65536"),
+        (with_row(image_width_px=2**40), "image_width_px is 1099511627776, not 1 to 65536"),
+        (with_row(frames=-3), "frames is -3, not 1 to"),
+        (with_row(focal_mm=float("nan")), "focal_mm is nan, not"),
+        (with_row(sensor_width_mm=float("inf")), "sensor_width_mm is inf, not"),
+        (with_row(baselines_cm=[float("nan")] * 15), "baselines_cm is nan, not"),
+        (with_row(baselines_cm=[-1.0] * 15), "baselines_cm is -1.0, not"),
+        (with_row(lateral_m=[float("inf")] * 6), "lateral_m is inf, not"),
+        (with_row(rig_residual_px=float("nan")), "rig_residual_px is nan, not 0 to inf"),
+        (with_row(depth_unit_m=[0.0] * 6), "depth_unit_m is 0.0, not"),
+        (with_row(depth_unit_source=["guess"] * 6), "depth_unit_source is 'guess', none of tag"),
+        (with_row(primary_left=6), "primary_left is 6, not 0 to 5"),
+        (with_row(primary_left=1, primary_right=1), "a primary pair has one camera twice"),
+        (with_row(split="test"), "split is 'test', none of train, eval"),
+        (with_row(subset="some"), "subset is 'some', none of seen_map, unseen_map, None"),
+        (with_row(family="a/b"), "family is 'a/b', no name of a folder"),
+        (with_row(map_name="\x1b[31m"), r"map_name is .*, no name of a folder"),
+        (
+            with_row(principal_x_px=3.0, principal_y_px=None),
+            "a principal point has one number",
+        ),
+        (with_row(valid_depth_ratio=float("nan")), "valid_depth_ratio is nan, not 0 to 1"),
+        (lambda rows: rows[1]["members"][0].update(size=-1), "size is -1, not 0 to"),
+        (lambda rows: rows[1]["members"][0].update(offset=2**62), "offset is 4611686018427387904"),
+    ],
+)
+def test_a_value_that_no_scene_has_is_refused_though_the_digest_is_right(
+    scenes, tmp_path, change, match
+):
+    def edit(table, head):
+        rows = table.to_pylist()
+        change(rows)
+        table = pa.Table.from_pylist(rows, schema=table.schema)
+        head["digest"] = table_digest(table.replace_schema_metadata())
+        return table
+
+    path = written(scenes, tmp_path)
+    altered(path, edit)
+
+    with pytest.raises(StorageError, match=rf"index.parquet: {match}"):
+        SceneIndex.open(path)
+
+
+def test_reasons_that_are_no_texts_are_refused(scenes, tmp_path):
+    path = written(scenes, tmp_path)
+    altered(path, lambda table, head: head.update(incomplete={"a": 3}))
+
+    with pytest.raises(StorageError, match="its description of itself was altered"):
+        SceneIndex.open(path)
+
+
+def test_an_index_whose_root_is_gone_says_where_it_was(scenes, tmp_path):
+    (tmp_path / "data").mkdir()
+    SceneIndex.from_scenes(scenes, tmp_path / "data").write(tmp_path / "index.parquet")
+    (tmp_path / "data").rmdir()
+
+    with pytest.raises(StorageError, match=f"its data were at {tmp_path}/data, which is no folder"):
+        SceneIndex.open(tmp_path / "index.parquet")
+
+
+def test_a_file_that_cannot_be_written_is_named_and_leaves_nothing(scenes, tmp_path):
+    (tmp_path / "index.parquet").mkdir()
+
+    with pytest.raises(StorageError, match=r"index cannot be written .*Choose another place"):
+        SceneIndex.from_scenes(scenes, tmp_path).write(tmp_path / "index.parquet")
+
+    assert [path.name for path in tmp_path.iterdir()] == ["index.parquet"]
+
+
+def test_a_tree_opens_directly(make_scene, root):
+    make_scene("train/Uniform/Car_Dealer/scene_000002")
+    make_scene("train/Uniform/Car_Dealer/scene_000001")
+
+    index = SceneIndex.open(root)
+
+    assert [key[-1] for key in index.column("key")] == ["1", "2"]
+    assert index.root == str(root)
+
+
+def test_incomplete_scenes_of_a_tree_are_warned_of(make_scene, root):
+    make_scene()
+    shutil.rmtree(make_scene("train/Uniform/Car_Dealer/scene_000002"))
+    (root / "train/Uniform/Car_Dealer/scene_000002").mkdir()
+
+    with pytest.warns(IncompleteSceneWarning, match=r"(?s)1 scene cannot be used:.*folder is empt"):
+        index = SceneIndex.open(root)
+
+    assert list(index.incomplete) == ["train/Uniform/Car_Dealer/scene_000002"]
+
+
+def test_broken_scenes_of_a_tree_are_an_error_that_lists_them(make_scene, root):
+    for number in range(12):
+        make_scene(f"train/Uniform/Car_Dealer/scene_{number:06d}")
+        (root / f"train/Uniform/Car_Dealer/scene_{number:06d}" / "trajectory.json").unlink()
+
+    with pytest.raises(StorageError, match="12 scenes cannot be used:") as caught:
+        SceneIndex.open(root)
+
+    lines = str(caught.value).splitlines()
+    assert "scene_000009: is marked as complete and has no trajectory.json" in lines[10]
+    assert lines[11].strip() == "and 2 more"
+    assert "stereogenbench index" in lines[12]
+
+
+def test_a_tree_of_unfinished_scenes_is_an_error(make_scene, root):
+    (make_scene() / "_scene_complete.json").unlink()
+
+    with pytest.raises(StorageError, match="no scene is finished: 1 scene cannot be used"):
+        SceneIndex.open(root)
+
+
+def test_what_was_left_out_is_told_when_the_index_is_opened(scenes, tmp_path):
+    index = SceneIndex.from_scenes(scenes, tmp_path)
+    index.incomplete = {"train/a/b/c": "is empty"}
+    index.broken = {"train/a/b/d": "has no baseline.json"}
+    index.write(tmp_path / "index.parquet")
+
+    with pytest.warns(IncompleteSceneWarning, match=r"(?s)2 scenes.*b/c: is empty.*b/d: has no b"):
+        opened = SceneIndex.open(tmp_path)
+
+    assert (opened.incomplete, opened.broken) == (index.incomplete, index.broken)
+
+
+def test_an_index_without_anything_left_out_opens_without_a_warning(scenes, tmp_path):
+    written(scenes, tmp_path)
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        SceneIndex.open(tmp_path)
+
+    assert caught == []
+
+
+def test_as_many_scenes_as_the_release_has_come_back(tmp_path):
+    scenes = [dataclasses.replace(scene_of(0), id=scene_of(n).id) for n in range(8493)]
+    SceneIndex.from_scenes(scenes, tmp_path).write(tmp_path / "index.parquet")
+
+    index = SceneIndex.open(tmp_path)
+
+    assert len(index) == 8493
+    assert index.scene(8492).id == scenes[8492].id
+    assert index.column("baselines_cm").shape == (8493, 15)

@@ -1,0 +1,227 @@
+"""Downloading a part of a release: only what is asked for, checked, gone on with, usable."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.shards import download as download_module
+from stereogenbench_data.shards.download import download, plan_download
+from stereogenbench_data.shards.pack import pack
+from tests.servers.fault import Answer
+
+
+@pytest.fixture
+def shards_on_the_web(web, small_release):
+    pack(small_release, web.folder / "shards", workers=1)
+    return f"{web.url}/shards"
+
+
+def fetched(url, dest, *, cameras=(0, 1), streams=("rgb", "depth"), rows=(0, 1)):
+    index = SceneIndex.open(url)
+    return download(index, plan_download(index, rows, cameras=cameras, streams=streams), dest)
+
+
+def test_only_the_files_of_the_cameras_are_fetched_and_are_the_released_ones(
+    shards_on_the_web, web, small_release, tmp_path
+):
+    dest = tmp_path / "part"
+
+    index = fetched(shards_on_the_web, dest)
+
+    files = sorted(path.relative_to(dest) for path in dest.rglob("*.*") if path.is_file())
+    assert len([path for path in files if path.suffix in (".mp4", ".mkv")]) == 2 * 4
+    for path in files:
+        if path.name != "index.parquet":
+            assert (dest / path).read_bytes() == (small_release / path).read_bytes()
+    sent = sum(asked.sent for asked in web.asked if asked.path.endswith(".tar"))
+    members = [member for row in range(2) for member in index.scene(row).members.values()]
+    assert sent == sum(member.size for member in members)
+
+
+def test_what_was_fetched_opens_as_a_dataset(shards_on_the_web, small_release, tmp_path):
+    fetched(shards_on_the_web, tmp_path / "part", rows=(0, 1, 2, 3))
+
+    part = StereoPairs(tmp_path / "part", pairs=[(0, 1)], frames="all")
+
+    whole = StereoPairs(small_release, pairs=[(0, 1)], frames="all")
+    assert len(part) == len(whole) == 28
+    np.testing.assert_array_equal(part[9]["disparity"], whole[9]["disparity"])
+
+
+def test_a_camera_that_was_not_fetched_is_named(shards_on_the_web, tmp_path):
+    fetched(shards_on_the_web, tmp_path / "part", streams=("rgb",))
+
+    assert len(StereoPairs(tmp_path / "part", pairs=[(0, 1)], fields=("left", "right"))) == 2
+    with pytest.raises(StorageError, match=r"has no cam_00_depth; videos of cameras 00, 01 were"):
+        StereoPairs(tmp_path / "part", pairs=[(0, 1)])
+    with pytest.raises(StorageError, match=r"has no cam_02_rgb, cam_03_rgb"):
+        StereoPairs(tmp_path / "part", pairs=[(2, 3)], fields=("left", "right"))
+
+
+def test_a_stopped_run_goes_on_where_it_was(shards_on_the_web, web, tmp_path):
+    dest = tmp_path / "part"
+    fetched(shards_on_the_web, dest)
+    lost = next(dest.rglob("cam_01_depth.mkv"))
+    size = lost.stat().st_size
+    lost.unlink()
+    web.asked.clear()
+
+    fetched(shards_on_the_web, dest)
+
+    assert sum(asked.sent for asked in web.asked if asked.path.endswith(".tar")) == size
+    assert lost.stat().st_size == size
+
+
+def test_a_damaged_file_is_refused_and_leaves_nothing_behind(shards_on_the_web, web, tmp_path):
+    index = SceneIndex.open(shards_on_the_web)
+    wanted = plan_download(index, [0], cameras=[0], streams=["rgb"])
+    shard = f"shards/{wanted.files[-1].member.path}"
+    web.always[shard] = Answer(change=lambda data: bytes([data[0] ^ 1]) + data[1:])
+
+    with pytest.raises(StorageError, match=r"came with crc32 [0-9a-f]{8}, and the index says"):
+        download(index, wanted, tmp_path / "part", workers=1)
+
+    assert [path for path in (tmp_path / "part").rglob("*") if path.is_file()] == []
+
+
+def test_a_full_disk_is_told_before_anything_is_fetched(shards_on_the_web, tmp_path, monkeypatch):
+    monkeypatch.setattr(download_module, "_SPARE_BYTES", 10**18)
+
+    with pytest.raises(StorageError, match=r"are to come, and the disk has room for"):
+        fetched(shards_on_the_web, tmp_path / "part")
+
+
+def test_the_folder_of_the_data_is_refused(small_release):
+    index = SceneIndex.open(small_release)
+    wanted = plan_download(index, [0], cameras=[0], streams=["rgb"])
+
+    with pytest.raises(StorageError, match=r"is where the data are"):
+        download(index, wanted, small_release)
+
+
+def test_a_part_cannot_give_what_it_lacks(shards_on_the_web, tmp_path):
+    part = fetched(shards_on_the_web, tmp_path / "part")
+
+    with pytest.raises(StorageError, match=r"has no cam_05_rgb, cam_05_depth: it is of a part"):
+        plan_download(part, [0], cameras=[5], streams=["rgb", "depth"])
+
+
+def test_the_command_says_the_size_first_and_reports(small_release, tmp_path):
+    dest = tmp_path / "part"
+    arguments = ["download", str(small_release), "--dest", str(dest), "--split", "eval"]
+    arguments += ["--cameras", "0,5", "--json"]
+
+    said = CliRunner().invoke(app, [*arguments, "--dry-run"])
+    done = CliRunner().invoke(app, arguments)
+
+    assert said.exit_code == done.exit_code == 0, done.output
+    assert "1 scene, 9 files" in said.stderr
+    assert json.loads(said.stdout)["dest"] is None
+    assert json.loads(done.stdout)["bytes"] == json.loads(said.stdout)["bytes"]
+    assert len(StereoPairs(dest, pairs=[(0, 5)])) == 1
+
+
+def test_a_camera_that_does_not_exist_is_refused(small_release, tmp_path):
+    done = CliRunner().invoke(
+        app, ["download", str(small_release), "--dest", str(tmp_path / "x"), "--cameras", "0,6"]
+    )
+
+    assert done.exit_code == 2
+    assert "write numbers from 0 to 5" in done.output
+
+
+def test_a_metadata_file_of_another_revision_is_fetched_again(shards_on_the_web, tmp_path):
+    dest = tmp_path / "part"
+    fetched(shards_on_the_web, dest)
+    changed = next(dest.rglob("baseline.json"))
+    text = changed.read_bytes()
+    changed.write_bytes(text.replace(b"1", b"2"))
+
+    fetched(shards_on_the_web, dest)
+
+    assert changed.read_bytes() == text
+
+
+def test_commands_that_need_all_cameras_name_what_a_part_lacks(shards_on_the_web, tmp_path):
+    dest = tmp_path / "part"
+    fetched(shards_on_the_web, dest)
+
+    shown = CliRunner().invoke(app, ["show", str(dest), "--out", str(tmp_path / "sheet.png")])
+
+    assert shown.exit_code == 2
+    assert "cam_02_rgb.mp4 is not among its files; there are cam_00_rgb.mp4" in shown.stderr
+
+
+def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(
+    shards_on_the_web, small_release, web, tmp_path
+):
+    """The process is killed while a server that answers slowly has sent some files."""
+    dest = tmp_path / "part"
+    command = ["download", shards_on_the_web, "--dest", str(dest), "--workers", "1"]
+    for name in sorted(path.relative_to(web.folder) for path in web.folder.rglob("*.tar")):
+        web.always[str(name)] = Answer(delay_s=0.1)
+    killed = subprocess.Popen(
+        [sys.executable, "-m", "stereogenbench_data.cli.main", *command],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not list(dest.rglob("cam_00_rgb.mp4")) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    killed.kill()
+    killed.wait()
+    there = [path for path in dest.rglob("*.*") if not path.name.startswith(".") and path.is_file()]
+    web.always.clear()
+
+    done = CliRunner().invoke(app, command)
+
+    assert 0 < len(there) < 4 * 17
+    for path in there:
+        assert path.read_bytes() == (small_release / path.relative_to(dest)).read_bytes()
+    assert done.exit_code == 0, done.output
+    assert len(StereoPairs(dest, pairs="all")) == 4 * 15
+    assert not list(dest.rglob(".*"))
+
+
+def linked(small_release, root, target):
+    """A copy of the data of which a rig is a link to a file of equal size."""
+    shutil.copytree(small_release, root)
+    index = SceneIndex.open(root)
+    rig = root / index.scene(0).members["baseline.json"].path
+    target.parent.mkdir(parents=True, exist_ok=True)
+    rig.rename(target)
+    rig.symlink_to(target)
+    return root
+
+
+def test_a_link_out_of_the_data_is_not_copied(small_release, tmp_path):
+    root = linked(small_release, tmp_path / "data", tmp_path / "secret")
+
+    with pytest.raises(
+        StorageError, match=rf"baseline.json: leads out of {root} by a link, to {tmp_path}/secret"
+    ):
+        fetched(root, tmp_path / "part")
+    place = SceneIndex.open(root).scene(0).members["baseline.json"].path
+    assert not (tmp_path / "part" / place).exists()
+
+
+@pytest.mark.parametrize(
+    ("root", "target"),
+    [("data", "data/else/x"), ("datasets--a--b/snapshots/0123", "datasets--a--b/blobs/4567")],
+)
+def test_a_link_within_the_data_is_copied(small_release, tmp_path, root, target):
+    linked(small_release, tmp_path / root, tmp_path / target)
+
+    fetched(tmp_path / root, tmp_path / "part")
+
+    for path in (tmp_path / "part").rglob("baseline.json"):
+        here = path.relative_to(tmp_path / "part")
+        assert path.read_bytes() == (small_release / here).read_bytes()

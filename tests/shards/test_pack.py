@@ -1,0 +1,874 @@
+"""Packing: the bytes, one way of packing against another, what stops it and how it goes on."""
+
+import errno
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tarfile
+import warnings
+import zlib
+from dataclasses import replace
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.engine.process_pool import run_tasks
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
+from stereogenbench_data.shards import writer as shard_writer
+from stereogenbench_data.shards.manifest import ShardTask
+from stereogenbench_data.shards.pack import OversizedSceneWarning, pack, prepare
+from stereogenbench_data.shards.plan import PlannedMember, PlannedShard, plan_shards
+from stereogenbench_data.shards.verify import verify
+from stereogenbench_data.shards.writer import pack_shard, pack_task
+from stereogenbench_data.sources.locks import locked
+from tests.servers.tools import small_disk
+
+ONE_EACH = 250_000
+"""A target that holds one of the small release's scenes, not two."""
+
+NAMES = [
+    "eval-seen_map-Uniform-000000.tar",
+    "train-IPD_Gaussian-000000.tar",
+    "train-Uniform-000000.tar",
+    "train-Uniform-000001.tar",
+]
+
+
+@pytest.fixture(scope="session")
+def release(small_release):
+    return SceneIndex.open(small_release)
+
+
+@pytest.fixture(scope="session")
+def packed(release, tmp_path_factory):
+    """The small release, one scene a shard; not to be changed."""
+    out = tmp_path_factory.mktemp("packed")
+    pack(release, out, target_bytes=ONE_EACH, workers=1)
+    return out
+
+
+@pytest.fixture
+def tree(small_release, tmp_path):
+    """A copy of the small release that a test may change."""
+    return shutil.copytree(small_release, tmp_path / "release")
+
+
+def bytes_of(folder):
+    """What is public in a folder: name to sha256."""
+    return {
+        path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and ".parts" not in path.parts
+    }
+
+
+def tars(folder):
+    return sorted(path.name for path in folder.iterdir() if ".tar" in path.name)
+
+
+def names_in(shard):
+    with tarfile.open(shard) as tar:
+        return tar.getnames()
+
+
+def test_shards_hold_the_bytes_of_the_release_and_nothing_else(packed, small_release):
+    found = {}
+    for name in NAMES:
+        with tarfile.open(packed / name) as tar:
+            found |= {info.name: tar.extractfile(info).read() for info in tar}
+
+    files = [path for path in small_release.rglob("*") if path.is_file()]
+    released = {
+        f"{path.parent.relative_to(small_release).as_posix()}.{path.name}": path.read_bytes()
+        for path in files
+    }
+    assert found == released
+
+
+def test_a_folder_holds_shards_the_index_and_what_others_read(packed):
+    assert sorted(path.name for path in packed.iterdir()) == [
+        ".parts", "dali", *NAMES[:1], "index.parquet", "shards.json", *NAMES[1:],
+    ]  # fmt: skip
+
+
+def test_the_index_places_every_file(packed, release):
+    index = SceneIndex.open(packed)
+
+    assert len(index) == len(release)
+    for row in range(len(index)):
+        scene, before = index.scene(row), release.scene(row)
+        assert (scene.id, scene.rig, scene.frames) == (before.id, before.rig, before.frames)
+        assert scene.members.keys() == before.members.keys()
+        for name, member in scene.members.items():
+            content = (packed / member.path).read_bytes()[member.offset :][: member.size]
+            assert content == Path(release.root, before.members[name].path).read_bytes()
+            assert member.crc32 == zlib.crc32(content)
+    facts = {
+        name: (facts.size, facts.sha256, facts.members) for name, facts in index.shards.items()
+    }
+    assert facts == {
+        name: (
+            (packed / name).stat().st_size,
+            sha256((packed / name).read_bytes()).hexdigest(),
+            len(names_in(packed / name)),
+        )
+        for name in NAMES
+    }
+
+
+def test_no_shard_has_more_bytes_than_planned(packed, release):
+    plan = plan_shards(release, ONE_EACH)
+
+    assert {shard.name: shard.size for shard in plan.shards} == {
+        name: (packed / name).stat().st_size for name in NAMES
+    }
+
+
+def test_packing_again_gives_the_same_bytes_with_two_workers(packed, release, tmp_path):
+    report = pack(release, tmp_path / "out", target_bytes=ONE_EACH, workers=2)
+
+    assert bytes_of(tmp_path / "out") == bytes_of(packed)
+    assert report.packed == report.part
+    assert report.index == tmp_path / "out" / "index.parquet"
+
+
+def test_packing_in_parts_gives_the_same_bytes(packed, release, tmp_path):
+    out = tmp_path / "out"
+    reports = [
+        pack(release, out, target_bytes=ONE_EACH, part=(number, 3), workers=1)
+        for number in (3, 1, 2)
+    ]
+
+    assert bytes_of(out) == bytes_of(packed)
+    assert [report.part for report in reports] == [
+        (NAMES[2],),
+        (NAMES[0], NAMES[3]),
+        (NAMES[1],),
+    ]
+    assert [len(report.missing) for report in reports] == [3, 1, 0]
+    assert [report.index is None for report in reports] == [True, True, False]
+
+
+def test_there_may_be_more_parts_than_shards(release, tmp_path):
+    report = pack(release, tmp_path, target_bytes=ONE_EACH, part=(5, 5), workers=1)
+
+    assert (report.part, len(report.missing)) == ((), 4)
+
+
+@pytest.mark.parametrize("part", [(0, 3), (4, 3), (1, 0), (-1, 2)])
+def test_a_part_that_cannot_be_is_refused(release, tmp_path, part):
+    with pytest.raises(ShardError, match=f"part {part[0]}/{part[1]}: a part is I/N"):
+        pack(release, tmp_path, part=part)
+
+
+def test_finished_shards_are_kept_and_progress_counts_them(release, tmp_path):
+    pack(release, tmp_path, target_bytes=ONE_EACH, part=(1, 2), workers=1)
+    before = {name: (tmp_path / name).stat().st_mtime_ns for name in tars(tmp_path)}
+    seen = []
+
+    report = pack(
+        release, tmp_path, target_bytes=ONE_EACH, workers=1, progress=lambda *now: seen.append(now)
+    )
+
+    total = sum(
+        member.size for row in range(len(release)) for member in release.scene(row).members.values()
+    )
+    assert len(before) == 2
+    assert report.packed == (NAMES[1], NAMES[3])
+    assert {name: (tmp_path / name).stat().st_mtime_ns for name in before} == before
+    assert 0 < seen[0][0] < total
+    assert seen[-1] == (total, total)
+    assert seen == sorted(seen)
+
+
+def test_a_shard_without_its_note_or_of_another_size_is_not_taken_for_finished(
+    packed, release, tmp_path
+):
+    out = shutil.copytree(packed, tmp_path / "out")
+    (out / NAMES[0]).unlink()
+    with (out / NAMES[1]).open("ab") as file:
+        file.write(b"\0")
+
+    report = pack(release, out, target_bytes=ONE_EACH, workers=1)
+
+    assert report.packed == (NAMES[0], NAMES[1])
+    assert bytes_of(out) == bytes_of(packed)
+
+
+def changed_bytes(path):
+    """Change a byte without changing the size, and the time of change for certain."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    os.utime(path, ns=(0, path.stat().st_mtime_ns + 10**9))
+
+
+def test_a_finished_shard_that_was_changed_at_the_same_size_is_packed_again(
+    packed, release, tmp_path
+):
+    out = shutil.copytree(packed, tmp_path / "out")
+    changed_bytes(out / NAMES[1])
+
+    report = pack(release, out, target_bytes=ONE_EACH, workers=1)
+
+    assert report.packed == (NAMES[1],)
+    assert bytes_of(out) == bytes_of(packed)
+
+
+def test_a_finished_shard_that_was_only_touched_is_read_and_kept(packed, release, tmp_path):
+    out = shutil.copytree(packed, tmp_path / "out")
+    for name in NAMES:
+        os.utime(out / name, (1, 1))
+
+    report = pack(release, out, target_bytes=ONE_EACH, workers=1)
+
+    assert report.packed == ()
+    assert {(out / name).stat().st_mtime for name in NAMES} == {1}
+    assert prepare(release, out, target_bytes=ONE_EACH, part=(1, 1)).unfinished() == []
+
+
+def focal_changed(folder):
+    """Edit a scene's focal length: the file keeps its size and its time of change."""
+    path = folder / "baseline.json"
+    text, before = path.read_text(), path.stat()
+    found = re.search(r'"focal_length_mm": *(\d)', text)
+    digit = str(9 - int(found[1]))
+    path.write_text(text[: found.start(1)] + digit + text[found.end(1) :])
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert path.stat().st_size == before.st_size
+
+
+@pytest.mark.parametrize("index_is", ["walked", "stale", "rebuilt"])
+def test_a_source_that_was_edited_after_its_shard_is_named(tree, tmp_path, index_is):
+    key = "eval/MapSeenInTrain/Uniform/SynthStage/scene_000000"
+    if index_is != "walked":
+        SceneIndex.open(tree).write(tree / "index.parquet")
+    pack(tree, tmp_path / "out", target_bytes=ONE_EACH, part=(1, 2), workers=1)
+    focal_changed(tree / key)
+    if index_is == "rebuilt":
+        (tree / "index.parquet").unlink()
+        SceneIndex.open(tree).write(tree / "index.parquet")
+
+    with pytest.raises(ShardError) as told:
+        pack(tree, tmp_path / "out", target_bytes=ONE_EACH, part=(2, 2), workers=1)
+
+    assert f"{key}: its baseline.json is not the one that {tmp_path / 'out' / NAMES[0]}" in str(
+        told.value
+    )
+    assert "Remove that shard to have it packed anew and run the same command again" in str(
+        told.value
+    )
+    assert not (tmp_path / "out" / "index.parquet").exists()
+
+
+def test_an_edited_scene_is_packed_anew_once_its_shard_is_removed(tree, tmp_path):
+    out = tmp_path / "out"
+    pack(tree, out, target_bytes=ONE_EACH, workers=1)
+    focal_changed(next(tree.glob("eval/*/*/*/scene_000000")))
+    (out / NAMES[0]).unlink()
+
+    report = pack(tree, out, target_bytes=ONE_EACH, workers=1)
+
+    assert report.packed == (NAMES[0],)
+    assert verify(out, workers=1).problems == ()
+
+
+def test_an_edited_video_is_named_whatever_its_size(tree, tmp_path):
+    pack(tree, tmp_path / "out", target_bytes=ONE_EACH, part=(1, 2), workers=1)
+    source = next(tree.glob("eval/*/*/*/scene_000000/cam_02_depth.mkv"))
+    touched = next(tree.glob("eval/*/*/*/scene_000000/cam_01_depth.mkv"))
+    os.utime(touched, (1, 1))
+    changed_bytes(source)
+
+    with pytest.raises(ShardError, match=r"scene_000000: its cam_02_depth\.mkv is not the one"):
+        pack(tree, tmp_path / "out", target_bytes=ONE_EACH, workers=1)
+
+
+def test_sources_that_were_removed_after_packing_contradict_nothing(tree, packed, tmp_path):
+    out = tmp_path / "out"
+    index = SceneIndex.open(tree)
+    pack(index, out, target_bytes=ONE_EACH, part=(1, 2), workers=1)
+    shutil.rmtree(next(tree.glob("eval/*/*/*/scene_000000")))
+
+    pack(index, out, target_bytes=ONE_EACH, part=(2, 2), workers=1)
+
+    assert bytes_of(out) == bytes_of(packed)
+
+
+def test_metadata_that_the_index_does_not_know_are_not_packed(tree, tmp_path):
+    SceneIndex.open(tree).write(tree / "index.parquet")
+    focal_changed(next(tree.glob("train/Uniform/*/scene_000001")))
+
+    with pytest.raises(ShardError) as told:
+        pack(tree, tmp_path / "out", target_bytes=ONE_EACH, workers=1)
+
+    assert re.search(
+        r"scene_000001/baseline\.json: tells focal_mm .* by the index it is", str(told.value)
+    )
+    assert "run `stereogenbench index` on the release again" in str(told.value)
+    assert NAMES[3] not in tars(tmp_path / "out")
+
+
+def test_an_index_that_was_changed_after_a_shard_is_not_written_beside_it(tree, tmp_path):
+    out, index = tmp_path / "out", SceneIndex.open(tree)
+    pack(index, out, target_bytes=ONE_EACH, part=(1, 2), workers=1)
+    scenes = [replace(index.scene(row), caption="Rain.") for row in range(len(index))]
+
+    with pytest.raises(ShardError, match=r"level\.json: tells the caption .* it is 'Rain\.'"):
+        pack(SceneIndex.from_scenes(scenes, tree), out, target_bytes=ONE_EACH, workers=1)
+
+    assert not (out / "index.parquet").exists()
+
+
+def test_packing_goes_on_without_the_notes_of_finished_shards(packed, release, tmp_path):
+    out = shutil.copytree(packed, tmp_path / "out")
+    shutil.rmtree(out / ".parts")
+    (out / NAMES[2]).unlink()
+
+    report = pack(release, out, target_bytes=ONE_EACH, workers=1)
+
+    assert report.packed == (NAMES[2],)
+    assert bytes_of(out) == bytes_of(packed)
+    assert pack(release, out, target_bytes=ONE_EACH, workers=1).packed == ()
+
+
+def test_without_its_note_a_shard_of_other_bytes_is_refused(packed, release, tmp_path):
+    out = shutil.copytree(packed, tmp_path / "out")
+    shutil.rmtree(out / ".parts")
+    changed_bytes(out / NAMES[2])
+
+    with pytest.raises(ShardError, match=f"{NAMES[2]}: is there and was not packed here by this"):
+        pack(release, out, target_bytes=ONE_EACH, workers=1)
+
+
+def test_of_two_packers_each_reports_what_it_packed(packed, release, tmp_path):
+    job = prepare(release, tmp_path, target_bytes=ONE_EACH, part=(1, 1))
+    shutil.copytree(packed, tmp_path, dirs_exist_ok=True)
+
+    outcomes = [pack_task(job.task(shard), lambda count: None) for shard in job.shards]
+
+    assert {outcome.work for outcome in outcomes} == {"kept"}
+
+
+KILLED_WHILE_PACKING = """
+import sys, time
+from stereogenbench_data.shards.pack import pack
+
+def progress(done, total):
+    if done > total * 0.6:
+        print("ready", flush=True)
+        time.sleep(60)
+
+pack(sys.argv[1], sys.argv[2], target_bytes=int(sys.argv[3]), workers=1, progress=progress)
+"""
+
+
+def test_a_killed_pack_goes_on_where_it_was(packed, small_release, release, tmp_path):
+    with subprocess.Popen(
+        [sys.executable, "-c", KILLED_WHILE_PACKING, small_release, tmp_path, str(ONE_EACH)],
+        stdout=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGKILL)
+    left = tars(tmp_path)
+    finished = [name for name in left if not name.endswith(".tmp")]
+    before = {name: (tmp_path / name).stat().st_mtime_ns for name in finished}
+
+    report = pack(release, tmp_path, target_bytes=ONE_EACH, workers=2)
+
+    assert process.returncode == -signal.SIGKILL
+    assert len(left) == len(finished) + 1
+    assert 1 <= len(finished) < 4
+    assert report.packed == tuple(sorted(set(NAMES) - set(finished)))
+    assert {name: (tmp_path / name).stat().st_mtime_ns for name in finished} == before
+    assert bytes_of(tmp_path) == bytes_of(packed)
+
+
+INTERRUPTED_COMMAND = """
+import sys, time
+from contextlib import contextmanager
+from stereogenbench_data.cli import main, pack
+
+waited = []
+
+@contextmanager
+def waiting_bar(doing, *, unit):
+    def bar(done, total):
+        if 0 < done and not waited:
+            waited.append(done)
+            print("ready", flush=True)
+            time.sleep(60)
+    yield bar
+
+pack.progress_bar = waiting_bar
+sys.argv = ["stereogenbench", "pack", *sys.argv[1:]]
+main.main()
+"""
+
+
+@pytest.mark.usefixtures("usual_signals")
+def test_ctrl_c_ends_with_exit_code_130_and_leaves_no_half_shard(small_release, tmp_path):
+    with subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED_COMMAND, small_release, tmp_path, "--workers", "1"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        try:
+            _, told = process.communicate(timeout=30)
+        finally:
+            process.kill()
+
+    assert process.returncode == 130
+    assert told == "stopped; run the same command again to go on from here\n"
+    assert tars(tmp_path) == []
+
+
+@pytest.fixture
+def large_tasks(tmp_path):
+    """Two shards of 400 MB each, whose source takes no room."""
+    with (tmp_path / "film").open("wb") as file:
+        file.truncate(400_000_000)
+    out = tmp_path / "out"
+    out.mkdir()
+    return [
+        ShardTask(
+            PlannedShard(name, 0, (), (PlannedMember("a.mp4", "film", 400_000_000),)),
+            str(tmp_path), str(out), "plan",
+        )
+        for name in ("x.tar", "y.tar")
+    ]  # fmt: skip
+
+
+def test_workers_stop_in_the_middle_of_their_shards(large_tasks, tmp_path):
+    def interrupted(count):
+        if count > 0:
+            assert tars(tmp_path / "out")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(run_tasks(pack_task, large_tasks, workers=2, after_bytes=interrupted))
+
+    assert tars(tmp_path / "out") == []
+
+
+class Deadly:
+    """Ends the process that unpickles it."""
+
+    def __reduce__(self):
+        return os._exit, (9,)
+
+
+def test_a_dead_worker_is_an_error_and_not_a_wait():
+    tasks = [Deadly(), Deadly()]
+
+    with pytest.raises(StorageError, match="a worker process died: it was killed"):
+        list(run_tasks(print, tasks, workers=2, after_bytes=lambda count: None))
+
+
+def test_no_workers_are_refused(release, tmp_path):
+    with pytest.raises(StorageError, match="workers must be at least 1, got 0"):
+        pack(release, tmp_path, workers=0)
+
+
+def test_an_error_in_a_worker_names_the_source(tree, tmp_path):
+    index = SceneIndex.open(tree)
+    gone = next(tree.glob("train/Uniform/*/scene_000001/cam_03_depth.mkv"))
+    gone.unlink()
+
+    with pytest.raises(ShardError, match=r"cam_03_depth\.mkv: cannot be read \(No such file"):
+        pack(index, tmp_path / "out", target_bytes=ONE_EACH, workers=2)
+
+    assert NAMES[3] not in tars(tmp_path / "out")
+    assert not any(name.endswith(".tmp") for name in tars(tmp_path / "out"))
+
+
+def change_while_packing(tree, out, change):
+    index = SceneIndex.open(tree)
+    source = next(tree.glob("train/Uniform/*/scene_000000/cam_00_rgb.mp4"))
+
+    def progress(done, total):
+        if done and not changed:
+            changed.append(done)
+            change(source)
+
+    changed = []
+    with pytest.raises(ShardError) as caught:
+        pack(index, out, target_bytes=10**9, workers=1, progress=progress)
+    return str(caught.value)
+
+
+def lengthened(source):
+    with source.open("ab") as file:
+        file.write(b"more")
+
+
+def test_a_source_that_grew_after_the_plan_is_an_error(tree, tmp_path):
+    told = change_while_packing(tree, tmp_path / "out", lengthened)
+
+    assert "cam_00_rgb.mp4: has " in told
+    assert "when the plan was made. Let nothing write to the release" in told
+    assert [name for name in tars(tmp_path / "out") if "train-Uniform" in name] == []
+
+
+def test_a_source_that_shrank_after_the_plan_is_an_error(tree, tmp_path):
+    told = change_while_packing(tree, tmp_path / "out", lambda source: os.truncate(source, 100))
+
+    assert "cam_00_rgb.mp4: has 100 bytes, and had" in told
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda source: os.utime(source, (1, 1)),
+        lengthened,
+        lambda source: Path(shutil.copy2(source, f"{source}.new")).replace(source),
+        lambda source: os.truncate(source, 4 * 1024 * 1024 + 1),
+    ],
+    ids=["touched", "lengthened", "replaced", "cut short"],
+)  # fmt: skip
+def test_a_source_that_is_changed_while_it_is_read_is_an_error(tmp_path, change):
+    source = tmp_path / "film"
+    source.write_bytes(bytes(9 * 1024 * 1024))
+    member = PlannedMember("a.mp4", "film", 9 * 1024 * 1024)
+    task = ShardTask(PlannedShard("x.tar", 0, (), (member,)), str(tmp_path), str(tmp_path), "plan")
+    calls = []
+
+    def after_bytes(count):
+        calls.append(count)
+        if len(calls) == 1:
+            change(source)
+
+    with pytest.raises(ShardError, match=r"film: (was changed while|has \d+ bytes, and had)"):
+        pack_task(task, after_bytes)
+
+    assert tars(tmp_path) == []
+
+
+def test_a_folder_in_the_place_of_a_file_is_an_error(tree, tmp_path):
+    index = SceneIndex.open(tree)
+    source = next(tree.glob("train/Uniform/*/scene_000000/cam_00_rgb.mp4"))
+    source.unlink()
+    source.mkdir()
+
+    with pytest.raises(ShardError, match=r"cam_00_rgb\.mp4: is no file"):
+        pack(index, tmp_path / "out", workers=1)
+
+
+def test_a_disk_that_returns_other_bytes_is_found_out(release, tmp_path, monkeypatch):
+    sync = os.fsync
+
+    def damaging(handle):
+        if os.fstat(handle).st_size > 10_000:
+            os.pwrite(handle, b"?", 5000)
+        sync(handle)
+
+    monkeypatch.setattr(shard_writer.os, "fsync", damaging)
+    plan = plan_shards(release, ONE_EACH)
+
+    with pytest.raises(ShardError, match=r"does not read back as it was written\. Check the disk"):
+        pack_shard(plan, 0, tmp_path)
+    assert tars(tmp_path) == []
+
+
+def test_one_shard_can_be_packed_by_itself(release, packed, tmp_path):
+    plan = plan_shards(release, ONE_EACH)
+
+    found = pack_shard(plan, 2, tmp_path)
+
+    assert (tmp_path / NAMES[2]).read_bytes() == (packed / NAMES[2]).read_bytes()
+    assert found.sha256 == sha256((packed / NAMES[2]).read_bytes()).hexdigest()
+    assert pack_shard(plan, 2, tmp_path) == found
+
+
+def test_a_shard_that_another_process_packs_is_left_to_it(release, tmp_path):
+    (tmp_path / ".parts").mkdir()
+
+    with (
+        locked(tmp_path / ".parts" / f"{NAMES[0]}.tmp.lock"),
+        pytest.raises(ShardError, match="another process is packing this shard"),
+    ):
+        pack_shard(plan_shards(release, ONE_EACH), 0, tmp_path)
+    assert tars(tmp_path) == []
+
+
+def test_a_file_system_without_locks_can_be_packed_into(release, tmp_path, monkeypatch):
+    import fcntl
+
+    def unknown(file, operation):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", unknown)
+
+    pack_shard(plan_shards(release, ONE_EACH), 0, tmp_path)
+
+    assert tars(tmp_path) == [NAMES[0]]
+
+
+def test_a_folder_that_holds_another_plan_is_refused(release, packed, tmp_path):
+    out = shutil.copytree(packed, tmp_path / "out")
+
+    with pytest.raises(
+        ShardError, match=r"begun with another plan \(4 shards of 250000 bytes"
+    ) as told:
+        pack(release, out, target_bytes=10**9)
+
+    assert "Pack into an empty folder, or remove what is in" in str(told.value)
+    assert bytes_of(out) == bytes_of(packed)
+
+
+@pytest.mark.parametrize("name", ["other.tar", NAMES[0], "other.tar.tmp", "index.parquet"])
+def test_a_folder_that_holds_something_else_is_refused(release, tmp_path, name):
+    (tmp_path / name).write_text("mine")
+
+    with pytest.raises(ShardError, match=f"{name}: is there, and .*empty folder"):
+        pack(release, tmp_path)
+
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == [name]
+
+
+def test_a_shard_that_came_from_elsewhere_meanwhile_is_refused(release, tmp_path):
+    job = prepare(release, tmp_path, target_bytes=ONE_EACH, part=(1, 1))
+    (tmp_path / NAMES[0]).write_text("mine")
+
+    with pytest.raises(ShardError, match="is there and was not packed here by this plan"):
+        pack_task(job.unfinished()[0], lambda count: None)
+
+
+def test_a_foreign_shard_among_ours_is_named(release, packed, tmp_path):
+    out = shutil.copytree(packed, tmp_path / "out")
+    (out / "train-Uniform-000002.tar").write_bytes(b"")
+
+    with pytest.raises(ShardError, match=r"train-Uniform-000002\.tar: is there, and is no shard"):
+        pack(release, out, target_bytes=ONE_EACH)
+
+
+def test_a_release_is_not_packed_into_itself(tree):
+    with pytest.raises(ShardError, match="is the release itself"):
+        pack(tree, tree)
+
+    assert not (tree / ".parts").exists()
+
+
+@pytest.mark.parametrize("place", ["train/out", "eval", "train/Uniform/SynthStage/scene_000000"])
+def test_a_release_is_not_packed_among_its_scenes(tree, place):
+    before = sorted(tree.rglob("*"))
+
+    with pytest.raises(ShardError, match=r"among the scenes of the release\. Pack into a folder"):
+        pack(tree, tree / place)
+
+    assert sorted(tree.rglob("*")) == before
+
+
+def test_shards_may_lie_beside_the_splits_of_their_release(tree, packed):
+    pack(tree, tree / "shards", target_bytes=ONE_EACH, workers=1)
+
+    assert bytes_of(tree / "shards") == bytes_of(packed)
+    assert len(SceneIndex.open(tree)) == 4
+
+
+def test_a_refused_folder_is_left_as_it_was(release, tmp_path):
+    (tmp_path / "other.tar").write_text("mine")
+
+    with pytest.raises(ShardError, match="no shard of this plan"):
+        pack(release, tmp_path)
+
+    assert [path.name for path in tmp_path.iterdir()] == ["other.tar"]
+
+
+def test_a_size_that_no_scene_fits_into_is_refused_before_anything_is_written(release, tmp_path):
+    with pytest.raises(ShardError, match=r"no scene fits into a shard of 1000 bytes: the smallest"):
+        pack(release, tmp_path / "out", target_bytes=1000)
+
+    assert not (tmp_path / "out").exists()
+
+
+def test_scenes_larger_than_a_shard_are_warned_of_once(release, tmp_path):
+    sizes = sorted(shard.size for shard in plan_shards(release, ONE_EACH).shards)
+
+    with pytest.warns(OversizedSceneWarning, match=f"1 of 4 shards exceed .* needs {sizes[-1]}$"):
+        pack(release, tmp_path, target_bytes=sizes[-1] - 1, part=(4, 4), workers=1)
+
+
+def test_shards_are_not_packed_again(packed, tmp_path):
+    with pytest.raises(ShardError, match="holds shards already"):
+        pack(packed, tmp_path)
+
+
+def test_a_place_that_is_no_folder_is_refused(release, tmp_path):
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(ShardError, match="cannot be written to"):
+        pack(release, tmp_path / "file")
+
+
+@pytest.fixture(name="small_disk")
+def small_disk_of_600_kb(tmp_path):
+    """A disk of 600 kB."""
+    with small_disk(tmp_path / "disk", size="600k") as place:
+        yield place
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_full_disk_is_named_and_holds_no_half_shard(release, packed, small_disk, workers):
+    match = r"(train|eval)-[\w-]+-00000\d.tar: the disk is full; the shard needs \d+ bytes"
+    with pytest.raises(ShardError, match=match):
+        pack(release, small_disk, target_bytes=ONE_EACH, workers=workers)
+
+    # two workers that write at once may fill the disk before either is done
+    assert (1 if workers == 1 else 0) <= len(tars(small_disk)) < 4
+    for name in tars(small_disk):
+        assert (small_disk / name).read_bytes() == (packed / name).read_bytes()
+
+
+def test_packing_goes_on_once_there_is_room(release, packed, small_disk):
+    with pytest.raises(ShardError, match="make room, then run the same command again"):
+        pack(release, small_disk, target_bytes=ONE_EACH, workers=1)
+    subprocess.run(["mount", "-o", "remount,size=10M", small_disk], check=True)
+
+    pack(release, small_disk, target_bytes=ONE_EACH, workers=1)
+
+    assert bytes_of(small_disk) == bytes_of(packed)
+
+
+def test_dali_finds_every_file_where_tarfile_finds_it(packed):
+    for name in NAMES:
+        head, *scenes = (packed / "dali" / name).with_suffix(".idx").read_text().splitlines()
+        words = [scene.split(" ") for scene in scenes]
+        with tarfile.open(packed / name) as tar:
+            expected = [
+                [info.name.partition(".")[2], str(info.offset_data), str(info.size), info.name]
+                for info in tar
+            ]
+
+        assert head == f"v1.2 {len(scenes)}"
+        assert [line[at : at + 4] for line in words for at in range(0, len(line), 4)] == expected
+
+
+def test_wids_is_told_of_every_shard(packed):
+    listed = json.loads((packed / "shards.json").read_text())
+
+    assert listed == {
+        "__kind__": "wids-shard-index-v1",
+        "wids_version": 1,
+        "shardlist": [
+            {"url": name, "nsamples": 1, "filesize": (packed / name).stat().st_size}
+            for name in NAMES
+        ],
+    }
+
+
+def command(*words):
+    return CliRunner().invoke(app, ["pack", *map(str, words)])
+
+
+def test_the_command_packs_and_tells_what_there_is(small_release, tmp_path, packed):
+    first = command(small_release, tmp_path, "--shard-size", "250kB", "--part", "1/2")
+    second = command(small_release, tmp_path, "--shard-size", "250kB", "--workers", "1")
+
+    assert (first.exit_code, second.exit_code) == (0, 0)
+    assert first.stdout == (
+        f"{tmp_path}: 2 shards packed, 0 were finished before\n"
+        f"2 shards of the plan yet to be packed, the first is {NAMES[1]}: the part that packs "
+        f"the last one writes the index\n"
+    )
+    assert second.stdout == (
+        f"{tmp_path}: 2 shards packed, 2 were finished before\n"
+        f"{tmp_path / 'index.parquet'}: 4 scenes\n"
+    )
+    assert bytes_of(tmp_path) == bytes_of(packed)
+
+
+def test_the_command_lists_incomplete_scenes_and_leaves_them_out(tree, tmp_path):
+    next(tree.glob("train/Uniform/*/scene_000001/_scene_complete.json")).unlink()
+
+    result = command(tree, tmp_path / "out", "--workers", "1")
+
+    assert result.exit_code == 0
+    assert "scene_000001: has no _scene_complete.json" in result.stderr
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", IncompleteSceneWarning)
+        assert len(SceneIndex.open(tmp_path / "out")) == 3
+
+
+def test_the_command_refuses_a_release_with_broken_scenes(tree, tmp_path):
+    next(tree.glob("train/Uniform/*/scene_000001/trajectory.json")).unlink()
+
+    result = command(tree, tmp_path / "out")
+
+    assert result.exit_code == 2
+    assert "scene_000001: is marked as complete and has no trajectory.json" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("part", ["3", "a/b", "1/2/3", ""])
+def test_a_part_that_is_not_written_as_one_is_a_usage_error(small_release, tmp_path, part):
+    result = command(small_release, tmp_path, "--part", part)
+
+    assert result.exit_code == 2
+    assert "is no part: write I/N" in " ".join(result.stderr.split())
+
+
+def test_help_imports_nothing_heavy():
+    code = (
+        "import sys; from stereogenbench_data.cli import main; sys.argv = ['x', '--help']\n"
+        "try: main.main()\n"
+        "except SystemExit: pass\n"
+        "sys.exit(', '.join({'torch', 'pyarrow', 'av', 'ray', 'numpy'} & sys.modules.keys()))"
+    )
+
+    shown = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+
+    assert "pack" in shown.stdout
+    assert "verify" in shown.stdout
+    assert {word for word in ("torch", "pyarrow", "av", "ray") if word in shown.stderr} == set()
+
+
+KILLED_PACK = """
+import os, signal, sys
+from stereogenbench_data.shards.pack import pack
+
+left = int(sys.argv[3])
+
+def after_event(event, arguments):
+    global left
+    mode = arguments[1] if event == "open" else None
+    writes = isinstance(mode, str) and mode[:1] in "wxa" and sys.argv[2] in str(arguments[0])
+    if writes or event in ("os.rename", "os.remove"):
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+sys.addaudithook(after_event)
+pack(sys.argv[1], sys.argv[2], target_bytes=int(sys.argv[4]), workers=1)
+"""
+
+
+@pytest.mark.parametrize("moment", [1, 3, 5, 8, 13, 26, 28, 30, 32, 34, 36, 38])
+def test_a_pack_killed_at_any_moment_leaves_nothing_behind_once_it_was_resumed(
+    moment, small_release, packed, tmp_path
+):
+    out = tmp_path / "out"
+    command = [sys.executable, "-c", KILLED_PACK, small_release, out]
+
+    killed = subprocess.run([*command, str(moment), str(ONE_EACH)], check=False)
+    had_index = (out / "index.parquet").is_file()
+    had_companions = (out / "shards.json").is_file() and len([*out.glob("dali/*.idx")]) == 4
+    subprocess.run([*command, "0", str(ONE_EACH)], check=True)
+
+    assert killed.returncode == -signal.SIGKILL
+    assert had_companions or not had_index
+    assert sorted(path.relative_to(out) for path in out.rglob("*")) == sorted(
+        path.relative_to(packed) for path in packed.rglob("*")
+    )
+    assert bytes_of(out) == bytes_of(packed)

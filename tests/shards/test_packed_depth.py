@@ -1,0 +1,400 @@
+"""Shards whose depth blosc2 packed: the same samples, in few bytes, verified, and turned back."""
+
+import json
+import shutil
+import sys
+import tarfile
+import zlib
+from dataclasses import replace
+from hashlib import sha256
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from stereogenbench_data import PAIR_FIELDS, SceneViews, StereoPairs, StereoPairStream
+from stereogenbench_data.bridges.scene_bytes import samples_of
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.errors import ExtraError, MediaError, ShardError, StorageError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.depth_frames import DepthFrames
+from stereogenbench_data.media.video import VideoReader
+from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES, depth_name, rgb_name
+from stereogenbench_data.shards.companion_files import write_foreign_indexes
+from stereogenbench_data.shards.pack import pack
+from stereogenbench_data.shards.unpack import unpack
+from stereogenbench_data.shards.verify import verify
+from tests.servers.tools import require_module
+
+PAIR = "train-Uniform-000000.tar"
+KEY = "train/Uniform/SynthStage/scene_000001"
+FIELDS = tuple(name for name in PAIR_FIELDS if name != "__url__")
+
+
+@pytest.fixture(scope="module")
+def packed(small_release, tmp_path_factory):
+    """The small release with depth by blosc2; not to be changed."""
+    require_module("blosc2")
+    out = tmp_path_factory.mktemp("packed_depth") / "shards"
+    pack(small_release, out, depth_codec="blosc2", workers=1)
+    return out
+
+
+@pytest.fixture(scope="module")
+def unpacked(packed, tmp_path_factory):
+    """The tree that unpacking makes of them, with the report; not to be changed."""
+    tree = tmp_path_factory.mktemp("unpacked") / "tree"
+    return tree, unpack(packed, tree, workers=1)
+
+
+@pytest.fixture
+def shards(packed, tmp_path):
+    """A copy that a test may change."""
+    return shutil.copytree(packed, tmp_path / "shards")
+
+
+def bytes_of(folder):
+    return {
+        path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and ".parts" not in path.parts
+    }
+
+
+def scenes_of(root):
+    index = SceneIndex.open(root)
+    return {scene.id.key: scene for scene in map(index.scene, range(len(index)))}
+
+
+def same(one, other):
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, other[name]), name
+        else:
+            assert value == other[name], name
+
+
+def test_the_index_differs_in_depths_names_places_and_codec_alone(packed, small_shards):
+    found, released = scenes_of(packed), scenes_of(small_shards)
+
+    assert found.keys() == released.keys()
+    for key, scene in found.items():
+        assert scene.depth_codec == ("blosc2",) * 6
+        assert replace(scene, members={}, depth_codec=()) == replace(
+            released[key], members={}, depth_codec=()
+        )
+        assert {PACKED_DEPTH_NAMES.get(name, name) for name in released[key].members} == set(
+            scene.members
+        )
+        assert scene.held_name(depth_name(2)) == "cam_02_depth.b2frame"
+        assert released[key].held_name(depth_name(2)) == "cam_02_depth.mkv"
+        assert len(scene.held_videos) == 12
+
+
+def test_an_index_has_the_same_columns_whatever_the_codec(packed, small_shards):
+    one, other = SceneIndex.open(packed), SceneIndex.open(small_shards)
+
+    assert one.column("depth_codec").tolist() == [["blosc2"] * 6] * 4
+    assert one.column("depth_unit_m").tolist() == other.column("depth_unit_m").tolist()
+    assert one.digest != other.digest
+
+
+def test_every_stored_number_is_that_of_the_released_video(packed, small_release):
+    for key, scene in scenes_of(packed).items():
+        for camera in range(6):
+            member = scene.members[PACKED_DEPTH_NAMES[depth_name(camera)]]
+            content = (packed / member.path).read_bytes()[member.offset :][: member.size]
+            (packed.parent / "one.b2frame").write_bytes(content)
+            video = small_release / key / depth_name(camera)
+            with (
+                DepthFrames(packed.parent / "one.b2frame", name="one", frames=7) as depth,
+                VideoReader(video, name="video", frames=7) as reader,
+            ):
+                for index in range(7):
+                    np.testing.assert_array_equal(
+                        depth.units(index), reader.frame(index).to_ndarray(format="gray16le")
+                    )
+
+
+@pytest.mark.parametrize("size", [None, (48, 56)])
+def test_pairs_are_the_same(packed, small_shards, size):
+    options = {"fields": FIELDS, "pairs": "all", "frames": [0, 5], "size": size}
+    one, other = StereoPairs(packed, **options), StereoPairs(small_shards, **options)
+
+    assert len(one) == len(other) == 4 * 15 * 2
+    for number in range(0, len(one), 13):
+        same(one[number], other[number])
+
+
+def test_views_and_streams_are_the_same(packed, small_shards):
+    for one, other in (
+        (SceneViews(packed), SceneViews(small_shards)),
+        (
+            StereoPairStream(packed, 3, fields=FIELDS, frames="all", tail="uneven"),
+            StereoPairStream(small_shards, 3, fields=FIELDS, frames="all", tail="uneven"),
+        ),
+    ):
+        for left, right in zip(one, other, strict=True):
+            left.pop("__url__", None)
+            right.pop("__url__", None)
+            same(left, right)
+
+
+def test_sound_shards_verify_and_every_frame_is_decoded(packed):
+    report = verify(packed, mode="decode", workers=1)
+
+    assert report.problems == ()
+    assert report.videos_decoded == 48
+
+
+def test_the_same_scenes_pack_to_the_same_bytes_by_two_workers(packed, small_release, tmp_path):
+    report = pack(small_release, tmp_path, depth_codec="blosc2", workers=2)
+
+    assert bytes_of(tmp_path) == bytes_of(packed)
+    assert pack(small_release, tmp_path, depth_codec="blosc2", workers=1).packed == ()
+    assert len(report.packed) == 3
+
+
+def test_shards_of_another_codec_are_not_mixed_in(shards, small_release):
+    before = bytes_of(shards)
+
+    with pytest.raises(ShardError, match=r"depth blosc2, \w+, and this one is .* depth released"):
+        pack(small_release, shards)
+
+    assert bytes_of(shards) == before
+
+
+def test_depth_that_is_packed_is_not_packed_again(packed, tmp_path):
+    with pytest.raises(ShardError, match=r"holds shards already\. To pack again, run `stereogenb"):
+        pack(packed, tmp_path, depth_codec="blosc2")
+
+
+def test_a_video_that_cannot_be_packed_whole_is_named(small_release, tmp_path):
+    require_module("blosc2")
+    tree = shutil.copytree(small_release, tmp_path / "tree")
+    shutil.copy(tree / KEY / rgb_name(0), tree / KEY / "cam_04_depth.mkv")
+
+    with pytest.raises(StorageError, match=r"cam_04_depth\.mkv: holds colours"):
+        pack(tree, tmp_path / "out", depth_codec="blosc2", workers=1)
+
+    assert not (tmp_path / "out" / PAIR).exists()
+
+
+def test_without_blosc2_the_extra_is_named_and_nothing_is_left(
+    packed, small_release, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "blosc2", None)
+    match = r"pip install 'stereogenbench-data\[blosc2\]'"
+
+    with pytest.raises(ExtraError, match=match):
+        pack(small_release, tmp_path / "out", depth_codec="blosc2")
+    with pytest.raises(ExtraError, match=match):
+        StereoPairs(packed)[0]
+
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.fixture
+def damaged(shards):
+    """Flip a byte of a member, and have the index take the shard for sound all the same."""
+
+    def damage(name, at):
+        index = SceneIndex.open(shards)
+        scenes = [index.scene(row) for row in range(len(index))]
+        row = [scene.id.key for scene in scenes].index(KEY)
+        member = scenes[row].members[name]
+        content = bytearray((shards / PAIR).read_bytes())
+        content[member.offset + at] ^= 1
+        (shards / PAIR).write_bytes(content)
+        crc32 = zlib.crc32(content[member.offset :][: member.size])
+        members = dict(scenes[row].members) | {name: replace(member, crc32=crc32)}
+        scenes[row] = replace(scenes[row], members=members)
+        facts = index.shards | {
+            PAIR: replace(index.shards[PAIR], sha256=sha256(content).hexdigest())
+        }
+        altered = SceneIndex.from_scenes(scenes, shards, shards=facts)
+        altered.write(shards / "index.parquet")
+        write_foreign_indexes(altered, out=shards)
+        return [str(each) for each in verify(shards, mode="decode", workers=1).problems]
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("at", "found"), [(200, "its description of itself fails its checksum"), (2000, "frame ")]
+)
+def test_damage_is_told_by_decoding_with_its_place(damaged, shards, at, found):
+    (told,) = damaged("cam_03_depth.b2frame", at)
+
+    assert told.startswith(f"{PAIR}: {KEY}: cam_03_depth.b2frame: {found}") or found in told
+    pairs = StereoPairs(shards, scenes=[KEY], pairs=[(3, 4)], frames="all", fields=("depth",))
+    with pytest.raises(MediaError, match=rf"{KEY}, frames .*cam_03_depth\.b2frame: "):
+        list(pairs)
+
+
+def test_a_flipped_byte_is_told_by_its_checksum(shards):
+    member = scenes_of(shards)[KEY].members["cam_05_depth.b2frame"]
+    content = bytearray((shards / PAIR).read_bytes())
+    content[member.offset + member.size - 1] ^= 1
+    (shards / PAIR).write_bytes(content)
+
+    (told,) = [str(each) for each in verify(shards, workers=1).problems]
+
+    assert told.startswith(f"{PAIR}: {KEY}: cam_05_depth.b2frame: its bytes have crc32 ")
+
+
+def test_one_frame_far_away_costs_the_header_and_its_own_bytes(web, large_release):
+    require_module("blosc2")
+    pack(large_release, web.folder / "shards", depth_codec="blosc2", workers=1)
+    index = SceneIndex.open(web.folder / "shards")
+    scene = index.scene(0)
+    member = scene.members["cam_00_depth.b2frame"]
+    pairs = StereoPairs(f"{web.url}/shards", fields=("depth",), frames=[4])
+
+    depth = pairs[0]["depth"]
+
+    size, header, chunk = [each for each in web.asked if each.path.endswith(".tar")]
+    assert depth.shape == (1, 320, 320)
+    assert (size.sent, header.start, header.sent) == (1, member.offset, 65536)
+    assert chunk.start + chunk.sent <= member.offset + member.size
+    assert chunk.sent <= 320 * 320 * 2 + 32 < 0.2 * member.size
+
+
+def same_videos(one, other):
+    with (
+        VideoReader(one, name="one", frames=7) as reader,
+        VideoReader(other, name="other", frames=7) as released,
+    ):
+        assert reader.facts.tags["depth_scale"] == released.facts.tags["depth_scale"]
+        for index in range(7):
+            frame, expected = reader.frame(index), released.frame(index)
+            assert frame.time == expected.time
+            np.testing.assert_array_equal(frame.to_ndarray(), expected.to_ndarray())
+
+
+def test_unpacking_gives_the_release_back(unpacked, small_release):
+    tree, report = unpacked
+
+    found, released = bytes_of(tree), bytes_of(small_release)
+    assert found.keys() == released.keys()
+    assert len(report.unpacked) == 4
+    for name, digest in found.items():
+        if name.endswith("_depth.mkv"):
+            same_videos(tree / name, small_release / name)
+        else:
+            assert digest == released[name]
+    again = scenes_of(tree)
+    for key, scene in scenes_of(small_release).items():
+        assert replace(again[key], members={}) == replace(scene, members={})
+
+
+def test_unpacked_scenes_pack_to_the_same_shards(packed, unpacked, tmp_path):
+    pack(unpacked[0], tmp_path / "again", depth_codec="blosc2", workers=1)
+
+    assert SceneIndex.open(tmp_path / "again").column("frames").tolist() == [7] * 4
+    for key, scene in scenes_of(tmp_path / "again").items():
+        before = scenes_of(packed)[key]
+        for name in before.held_videos:
+            assert scene.members[name].crc32 == before.members[name].crc32
+
+
+def test_released_videos_come_back_byte_for_byte(small_shards, small_release, tmp_path):
+    unpack(small_shards, tmp_path / "tree", workers=2)
+
+    assert bytes_of(tmp_path / "tree") == bytes_of(small_release)
+
+
+def test_unpacking_goes_on_where_it_was(small_shards, small_release, tmp_path):
+    tree = tmp_path / "tree"
+    unpack(small_shards, tree, workers=1)
+    shutil.rmtree(tree / KEY)
+    (tree / KEY).with_name(".scene_000001.unpacking").mkdir()
+    seen = []
+
+    report = unpack(small_shards, tree, workers=1, progress=lambda *now: seen.append(now))
+
+    assert report.unpacked == (KEY,)
+    assert len(report.kept) == 3
+    assert seen[-1][0] == seen[-1][1]
+    assert bytes_of(tree) == bytes_of(small_release)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("baseline.json", lambda path: path.write_text("{}")),
+        ("cam_02_depth.mkv", lambda path: path.write_bytes(b"mine")),
+        ("notes.txt", lambda path: path.write_text("mine")),
+        ("cam_00_rgb.mp4", lambda path: path.unlink()),
+    ],
+)
+def test_a_scene_that_is_there_and_differs_is_left_alone(packed, unpacked, tmp_path, name, change):
+    tree = shutil.copytree(unpacked[0], tmp_path / "tree")
+    change(tree / KEY / name)
+    before = bytes_of(tree)
+
+    with pytest.raises(ShardError, match=rf"scene_000001: is there, and is not .*\({name} differ"):
+        unpack(packed, tree, workers=1)
+
+    assert bytes_of(tree) == before
+
+
+@pytest.mark.parametrize("name", ["cam_03_depth.b2frame", "trajectory.json"])
+def test_a_damaged_member_is_not_unpacked(shards, tmp_path, name):
+    member = scenes_of(shards)[KEY].members[name]
+    content = bytearray((shards / PAIR).read_bytes())
+    content[member.offset + 100] ^= 1
+    (shards / PAIR).write_bytes(content)
+
+    with pytest.raises(ShardError, match=rf"{PAIR}: {KEY}\.{name}: has crc32"):
+        unpack(shards, tmp_path / "tree", workers=1)
+
+    assert not (tmp_path / "tree" / KEY).exists()
+    assert not list((tmp_path / "tree").rglob("*.unpacking"))
+
+
+def test_where_there_are_no_shards_nothing_is_unpacked(packed, small_release, tmp_path):
+    with pytest.raises(ShardError, match="is a released tree already"):
+        unpack(small_release, tmp_path)
+    with pytest.raises(ShardError, match="is far away"):
+        unpack("https://example.org/shards", tmp_path)
+    with pytest.raises(ShardError, match="holds the shards themselves"):
+        unpack(packed, packed)
+    with pytest.raises(StorageError, match="does not exist"):
+        unpack(tmp_path / "nothing", tmp_path / "tree")
+
+
+def test_the_commands_pack_and_unpack(small_release, packed, tmp_path):
+    runner = CliRunner()
+    words = ["pack", str(small_release), str(tmp_path / "shards"), "--depth-codec", "blosc2"]
+    first = runner.invoke(app, [*words, "--workers", "1"])
+    second = runner.invoke(
+        app, ["unpack", str(tmp_path / "shards"), str(tmp_path / "tree"), "--workers", "1"]
+    )
+    third = runner.invoke(
+        app, ["unpack", str(tmp_path / "shards"), str(tmp_path / "tree"), "--json"]
+    )
+
+    assert (first.exit_code, second.exit_code, third.exit_code) == (0, 0, 0)
+    assert bytes_of(tmp_path / "shards") == bytes_of(packed)
+    assert second.stdout == f"{tmp_path / 'tree'}: 4 scenes unpacked, 0 were there before\n"
+    assert json.loads(third.stdout)["unpacked"] == []
+
+
+def test_a_scene_that_another_library_read_gives_the_same_samples(packed, small_shards):
+    with tarfile.open(packed / PAIR) as tar:
+        files = {
+            info.name.partition(".")[2]: tar.extractfile(info).read()
+            for info in tar
+            if info.name.startswith(f"{KEY}.")
+        }
+    options = {"pairs": "primary", "frames": "all"}
+
+    found = list(samples_of(KEY, files, fields=FIELDS, epoch=0, options=options))
+
+    for one, other in zip(
+        found, StereoPairs(small_shards, scenes=[KEY], fields=FIELDS, **options), strict=True
+    ):
+        same(one, other)

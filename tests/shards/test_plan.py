@@ -1,0 +1,165 @@
+"""Which scene goes into which shard."""
+
+from dataclasses import replace
+
+import pytest
+
+from stereogenbench_data.errors import ShardError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.records import Member
+from stereogenbench_data.shards.plan import MEMBER_ORDER, parse_size, plan_shards
+
+
+@pytest.fixture(scope="module")
+def pattern(small_release):
+    return SceneIndex.open(small_release).scene(0)
+
+
+@pytest.fixture
+def index_of(pattern):
+    """An index of scenes with these keys, each with one file of so many bytes."""
+
+    def make(sizes, **places):
+        scenes = []
+        for key, size in sizes.items():
+            family, map_name = key.split("/")[-3:-1]
+            split = key.split("/")[0]
+            subset = "unseen_map" if split == "eval" else None
+            place = replace(
+                pattern.id, key=key, family=family, map_name=map_name, split=split, subset=subset
+            )
+            members = {"baseline.json": Member(f"{key}/baseline.json", 0, size)}
+            scenes.append(replace(pattern, id=place, members=members))
+        return SceneIndex.from_scenes(scenes, places.pop("root", "/release"), **places)
+
+    return make
+
+
+def key(number, family="Uniform"):
+    return f"train/{family}/Town/scene_{number:06d}"
+
+
+def test_shards_are_filled_in_the_order_of_keys_with_whole_scenes(index_of):
+    """A scene of 512 bytes takes 1024; the end of a shard takes 1024 too."""
+    plan = plan_shards(index_of({key(number): 512 for number in range(5)}), 3 * 1024)
+
+    assert [shard.keys for shard in plan.shards] == [
+        (key(0), key(1)),
+        (key(2), key(3)),
+        (key(4),),
+    ]
+    assert [shard.size for shard in plan.shards] == [3072, 3072, 2048]
+    assert [shard.name for shard in plan.shards] == [
+        f"train-Uniform-{number:06d}.tar" for number in range(3)
+    ]
+
+
+def test_a_byte_less_leaves_room_for_one_scene_less(index_of):
+    plan = plan_shards(index_of({key(number): 512 for number in range(4)}), 3 * 1024 - 1)
+
+    assert [len(shard.keys) for shard in plan.shards] == [1, 1, 1, 1]
+
+
+def test_a_scene_larger_than_the_target_has_a_shard_of_its_own(index_of):
+    plan = plan_shards(index_of({key(0): 1, key(1): 90_000, key(2): 1, key(3): 1}), 5000)
+
+    assert [shard.keys for shard in plan.shards] == [(key(0),), (key(1),), (key(2), key(3))]
+
+
+def test_splits_subsets_and_families_have_shards_of_their_own(index_of):
+    keys = [
+        key(0),
+        key(0, "IPD_Gaussian"),
+        "eval/MapUnseenInTrain/Uniform/Town/scene_000000",
+    ]
+
+    plan = plan_shards(index_of(dict.fromkeys(keys, 1)), 10**9)
+
+    assert [shard.name for shard in plan.shards] == [
+        "eval-unseen_map-Uniform-000000.tar",
+        "train-IPD_Gaussian-000000.tar",
+        "train-Uniform-000000.tar",
+    ]
+
+
+def test_files_come_metadata_first_then_camera_by_camera(small_release):
+    shard = plan_shards(SceneIndex.open(small_release), 1).shards[0]
+
+    names = [member.name.partition(".")[2] for member in shard.members]
+
+    assert names == [name for name in MEMBER_ORDER if name in names]
+    assert names[:3] == ["baseline.json", "trajectory.json", "_scene_complete.json"]
+    assert names[-4:] == [
+        "cam_04_rgb.mp4", "cam_04_depth.mkv", "cam_05_rgb.mp4", "cam_05_depth.mkv",
+    ]  # fmt: skip
+
+
+def test_a_plan_is_the_same_each_time_and_wherever_the_release_lies(index_of):
+    sizes = {key(number): 512 for number in range(5)}
+    plan = plan_shards(index_of(sizes), 3072)
+
+    assert plan_shards(index_of(dict(reversed(sizes.items())), root="/moved"), 3072) == replace(
+        plan, root="/moved"
+    )
+
+
+@pytest.mark.parametrize(
+    ("sizes", "target"),
+    [({key(0): 512, key(1): 513}, 3072), ({key(0): 512, key(2): 512}, 3072),
+     ({key(0): 512, key(1): 512}, 3073), ({key(0): 512}, 3072)],
+    ids=["a size", "a key", "the target", "a scene less"],
+)  # fmt: skip
+def test_another_release_or_target_is_another_plan(index_of, sizes, target):
+    digest = plan_shards(index_of({key(0): 512, key(1): 512}), 3072).digest
+
+    assert plan_shards(index_of(sizes), target).digest != digest
+
+
+def test_families_that_differ_in_case_alone_are_refused(index_of):
+    index = index_of({key(0): 1, key(0, "UNIFORM"): 1})
+
+    with pytest.raises(ShardError, match="would be one file where case does not count"):
+        plan_shards(index)
+
+
+def test_scenes_that_were_left_out_as_broken_are_not_left_out_in_silence(index_of):
+    index = index_of({key(0): 1})
+    index.broken = {key(1): "no rgb"}
+
+    with pytest.raises(ShardError, match=r"leaves out 1 broken scenes \(.*scene_000001\)"):
+        plan_shards(index)
+
+
+def test_a_file_of_8_gib_is_refused(index_of):
+    with pytest.raises(ShardError, match="has 8589934592 bytes, and ustar holds"):
+        plan_shards(index_of({key(0): 8 * 2**30}))
+
+
+def test_a_key_too_long_for_ustar_is_refused(index_of):
+    with pytest.raises(ShardError, match="Shorten its folders' names"):
+        plan_shards(index_of({f"train/{'f' * 90}/{'m' * 90}/scene_000001": 1}))
+
+
+def test_data_behind_a_url_are_not_packed(index_of):
+    with pytest.raises(ShardError, match="is far away"):
+        plan_shards(index_of({key(0): 1}, root="https://example.org/data"))
+
+
+def test_a_target_of_nothing_is_refused(index_of):
+    with pytest.raises(ShardError, match="at least 1 byte, got 0"):
+        plan_shards(index_of({key(0): 1}), 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("500MB", 500_000_000), ("2GiB", 2**31), ("1.5 kb", 1500), ("12", 12), ("3k", 3000),
+     ("1TB", 10**12)],
+)  # fmt: skip
+def test_a_size_is_read_as_it_is_written(text, size):
+    assert parse_size(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "GB", "-2GB", "2 parsecs", "0", "0.1", "1e9", "2GBB"])
+def test_what_is_no_size_is_refused(text):
+    with pytest.raises(ShardError, match="is no size of a shard: write one such as 500MB"):
+        parse_size(text)

@@ -1,0 +1,595 @@
+"""Verifying shards: each kind of damage is found, named, and told with its cure."""
+
+import io
+import json
+import shutil
+import subprocess
+import sys
+import tarfile
+import zlib
+from dataclasses import replace
+from hashlib import sha256
+
+import pytest
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.parse import parse_scene_key
+from stereogenbench_data.schema.records import Member, ShardFacts
+from stereogenbench_data.shards.companion_files import write_foreign_indexes
+from stereogenbench_data.shards.pack import pack
+from stereogenbench_data.shards.tar import END_OF_ARCHIVE, member_header, padded, read_members
+from stereogenbench_data.shards.verify import verify
+from stereogenbench_data.shards.verify_decode import Problem
+from tests.servers.scene_fixtures import write_video
+
+PAIR = "train-Uniform-000000.tar"
+SINGLE = "train-IPD_Gaussian-000000.tar"
+SCENES = [f"train/Uniform/SynthStage/scene_00000{number}" for number in range(2)]
+FETCH = "Fetch the shard again, or pack it again."
+
+
+@pytest.fixture
+def shards(small_shards, tmp_path):
+    """A copy of three sound shards, the one for Uniform with two scenes."""
+    return shutil.copytree(small_shards, tmp_path / "shards")
+
+
+@pytest.fixture
+def edit(shards):
+    """Change the bytes of a shard."""
+
+    def change(name, how):
+        path = shards / name
+        content = bytearray(path.read_bytes())
+        path.write_bytes(how(content) or content)
+
+    return change
+
+
+@pytest.fixture
+def place(shards):
+    """Where a file of the index lies."""
+    index = SceneIndex.open(shards)
+    scenes = {scene.id.key: scene for scene in map(index.scene, range(len(index)))}
+    return lambda scene, name: scenes[scene].members[name]
+
+
+def lines(shards, **how):
+    report = verify(shards, workers=1, **how)
+    return [str(problem) for problem in report.problems]
+
+
+def flipped(at):
+    def flip(content):
+        content[at] ^= 1
+
+    return flip
+
+
+def test_sound_shards_have_no_problem(small_shards):
+    report = verify(small_shards)
+
+    assert report.problems == ()
+    assert (report.shards, report.scenes, report.members) == (3, 4, 4 * 17)
+    assert report.bytes == sum(path.stat().st_size for path in small_shards.glob("*.tar"))
+    assert report.videos_decoded == 0
+
+
+def test_decoding_counts_every_video_and_progress_ends_at_the_end(small_shards):
+    seen = []
+
+    report = verify(
+        small_shards / "index.parquet", mode="decode", workers=1,
+        progress=lambda *now: seen.append(now),
+    )  # fmt: skip
+
+    assert report.problems == ()
+    assert report.videos_decoded == 4 * 12
+    assert seen[-1][0] == seen[-1][1] > report.bytes
+    assert seen == sorted(seen)
+
+
+@pytest.mark.parametrize(
+    ("where", "found"),
+    [
+        ("in a header", "only 100 of the 512 bytes of a header or of the end of the archive"),
+        ("at a header", "nothing of a header or of the end of the archive is there"),
+        ("in a payload", "'{member}' claims "),
+        ("before the end", "nothing of a header or of the end of the archive is there"),
+        ("in the end", "only 512 of the 1024 zeros are there that end the archive"),
+    ],
+)
+def test_a_cut_shard_is_told_with_the_place_and_what_is_lost(shards, edit, place, where, found):
+    member = place(SCENES[1], "cam_02_rgb.mp4")
+    size = (shards / PAIR).stat().st_size
+    cut = {
+        "in a header": member.offset - 412,
+        "at a header": member.offset - 512,
+        "in a payload": member.offset + 10,
+        "before the end": size - 1024,
+        "in the end": size - 512,
+    }[where]
+    edit(PAIR, lambda content: content[:cut])
+
+    told = lines(shards)
+
+    assert told[0].startswith(f"{PAIR}: at byte ")
+    assert found.format(member=f"{SCENES[1]}.cam_02_rgb.mp4") in told[0]
+    assert "cut short" in told[0]
+    assert told[0].endswith(f". {FETCH}")
+    lost = [] if "end" in where else [
+        f"{PAIR}: {SCENES[1]}: 8 of its files are cut off (cam_02_depth.mkv, cam_02_rgb.mp4, "
+        f"cam_03_depth.mkv, ...). {FETCH}"
+    ]  # fmt: skip
+    assert told[1:] == lost
+
+
+def test_a_flipped_payload_byte_is_told_with_its_member(shards, edit, place):
+    member = place(SCENES[1], "cam_03_depth.mkv")
+    edit(PAIR, flipped(member.offset + 1000))
+
+    (told,) = lines(shards)
+
+    assert told.startswith(f"{PAIR}: {SCENES[1]}: cam_03_depth.mkv: its bytes have crc32 ")
+    assert told.endswith(f", and by the index {member.crc32:08x} is right. {FETCH}")
+
+
+def test_a_flipped_header_byte_is_told_and_what_follows_is_still_looked_at(shards, edit, place):
+    edit(PAIR, flipped(place(SCENES[0], "cam_00_rgb.mp4").offset - 512 + 5))
+    edit(PAIR, flipped(place(SCENES[1], "baseline.json").offset))
+
+    header, payload = lines(shards)
+
+    assert f"{PAIR}: at byte " in header
+    assert "the header is damaged: its checksum is" in header
+    assert payload.startswith(f"{PAIR}: {SCENES[1]}: baseline.json: its bytes have crc32")
+
+
+def test_a_byte_between_members_is_told_by_the_shard_alone(shards, edit, place):
+    member = place(SCENES[0], "_scene_complete.json")
+    assert member.size % 512
+    edit(PAIR, flipped(member.offset + member.size))
+
+    (told,) = lines(shards)
+
+    assert told.startswith(f"{PAIR}: all members are whole, and yet the file has ")
+
+
+def test_bytes_after_the_end_are_told(shards, edit):
+    edit(PAIR, lambda content: content + bytes(512))
+
+    (told,) = lines(shards)
+
+    assert "all members are whole, and yet the file has" in told
+
+
+def tar_of(files):
+    return (
+        b"".join(
+            member_header(name, len(content)) + content + bytes(padded(len(content)) - len(content))
+            for name, content in files
+        )
+        + END_OF_ARCHIVE
+    )
+
+
+KEY = "train/Uniform/Town/scene_000001"
+FILES = [
+    (f"{KEY}.cam_00_depth.mkv", b"{}"),
+    (f"{KEY}.cam_00_rgb.mp4", b"left" * 128),
+    (f"{KEY}.cam_01_rgb.mp4", b"four" * 128),
+]
+
+
+@pytest.fixture
+def toy(small_shards, tmp_path):
+    """A shard of three small files with its index; verifies another tar in the shard's place."""
+    root = tmp_path / "toy"
+    root.mkdir()
+    content = tar_of(FILES)
+    (root / "x.tar").write_bytes(content)
+    pattern = SceneIndex.open(small_shards).scene(0)
+    members = {
+        each.name.removeprefix(f"{KEY}."): Member(
+            "x.tar", each.offset, each.size, zlib.crc32(content[each.offset :][: each.size])
+        )
+        for each in read_members(io.BytesIO(content), len(content), where="x.tar")
+    }
+    scene = replace(pattern, id=parse_scene_key(KEY), members=members)
+    facts = ShardFacts(len(content), sha256(content).hexdigest(), len(FILES))
+    index = SceneIndex.from_scenes([scene], root, shards={"x.tar": facts})
+    index.write(root / "index.parquet")
+    write_foreign_indexes(index, out=root)
+
+    def verified(other):
+        (root / "x.tar").write_bytes(other)
+        return lines(root)
+
+    assert verified(content) == []
+    return verified
+
+
+def test_exchanged_payloads_are_both_told(toy):
+    exchanged = [FILES[0], (FILES[1][0], FILES[2][1]), (FILES[2][0], FILES[1][1])]
+
+    told = toy(tar_of(exchanged))
+
+    assert [line.split(": ")[2] for line in told] == ["cam_00_rgb.mp4", "cam_01_rgb.mp4"]
+    assert all("its bytes have crc32" in line for line in told)
+
+
+def test_exchanged_names_are_both_told(toy):
+    exchanged = [FILES[0], (FILES[2][0], FILES[1][1]), (FILES[1][0], FILES[2][1])]
+
+    told = toy(tar_of(exchanged))
+
+    assert told == [
+        f"x.tar: {KEY}: cam_00_rgb.mp4: has 512 bytes from byte 2560 on, and by the index 512 "
+        f"from 1536 on. {FETCH}",
+        f"x.tar: {KEY}: cam_01_rgb.mp4: has 512 bytes from byte 1536 on, and by the index 512 "
+        f"from 2560 on. {FETCH}",
+    ]
+
+
+def test_a_missing_member_is_told_and_so_is_what_moved(toy):
+    told = toy(tar_of([FILES[0], FILES[2]]))
+
+    assert told[0] == f"x.tar: {KEY}: cam_00_rgb.mp4: is missing. {FETCH}"
+    assert "cam_01_rgb.mp4: has 512 bytes from byte 1536 on" in told[1]
+    assert len(told) == 2
+
+
+def test_a_member_too_many_is_told(toy):
+    told = toy(tar_of([*FILES, (f"{KEY}.cam_09_rgb.mp4", b"more")]))
+
+    assert told == [
+        f"x.tar: {KEY}: cam_09_rgb.mp4: is there, and the index does not know it. {FETCH}"
+    ]
+
+
+def test_a_renamed_scene_is_of_another_pack(toy):
+    told = toy(tar_of([(name.replace("0001", "0002"), content) for name, content in FILES]))
+
+    assert told == [
+        f"x.tar: holds other scenes than the index says: 1 unknown, 1 not there ({KEY}, "
+        f"{KEY[:-1]}2); shard and index are of different packs. Put the index beside the shards "
+        f"that it was packed with."
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "found"),
+    [
+        ("a/x.pkl", tarfile.REGTYPE, "'a/x.pkl': may hold code that runs when it is loaded"),
+        ("a/x.pyd", tarfile.REGTYPE, "may hold code that runs when it is loaded (.pyd)"),
+        ("a/x.pth", tarfile.REGTYPE, "may hold code that runs when it is loaded (.pth)"),
+        ("../x.json", tarfile.REGTYPE, "'../x.json': its name is no relative path"),
+        ("/x.json", tarfile.REGTYPE, "'/x.json': its name is no relative path"),
+        ("a/x.mp4", tarfile.SYMTYPE, "'a/x.mp4' is a symbolic link"),
+        ("a/x.mp4", tarfile.LNKTYPE, "'a/x.mp4' is a hard link"),
+        ("a/x.mp4", tarfile.CHRTYPE, "'a/x.mp4' is a character device"),
+        ("a/x", tarfile.DIRTYPE, "'a/x/' is a directory"),
+        ("a/x.mp4", tarfile.GNUTYPE_SPARSE, "'a/x.mp4' is a GNU sparse file"),
+        ("a/x.mp4", tarfile.XHDTYPE, "'a/x.mp4' is a PAX header"),
+        ("././@LongLink", tarfile.GNUTYPE_LONGNAME, "is a GNU long name"),
+        (FILES[0][0], tarfile.REGTYPE, "_000001.cam_00_depth.mkv' is there a second time"),
+    ],
+)  # fmt: skip
+def test_a_member_that_no_shard_may_hold_is_refused_by_name(toy, name, kind, found):
+    info = tarfile.TarInfo(name)
+    info.type = kind
+    whole = tar_of(FILES)[: -len(END_OF_ARCHIVE)]
+
+    (told,) = toy(whole + info.tobuf(tarfile.USTAR_FORMAT) + END_OF_ARCHIVE)
+
+    assert told.startswith("x.tar: at byte 3072, after ")
+    assert found in told
+
+
+def test_ten_gigabytes_that_are_not_there_are_refused_at_once(toy):
+    header = bytearray(member_header("a/x.mp4", 1))
+    header[124:136] = b"%012o" % 10_000_000_000
+    header[148:156] = b" " * 8
+    header[148:156] = b"%06o\0 " % sum(header)
+
+    (told,) = toy(tar_of(FILES)[: -len(END_OF_ARCHIVE)] + header + END_OF_ARCHIVE)
+
+    assert "'a/x.mp4' claims 10000000000 bytes" in told
+
+
+def test_a_missing_shard_is_told_with_what_it_held(shards):
+    (shards / PAIR).unlink()
+
+    assert lines(shards, mode="decode") == [f"{PAIR}: is missing, with 2 scenes. {FETCH}"]
+
+
+def test_shards_that_the_index_does_not_know_are_told(shards):
+    shutil.copy(shards / PAIR, shards / "train-Uniform-000001.tar")
+    (shards / "train-Uniform-000002.tar.tmp").write_bytes(b"half")
+
+    assert lines(shards) == [
+        "train-Uniform-000001.tar: is there, and the index does not know it. Put the index "
+        "beside the shards that it was packed with.",
+        "train-Uniform-000002.tar.tmp: is an unfinished shard. Run `stereogenbench pack` again, "
+        "or remove it.",
+    ]
+
+
+def test_an_index_of_another_pack_is_told_for_every_shard_that_differs(
+    shards, small_release, tmp_path
+):
+    pack(small_release, tmp_path / "other", target_bytes=250_000, workers=1)
+    shutil.copy(tmp_path / "other" / "index.parquet", shards / "index.parquet")
+
+    told = lines(shards, mode="decode")
+
+    assert [line.partition(":")[0] for line in told] == [
+        "dali/train-Uniform-000000.idx", "dali/train-Uniform-000001.idx", "shards.json", PAIR,
+        "train-Uniform-000001.tar",
+    ]  # fmt: skip
+    assert told[3].startswith(
+        f"{PAIR}: holds 17 members that the index does not place in it ({SCENES[1]}._scene"
+    )
+    assert told[3].endswith(
+        ": something was appended, or the index is of another pack. Fetch the shard and its index "
+        "again, or pack them again."
+    )
+    assert told[4].startswith("train-Uniform-000001.tar: is missing, with 1 scene.")
+
+
+def test_all_problems_are_listed_whatever_the_workers(shards, edit, place):
+    (shards / SINGLE).unlink()
+    for scene in SCENES:
+        edit(PAIR, flipped(place(scene, "trajectory.json").offset))
+
+    told = verify(shards, workers=2).problems
+
+    assert [(each.shard, each.scene, each.member) for each in told] == [
+        (SINGLE, "", ""),
+        (PAIR, SCENES[0], "trajectory.json"),
+        (PAIR, SCENES[1], "trajectory.json"),
+    ]
+
+
+@pytest.fixture
+def repacked(small_release, tmp_path):
+    """Pack the release after one of its files was exchanged, with the index as it was before."""
+
+    def make(name, content):
+        tree = shutil.copytree(small_release, tmp_path / "tree")
+        index = SceneIndex.open(tree)
+        row = [index.scene(row).id.key for row in range(len(index))].index(SCENES[0])
+        (tree / SCENES[0] / name).write_bytes(content)
+        scenes = [index.scene(number) for number in range(len(index))]
+        members = dict(scenes[row].members)
+        members[name] = replace(members[name], size=len(content))
+        scenes[row] = replace(scenes[row], members=members)
+        out = tmp_path / "repacked"
+        pack(SceneIndex.from_scenes(scenes, tree), out, workers=1)
+        assert lines(out) == []
+        return lines(out, mode="decode")
+
+    return make
+
+
+def test_a_video_with_fewer_frames_is_told_by_decoding(repacked, tmp_path):
+    short = write_video(tmp_path / "short.mp4", frames=6, size=(64, 64), tags={})
+
+    assert repacked("cam_01_rgb.mp4", short.read_bytes()) == [
+        f"{PAIR}: {SCENES[0]}: cam_01_rgb.mp4: has 6 frames of 64x64 pixels, and by the index 7 "
+        f"of 64x64. Pack the scene again from a video that is whole."
+    ]
+
+
+def test_a_damaged_video_is_told_by_decoding(repacked, small_release):
+    content = bytearray((small_release / SCENES[0] / "cam_02_depth.mkv").read_bytes())
+    content[len(content) // 2] ^= 0x55
+
+    (told,) = repacked("cam_02_depth.mkv", bytes(content))
+
+    assert told.startswith(f"{PAIR}: {SCENES[0]}: cam_02_depth.mkv: ")
+    assert "frame" in told
+
+
+def test_depth_of_another_unit_than_the_index_says_is_told_by_decoding(repacked, tmp_path):
+    other = write_video(
+        tmp_path / "o_depth.mkv", frames=7, size=(64, 64), tags={"DEPTH_SCALE": "0.5"}
+    )
+
+    (told,) = repacked("cam_05_depth.mkv", other.read_bytes())
+
+    assert (
+        "cam_05_depth.mkv: is stored as ('ffv1', 'gray16le', 0.5), and by the index as "
+        "('ffv1', 'gray16le', 0.001)"
+    ) in told
+
+
+def test_what_is_no_video_is_told_by_decoding(repacked):
+    (told,) = repacked("cam_00_rgb.mp4", b"no film")
+
+    assert "cam_00_rgb.mp4: cannot be opened as MP4 or Matroska" in told
+
+
+def test_a_folder_that_was_not_finished_is_refused(shards):
+    (shards / "index.parquet").unlink()
+
+    with pytest.raises(ShardError, match="Packing was not finished: run `stereogenbench pack`"):
+        verify(shards)
+
+
+def test_a_folder_without_index_is_refused(tmp_path):
+    with pytest.raises(ShardError, match=r"holds no index\.parquet\. Point at a folder that"):
+        verify(tmp_path)
+
+
+def test_a_released_folder_is_not_shards(small_release, tmp_path):
+    SceneIndex.open(small_release).write(tmp_path / "index.parquet")
+
+    with pytest.raises(ShardError, match="is the index of a released folder, not of shards"):
+        verify(tmp_path, root=small_release)
+
+
+def test_far_shards_are_to_be_fetched(tmp_path):
+    with pytest.raises(ShardError, match=r"is far away\. Fetch the shards"):
+        verify("https://example.org/shards")
+
+
+@pytest.mark.parametrize(
+    ("member", "change", "found"),
+    [
+        ("baseline.json", lambda scene: {"rig": replace(scene.rig, focal_mm=99.0)},
+         "tells focal_mm "),
+        ("baseline.json",
+         lambda scene: {"rig": replace(scene.rig, baselines_cm=(7.0,) * 15)},
+         "tells baselines_cm ("),
+        ("baseline.json", lambda scene: {"rig": replace(scene.rig, primary_pair=(2, 4))},
+         "tells primary_pair (0, 1), and by the index it is (2, 4)"),
+        ("trajectory.json", lambda scene: {"frames": 6},
+         "tells frames 7, and by the index it is 6"),
+        ("trajectory.json", lambda scene: {"lateral_m": (0.0,) * 6}, "tells lateral_m (0.0, "),
+        ("trajectory.json", lambda scene: {"rig_residual_px": 5.0}, "tells rig_residual_px "),
+        ("scene_description_qwen_dataset_level.json", lambda scene: {"caption": "Snow."},
+         "and by the index it is 'Snow.'"),
+        ("baseline.json", lambda scene: {"labels": replace(scene.labels, character="Nobody")},
+         "and by the index it is 'Nobody'"),
+        ("", lambda scene: {"id": replace(scene.id, family="IPD_Gaussian")},
+         "its path tells family 'Uniform', and by the index it is 'IPD_Gaussian'"),
+    ],
+)  # fmt: skip
+def test_an_index_that_contradicts_a_shards_metadata_is_told(shards, member, change, found):
+    index = SceneIndex.open(shards)
+    scenes = [index.scene(row) for row in range(len(index))]
+    row = [scene.id.key for scene in scenes].index(SCENES[1])
+    scenes[row] = replace(scenes[row], **change(scenes[row]))
+    altered = SceneIndex.from_scenes(scenes, shards, shards=index.shards)
+    altered.write(shards / "index.parquet")
+
+    (told,) = lines(shards)
+
+    assert told.startswith(": ".join(part for part in (PAIR, SCENES[1], member) if part) + ": ")
+    assert found in told
+    assert told.endswith(". Fetch the shard and its index again, or pack them again.")
+
+
+@pytest.mark.parametrize("name", ["shards.json", f"dali/{PAIR[:-4]}.idx"])
+def test_files_for_other_readers_that_are_missing_or_altered_are_told(shards, name):
+    write = "Fetch it again, or write it anew: run `stereogenbench pack` again."
+    content = (shards / name).read_bytes()
+    (shards / name).write_bytes(content.replace(b"1", b"2", 1))
+    altered = lines(shards)
+    (shards / name).unlink()
+
+    missing = lines(shards)
+
+    assert altered == [f"{name}: contradicts the index. {write}"]
+    assert missing == [f"{name}: is missing, and pack wrote it. {write}"]
+
+
+def test_a_file_that_was_appended_to_a_shard_is_told_as_such(shards, edit):
+    added = tar_of([("train/Uniform/SynthStage/scene_000009.notes.txt", b"mine")])
+    edit(PAIR, lambda content: content[: -len(END_OF_ARCHIVE)] + added)
+
+    assert lines(shards) == [
+        f"{PAIR}: holds 1 member that the index does not place in it (train/Uniform/SynthStage/"
+        f"scene_000009.notes.txt): something was appended, or the index is of another pack. Fetch "
+        f"the shard and its index again, or pack them again."
+    ]
+
+
+def test_a_damaged_index_of_shards_is_to_be_fetched_or_packed_again(shards):
+    content = bytearray((shards / "index.parquet").read_bytes())
+    content[len(content) // 2 :] = b""
+    (shards / "index.parquet").write_bytes(content)
+
+    with pytest.raises(StorageError, match="the index of shards: fetch it again or, where"):
+        verify(shards)
+
+
+def test_an_index_that_contradicts_itself_is_refused(shards):
+    index = SceneIndex.open(shards)
+    index.shards.pop(PAIR)
+    index.write(shards / "index.parquet")
+
+    with pytest.raises(ShardError, match=f"in {PAIR} and knows no such shard"):
+        verify(shards)
+
+
+def test_a_problem_is_one_line():
+    problem = Problem("x.tar", "", "", "is\nodd", "Do this.")
+
+    assert str(problem) == "x.tar: is odd. Do this."
+
+
+def command(*words):
+    return CliRunner().invoke(app, ["verify", *map(str, words)])
+
+
+def test_the_command_ends_with_0_where_all_is_well(small_shards):
+    result = command(small_shards, "--deep", "--workers", "1")
+
+    assert result.exit_code == 0
+    assert result.stdout.startswith(f"{small_shards}: 3 shards, 4 scenes, 68 members, ")
+    assert result.stdout.endswith(" MB, 48 videos decoded; 0 problems\n")
+
+
+def test_the_command_ends_with_1_and_a_line_for_each_problem(shards):
+    (shards / PAIR).unlink()
+    (shards / SINGLE).unlink()
+
+    result = command(shards)
+
+    assert result.exit_code == 1
+    assert [line.split(": ")[0] for line in result.stdout.splitlines()] == [
+        SINGLE,
+        PAIR,
+        str(shards),
+    ]
+    assert result.stdout.splitlines()[-1].endswith("; 2 problems")
+
+
+def test_one_problem_is_told_in_the_singular(shards):
+    (shards / "shards.json").unlink()
+
+    assert command(shards).stdout.endswith("; 1 problem\n")
+
+
+def test_the_command_reports_as_json(shards):
+    (shards / PAIR).unlink()
+
+    result = command(shards, "--json")
+
+    told = json.loads(result.stdout)
+    assert result.exit_code == 1
+    assert (told["shards"], told["scenes"]) == (3, 4)
+    assert told["problems"] == [
+        {
+            "shard": PAIR,
+            "scene": "",
+            "member": "",
+            "found": "is missing, with 2 scenes",
+            "cure": FETCH,
+        }
+    ]
+
+
+def test_the_command_ends_with_2_where_there_is_nothing_to_verify(tmp_path):
+    ended = subprocess.run(
+        [sys.executable, "-m", "stereogenbench_data.cli.main", "verify", tmp_path],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+    assert ended.returncode == 2
+    assert "ShardError" in ended.stderr
+
+
+def test_a_link_to_nowhere_is_no_shard(shards):
+    shard = sorted(shards.glob("*.tar"))[0]
+    shard.unlink()
+    shard.symlink_to("/nonexistent")
+
+    [line] = lines(shards)
+
+    assert line.startswith(f"{shard.name}: is no file, with ")

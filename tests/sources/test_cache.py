@@ -1,0 +1,446 @@
+"""The cache: each member fetched once, whole, within its limit, and nobody else's files touched."""
+
+import errno
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+import zlib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.schema.records import Member
+from stereogenbench_data.sources import cache as cache_module
+from stereogenbench_data.sources.cache import FOLDER_NAME, ShardCache, require_limit
+from stereogenbench_data.sources.remote import RemoteObject
+from tests.servers.fault import Answer
+from tests.servers.tools import small_disk
+
+DATA = bytes(number * 7 % 256 for number in range(100_000))
+
+
+class Shelf(RemoteObject):
+    """A shard that is here; it notes what is fetched, and hands out other bytes as it is told."""
+
+    def __init__(self, data=DATA, *, where="https://h/x.tar"):
+        super().__init__(where)
+        self.data = data
+        self.fetched = []
+        self.wrong = []
+
+    def chunks(self, start, stop):
+        self.fetched.append((start, stop))
+        data = self.wrong.pop() if self.wrong else self.data[start:stop]
+        for first in range(0, len(data), 400):
+            yield data[first : first + 400]
+
+
+def member(offset, size, **how):
+    crc32 = how.get("crc32", zlib.crc32(DATA[offset : offset + size]))
+    return Member(how.get("path", "x.tar"), offset, size, crc32)
+
+
+def read(cache, wanted, shelf, *, revision="1"):
+    with cache.open(wanted, remote=shelf, revision=revision) as file:
+        return file.read()
+
+
+def items(folder):
+    return sorted((folder / FOLDER_NAME / "items").iterdir())
+
+
+@pytest.fixture
+def shelf():
+    return Shelf()
+
+
+@pytest.fixture
+def cache(tmp_path):
+    return ShardCache(tmp_path, limit_bytes=10_000)
+
+
+def test_a_member_is_fetched_once(cache, shelf):
+    for _ in range(3):
+        assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
+
+    assert shelf.fetched == [(1000, 3000)]
+    assert cache.used_bytes() == 2000
+
+
+def test_another_cache_in_the_folder_finds_it(cache, shelf, tmp_path):
+    read(cache, member(1000, 2000), shelf)
+    read(ShardCache(tmp_path, limit_bytes=5000), member(1000, 2000), shelf)
+    read(pickle.loads(pickle.dumps(cache)), member(1000, 2000), shelf)
+
+    assert len(shelf.fetched) == 1
+
+
+@pytest.mark.parametrize(
+    ("other", "revision"),
+    [
+        (member(1000, 2000), "2"),
+        (member(1000, 2000, path="y.tar"), "1"),
+        (member(1000, 2000, crc32=None), "1"),
+        (member(1001, 2000), "1"),
+        (member(1000, 1999), "1"),
+    ],
+    ids=["revision", "shard", "checksum", "offset", "size"],
+)
+def test_what_differs_in_anything_is_another_item(cache, shelf, other, revision):
+    read(cache, member(1000, 2000), shelf)
+
+    assert read(cache, other, shelf, revision=revision) == DATA[other.offset :][: other.size]
+    assert len(shelf.fetched) == 2
+
+
+def test_members_with_a_checksum_are_shared_by_all_addresses_others_are_not(cache):
+    one, other = Shelf(where="https://a/x.tar"), Shelf(where="https://b/x.tar")
+    for crc32 in (zlib.crc32(DATA[:50]), None):
+        read(cache, member(0, 50, crc32=crc32), one)
+        read(cache, member(0, 50, crc32=crc32), other)
+
+    assert (len(one.fetched), len(other.fetched)) == (2, 1)
+
+
+def test_wrong_bytes_are_fetched_again_once(cache, shelf):
+    shelf.wrong = [bytes(2000)]
+
+    assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
+    assert len(shelf.fetched) == 2
+
+
+def test_bytes_that_stay_wrong_are_an_error_and_are_not_kept(cache, shelf, tmp_path):
+    shelf.wrong = [bytes(2000), bytes(2000)]
+
+    with pytest.raises(
+        ShardError,
+        match=r"https://h/x.tar: the 2000 bytes from 1000 on have crc32 [0-9a-f]{8}, and the index "
+        r"says [0-9a-f]{8}, twice. The shard was damaged or replaced",
+    ):
+        cache.open(member(1000, 2000), remote=shelf, revision="1")
+    assert items(tmp_path) == []
+    assert cache.used_bytes() == 0
+
+
+def test_an_item_of_another_size_is_fetched_again(cache, shelf, tmp_path):
+    read(cache, member(1000, 2000), shelf)
+    for cut in (1999, 0):
+        os.truncate(items(tmp_path)[0], cut)
+        assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
+
+    assert len(shelf.fetched) == 3
+
+
+def test_an_item_that_was_written_into_is_fetched_again(cache, shelf, tmp_path):
+    read(cache, member(1000, 2000), shelf)
+    items(tmp_path)[0].write_bytes(bytes(2000))
+
+    assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
+    assert len(shelf.fetched) == 2
+
+
+@pytest.mark.parametrize(("crc32", "fetched"), [(zlib.crc32(DATA[1000:3000]), 1), (None, 2)])
+def test_an_item_of_another_time_is_kept_if_its_checksum_is_right(
+    cache, shelf, tmp_path, crc32, fetched
+):
+    wanted = member(1000, 2000, crc32=crc32)
+    read(cache, wanted, shelf)
+    os.utime(items(tmp_path)[0])
+    read(cache, wanted, shelf)
+
+    assert len(shelf.fetched) == fetched
+    assert read(cache, wanted, shelf) == DATA[1000:3000]
+    assert len(shelf.fetched) == fetched
+
+
+def test_a_folder_in_an_items_place_makes_way_for_it_and_is_kept(cache, shelf, tmp_path):
+    read(cache, member(1000, 2000), shelf)
+    item = items(tmp_path)[0]
+    item.unlink()
+    item.mkdir()
+    (item / "mine.txt").touch()
+
+    assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
+    assert item.is_file()
+    assert len(list(tmp_path.rglob("mine.txt"))) == 1
+
+
+def test_a_damaged_item_is_found_and_dropped_when_it_is_looked_for(cache, shelf, tmp_path):
+    wanted = member(1000, 2000)
+    how = {"where": shelf.where, "revision": "1"}
+    assert not cache.drop_damaged(wanted, **how)
+    read(cache, wanted, shelf)
+    assert not cache.drop_damaged(wanted, **how)
+    item = items(tmp_path)[0]
+    times = item.stat()
+    item.write_bytes(bytes(2000))
+    os.utime(item, ns=(times.st_atime_ns, times.st_mtime_ns))
+
+    assert cache.drop_damaged(wanted, **how)
+    assert read(cache, wanted, shelf) == DATA[1000:3000]
+
+
+def test_what_was_not_used_for_longest_goes_first(cache, shelf, tmp_path):
+    first, second, third = (member(3000 * each, 3000) for each in range(3))
+    for age, wanted in enumerate((first, second, third)):
+        known = set(items(tmp_path))
+        read(cache, wanted, shelf)
+        newest = (set(items(tmp_path)) - known).pop()
+        os.utime(newest, (1000 + age, newest.stat().st_mtime))
+    read(cache, first, shelf)
+    shelf.fetched.clear()
+
+    read(cache, member(9000, 2000), shelf)
+    assert cache.used_bytes() == 8000
+    read(cache, third, shelf)
+    read(cache, first, shelf)
+    assert shelf.fetched == [(9000, 11_000)]
+    read(cache, second, shelf)
+    assert len(shelf.fetched) == 2
+
+
+def test_a_reader_keeps_what_was_evicted_under_it(cache, shelf):
+    with cache.open(member(0, 6000), remote=shelf, revision="1") as file:
+        read(cache, member(6000, 6000), shelf)
+
+        assert cache.used_bytes() == 6000
+        assert file.read() == DATA[:6000]
+
+
+def test_an_item_above_the_limit_is_refused_with_both_sizes(cache, shelf):
+    with pytest.raises(
+        StorageError, match=r"limit of 10000 bytes is below the 10001 bytes of a member of https"
+    ):
+        cache.open(member(0, 10_001), remote=shelf, revision="1")
+    assert shelf.fetched == []
+    assert len(read(cache, member(0, 10_000), shelf)) == 10_000
+
+
+def test_files_of_others_are_neither_counted_nor_deleted(cache, shelf, tmp_path):
+    (tmp_path / "mine.txt").write_bytes(bytes(50_000))
+    (tmp_path / FOLDER_NAME / "items" / "mine.tar").write_bytes(bytes(50_000))
+    for each in range(8):
+        read(cache, member(4000 * each, 4000), shelf)
+
+    assert cache.used_bytes() == 8000
+    assert (tmp_path / "mine.txt").stat().st_size == 50_000
+    assert (tmp_path / FOLDER_NAME / "items" / "mine.tar").stat().st_size == 50_000
+
+
+def test_a_folder_of_that_name_that_is_no_cache_is_refused(tmp_path):
+    (tmp_path / FOLDER_NAME).mkdir()
+    (tmp_path / FOLDER_NAME / "thesis.tex").touch()
+    with pytest.raises(StorageError, match=r"members: holds thesis.tex and is no cache of this"):
+        ShardCache(tmp_path, limit_bytes=1)
+
+    (tmp_path / FOLDER_NAME / "CACHEDIR.TAG").write_text("something else")
+    with pytest.raises(StorageError, match=r"CACHEDIR.TAG: was not written by this package"):
+        ShardCache(tmp_path, limit_bytes=1)
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+    (tmp_path / "file").touch()
+
+    with pytest.raises(
+        StorageError, match=r"cannot be read or written \(Not a directory\). Choose"
+    ):
+        ShardCache(tmp_path / "file", limit_bytes=1)
+
+
+@pytest.mark.parametrize("limit", [0, -1, "1GB", None, 1.5, True], ids=repr)
+def test_a_limit_that_is_no_number_of_bytes_is_refused(tmp_path, limit):
+    with pytest.raises(
+        StorageError, match=rf"limit in whole bytes above 0, got {limit!r}: give a number, such as"
+    ):
+        require_limit(limit, folder=tmp_path)
+    if type(limit) is int:
+        with pytest.raises(StorageError, match="above 0"):
+            ShardCache(tmp_path, limit_bytes=limit)
+
+
+def test_a_folder_without_a_name_is_refused():
+    with pytest.raises(StorageError, match="a cache needs a folder, got ''"):
+        ShardCache("", limit_bytes=1)
+
+
+def test_a_folder_of_shards_is_refused_and_left_as_it_is(tmp_path):
+    (tmp_path / "train-Uniform-000000.tar").touch()
+
+    with pytest.raises(StorageError, match=r"holds shards \(train-Uniform-000000.tar\), which"):
+        ShardCache(tmp_path, limit_bytes=1)
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_full_disk_is_told_and_leaves_nothing(cache, shelf, tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(cache_module.os, "fsync", full)
+    with pytest.raises(StorageError, match=r"\(No space left on device\). Free space, or give"):
+        cache.open(member(0, 2000), remote=shelf, revision="1")
+    assert items(tmp_path) == []
+
+
+def test_a_count_that_was_lost_is_made_again(cache, shelf, tmp_path):
+    ledger = tmp_path / FOLDER_NAME / "locks" / "size"
+    read(cache, member(0, 6000), shelf)
+    for damage in (b"", b"\xff nonsense"):
+        ledger.write_bytes(damage)
+        read(cache, member(6000, 3000), shelf)
+        read(cache, member(10_000, 3000), shelf)
+
+        assert cache.used_bytes() <= 10_000
+
+
+def test_the_rest_of_a_fill_that_was_killed_is_cleared_when_room_is_needed(cache, shelf, tmp_path):
+    (tmp_path / FOLDER_NAME / "items" / ("0" * 64 + ".part")).write_bytes(bytes(7000))
+    assert cache.used_bytes() == 7000
+
+    read(cache, member(0, 6000), shelf)
+    assert cache.used_bytes() == 6000
+
+
+@given(
+    opened=st.lists(st.integers(0, 11), max_size=25),
+    limit=st.integers(6000, 20_000),
+)
+@settings(deadline=None, max_examples=25)
+def test_it_never_holds_more_than_its_limit_and_never_lies(tmp_path_factory, opened, limit):
+    cache = ShardCache(tmp_path_factory.mktemp("cache"), limit_bytes=limit)
+    shelf = Shelf()
+    for each in opened:
+        wanted = member(1000 * each, 500 * each)
+
+        assert read(cache, wanted, shelf) == DATA[1000 * each :][: 500 * each]
+        assert cache.used_bytes() <= limit
+
+
+FILL = """
+import sys
+from stereogenbench_data.schema.records import Member
+from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.remote import RemoteObject
+
+folder, url, limit, *numbers = sys.argv[1:]
+cache, remote = ShardCache(folder, limit_bytes=int(limit)), RemoteObject(url)
+print("ready", flush=True)
+sys.stdin.readline()
+for number in map(int, numbers):
+    with cache.open(Member("x.tar", 1000 * number, 5000), remote=remote, revision="1") as file:
+        data = file.read()
+    expected = bytes(place * 7 % 256 for place in range(1000 * number, 1000 * number + 5000))
+    assert data == expected, number
+print("done", flush=True)
+"""
+
+
+class Fillers:
+    """Processes that open members of a shard through one cache, all at once."""
+
+    def __init__(self, folder, url):
+        self.folder, self.url = folder, url
+        self.processes = []
+
+    def start(self, *numbers, limit=10**6):
+        command = [sys.executable, "-c", FILL, str(self.folder), self.url, str(limit)]
+        process = subprocess.Popen(
+            [*command, *map(str, numbers)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.processes.append(process)
+        return process
+
+    def go(self):
+        for process in self.processes:
+            assert process.stdout.readline() == "ready\n"
+        for process in self.processes:
+            process.stdin.write("\n")
+            process.stdin.flush()
+
+    def end(self):
+        return [process.communicate(timeout=60)[0] for process in self.processes]
+
+
+@pytest.fixture
+def fillers(tmp_path, web):
+    (web.folder / "x.tar").write_bytes(DATA)
+    started = Fillers(tmp_path / "cache", f"{web.url}/x.tar")
+    yield started
+    for process in started.processes:
+        process.kill()
+        process.communicate()
+
+
+def test_processes_that_fill_it_at_once_fetch_once(fillers, web):
+    web.always["x.tar"] = Answer(delay_s=0.5)
+    for _ in range(3):
+        fillers.start(4)
+    fillers.go()
+
+    assert fillers.end() == ["done\n"] * 3
+    assert [(asked.start, asked.stop) for asked in web.asked] == [(4000, 9000)]
+    assert web.sent == 5000
+
+
+def test_processes_that_need_more_than_fits_all_read_what_they_ask_for(fillers, web, tmp_path):
+    for first in range(3):
+        fillers.start(*[(first * 5 + each * 3) % 20 for each in range(20)], limit=22_000)
+    fillers.go()
+
+    assert fillers.end() == ["done\n"] * 3
+    assert ShardCache(tmp_path / "cache", limit_bytes=22_000).used_bytes() <= 22_000
+
+
+def test_a_process_that_is_killed_while_it_fills_leaves_no_lock_and_no_half(fillers, web):
+    web.answers = [Answer(stop_after=2000), Answer(delay_s=5.0)]
+    killed = fillers.start(4)
+    fillers.go()
+    deadline = time.monotonic() + 60
+    while len(web.answers) > 0 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    fillers.processes.clear()
+    killed.stdin.close()
+    killed.stdout.close()
+    fillers.start(4)
+    fillers.go()
+
+    assert fillers.end() == ["done\n"]
+    assert web.asked[-1].start == 4000
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A small disk that can be made read-only."""
+    with small_disk(tmp_path / "disk", size="1M") as place:
+        yield place
+
+
+def test_a_cache_that_may_only_be_read_serves_what_it_holds(disk, shelf):
+    wanted = member(1000, 2000)
+    read(ShardCache(disk, limit_bytes=10_000), wanted, shelf)
+    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
+
+    cache = ShardCache(disk, limit_bytes=10_000)
+
+    assert read(cache, wanted, shelf) == DATA[1000:3000]
+    assert not cache.drop_damaged(wanted, where="https://h/x.tar", revision="1")
+    assert shelf.fetched == [(1000, 3000)]
+    with pytest.raises(StorageError, match=r"Read-only file system\). Choose a place that can be"):
+        read(cache, member(0, 1000), shelf)
+
+
+def test_a_cache_that_another_process_is_making_is_used(tmp_path, shelf):
+    (tmp_path / FOLDER_NAME).mkdir()
+    (tmp_path / FOLDER_NAME / ".CACHEDIR.TAG.unfinished").write_bytes(b"Signat")
+
+    assert read(ShardCache(tmp_path, limit_bytes=10_000), member(0, 10), shelf) == DATA[:10]
+    assert not (tmp_path / FOLDER_NAME / ".CACHEDIR.TAG.unfinished").exists()

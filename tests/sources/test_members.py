@@ -1,0 +1,334 @@
+"""Members: the file that was indexed, or an error that says what was found."""
+
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+import zlib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from stereogenbench_data import errors
+from stereogenbench_data.errors import SchemaError, ShardError, StereoGenBenchError, StorageError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.records import Member, ShardFacts
+from stereogenbench_data.shards.pack import pack
+from stereogenbench_data.sources.location import is_remote, joined, local_path, shown, split_name
+from stereogenbench_data.sources.members import MemberSource, member_path, open_local
+from tests.servers.fault import Answer
+
+TEXT = b"12345"
+
+
+@pytest.fixture
+def root(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "b.json").write_bytes(TEXT)
+    (tmp_path / "x.tar").write_bytes(b"before" + TEXT + b"behind")
+    return tmp_path
+
+
+@pytest.fixture
+def scene(small_release):
+    return SceneIndex.open(small_release).scene(0)
+
+
+@pytest.fixture
+def in_shard(scene):
+    """A scene of one file that lies in a shard, and what the index knows of that."""
+    member = Member("x.tar", 6, 5, zlib.crc32(TEXT))
+    return replace(scene, members={"b.json": member}), {"x.tar": ShardFacts(17, "", 1)}
+
+
+def with_file(scene, member):
+    return replace(scene, members={"b.json": member})
+
+
+def test_a_released_file_is_given_by_its_path(root, scene):
+    source = MemberSource(root, shards={})
+    scene = with_file(scene, Member("a/b.json", 0, 5))
+
+    assert source.open(scene, "b.json") == root / "a" / "b.json"
+    assert source.read(scene, "b.json") == TEXT
+    assert source.label(scene, "b.json") == str(root / "a" / "b.json")
+    assert source.url(scene, "b.json") == str(root / scene.id.key)
+
+
+def test_a_member_of_a_shard_is_an_open_file_of_its_bytes(root, in_shard):
+    scene, shards = in_shard
+    source = MemberSource(root.as_uri(), shards=shards)
+
+    with source.open(scene, "b.json") as file:
+        assert file.read() == TEXT
+    assert source.read(scene, "b.json") == TEXT
+    assert source.label(scene, "b.json") == f"{root}/x.tar: b.json"
+    assert source.url(scene, "b.json") == f"{root}/x.tar"
+
+
+def test_a_member_whose_checksum_differs_is_told(root, in_shard):
+    scene, shards = in_shard
+    (root / "x.tar").write_bytes(b"before12344behind")
+
+    with pytest.raises(
+        ShardError, match=r"x.tar: b.json: has crc32 bcf20a8a, and the index says cbf53a1c. It"
+    ):
+        MemberSource(root, shards=shards).read(scene, "b.json")
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/etc/passwd", "../a/b.json", "a/../../x", "a/..", "..", "", "a//b", "a/./b", "C:/a", "a\\b"],
+)
+def test_a_path_that_could_leave_the_root_is_refused(root, scene, path):
+    scene = with_file(scene, Member(path, 0, 5))
+    for place in (str(root), "https://example.org"):
+        with pytest.raises(StorageError, match="is relative to the data's root and stays inside"):
+            MemberSource(place, shards={}).open(scene, "b.json")
+    with pytest.raises(StorageError, match="is relative to the data's root and stays inside"):
+        open_local(root, Member(path, 6, 5))
+
+
+def test_a_name_that_begins_or_ends_with_dots_is_let_through(root):
+    (root / "a" / "..b.").write_bytes(b"1")
+
+    assert member_path(root, Member("a/..b.", 0, 1)) == root / "a" / "..b."
+
+
+def test_a_file_of_another_size_is_named_with_both_sizes(root):
+    with pytest.raises(StorageError, match=r"b.json: has 5 bytes, and the index says 6. The file"):
+        open_local(root, Member("a/b.json", 0, 6))
+
+
+def test_a_file_that_is_gone_is_named(root):
+    with pytest.raises(StorageError, match=r"c.json: cannot be read \(No such file.*index` again"):
+        open_local(root, Member("a/c.json", 0, 5))
+
+
+def test_a_shard_that_is_gone_is_named(root, in_shard):
+    scene, shards = in_shard
+    (root / "x.tar").unlink()
+
+    with pytest.raises(ShardError, match=r"x.tar: cannot be read \(No such file.*Fetch the shard"):
+        MemberSource(root, shards=shards).open(scene, "b.json")
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_what_is_no_file_in_a_shards_place_is_named_and_not_waited_for(root, in_shard, make):
+    scene, shards = in_shard
+    (root / "x.tar").unlink()
+    make(root / "x.tar")
+
+    with pytest.raises(ShardError, match=r"x.tar: cannot be read \(it is no regular file\). Fetch"):
+        MemberSource(root, shards=shards).open(scene, "b.json")
+
+
+def test_a_shard_of_another_size_is_named_with_both_sizes(root, in_shard):
+    scene, shards = in_shard
+    os.truncate(root / "x.tar", 16)
+
+    with pytest.raises(
+        ShardError,
+        match=r"x.tar: has 16 bytes, and the index says 17. The index is of another pack, or the "
+        r"shard was replaced or cut short",
+    ):
+        MemberSource(root, shards=shards).open(scene, "b.json")
+
+
+def test_a_shard_of_which_no_size_is_known_must_hold_the_member(root):
+    os.truncate(root / "x.tar", 10)
+
+    with pytest.raises(ShardError, match="has 10 bytes, and the index says at least 11"):
+        open_local(root, Member("x.tar", 6, 5))
+
+
+@pytest.mark.parametrize("place", ["a folder", "a URL"])
+def test_a_metadata_file_that_is_too_large_is_not_read(root, scene, place):
+    scene = with_file(scene, Member("a/b.json", 0, 2**26))
+    source = MemberSource(root if place == "a folder" else "https://example.org", shards={})
+
+    with pytest.raises(SchemaError, match=r"b.json: .*this one has 67,108,864. It was not read"):
+        source.read(scene, "b.json")
+
+
+def test_a_pipe_in_a_files_place_is_named_and_not_waited_for(root, scene):
+    os.mkfifo(root / "pipe")
+    scene = with_file(scene, Member("pipe", 0, 0))
+
+    with pytest.raises(StorageError, match=r"pipe: b.json: is no file. Put the release's own"):
+        MemberSource(root, shards={}).read(scene, "b.json")
+
+
+def test_a_folder_in_a_files_place_is_named(root, scene):
+    scene = with_file(scene, Member("a", 0, (root / "a").stat().st_size))
+
+    with pytest.raises(StorageError, match=r"a: b.json: is no file. Put the release"):
+        MemberSource(root, shards={}).read(scene, "b.json")
+
+
+def test_a_member_behind_a_url_is_fetched_by_its_range(web, in_shard, root):
+    scene, shards = in_shard
+    (web.folder / "x.tar").write_bytes((root / "x.tar").read_bytes())
+    source = MemberSource(f"{web.url}?key=secret", shards=shards)
+
+    assert source.read(scene, "b.json") == TEXT
+    assert [(asked.start, asked.stop) for asked in web.asked] == [(0, 1), (6, 11)]
+    assert source.label(scene, "b.json") == f"{web.url}/x.tar: b.json"
+    assert source.url(scene, "b.json") == f"{web.url}/x.tar"
+
+
+def test_a_copy_in_another_process_checks_sizes_for_itself(web, in_shard, root):
+    scene, shards = in_shard
+    (web.folder / "x.tar").write_bytes((root / "x.tar").read_bytes())
+    source = MemberSource(web.url, shards=shards)
+    source.read(scene, "b.json")
+    web.always["x.tar"] = Answer(size=18)
+
+    copy = pickle.loads(pickle.dumps(source))
+    with pytest.raises(ShardError, match="has 18 bytes, and the index says 17"):
+        copy.read(scene, "b.json")
+
+
+def test_a_file_of_a_released_folder_can_lie_behind_a_url(web, scene):
+    (web.folder / "a #1").mkdir()
+    (web.folder / "a #1" / "b.json").write_bytes(TEXT)
+    scene = with_file(scene, Member("a #1/b.json", 0, 5))
+    source = MemberSource(web.url, shards={})
+
+    assert source.read(scene, "b.json") == TEXT
+    assert source.url(scene, "b.json") == f"{web.url}/{scene.id.key}"
+
+
+@pytest.mark.parametrize(
+    ("root", "expected"),
+    [
+        ("https://h/a/", "https://h/a/b%20c/x.tar"),
+        ("https://h/a?key=1", "https://h/a/b%20c/x.tar?key=1"),
+        ("https://me:word@h", "https://me:word@h/b%20c/x.tar"),
+        ("s3://bucket/a", "s3://bucket/a/b c/x.tar"),
+        ("hf://datasets/org/name@main", "hf://datasets/org/name@main/b c/x.tar"),
+        ("zip://in::s3://bucket/all.zip", "zip://in/b c/x.tar::s3://bucket/all.zip"),
+    ],
+)
+def test_a_path_is_joined_to_a_root(root, expected):
+    assert joined(root, "b c/x.tar") == expected
+
+
+def test_a_name_cannot_make_a_chain_of_a_root():
+    with pytest.raises(StorageError, match=r"s3://b: holds 'a::local:', and a name with '::' in"):
+        joined("s3://b", "a::local:")
+
+
+def test_what_is_secret_in_a_url_is_not_shown():
+    assert shown("https://me:word@h:1/a/x.tar?key=1#2") == "https://h:1/a/x.tar"
+    assert shown("hf://datasets/org/name@main/x.tar") == "hf://datasets/org/name@main/x.tar"
+    assert shown("s3://bucket/a") == "s3://bucket/a"
+    assert shown("a?b") == "a?b"
+
+
+@pytest.mark.parametrize(
+    ("url", "told"),
+    [
+        ("s3://K:PW@b/x", "s3://b/x"),
+        ("ftp://u:PW@h/x", "ftp://h/x"),
+        ("HTTP://u:PW@h", "HTTP://h"),
+        ("simplecache::https://u:PW@h/x?token=PW", "simplecache::https://h/x"),
+        ("zip://a::http://u:PW@h/z#PW", "zip://a::http://h/z"),
+        ("zip://a.*::simplecache::https://u:PW@h", "zip://a.*::simplecache::https://h"),
+        ("http://u:P/PW@h/x", "http://h/x"),
+        ("http://u:P?PW@h/x", "http://h/x"),
+        ("http://u:P@PW@h/x", "http://h/x"),
+        ("http://u::PW@h/x", "http://h/x"),
+        ("http://u:PW@[::1/x", "http://[::1/x"),
+        ("http://[::1]:80/x", "http://[::1]:80/x"),
+        ("http:////u:PW@h/x", "http:////h/x"),
+        ("hf://u:PW@datasets/a/b@main", "hf://datasets/a/b@main"),
+        ("https://h/x?X-Amz-Signature=PW", "https://h/x"),
+    ],
+)
+def test_no_login_and_no_query_of_any_link_of_a_chain_is_shown(url, told):
+    assert shown(url) == told
+    assert str(StorageError(f"{url}: is there; see '{url}'.")).count("PW") == 0
+
+
+def test_a_url_given_as_a_path_shows_no_login():
+    with pytest.raises(StorageError, match=r"http:/h/x does not exist") as caught:
+        SceneIndex.open(Path("http://u:PW@h/x?key=PW"))
+    assert "PW" not in str(caught.value)
+
+
+def test_every_error_is_made_of_one_text_that_shows_no_login():
+    kinds = [each for each in vars(errors).values() if isinstance(each, type)]
+    kinds = [each for each in kinds if issubclass(each, StereoGenBenchError)]
+
+    for kind in kinds:
+        error = pickle.loads(pickle.dumps(kind("s3://K:PW@b/x: is gone.")))
+        assert type(error) is kind
+        assert error.args == ("s3://b/x: is gone.",)
+    assert len(kinds) > 10
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["http://u:PW@[::1/x", "http://u:PW@h:99999/x", "http://u:PW@h:\u00b2/x", "http://u:PW@/x",
+     "http://u:PW@h..h/x"],
+)  # fmt: skip
+def test_a_url_that_is_none_is_named_without_its_login(url):
+    with pytest.raises(StorageError, match=r"is no URL: correct it") as caught:
+        SceneIndex.open(url)
+    assert "PW" not in str(caught.value)
+
+
+def test_a_file_url_is_a_path_of_this_machine(tmp_path):
+    place = tmp_path / "a b"
+
+    assert not is_remote(place.as_uri())
+    assert local_path(place.as_uri()) == place
+    assert is_remote("s3://bucket")
+    assert not is_remote(Path("a"))
+
+
+def test_the_last_part_of_a_url_is_its_name():
+    assert split_name("https://h/a/index.parquet?k=1") == ("https://h/a?k=1", "index.parquet")
+    assert split_name("hf://datasets/o/n/x.parquet") == ("hf://datasets/o/n", "x.parquet")
+
+
+OUT_OF_FILES = """
+import os, resource, sys
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.errors import StorageError
+
+pairs = StereoPairs(sys.argv[1], fields=("left",))
+pairs[0]
+opened = [os.open(os.devnull, os.O_RDONLY)]
+_, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+resource.setrlimit(resource.RLIMIT_NOFILE, (opened[0] + 1, most))
+for opens in (lambda: pairs[len(pairs) - 1], lambda: StereoPairs(sys.argv[1])):
+    try:
+        opens()
+    except StorageError as error:
+        print(str(error).replace(chr(10), " "))
+"""
+
+
+@pytest.mark.parametrize("kind", ["tree", "shards", "packed depth"])
+def test_too_many_open_files_are_told_as_such(kind, small_release, tmp_path):
+    data = small_release
+    if kind == "tree":
+        data = shutil.copytree(small_release, tmp_path / "tree")
+        SceneIndex.open(data).write(data / "index.parquet")
+    else:
+        data = tmp_path / "shards"
+        codec = "released" if kind == "shards" else "blosc2"
+        pack(small_release, data, depth_codec=codec, workers=1)
+
+    told = subprocess.run(
+        [sys.executable, "-c", OUT_OF_FILES, data], check=True, capture_output=True, text=True
+    ).stdout.splitlines()
+
+    assert len(told) == 2
+    for line in told:
+        assert "(Too many open files). Raise the limit of open files (`ulimit -n`)" in line
+        assert "again" not in line

@@ -1,0 +1,601 @@
+"""Bytes from a server that fails: had all the same, each once, or an error that says why not."""
+
+import pickle
+import threading
+
+import pytest
+import urllib3
+
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.sources import http as web_transport
+from stereogenbench_data.sources.members import read_range, size_of
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import Fault, Patience
+from tests.servers.fault import Answer, serving
+from tests.servers.raw import raw_serving
+
+DATA = bytes(range(256)) * 1000
+
+
+class Clock:
+    """Waits that take no time, and are noted."""
+
+    def __init__(self):
+        self.waits_s = []
+
+    def patience(self, **how):
+        return Patience(sleep=self.waits_s.append, chance=lambda: 0.0, **how)
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def served(web):
+    (web.folder / "x.tar").write_bytes(DATA)
+    return web
+
+
+def ranges(server):
+    return [(asked.start, asked.stop) for asked in server.asked]
+
+
+def test_a_range_is_asked_for_alone(served):
+    assert read_range(f"{served.url}/x.tar", 1000, 3000) == DATA[1000:3000]
+    assert ranges(served) == [(1000, 3000)]
+    assert served.sent == 2000
+
+
+def test_the_size_costs_one_byte(served):
+    assert size_of(f"{served.url}/x.tar") == len(DATA)
+    assert served.sent == 1
+
+
+def test_a_local_file_is_read_by_range_too(tmp_path):
+    (tmp_path / "x y.tar").write_bytes(DATA)
+
+    for place in (tmp_path / "x y.tar", (tmp_path / "x y.tar").as_uri()):
+        assert read_range(place, 1000, 3000) == DATA[1000:3000]
+        assert size_of(place) == len(DATA)
+    with pytest.raises(StorageError, match=r"gone.tar: cannot be read \(No such file"):
+        size_of(tmp_path / "gone.tar")
+    with pytest.raises(StorageError, match=r"gone.tar: cannot be read \(No such file"):
+        read_range(tmp_path / "gone.tar", 0, 1)
+    with pytest.raises(StorageError, match=r"x y.tar: ends at byte 256000"):
+        read_range(tmp_path / "x y.tar", 0, len(DATA) + 1)
+
+
+def test_an_answer_cut_short_is_gone_on_with_where_it_ended(served, clock):
+    served.answers = [Answer(stop_after=30_000), Answer(stop_after=100_000)]
+    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience())
+
+    assert remote.read(500, 200_500) == DATA[500:200_500]
+    assert ranges(served) == [(500, 200_500), (30_500, 200_500), (130_500, 200_500)]
+    assert served.sent == 200_000
+    assert clock.waits_s == [0.5, 0.5]
+
+
+def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, clock):
+    served.always["x.tar"] = Answer(status=503)
+    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience(longest_wait_s=3.0))
+
+    with pytest.raises(
+        StorageError,
+        match=r"x.tar: cannot be read, at byte 0 of 9 \(the server answers 503 Service Unavailable;"
+        r" 6 tries\). Check the network and the server",
+    ):
+        remote.read(0, 9)
+    assert clock.waits_s == [0.5, 1.0, 2.0, 3.0, 3.0]
+
+
+@pytest.mark.parametrize("status", [429, 503])
+def test_the_server_says_how_long_to_wait(served, clock, status):
+    served.answers = [Answer(status=status, headers={"Retry-After": "7"})]
+    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience())
+
+    assert remote.read(0, 9) == DATA[:9]
+    assert clock.waits_s == [7.0]
+
+
+def test_the_server_may_say_until_when_to_wait(served, clock):
+    dates = ["Wed, 21 Oct 2015 07:28:00 GMT", "Fri, 21 Oct 2095 07:28:00 -0000", "soon"]
+    served.answers = [
+        Answer(status=503, headers={"Retry-After": date}) for date in (dates[0], dates[2], dates[1])
+    ]
+    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience())
+
+    with pytest.raises(StorageError, match=r"503 Service Unavailable, which asks to wait \d{9,} s"):
+        remote.read(0, 9)
+    assert clock.waits_s == [0.5, 1.0]
+
+
+def test_jitter_shortens_a_wait_by_up_to_a_half():
+    waits_s = []
+    for chance in (0.0, 0.5, 1.0):
+        patience = Patience(sleep=waits_s.append, chance=lambda chance=chance: chance)
+        patience.wait(Fault("x"), failures=3)
+
+    assert waits_s == [2.0, 1.5, 1.0]
+
+
+def test_silence_is_a_fault(served, clock):
+    served.answers = [Answer(delay_s=1.0)]
+    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience(timeout_s=0.2))
+
+    assert remote.read(0, 9) == DATA[:9]
+    assert len(clock.waits_s) == 1
+
+
+def test_a_server_that_is_not_there_is_told_after_some_tries(served, clock):
+    remote = RemoteObject("http://127.0.0.1:1/x.tar", patience=clock.patience(attempts=3))
+
+    with pytest.raises(StorageError, match=r"Connection refused.*; 3 tries\)"):
+        remote.read(0, 9)
+    assert len(clock.waits_s) == 2
+
+
+@pytest.mark.parametrize(
+    ("status", "cure"),
+    [
+        (404, "Check the URL, and that the index and its shards lie in one folder"),
+        (403, "It may not be read with what the URL says: check access"),
+        (401, "It asks for a login"),
+        (400, "Check the URL and the server"),
+    ],
+)
+def test_what_will_not_pass_is_told_at_once(served, clock, status, cure):
+    served.always["x.tar"] = Answer(status=status)
+    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience())
+
+    with pytest.raises(StorageError, match=rf"x.tar: the server answers {status} .*\. {cure}"):
+        remote.read(0, 9)
+    assert len(served.asked) == 1
+    assert clock.waits_s == []
+
+
+def test_a_server_that_ignores_ranges_is_refused_before_it_has_sent_all(served):
+    served.always["x.tar"] = Answer(whole=True)
+
+    with pytest.raises(
+        StorageError,
+        match=r"sends the whole file \(256000 bytes\) when asked for bytes 5 to 9. Members are "
+        r"read in parts: use a server that honours ranges, as nginx does",
+    ):
+        read_range(f"{served.url}/x.tar", 5, 9)
+
+
+def test_the_whole_may_be_sent_where_the_whole_is_asked_for(served):
+    served.always["x.tar"] = Answer(whole=True)
+
+    assert size_of(f"{served.url}/x.tar") == len(DATA)
+    assert read_range(f"{served.url}/x.tar", 0, len(DATA)) == DATA
+
+
+@pytest.mark.parametrize(
+    ("told", "message"),
+    [
+        ("bytes 6-8/256000", r"sends bytes 6 to 8 when asked for 5 to 8. It does not honour"),
+        ("bytes 5-9/256000", r"sends bytes 5 to 9 when asked for 5 to 8. It does not honour"),
+        ("pages 5-8/256000", r"does not tell which part it sends \(Content-Range: 'pages 5-8/256"),
+    ],
+)
+def test_another_part_than_the_one_asked_for_is_refused(served, told, message):
+    served.always["x.tar"] = Answer(content_range=told)
+
+    with pytest.raises(StorageError, match=message):
+        read_range(f"{served.url}/x.tar", 5, 9)
+
+
+def test_a_file_that_ends_before_the_range_is_told(served):
+    with pytest.raises(StorageError, match=r"x.tar: has 256000 bytes, and byte 256009 is asked"):
+        read_range(f"{served.url}/x.tar", 256_000, 256_010)
+
+
+def test_a_size_that_is_not_told_is_an_error(served):
+    served.always["x.tar"] = Answer(content_range="bytes 0-0/*")
+
+    with pytest.raises(StorageError, match="its server does not tell how large it is"):
+        size_of(f"{served.url}/x.tar")
+
+
+def test_a_file_of_another_size_than_the_index_says_is_told_before_it_is_read(served):
+    remote = RemoteObject(f"{served.url}/x.tar", expected_size=255_999)
+
+    with pytest.raises(
+        ShardError,
+        match=r"x.tar: has 256000 bytes, and the index says 255999. The index is of another pack, "
+        r"or the file was replaced or cut short",
+    ):
+        remote.read(0, 9)
+    assert served.sent == 1
+
+
+def test_the_size_is_checked_once(served):
+    remote = RemoteObject(f"{served.url}/x.tar", expected_size=256_000)
+    for start in range(3):
+        remote.read(start, start + 9)
+
+    assert ranges(served) == [(0, 1), (0, 9), (1, 10), (2, 11)]
+
+
+def test_redirects_are_followed(served):
+    there = Answer(status=302, headers={"Location": f"{served.url}/x.tar"})
+    served.always["old/x.tar"] = there
+
+    assert read_range(f"{served.url}/old/x.tar", 5, 9) == DATA[5:9]
+
+
+def test_redirects_in_a_circle_are_told(served):
+    served.always["x.tar"] = Answer(status=302, headers={"Location": f"{served.url}/x.tar"})
+
+    with pytest.raises(StorageError, match=r"x.tar: is redirected more than 5 times"):
+        read_range(f"{served.url}/x.tar", 5, 9)
+
+
+def test_a_login_in_the_url_is_sent_and_never_shown(served):
+    url = served.url.replace("http://", "http://me:pass%20word@")
+    read_range(f"{url}/x.tar?key=secret", 0, 9)
+
+    assert served.asked[0].headers["authorization"] == "Basic bWU6cGFzcyB3b3Jk"
+    served.always["x.tar"] = Answer(status=404)
+    with pytest.raises(StorageError) as caught:
+        read_range(f"{url}/x.tar?key=secret", 0, 9)
+    assert f"{served.url}/x.tar: the server answers 404" in str(caught.value)
+
+
+def test_a_query_is_neither_shown_nor_chained(clock):
+    remote = RemoteObject(
+        "http://127.0.0.1:1/x.tar?key=secret", patience=clock.patience(attempts=1)
+    )
+    with pytest.raises(StorageError) as caught:
+        remote.read(0, 9)
+
+    error: BaseException | None = caught.value
+    while error is not None:
+        assert "secret" not in str(error)
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+
+
+def test_a_url_that_is_none_is_told(clock):
+    with pytest.raises(StorageError, match="is no URL: correct it"):
+        RemoteObject("http://a:b:c/x", patience=clock.patience()).read(0, 9)
+
+
+def test_threads_read_at_the_same_time_over_connections_that_are_used_again(served):
+    remote = RemoteObject(f"{served.url}/x.tar")
+    wrong = []
+
+    def read(first):
+        for start in range(first, first + 20_000, 1000):
+            if remote.read(start, start + 500) != DATA[start : start + 500]:
+                wrong.append(start)
+
+    threads = [threading.Thread(target=read, args=(10_000 * each,)) for each in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert wrong == []
+    assert len(served.asked) == 80
+    assert served.connections <= 8
+
+
+def test_connections_can_be_closed_and_are_opened_anew(served):
+    read_range(f"{served.url}/x.tar", 0, 9)
+    web_transport.close_connections()
+
+    assert read_range(f"{served.url}/x.tar", 0, 9) == DATA[:9]
+
+
+def test_a_remote_object_can_be_sent_to_another_process(served):
+    remote = pickle.loads(pickle.dumps(RemoteObject(f"{served.url}/x.tar")))
+
+    assert remote.read(5, 9) == DATA[5:9]
+
+
+MONDAY, TUESDAY = "Mon, 02 Feb 2026 07:28:00 GMT", "Tue, 03 Feb 2026 07:28:00 GMT"
+
+
+@pytest.mark.parametrize("honours_if_range", [True, False])
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ({"ETag": '"a"'}, {"ETag": '"b"'}, r'its ETag was "a" and is "b"'),
+        ({"ETag": 'W/"a"'}, {"ETag": 'W/"b"'}, r'its ETag was "a" and is "b"'),
+        (
+            {"Last-Modified": MONDAY},
+            {"Last-Modified": TUESDAY},
+            f"its Last-Modified was {MONDAY} and is {TUESDAY}",
+        ),
+        (
+            {"ETag": '"a"', "Last-Modified": MONDAY},
+            {"Last-Modified": TUESDAY},
+            f"its Last-Modified was {MONDAY} and is {TUESDAY}",
+        ),
+    ],
+)
+def test_a_file_that_is_replaced_between_two_ranges_is_told(
+    served, before, after, message, honours_if_range
+):
+    served.validators, served.honours_if_range = before, honours_if_range
+    remote = RemoteObject(f"{served.url}/x.tar")
+    remote.read(0, 9)
+    (served.folder / "x.tar").write_bytes(DATA[::-1])
+    served.validators = after
+
+    for _ in range(2):
+        with pytest.raises(
+            ShardError, match=rf"x.tar: was replaced on its server while it was read: {message}. "
+        ):
+            remote.read(9, 18)
+
+
+def test_a_file_that_is_replaced_within_one_read_is_told(served, clock):
+    served.validators = {"ETag": '"a"'}
+    served.answers = [Answer(stop_after=30_000)]
+    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience())
+    chunks = remote.chunks(0, 200_000)
+    next(chunks)
+    served.validators = {"ETag": '"b"'}
+
+    with pytest.raises(ShardError, match=r'its ETag was "a" and is "b"'):
+        list(chunks)
+
+
+def test_a_file_of_another_size_is_told_as_replaced_without_any_validator(served):
+    remote = RemoteObject(f"{served.url}/x.tar")
+    remote.read(0, 9)
+    (served.folder / "x.tar").write_bytes(DATA[:-1])
+
+    with pytest.raises(ShardError, match="its size was 256000 and is 255999"):
+        remote.read(9, 18)
+
+
+@pytest.mark.parametrize(
+    ("validators", "condition"),
+    [
+        ({"ETag": '"a"', "Last-Modified": MONDAY}, '"a"'),
+        ({"Last-Modified": MONDAY}, MONDAY),
+        ({"ETag": 'W/"a"', "Last-Modified": MONDAY}, None),
+        ({"ETag": "odd \u00b2"}, None),
+        ({}, None),
+    ],
+)
+def test_later_ranges_are_asked_for_on_condition(served, validators, condition):
+    served.validators = validators
+    remote = RemoteObject(f"{served.url}/x.tar")
+
+    assert remote.read(0, 9) + remote.read(9, 18) == DATA[:18]
+    asked = [asked.headers.get("if-range") for asked in served.asked]
+    assert asked == [None, condition]
+
+
+def test_mirrors_with_other_dates_and_one_etag_have_one_file(served):
+    served.validators = {"ETag": '"a"', "Last-Modified": MONDAY}
+    remote = RemoteObject(f"{served.url}/x.tar")
+    remote.read(0, 9)
+    served.validators = {"ETag": '"a"', "Last-Modified": TUESDAY}
+
+    assert remote.read(9, 18) == DATA[9:18]
+
+
+def head(start, stop, *more):
+    told = f"bytes {start}-{stop - 1}/{len(DATA)}"
+    lines = ["HTTP/1.1 206 x", f"Content-Range: {told}", f"Content-Length: {stop - start}", *more]
+    return "\r\n".join([*lines, "", ""]).encode("latin-1")
+
+
+def half_then_silence(start, stop):
+    yield head(start, stop) + DATA[start : (start + stop + 1) // 2]
+    yield 60.0
+
+
+def a_byte_at_a_time(start, stop):
+    yield head(start, stop)
+    for place in range(start, stop):
+        yield DATA[place : place + 1]
+        yield 0.02
+
+
+def a_byte_an_answer(start, stop):
+    yield head(start, stop) + DATA[start : start + 1]
+
+
+def a_trickling_head(start, stop):
+    for letter in head(start, stop, f"X: {'x' * 5000}"):
+        yield bytes([letter])
+        yield 0.02
+
+
+def a_trickling_redirect(start, stop):
+    for letter in b"HTTP/1.1 302 x\r\nLocation: /y\r\nContent-Length: 5000\r\n\r\n" + b"x" * 5000:
+        yield bytes([letter])
+        yield 0.005
+
+
+def a_trickling_length_of_a_chunk(start, stop):
+    yield (
+        f"HTTP/1.1 206 x\r\nContent-Range: bytes {start}-{stop - 1}/{len(DATA)}\r\n"
+        "Transfer-Encoding: chunked\r\n\r\n"
+    ).encode()
+    while True:
+        yield b"0"
+        yield 0.02
+
+
+@pytest.mark.parametrize(
+    ("answering", "reason"),
+    [
+        (half_then_silence, "fewer than 1000000 bytes a second over 0.2 s"),
+        (a_byte_at_a_time, "fewer than 1000000 bytes a second over 0.2 s"),
+        (a_byte_an_answer, "ProtocolError"),
+        (a_trickling_head, "no answer within 0.4 s"),
+        (a_trickling_redirect, "no answer within 0.4 s"),
+        (a_trickling_length_of_a_chunk, "fewer than 1000000 bytes a second over 0.2 s"),
+    ],
+)
+def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, reason):
+    patience = Patience(
+        attempts=2, first_wait_s=0.001, timeout_s=0.4, window_s=0.2, least_rate_bytes_s=1e6
+    )
+    with (
+        raw_serving(answering) as url,
+        pytest.raises(
+            StorageError,
+            match=rf"x.tar: cannot be read, at byte \d+ of 65536 \({reason}; 2 tries\)[^(]*"
+            r".*Patience\(...\)\), which has least_rate_bytes_s=1000000 over window_s=0.2, "
+            r"timeout_s=0.4, longest_read_s=600 now",
+        ),
+    ):
+        RemoteObject(f"{url}/x.tar", patience=patience).read(0, 65536)
+
+
+def test_a_read_has_a_bound_in_all_whatever_it_gains():
+    def slow(start, stop):
+        yield head(start, stop)
+        for place in range(start, stop, 100):
+            yield DATA[place : place + 100]
+            yield 0.02
+
+    patience = Patience(least_rate_bytes_s=0.0, longest_read_s=0.3)
+    with (
+        raw_serving(slow) as url,
+        pytest.raises(
+            StorageError, match=r"a read may take 0.3 s; 1 try\).*longest_read_s=0.3 now"
+        ),
+    ):
+        RemoteObject(f"{url}/x.tar", patience=patience).read(0, 65536)
+
+
+def test_waits_count_into_the_bound(served):
+    now_s = [0.0]
+    served.always["x.tar"] = Answer(status=503, headers={"Retry-After": "40"})
+
+    def sleep(seconds):
+        now_s[0] += seconds
+
+    patience = Patience(attempts=99, longest_read_s=100.0, sleep=sleep, clock=lambda: now_s[0])
+    with pytest.raises(StorageError, match=r"which asks to wait 40 s; 3 tries\)"):
+        RemoteObject(f"{served.url}/x.tar", patience=patience).read(0, 9)
+    assert now_s == [80.0]
+
+
+def test_a_steady_server_above_the_least_rate_is_read_to_the_end():
+    def steady(start, stop):
+        yield head(start, stop)
+        for place in range(start, stop, 4096):
+            yield DATA[place : min(place + 4096, stop)]
+            yield 0.01
+
+    patience = Patience(window_s=5.0, least_rate_bytes_s=1000.0, attempts=1)
+    with raw_serving(steady) as url:
+        assert RemoteObject(f"{url}/x.tar", patience=patience).read(7, 65536) == DATA[7:65536]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("attempts", 0), ("window_s", 0.0), ("longest_read_s", -1.0), ("timeout_s", float("nan"))],
+)
+def test_patience_without_an_end_is_refused(name, value):
+    with pytest.raises(StorageError, match=rf"Patience: {name} must be above 0, got {value}"):
+        Patience(**{name: value})
+
+
+@pytest.mark.parametrize(
+    "told", ["\u00b2", "9" * 5000, "Fri, 21 Oct 99999 07:28:00 GMT", ",", "-1"]
+)
+def test_a_retry_after_that_is_none_is_no_error_of_its_own(clock, told):
+    def busy(start, stop):
+        yield f"HTTP/1.1 503 x\r\nRetry-After: {told}\r\nContent-Length: 0\r\n\r\n".encode(
+            "latin-1"
+        )
+
+    with raw_serving(busy) as url, pytest.raises(StorageError, match=r"the server answers 503 x"):
+        RemoteObject(f"{url}/x.tar", patience=clock.patience(attempts=2)).read(0, 9)
+
+
+@pytest.mark.parametrize("told", ["\u00b2\u00b2", "9" * 5000, "-5", "0x10", ""])
+def test_a_length_that_is_no_number_is_named(told):
+    def whole(start, stop):
+        yield f"HTTP/1.1 200 x\r\nContent-Length: {told}\r\n\r\n".encode("latin-1") + DATA[:1]
+
+    with (
+        raw_serving(whole) as url,
+        pytest.raises(
+            StorageError, match=rf"its server does not tell how large it is \('{told[:80]}'\)"
+        ),
+    ):
+        RemoteObject(f"{url}/x.tar").size()
+
+
+@pytest.mark.parametrize(
+    "told",
+    [f"bytes 0-0/{'9' * 5000}", "bytes 0-\u00b2/9", "bytes -1-8/9", "bytes 0-8/9, bytes 0-8/9"],
+)
+@pytest.mark.parametrize("status", [206, 416])
+def test_a_content_range_that_is_none_is_named(told, status):
+    def odd(start, stop):
+        lines = [f"HTTP/1.1 {status} x", f"Content-Range: {told}", "Content-Length: 9", "", ""]
+        yield "\r\n".join(lines).encode("latin-1") + DATA[:9]
+
+    with (
+        raw_serving(odd) as url,
+        pytest.raises(
+            StorageError, match=rf"answers {status} and does not tell which part it sends"
+        ) as caught,
+    ):
+        RemoteObject(f"{url}/x.tar").read(0, 9)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("location", "message"),
+    [
+        (None, "the server answers 302 and names no place to go to"),
+        ("http://[::1", r"sends on to 'http://\[::1', which is no URL of a web server"),
+        ("file:///etc/passwd", "sends on to 'file:///etc/passwd', which is no URL of a web server"),
+        ("ftp://me:word@h/x", "sends on to 'ftp://h/x', which is no URL of a web server"),
+        ("http://h:99999/", "sends on to 'http://h:99999/', which is no URL of a web server"),
+        ("http://a..b/", "is redirected to http://a..b/, which is no URL"),
+    ],
+)
+def test_a_redirect_to_no_place_is_named(served, location, message):
+    headers = {} if location is None else {"Location": location}
+    served.always["x.tar"] = Answer(status=302, headers=headers)
+
+    with pytest.raises(StorageError, match=rf"x.tar: .*{message}"):
+        read_range(f"{served.url}/x.tar", 5, 9)
+
+
+@pytest.mark.parametrize(
+    ("url", "there", "message"),
+    [
+        ("https://8.8.8.8/x", "http://8.8.8.8/x", "sends on from https to http://8.8.8.8/x, which"),
+        ("https://8.8.8.8/x", "https://127.0.0.1/y", "inside this machine's own network"),
+        ("http://8.8.8.8/x", "http://[::ffff:10.0.0.1]/y", "inside this machine's own network"),
+        ("http://8.8.8.8/x", "http://169.254.169.254/", "inside this machine's own network"),
+        ("http://8.8.8.8/x", "http://localhost:80/", "inside this machine's own network"),
+    ],
+)
+def test_a_redirect_into_the_own_network_or_without_tls_is_refused(
+    monkeypatch, url, there, message
+):
+    def moved(*_):
+        return urllib3.HTTPResponse(status=302, headers={"Location": there})
+
+    monkeypatch.setattr(web_transport.WebTransport, "_ask", moved)
+
+    with pytest.raises(StorageError, match=message):
+        read_range(url, 0, 9)
+
+
+def test_a_login_is_not_sent_on_to_another_server(served, tmp_path):
+    with serving(served.folder) as other:
+        served.always["x.tar"] = Answer(status=302, headers={"Location": f"{other.url}/x.tar"})
+        url = served.url.replace("http://", "http://me:word@")
+
+        assert read_range(f"{url}/x.tar", 5, 9) == DATA[5:9]
+        assert "authorization" in served.asked[0].headers
+        assert "authorization" not in other.asked[0].headers

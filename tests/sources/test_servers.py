@@ -1,0 +1,261 @@
+"""Ranges from real servers of each kind: nginx, an S3 endpoint, and a Hub for its own client."""
+
+import io
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import ClassVar
+
+import fsspec
+import pytest
+
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.sources import filesystems
+from stereogenbench_data.sources.members import read_range, size_of
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import Patience
+from tests.servers.fault import Answer
+from tests.servers.fixtures import BUCKET
+from tests.servers.hub import COMMIT, REPOSITORY, HubHandler
+from tests.servers.tools import require_module
+
+
+def shard_of(folder: Path) -> Path:
+    return sorted(folder.glob("*.tar"))[0]
+
+
+def same_index(root, folder):
+    index = SceneIndex.open(root)
+    return index.root == root and index.digest == SceneIndex.open(folder).digest
+
+
+def test_nginx_sends_the_range_asked_for(nginx, small_shards):
+    shard = shard_of(small_shards)
+    url = f"{nginx.url}/{shard.name}"
+
+    assert size_of(url) == shard.stat().st_size
+    assert read_range(url, 1000, 3000) == shard.read_bytes()[1000:3000]
+    assert nginx.sent(requests=2) == 2001
+    assert same_index(nginx.url, small_shards)
+
+
+def test_nginx_redirects(nginx, small_shards):
+    shard = shard_of(small_shards)
+
+    assert read_range(f"{nginx.url}/moved/{shard.name}", 10, 20) == shard.read_bytes()[10:20]
+    assert nginx.statuses(requests=2) == [302, 206]
+
+
+def test_what_nginx_refuses_is_told(nginx, small_shards):
+    size = shard_of(small_shards).stat().st_size
+    with pytest.raises(StorageError, match=r"none.tar: the server answers 404 Not Found. Check"):
+        read_range(f"{nginx.url}/none.tar", 0, 9)
+    with pytest.raises(StorageError, match=r"x.tar: the server answers 403 Forbidden. It may not"):
+        read_range(f"{nginx.url}/forbidden/x.tar", 0, 9)
+    with pytest.raises(StorageError, match=rf"has {size} bytes, and byte {size + 8} is asked for"):
+        read_range(f"{nginx.url}/{shard_of(small_shards).name}", size, size + 9)
+
+
+def test_an_index_behind_a_url_may_be_named_itself(nginx, small_shards):
+    index = SceneIndex.open(f"{nginx.url}/index.parquet")
+
+    assert index.root == nginx.url
+    assert index.digest == SceneIndex.open(small_shards).digest
+
+
+def test_the_hub_sends_the_range_asked_for(hub, small_shards):
+    shard = shard_of(small_shards)
+    for revision in ("", "@main", f"@{COMMIT}"):
+        root = f"hf://datasets/{REPOSITORY}{revision}"
+        hub.asked.clear()
+
+        assert size_of(f"{root}/{shard.name}") == shard.stat().st_size
+        assert read_range(f"{root}/{shard.name}", 1000, 3000) == shard.read_bytes()[1000:3000]
+        assert hub.sent == 2000
+        assert same_index(root, small_shards)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        f"hf://datasets/{REPOSITORY}/none.tar",
+        f"hf://datasets/{REPOSITORY}@other/x.tar",
+        "hf://datasets/nobody/nothing/x.tar",
+    ],
+)
+def test_what_the_hub_does_not_have_is_told_at_once(hub, url):
+    with pytest.raises(StorageError, match=rf"{url}: does not exist, or is private. Check the URL"):
+        read_range(url, 0, 9)
+
+
+def test_a_private_data_set_is_told_without_the_token(hub, small_shards, monkeypatch):
+    conf = fsspec.config.conf["hf"] | {"token": "hf_expired"}
+    monkeypatch.setitem(fsspec.config.conf, "hf", conf)
+    url = f"hf://datasets/{REPOSITORY}/{shard_of(small_shards).name}"
+
+    with pytest.raises(StorageError, match="does not exist, or is private") as caught:
+        read_range(url, 0, 9)
+    assert "expired" not in str(caught.value)
+
+
+def test_a_hub_that_is_busy_is_asked_again_by_its_own_client(hub, small_shards):
+    shard = shard_of(small_shards)
+    url = f"hf://datasets/{REPOSITORY}/{shard.name}"
+    hub.answers = [Answer(status=503)]
+
+    assert read_range(url, 0, 9) == shard.read_bytes()[:9]
+    assert len(hub.asked) == 2
+
+
+def test_a_hub_that_sends_too_much_is_refused(hub, small_shards):
+    url = f"hf://datasets/{REPOSITORY}/{shard_of(small_shards).name}"
+    hub.answers = [Answer(whole=True)]
+
+    with pytest.raises(StorageError, match=r"sent more than the 9 bytes asked for from byte 0 on"):
+        read_range(url, 0, 9)
+
+
+def test_s3_sends_the_range_asked_for(s3, small_shards):
+    shard = shard_of(small_shards)
+
+    assert size_of(f"{s3}/{shard.name}") == shard.stat().st_size
+    assert read_range(f"{s3}/{shard.name}", 1000, 3000) == shard.read_bytes()[1000:3000]
+    assert same_index(s3, small_shards)
+
+
+def test_what_s3_does_not_have_is_told_at_once(s3):
+    with pytest.raises(StorageError, match=rf"{s3}/none.tar: does not exist, or is private"):
+        read_range(f"{s3}/none.tar", 0, 9)
+    with pytest.raises(StorageError, match=r"s3://no-bucket/x.tar: does not exist, or is private"):
+        size_of("s3://no-bucket/x.tar")
+
+
+def test_s3_without_a_login_is_told_at_once(s3, monkeypatch):
+    conf = {"endpoint_url": fsspec.config.conf["s3"]["endpoint_url"]}
+    monkeypatch.setitem(fsspec.config.conf, "s3", conf)
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_PROFILE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", os.devnull)
+    monkeypatch.setenv("AWS_CONFIG_FILE", os.devnull)
+
+    with pytest.raises(StorageError, match=r"may not be read \(NoCredentialsError\). Log in to"):
+        read_range(f"{s3}/x.tar", 0, 9)
+
+
+def test_a_shard_of_another_size_in_a_store_is_told(s3, small_shards):
+    url = f"{s3}/{shard_of(small_shards).name}"
+
+    with pytest.raises(ShardError, match=r"tar: has \d+ bytes, and the index says 5. The index"):
+        RemoteObject(url, expected_size=5).read(0, 3)
+
+
+def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_told(s3):
+    boto = require_module("boto3")
+    store = boto.client(
+        "s3", endpoint_url=fsspec.config.conf["s3"]["endpoint_url"], region_name="us-east-1",
+        aws_access_key_id="key", aws_secret_access_key="word",
+    )  # fmt: skip
+    store.put_object(Bucket=BUCKET, Key="shards/changing.tar", Body=b"0" * 1000)
+    remote = RemoteObject(f"{s3}/changing.tar", patience=Patience(attempts=1))
+    assert remote.read(0, 9) == b"0" * 9
+    store.put_object(Bucket=BUCKET, Key="shards/changing.tar", Body=b"1" * 1000)
+
+    with pytest.raises(ShardError, match=r"changing.tar: was replaced in its store while it was"):
+        remote.read(9, 18)
+    assert RemoteObject(f"{s3}/changing.tar").read(9, 18) == b"1" * 9
+    store.delete_object(Bucket=BUCKET, Key="shards/changing.tar")
+    store.close()
+
+
+def test_what_is_read_of_a_branch_of_the_hub_is_of_one_commit(hub, small_shards):
+    url = f"hf://datasets/{REPOSITORY}@main/{shard_of(small_shards).name}"
+    remote = RemoteObject(url)
+    paths = []
+
+    class Listening(HubHandler):
+        def parse_request(self):
+            parsed = super().parse_request()
+            paths.append(self.path)
+            return parsed
+
+    hub.RequestHandlerClass = Listening
+    filesystems._commits.clear()
+    remote.read(0, 9)
+
+    asked = [path for path in paths if "/resolve/" in path]
+    assert asked
+    assert all(f"/resolve/{COMMIT}/" in path for path in asked)
+
+
+def test_a_file_system_that_does_not_come_back_is_left(monkeypatch):
+    files = fsspec.filesystem("memory")
+    files.pipe_file("/shard.tar", b"0123456789")
+    done = threading.Event()
+    monkeypatch.setattr(files, "open", lambda *args, **how: done.wait())
+    remote = RemoteObject("memory://shard.tar", patience=Patience(longest_read_s=0.2))
+
+    with pytest.raises(StorageError, match=r"a read may take 0.2 s; 1 try\).*longest_read_s=0.2"):
+        remote.read(0, 9)
+    done.set()
+    files.rm("/shard.tar")
+
+
+def test_a_file_that_a_file_system_tells_otherwise_is_told_as_replaced(monkeypatch):
+    files = fsspec.filesystem("memory")
+    files.pipe_file("/shard.tar", b"0123456789")
+    tags = iter("aab")
+
+    class Tagged(io.BytesIO):
+        details: ClassVar = {}
+
+    def opened(path, *args, **how):
+        file = Tagged(b"0123456789")
+        file.details = {"ETag": next(tags), "size": 10}
+        return file
+
+    monkeypatch.setattr(files, "open", opened)
+    remote = RemoteObject("memory://shard.tar", patience=Patience(attempts=1))
+
+    assert remote.read(0, 3) + remote.read(3, 6) == b"012345"
+    with pytest.raises(ShardError, match=r"was replaced in its store .*: its ETag was a and is b"):
+        remote.read(6, 9)
+    files.rm("/shard.tar")
+
+
+def test_a_file_system_that_fails_is_asked_again(monkeypatch):
+    waits_s: list[float] = []
+    files = fsspec.filesystem("memory")
+    files.pipe_file("/shard.tar", b"0123456789")
+    failures = [OSError("connection reset"), TimeoutError()]
+
+    def opened(*args, **how):
+        if failures:
+            raise failures.pop()
+        return type(files).open(files, *args, **how)
+
+    monkeypatch.setattr(files, "open", opened)
+    remote = RemoteObject(
+        "memory://shard.tar", patience=Patience(sleep=waits_s.append, chance=lambda: 0.0)
+    )
+
+    assert remote.read(2, 6) == b"2345"
+    assert waits_s == [0.5, 1.0]
+    files.rm("/shard.tar")
+
+
+def test_a_url_that_no_file_system_opens_is_told():
+    with pytest.raises(StorageError, match=r"nope://a/b: is no URL that fsspec can open. Correct"):
+        read_range("nope://a/b", 0, 9)
+
+
+def test_a_file_system_that_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, "s3", raising=False)
+
+    with pytest.raises(
+        StorageError, match=r"s3://a/b: needs .*: pip install 'stereogenbench-data\[s3\]'"
+    ):
+        read_range("s3://a/b", 0, 9)
