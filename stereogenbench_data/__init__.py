@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from stereogenbench_data.schema.records import DepthEncoding
     from stereogenbench_data.selection.quality import order_quality
     from stereogenbench_data.sources.cache import ShardCache
-    from stereogenbench_data.sources.retry import Patience
+    from stereogenbench_data.sources.retry import RetryPolicy
 
 _HOMES = {
     "datasets.adapters": ("to_raft_stereo", "to_torchvision"),
@@ -104,7 +104,7 @@ _HOMES = {
     "selection.quality": ("order_quality",),
     "sources.cache": ("ShardCache",),
     "index.table": ("SceneIndex",),
-    "sources.retry": ("Patience",),
+    "sources.retry": ("RetryPolicy",),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -128,10 +128,10 @@ __all__ = [
     "MediaError",
     "PairsLoader",
     "PassError",
-    "Patience",
     "RandomCrop",
     "RandomScale",
     "Resize",
+    "RetryPolicy",
     "SceneIndex",
     "SceneViews",
     "SchemaError",

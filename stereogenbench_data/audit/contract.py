@@ -28,7 +28,7 @@ from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.sources.members import MemberSource
-from stereogenbench_data.sources.retry import Patience
+from stereogenbench_data.sources.retry import RetryPolicy
 
 MOST_RESIDUAL_PX: Final = 0.5
 """Rigs that are further from rectified are left out: disparity alone does not explain them."""
@@ -70,12 +70,12 @@ class SceneTask:
     revision: str
     frames: int
     encoding: DepthEncoding
-    patience: Patience | None = None
+    retry: RetryPolicy | None = None
 
     def streams(self) -> Streams:
         """Return the scene's videos."""
         source = MemberSource(
-            self.root, shards=self.shards, revision=self.revision, patience=self.patience
+            self.root, shards=self.shards, revision=self.revision, retry=self.retry
         )
         return Streams(source)
 
@@ -144,7 +144,7 @@ def _task(index: SceneIndex, row: int, *, frames: int, encoding: DepthEncoding) 
     scene = index.scene(row)
     paths = {member.path for member in scene.members.values()}
     shards = {path: facts for path, facts in index.shards.items() if path in paths}
-    return SceneTask(scene, index.root, shards, index.digest, frames, encoding, index.patience)
+    return SceneTask(scene, index.root, shards, index.digest, frames, encoding, index.retry)
 
 
 def _diagnoses(tasks: list[SceneTask], *, workers: int | None) -> Iterator[SceneDiagnosis]:

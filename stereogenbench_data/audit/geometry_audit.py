@@ -260,7 +260,7 @@ def _task(index: SceneIndex, scene: Scene, request: AuditRequest) -> SceneTask:
     places = {member.path for member in scene.members.values()}
     return SceneTask(
         root=index.root,
-        patience=index.patience,
+        retry=index.retry,
         shards={path: index.shards[path] for path in places if path in index.shards},
         revision=index.digest,
         scene=scene,

@@ -43,7 +43,7 @@ from stereogenbench_data.schema.release import (
     rgb_name,
 )
 from stereogenbench_data.sources.members import MemberSource
-from stereogenbench_data.sources.retry import Patience
+from stereogenbench_data.sources.retry import RetryPolicy
 
 LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
 """The non-adjacent pair that the paper audits beside the primary one."""
@@ -62,7 +62,7 @@ class SceneTask:
         scene: The scene.
         frames: How many frames to audit, evenly spread; 0 for all.
         depth: The depth contract, None for what the files say.
-        patience: How reading deals with a slow server, None for the defaults.
+        retry: How reading deals with a slow server, None for the defaults.
     """
 
     root: str
@@ -71,7 +71,7 @@ class SceneTask:
     scene: Scene
     frames: int
     depth: DepthEncoding | None = None
-    patience: Patience | None = None
+    retry: RetryPolicy | None = None
 
 
 def spread_frames(frames: int, wanted: int) -> tuple[int, ...]:
@@ -105,7 +105,7 @@ class _SceneCheck:
         self.frames = spread_frames(task.scene.frames, task.frames)
         self.intrinsics = rig_intrinsics(task.scene.rig)
         source = MemberSource(
-            task.root, shards=task.shards, revision=task.revision, patience=task.patience
+            task.root, shards=task.shards, revision=task.revision, retry=task.retry
         )
         self.files = SceneFiles(source, task.scene, contract=task.depth or DepthEncoding())
         self.light = [LightCheck() for _ in range(CAMERA_COUNT)]

@@ -110,7 +110,7 @@ def export_inputs(
                 [extent.index.scene(rows[each.scene])],
                 extent.index.root,
                 shards=extent.index.shards,
-                patience=extent.index.patience,
+                retry=extent.index.retry,
             ),
             each,
             known,

@@ -200,5 +200,5 @@ def _part_of(index: SceneIndex, rows: Sequence[int]) -> SceneIndex:
         [index.scene(row) for row in rows],
         index.root,
         shards=index.shards,
-        patience=index.patience,
+        retry=index.retry,
     )

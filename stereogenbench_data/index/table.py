@@ -43,7 +43,7 @@ from stereogenbench_data.sources.location import (
     split_name,
 )
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import Patience
+from stereogenbench_data.sources.retry import RetryPolicy
 
 INDEX_NAME: Final = "index.parquet"
 MAX_INDEX_BYTES: Final = 256 * 2**20
@@ -65,7 +65,7 @@ class SceneIndex:
     Attributes:
         root: The folder or URL to which the members' paths are relative, with its login if it has
             one; `where` is what may be shown.
-        patience: How reading from a URL deals with a slow or failing server; None for the defaults.
+        retry: How reading from a URL deals with a slow or failing server; None for the defaults.
         incomplete: Key to reason, for scenes that were not finished when the index was made.
         broken: Key to what is wrong, for scenes that were left out for it.
         shards: What is known of each shard, by its path below the root; empty for folders.
@@ -78,7 +78,7 @@ class SceneIndex:
     def __init__(self, table: pa.Table, *, root: str | Path, head: Mapping[str, Any]) -> None:
         """Take a checked table; use `open` or `from_scenes` to make an index."""
         self.root = str(root)
-        self.patience: Patience | None = None
+        self.retry: RetryPolicy | None = None
         self.incomplete: dict[str, str] = dict(head.get("incomplete", {}))
         self.broken: dict[str, str] = dict(head.get("broken", {}))
         self.shards: dict[str, ShardFacts] = {
@@ -98,7 +98,7 @@ class SceneIndex:
         data: str | Path,
         *,
         root: str | Path | None = None,
-        patience: Patience | None = None,
+        retry: RetryPolicy | None = None,
     ) -> "SceneIndex":
         """Return the index of some data.
 
@@ -115,29 +115,27 @@ class SceneIndex:
                 ``stereogenbench index`` keeps the result).
             root: Where the data of an index file are, on your word and whatever the file says: any
                 folder or URL.
-            patience: How often to try a server that fails, and how slow it may be.
+            retry: How often to try a server that fails, and how slow it may be.
 
         Raises:
             StorageError: If there is no such data, it holds no scene, the index is damaged or
                 was made by another version, its data are where only your word lets them be opened,
                 or scenes of a tree are broken.
         """
-        index = cls._opened(
-            data, root=None if root is None else _root_said(root), patience=patience
-        )
+        index = cls._opened(data, root=None if root is None else _root_said(root), retry=retry)
         where = shown(data) if is_remote(data) else str(local_path(data))
         _warn_of(index.incomplete | index.broken, where=where)
         if index.stale:
             warnings.warn(index.stale, StaleIndexWarning, stacklevel=2)
-        index.patience = patience
+        index.retry = retry
         return index
 
     @classmethod
     def _opened(
-        cls, data: str | Path, *, root: str | None, patience: Patience | None
+        cls, data: str | Path, *, root: str | None, retry: RetryPolicy | None
     ) -> "SceneIndex":
         if is_remote(data):
-            return cls._from_url(str(data), root=root, patience=patience)
+            return cls._from_url(str(data), root=root, retry=retry)
         path = local_path(data)
         if path.is_dir():
             if not (path / INDEX_NAME).is_file():
@@ -158,7 +156,7 @@ class SceneIndex:
         root: str | Path,
         *,
         shards: Mapping[str, ShardFacts] | None = None,
-        patience: Patience | None = None,
+        retry: RetryPolicy | None = None,
     ) -> "SceneIndex":
         """Return the index of some scenes, in whatever order they come.
 
@@ -166,7 +164,7 @@ class SceneIndex:
             scenes: The scenes, with the places of their members.
             root: The folder to which these places are relative.
             shards: What is known of each shard, where the members lie in shards.
-            patience: As for `open`.
+            retry: As for `open`.
 
         Raises:
             StorageError: If two scenes have one key, or a path leaves the root.
@@ -180,7 +178,7 @@ class SceneIndex:
             ) from error
         require_sound(table, where=shown(str(root)))
         index = cls(table, root=root, head={})
-        index.shards, index.patience = dict(shards or {}), patience
+        index.shards, index.retry = dict(shards or {}), retry
         return index
 
     @classmethod
@@ -213,13 +211,13 @@ class SceneIndex:
         return index
 
     @classmethod
-    def _from_url(cls, url: str, *, root: str | None, patience: Patience | None) -> "SceneIndex":
+    def _from_url(cls, url: str, *, root: str | None, retry: RetryPolicy | None) -> "SceneIndex":
         """Fetch an index; its data lie beside it, unless the user says where."""
         beside, name = split_name(url)
         is_folder = not name.endswith(".parquet")
         if is_folder:
             beside, url = url.rstrip("/"), joined(url.rstrip("/"), INDEX_NAME)
-        remote = RemoteObject(url, patience=patience)
+        remote = RemoteObject(url, retry=retry)
         try:
             size = remote.size()
         except MissingObject:

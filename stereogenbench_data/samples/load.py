@@ -77,7 +77,7 @@ class SampleLoader:
             revision=index.digest,
             cache=cache,
             check=check,
-            patience=index.patience,
+            retry=index.retry,
         )
         self._streams = Streams(self._source)
         self._shares_frames = frames == "shared"

@@ -226,7 +226,7 @@ def _until(stop: Event, chunks: Iterator[bytes]) -> Iterator[bytes]:
 
 def _chunks(index: SceneIndex, member: Member) -> Iterator[bytes]:
     if is_remote(index.root):
-        remote = RemoteObject(joined(index.root, member.path), patience=index.patience)
+        remote = RemoteObject(joined(index.root, member.path), retry=index.retry)
         yield from remote.chunks(member.offset, member.offset + member.size)
         return
     opened = open_local(index.root, member, shard=index.shards.get(member.path))

@@ -13,7 +13,7 @@ from typing import Any, Final, TypeVar
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources.location import shown
-from stereogenbench_data.sources.retry import Fault, Pace, TooSlow
+from stereogenbench_data.sources.retry import Attempt, TooSlow, TransientError
 
 _T = TypeVar("_T")
 
@@ -55,22 +55,22 @@ class FilesystemTransport:
         self._file: Any = None
         self._seen: dict[str, dict[str, str]] = {}
 
-    def size(self, pace: Pace) -> int:
+    def size(self, attempt: Attempt) -> int:
         """Return how many bytes the object has."""
         with self._named_errors():
-            files, path = self._filesystem(pace)
+            files, path = self._filesystem(attempt)
             if _is_s3(files):
-                return int(self._conditional(pace).size)
-            size = _within(pace, lambda: files.size(path))
+                return int(self._conditional(attempt).size)
+            size = _within(attempt, lambda: files.size(path))
         if not isinstance(size, int):
             raise StorageError(f"{self._where}: has no size ({size!r}): is it a folder?")
         return size
 
-    def entries(self, pace: Pace) -> dict[str, int | None]:
+    def entries(self, attempt: Attempt) -> dict[str, int | None]:
         """Return what a folder holds: names, with the size of a file and None for a folder."""
         with self._named_errors():
-            files, path = self._filesystem(pace)
-            listed = _within(pace, lambda: files.ls(path, detail=True))
+            files, path = self._filesystem(attempt)
+            listed = _within(attempt, lambda: files.ls(path, detail=True))
         names = [str(entry["name"]).rstrip("/").rpartition("/")[2] for entry in listed]
         sizes = [
             None if entry["type"] == "directory" else int(entry["size"] or 0) for entry in listed
@@ -82,23 +82,23 @@ class FilesystemTransport:
             if name and (name != own or str(entry["name"]).strip("/") != path.strip("/"))
         }
 
-    def part(self, start: int, stop: int, pace: Pace) -> Generator[bytes, None, None]:
+    def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop."""
         for first in range(start, stop, _CHUNK):
             last = min(first + _CHUNK, stop)
             with self._named_errors():
-                data = self._read(first, last, pace)
+                data = self._read(first, last, attempt)
             yield data
             if len(data) != last - first:
                 return
 
-    def _read(self, first: int, last: int, pace: Pace) -> bytes:
-        files, path = self._filesystem(pace)
+    def _read(self, first: int, last: int, attempt: Attempt) -> bytes:
+        files, path = self._filesystem(attempt)
         if _is_s3(files):
-            file = self._conditional(pace)
-            return bytes(_within(pace, lambda: file._fetch_range(first, last)))
+            file = self._conditional(attempt)
+            return bytes(_within(attempt, lambda: file._fetch_range(first, last)))
         if files.async_impl:
-            return bytes(_within(pace, lambda: files.cat_file(path, start=first, end=last)))
+            return bytes(_within(attempt, lambda: files.cat_file(path, start=first, end=last)))
 
         def read() -> tuple[bytes, Any]:
             # Without a cache, or fsspec would read megabytes ahead.
@@ -106,17 +106,17 @@ class FilesystemTransport:
                 file.seek(first)
                 return file.read(last - first), getattr(file, "details", None)
 
-        data, details = _within(pace, read)
+        data, details = _within(attempt, read)
         self._require_same(details)
         return data
 
-    def _conditional(self, pace: Pace) -> Any:
+    def _conditional(self, attempt: Attempt) -> Any:
         """Return an object of S3, opened once: it is read only while its ETag is the same."""
-        files, path = self._filesystem(pace)
+        files, path = self._filesystem(attempt)
         if self._file is None:
             # What was listed before may be of an older object.
             files.invalidate_cache(path)
-            self._file = _within(pace, lambda: files.open(path, "rb", cache_type="none"))
+            self._file = _within(attempt, lambda: files.open(path, "rb", cache_type="none"))
         return self._file
 
     def _require_same(self, details: Any) -> None:
@@ -137,14 +137,14 @@ class FilesystemTransport:
             f"the new one."
         )
 
-    def _filesystem(self, pace: Pace) -> tuple[Any, str]:
+    def _filesystem(self, attempt: Attempt) -> tuple[Any, str]:
         """Return this process's file system, and the object's path in it."""
         if self._opened is None or self._opened[0] != os.getpid():
             import fsspec.core
 
             files, path = fsspec.core.url_to_fs(self._url)
             if self._url.partition("://")[0] == "hf":
-                path = _within(pace, lambda: _pinned(files, path))
+                path = _within(attempt, lambda: _pinned(files, path))
             self._opened, self._file = (os.getpid(), files, path), None
         return self._opened[1:]
 
@@ -183,15 +183,15 @@ class FilesystemTransport:
                 f"up its file system."
             ) from None
 
-    def _failure(self, error: BaseException) -> Fault | StorageError:
+    def _failure(self, error: BaseException) -> TransientError | StorageError:
         """Return what is raised where a store was reached, or a network was not."""
         if isinstance(error, TooSlow):
-            return Fault(str(error))
+            return TransientError(str(error))
         if type(error).__name__ == "FileExpired":  # s3fs: the ETag is another
             return self._replaced(f"{error.args[-1]!s:.120}")
         if _status(error) in _REFUSED:
             return StorageError(f"{self._where}: {_reason(error)}. {_MISSING}")
-        return Fault(_reason(error))
+        return TransientError(_reason(error))
 
     def _uninstalled(self, error: ImportError) -> str:
         scheme = self._url.partition("://")[0]
@@ -232,7 +232,7 @@ _commits: Final[dict[tuple[int, str, str, str, str], str | None]] = {}
 """Commits of the Hub's branches, as this process has met them."""
 
 
-def _within(pace: Pace, call: Callable[[], _T]) -> _T:
+def _within(attempt: Attempt, call: Callable[[], _T]) -> _T:
     """Return what a call returns, in the time that a read has left.
 
     File systems bound single waits at best. A call that takes longer is left to itself, in a thread
@@ -251,14 +251,14 @@ def _within(pace: Pace, call: Callable[[], _T]) -> _T:
             raised.append(error)
 
     thread = Thread(target=run, daemon=True)
-    began_s = pace.clock()
+    began_s = attempt.clock()
     thread.start()
-    thread.join(pace.left_s)
-    pace.add(pace.clock() - began_s, 0)
+    thread.join(attempt.left_s)
+    attempt.add(attempt.clock() - began_s, 0)
     if raised:
         raise raised[0]
     if not returned:
-        raise pace.broken()
+        raise attempt.too_slow()
     return returned[0]
 
 

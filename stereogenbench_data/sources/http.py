@@ -24,7 +24,7 @@ from urllib3.exceptions import HTTPError, LocationValueError
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources.location import WEB_SCHEMES, is_inside, shown, split_url
-from stereogenbench_data.sources.retry import Fault, Pace, TooSlow
+from stereogenbench_data.sources.retry import Attempt, TooSlow, TransientError
 
 _REDIRECTS: Final = frozenset({301, 302, 303, 307, 308})
 _MOST_REDIRECTS: Final = 5
@@ -48,8 +48,8 @@ _pools: Final[dict[tuple[int, str], urllib3.PoolManager]] = {}
 """Connections by process and proxy. Those that came over a fork are left alone: their sockets
 belong to the parent."""
 
-_current_pace: Final[ContextVar[Pace | None]] = ContextVar("_current_pace", default=None)
-"""The pace of the request that this thread makes."""
+_current_attempt: Final[ContextVar[Attempt | None]] = ContextVar("_current_attempt", default=None)
+"""The attempt that this thread's request belongs to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,9 +91,9 @@ class WebTransport:
             self._headers |= urllib3.make_headers(basic_auth=unquote(login))
         self._seen: dict[str, _Version] = {}
 
-    def size(self, pace: Pace) -> int:
+    def size(self, attempt: Attempt) -> int:
         """Return how many bytes the object has, as told with its first byte."""
-        response = self._get(0, 1, pace)
+        response = self._get(0, 1, attempt)
         response.close()
         told = self._size_told(response)
         if not _NUMBER.fullmatch(told):
@@ -103,25 +103,25 @@ class WebTransport:
             )
         return int(told)
 
-    def part(self, start: int, stop: int, pace: Pace) -> Generator[bytes, None, None]:
+    def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
-        response = self._get(start, stop, pace)
+        response = self._get(start, stop, attempt)
         try:
             self._require_part(response, start, stop)
-            pace.begin_body()
+            attempt.begin_body()
             while data := response.read1(_CHUNK):
                 yield data
         except HTTPError as error:
-            raise Fault(_reason(error)) from None
+            raise TransientError(_reason(error)) from None
         finally:
             # What was read to its end has gone back to the pool already, and is not closed.
             response.close()
 
-    def _get(self, start: int, stop: int, pace: Pace) -> urllib3.BaseHTTPResponse:
+    def _get(self, start: int, stop: int, attempt: Attempt) -> urllib3.BaseHTTPResponse:
         headers = self._headers | {"Range": f"bytes={start}-{stop - 1}"} | self._condition()
         url = self._url
         for _ in range(_MOST_REDIRECTS + 1):
-            response = self._ask(url, headers, pace)
+            response = self._ask(url, headers, attempt)
             if response.status not in _REDIRECTS:
                 break
             there = self._redirected(url, response)
@@ -139,11 +139,13 @@ class WebTransport:
             self._require_same(response)
         return response
 
-    def _ask(self, url: str, headers: Mapping[str, str], pace: Pace) -> urllib3.BaseHTTPResponse:
+    def _ask(
+        self, url: str, headers: Mapping[str, str], attempt: Attempt
+    ) -> urllib3.BaseHTTPResponse:
         """Return a server's answer, or the first of several."""
-        token = _current_pace.set(pace)
+        token = _current_attempt.set(attempt)
         try:
-            allowed_s = pace.allowed_s()
+            allowed_s = attempt.next_wait_s()
             return _pool(url).request(
                 "GET",
                 url,
@@ -154,14 +156,14 @@ class WebTransport:
                 preload_content=False,
             )
         except TooSlow as error:
-            raise Fault(str(error)) from None
+            raise TransientError(str(error)) from None
         except (LocationValueError, UnicodeError):
             sent = "" if url == self._url else f"is redirected to {shown(url)[:200]}, which "
             raise StorageError(f"{self._where}: {sent}is no URL: correct it.") from None
         except HTTPError as error:
-            raise Fault(_reason(error)) from None
+            raise TransientError(_reason(error)) from None
         finally:
-            _current_pace.reset(token)
+            _current_attempt.reset(token)
 
     def _redirected(self, url: str, response: urllib3.BaseHTTPResponse) -> str:
         """Return where an answer sends its reader, if that is a place to go to."""
@@ -228,7 +230,7 @@ class WebTransport:
         answer = f"{response.status} {reason}".rstrip()
         if response.status in _PASSING:
             wait_s = _retry_after_s(response.headers.get("Retry-After", ""))
-            raise Fault(f"the server answers {answer}", wait_s=wait_s)
+            raise TransientError(f"the server answers {answer}", wait_s=wait_s)
         cure = _CURES.get(response.status, f"Check the URL and the server, {_FETCH}.")
         raise StorageError(f"{self._where}: the server answers {answer}. {cure}")
 
@@ -275,29 +277,29 @@ class WebTransport:
         return first, last, size
 
 
-class _PacedStream(io.RawIOBase):
-    """A connection's bytes, of which none is waited for longer than its pace allows."""
+class _TimedStream(io.RawIOBase):
+    """The bytes of a connection; no wait for them exceeds the limits of the attempt."""
 
-    def __init__(self, stream: io.RawIOBase, connection: socket.socket, pace: Pace) -> None:
+    def __init__(self, stream: io.RawIOBase, connection: socket.socket, attempt: Attempt) -> None:
         super().__init__()
         self._stream = stream
         self._connection = connection
-        self._pace = pace
+        self._attempt = attempt
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, buffer: Any, /) -> int | None:
-        self._connection.settimeout(self._pace.allowed_s())
-        began_s, count = self._pace.clock(), 0
+        self._connection.settimeout(self._attempt.next_wait_s())
+        began_s, count = self._attempt.clock(), 0
         try:
             count = self._stream.readinto(buffer) or 0
         except TooSlow:
             raise
         except TimeoutError:
-            self._pace.add(self._pace.clock() - began_s, 0)
-            raise self._pace.broken() from None
-        self._pace.add(self._pace.clock() - began_s, count)
+            self._attempt.add(self._attempt.clock() - began_s, 0)
+            raise self._attempt.too_slow() from None
+        self._attempt.add(self._attempt.clock() - began_s, count)
         return count
 
     def close(self) -> None:
@@ -305,22 +307,22 @@ class _PacedStream(io.RawIOBase):
         super().close()
 
 
-class _PacedResponse(http.client.HTTPResponse):
-    """An answer whose head and body are read at the pace of the request."""
+class _TimedResponse(http.client.HTTPResponse):
+    """A response whose head and body are read within the limits of the attempt."""
 
     def __init__(self, sock: socket.socket, *args: Any, **how: Any) -> None:
         super().__init__(sock, *args, **how)
-        pace = _current_pace.get()
-        if pace is not None:
-            self.fp = io.BufferedReader(_PacedStream(self.fp.detach(), sock, pace))
+        attempt = _current_attempt.get()
+        if attempt is not None:
+            self.fp = io.BufferedReader(_TimedStream(self.fp.detach(), sock, attempt))
 
 
 class _Connection(urllib3.connection.HTTPConnection):
-    response_class = _PacedResponse
+    response_class = _TimedResponse
 
 
 class _SecureConnection(urllib3.connection.HTTPSConnection):
-    response_class = _PacedResponse
+    response_class = _TimedResponse
 
 
 class _Pool(urllib3.HTTPConnectionPool):

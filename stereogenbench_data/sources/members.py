@@ -20,7 +20,7 @@ from stereogenbench_data.sources.ranged_file import (
     require_crc32,
 )
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import Patience
+from stereogenbench_data.sources.retry import RetryPolicy
 
 UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
 """What no member's path may hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
@@ -81,7 +81,7 @@ class MemberSource:
         revision: str = "",
         cache: ShardCache | None = None,
         check: Literal["opened", "metadata"] = "metadata",
-        patience: Patience | None = None,
+        retry: RetryPolicy | None = None,
     ) -> None:
         """Prepare to read; nothing is opened yet.
 
@@ -93,14 +93,14 @@ class MemberSource:
             check: What is compared with its checksum. "opened": each member of a shard or of the
                 cache when this process first opens it, and one from a URL when its last byte
                 comes. "metadata": metadata files alone.
-            patience: How often to try a server, and how slow it may be; None for the defaults.
+            retry: How often to try a server, and how slow it may be; None for the defaults.
         """
         self._root = str(root)
         self._shards = shards
         self._revision = revision
         self._cache = cache
         self._check = check
-        self._patience = patience
+        self._policy = retry
         self._sound: set[tuple[str, int]] = set()
         self._objects: dict[str, RemoteObject] = {}
 
@@ -196,7 +196,7 @@ class MemberSource:
             self._objects[member.path] = RemoteObject(
                 joined(self._root, member.path),
                 expected_size=member.offset + member.size if shard is None else shard.size,
-                patience=self._patience,
+                retry=self._policy,
             )
         return self._objects[member.path]
 

@@ -1,6 +1,6 @@
-"""Bytes of things that lie elsewhere: any range of them, resumed where a connection broke off.
+"""Files behind URLs: any range of their bytes, resumed where a connection broke off.
 
-How a request is made is up to a transport: `web` for http and https, `filesystems` for the rest.
+A transport makes the requests: `http` for http and https, `filesystems` for everything else.
 """
 
 from collections.abc import Callable, Generator, Iterator
@@ -10,111 +10,110 @@ from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources.filesystems import FilesystemTransport
 from stereogenbench_data.sources.http import WebTransport
 from stereogenbench_data.sources.location import is_web, shown
-from stereogenbench_data.sources.retry import Effort, Fault, Pace, Patience
+from stereogenbench_data.sources.retry import Attempt, RetryPolicy, RetryState, TransientError
 
 _T = TypeVar("_T")
 
 
 class Transport(Protocol):
-    """One way to reach one remote object."""
+    """One way to reach one remote file.
 
-    def size(self, pace: Pace) -> int:
-        """Return how many bytes it has.
+    Both methods raise `TransientError` where another attempt may help, else `StorageError`.
+    """
 
-        Raises:
-            Fault: If trying again may help.
-            StorageError: If not.
-        """
+    def size(self, attempt: Attempt) -> int:
+        """Return the size of the file in bytes."""
         ...
 
-    def part(self, start: int, stop: int, pace: Pace) -> Generator[bytes, None, None]:
-        """Yield its bytes from start to stop, or the first of them.
-
-        Raises:
-            Fault: If trying again may help.
-            StorageError: If not.
-        """
+    def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
+        """Yield the bytes from start to stop, or the first of them."""
         ...
 
 
 class RemoteObject:
-    """A file somewhere else. It holds no connection: any thread and process may read it.
+    """A file behind a URL. It holds no connection: any thread and process may read it.
 
     Attributes:
-        where: Its URL as messages may show it.
+        where: Its URL as messages may show it, without login and query.
     """
 
     def __init__(
-        self, url: str, *, expected_size: int | None = None, patience: Patience | None = None
+        self, url: str, *, expected_size: int | None = None, retry: RetryPolicy | None = None
     ) -> None:
-        """Name an object; nothing is asked of it yet.
+        """Name a file; nothing is requested yet.
 
         Args:
             url: Where it is.
-            expected_size: The bytes that it must have, by an index; None if that is not known.
-            patience: How often and how long to try; None for a minute or so.
+            expected_size: The size in bytes that the index records; None if it is not known.
+            retry: How reading is retried; None for the defaults.
 
         Raises:
-            StorageError: If it is no URL.
+            StorageError: If it is not a URL.
         """
         self.where = shown(url)
         self._expected_size = expected_size
         self._is_checked = expected_size is None
-        self._patience = patience or Patience()
+        self._policy = retry or RetryPolicy()
         self._transport: Transport = (WebTransport if is_web(url) else FilesystemTransport)(url)
 
+    def __repr__(self) -> str:
+        """Return the URL, without login and query."""
+        return f"RemoteObject({self.where!r})"
+
     def size(self) -> int:
-        """Return how many bytes it has.
+        """Return the size of the file in bytes.
 
         Raises:
-            StorageError: If it cannot be had.
+            StorageError: If it cannot be fetched.
         """
-        return self._persist(self._transport.size)
+        return self._retried(self._transport.size)
 
     def read(self, start: int, stop: int) -> bytes:
         """Return the bytes from start to stop.
 
         Raises:
-            StorageError: If they cannot be had.
+            StorageError: If they cannot be fetched.
         """
         return b"".join(self.chunks(start, stop))
 
     def chunks(self, start: int, stop: int) -> Iterator[bytes]:
-        """Yield the bytes from start to stop, piece by piece; none comes twice.
+        """Yield the bytes from start to stop in pieces; each byte comes once.
 
         Raises:
-            StorageError: If they cannot be had.
+            ShardError: If the file does not have the expected size, or was replaced meanwhile.
+            StorageError: If they cannot be fetched.
         """
         self._require_expected_size()
-        effort = Effort(self._patience)
+        state = RetryState(self._policy)
         while start < stop:
             begin = start
-            fault = Fault("the answer ended early")
-            pieces = self._transport.part(start, stop, effort.pace())
+            error = TransientError("the answer ended early")
+            pieces = self._transport.part(start, stop, state.attempt())
             try:
                 while True:
-                    with effort.timed():
+                    with state.timed():
                         data = next(pieces, None)
                     if data is None:
                         break
                     start += len(data)
-                    effort.gain(len(data))
+                    state.add(len(data))
                     if start > stop:
                         raise StorageError(
-                            f"{self.where}: sent more than the {stop - begin} bytes asked for "
-                            f"from byte {begin} on. Its server does not honour ranges: fetch the "
-                            f"data and pass the folder."
+                            f"{self.where}: sent more than the {stop - begin} bytes requested from "
+                            f"byte {begin} on. Its server does not honour ranges: fetch the data "
+                            f"and pass the folder."
                         )
                     yield data
-            except Fault as found:
-                fault = found
+            except TransientError as found:
+                error = found
             finally:
                 pieces.close()
             if start < stop:
-                self._wait(effort, fault, gained=start - begin, doing=f"at byte {start} of {stop}")
+                doing = f"at byte {start} of {stop}"
+                self._wait(state, error, received=start - begin, doing=doing)
 
     def entries(self) -> dict[str, int | None]:
-        """Return what it holds as a folder: names, with a file's size, and None for a folder.
+        """List the file as a folder: name to size in bytes, None for a folder.
 
         Raises:
             StorageError: If it cannot be listed; plain web servers have no lists.
@@ -124,7 +123,7 @@ class RemoteObject:
                 f"{self.where}: a web server does not list its folders. Pass a folder with an "
                 "index.parquet, or an index that names this URL as its root."
             )
-        return self._persist(self._transport.entries)
+        return self._retried(self._transport.entries)
 
     def _require_expected_size(self) -> None:
         if self._is_checked:
@@ -138,20 +137,20 @@ class RemoteObject:
             )
         self._is_checked = True
 
-    def _persist(self, ask: Callable[[Pace], _T]) -> _T:
-        effort = Effort(self._patience)
+    def _retried(self, request: Callable[[Attempt], _T]) -> _T:
+        state = RetryState(self._policy)
         while True:
             try:
-                with effort.timed():
-                    return ask(effort.pace())
-            except Fault as fault:
-                self._wait(effort, fault, gained=0, doing="asked for its size")
+                with state.timed():
+                    return request(state.attempt())
+            except TransientError as error:
+                self._wait(state, error, received=0, doing="asked for its size")
 
-    def _wait(self, effort: Effort, fault: Fault, *, gained: int, doing: str) -> None:
-        if not effort.goes_on(fault, gained=gained):
+    def _wait(self, state: RetryState, error: TransientError, *, received: int, doing: str) -> None:
+        if not state.wait(error, received=received):
             raise StorageError(
-                f"{self.where}: cannot be read, {doing} ({effort.told(fault)}). Check the network "
-                f"and the server, then try again; or fetch the data and pass the folder; or allow "
-                f"for a slower one: SceneIndex.open(..., patience=Patience(...)), which has "
-                f"{self._patience.bounds} now."
-            ) from fault
+                f"{self.where}: cannot be read, {doing} ({state.describe(error)}). Check the "
+                f"network and the server, then try again; or fetch the data and pass the folder; "
+                f"or allow a slower server: SceneIndex.open(..., retry=RetryPolicy(...)), which "
+                f"has {self._policy.limits} now."
+            ) from error

@@ -1,58 +1,59 @@
-"""Patience with a network: what is tried again, after which wait, and when to give up."""
+"""Retries: what is tried again, after which wait, and when reading from a server gives up."""
 
 import math
 import random
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from stereogenbench_data.errors import StorageError
 
-_BYTES_A_BOUND: Final = 8 * 2**20
-"""Bytes of a read for which the bound on its time holds; the next ones have as long again."""
+_BYTES_PER_TIME_LIMIT: Final = 8 * 2**20
+"""The time limit of a read starts anew after this many bytes."""
 
 _JITTER: Final = random.SystemRandom()
-"""Not the program's own random numbers: reading must not disturb them."""
+"""Jitter must not draw from the program's own random numbers."""
 
 
-def _chance() -> float:
+def _random() -> float:
     return _JITTER.random()
 
 
-class Fault(Exception):
-    """Something that may pass if it is tried again; ``wait_s`` is what the other side asked for."""
+class TransientError(Exception):
+    """A failure that may not occur again; ``wait_s`` is the wait that the server asked for."""
 
-    def __init__(self, what: str, *, wait_s: float = 0.0) -> None:
+    def __init__(self, reason: str, *, wait_s: float = 0.0) -> None:
         """Say what happened."""
-        super().__init__(what)
+        super().__init__(reason)
         self.wait_s = wait_s
 
 
 class TooSlow(TimeoutError):
-    """An answer came too slowly; the message says which bound it broke."""
+    """A response was too slow; the message names the limit that it exceeded."""
 
 
 @dataclass(frozen=True, slots=True)
-class Patience:
-    """How often to try, how long to wait between, and how slow a server may be.
+class RetryPolicy:
+    """How often reading from a server is retried, how long it waits, and how slow a server may be.
 
     Attributes:
-        attempts: Tries in a row that gain less than the least rate before giving up.
-        first_wait_s: Seconds before the second try; doubled for each that follows, and shortened
-            at random by up to a half, so that many workers do not come back at once.
-        longest_wait_s: Seconds that no wait of our own exceeds.
-        longest_asked_s: Seconds that the other side may ask for; beyond them we give up.
-        timeout_s: Seconds that a connection and the begin of an answer, with all redirects, may
-            each take.
-        least_rate_bytes_s: Bytes a second that an answer must bring once it has begun: fewer over
-            ``window_s``, silence among them, end the try.
-        window_s: Seconds over which the rate is taken.
-        longest_read_s: Seconds that one read may take in all, its tries and waits counted; of a
-            longer read, each 8 MiB. Time in which nothing is asked of the server does not count.
+        attempts: Consecutive attempts below the least rate before reading gives up.
+        first_wait_s: Seconds before the second attempt. The wait doubles with each attempt and is
+            shortened at random by up to a half, so that many workers do not retry at once.
+        longest_wait_s: The longest wait in seconds, unless the server asks for more.
+        longest_asked_s: The longest wait in seconds that a server may ask for; beyond it reading
+            gives up.
+        timeout_s: Seconds that connecting may take, and seconds until a response begins, with all
+            redirects.
+        least_rate_bytes_s: Bytes per second that a response must deliver once it has begun. Fewer
+            over ``window_s`` end the attempt.
+        window_s: Seconds over which the rate is measured.
+        longest_read_s: Seconds that one read may take with all attempts and waits; of a long read,
+            each 8 MiB. Time in which nothing is asked of the server does not count.
         sleep: What waits.
-        chance: What gives a number of 0 to 1.
+        chance: What draws a random number from 0 to 1.
         clock: What tells the time in seconds.
     """
 
@@ -64,58 +65,60 @@ class Patience:
     least_rate_bytes_s: float | int = 4096.0
     window_s: float | int = 10.0
     longest_read_s: float | int = 600.0
-    sleep: Callable[[float], None] = time.sleep
-    chance: Callable[[], float] = _chance
-    clock: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = field(default=time.sleep, repr=False)
+    chance: Callable[[], float] = field(default=_random, repr=False)
+    clock: Callable[[], float] = field(default=time.monotonic, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse numbers that bound nothing.
+        """Refuse limits that limit nothing.
 
         Raises:
-            StorageError: If there is to be no try, or a bound is negative or no number.
+            StorageError: If there is to be no attempt, or a limit is negative or not a number.
         """
         above_zero = ("attempts", "timeout_s", "window_s", "longest_read_s")
         for name in (*above_zero, "least_rate_bytes_s", "first_wait_s", "longest_wait_s"):
             value = getattr(self, name)
             if not value >= 0 or (name in above_zero and value == 0):
                 least = "above 0" if name in above_zero else "0 or more"
-                raise StorageError(f"Patience: {name} must be {least}, got {value!r}.")
+                raise StorageError(f"RetryPolicy: {name} must be {least}, got {value!r}.")
 
-    def wait(self, fault: Fault, *, failures: int, left_s: float = math.inf) -> bool:
-        """Wait before the next try, after so many failures in a row; False is to give up.
+    def wait(self, error: TransientError, *, failures: int, left_s: float = math.inf) -> bool:
+        """Wait before the next attempt, after so many consecutive failures.
 
-        A wait that would last longer than ``left_s`` is one too many.
+        Returns:
+            False, at once, to give up: after the last attempt, or if the wait would take as long
+            as ``left_s``.
         """
-        if failures >= self.attempts or fault.wait_s > self.longest_asked_s:
+        if failures >= self.attempts or error.wait_s > self.longest_asked_s:
             return False
-        own_s = min(self.longest_wait_s, self.first_wait_s * 2.0 ** min(failures - 1, 60))
-        wait_s = max(fault.wait_s, own_s * (1 - self.chance() / 2))
+        backoff_s = min(self.longest_wait_s, self.first_wait_s * 2.0 ** min(failures - 1, 60))
+        wait_s = max(error.wait_s, backoff_s * (1 - self.chance() / 2))
         if wait_s >= left_s:
             return False
         self.sleep(wait_s)
         return True
 
     @property
-    def bounds(self) -> str:
-        """What a server must keep to, in words."""
+    def limits(self) -> str:
+        """The limits on a server's speed, for messages."""
         return (
             f"least_rate_bytes_s={self.least_rate_bytes_s:.10g} over window_s={self.window_s:g}, "
             f"timeout_s={self.timeout_s:g}, longest_read_s={self.longest_read_s:g}"
         )
 
 
-class Pace:
-    """The time that one try has: told of each wait for bytes, it says how long the next may be."""
+class Attempt:
+    """The time limits of one attempt: it is told of each wait for bytes and limits the next one."""
 
-    def __init__(self, patience: Patience, *, left_s: float) -> None:
-        """Begin with an answer's head, in a read that has so many seconds left."""
-        self.clock = patience.clock
-        self.timeout_s = patience.timeout_s
-        self._patience = patience
+    def __init__(self, policy: RetryPolicy, *, left_s: float) -> None:
+        """Begin with the head of a response, in a read that has so many seconds left."""
+        self.clock = policy.clock
+        self.timeout_s = policy.timeout_s
+        self._policy = policy
         self._left_s = left_s
         self._in_body = False
         self._waited_s = 0.0
-        self._gained = 0
+        self._received = 0
 
     @property
     def left_s(self) -> float:
@@ -123,88 +126,87 @@ class Pace:
         return self._left_s
 
     def begin_body(self) -> None:
-        """Go on to an answer's body: from here on the rate counts."""
-        self._in_body, self._waited_s, self._gained = True, 0.0, 0
+        """Go on to the body of a response, where the rate is measured."""
+        self._in_body, self._waited_s, self._received = True, 0.0, 0
 
-    def allowed_s(self) -> float:
+    def next_wait_s(self) -> float:
         """Return how many seconds the next wait may last, above 0.
 
         Raises:
             TooSlow: If none is left.
         """
-        bound_s = self._patience.window_s if self._in_body else self._patience.timeout_s
-        allowed_s = min(bound_s - self._waited_s, self._left_s)
-        if allowed_s <= 0:
-            raise self.broken()
-        return allowed_s
+        limit_s = self._policy.window_s if self._in_body else self._policy.timeout_s
+        wait_s = min(limit_s - self._waited_s, self._left_s)
+        if wait_s <= 0:
+            raise self.too_slow()
+        return wait_s
 
-    def add(self, waited_s: float, gained: int) -> None:
-        """Take note of a wait, and of the bytes that came."""
+    def add(self, waited_s: float, received: int) -> None:
+        """Count a wait, and the bytes that it brought."""
         self._left_s -= waited_s
         self._waited_s += waited_s
-        self._gained += gained
-        enough = self._patience.least_rate_bytes_s * self._patience.window_s
-        if self._in_body and gained and self._gained >= enough:
-            self._waited_s, self._gained = 0.0, 0
+        self._received += received
+        enough = self._policy.least_rate_bytes_s * self._policy.window_s
+        if self._in_body and received and self._received >= enough:
+            self._waited_s, self._received = 0.0, 0
 
-    def broken(self) -> TooSlow:
-        """Return the error that says which bound was broken."""
+    def too_slow(self) -> TooSlow:
+        """Return the error that names the exceeded limit."""
         if self._left_s <= 0:
-            return TooSlow(f"a read may take {self._patience.longest_read_s:g} s")
+            return TooSlow(f"a read may take {self._policy.longest_read_s:g} s")
         if self._in_body:
             return TooSlow(
-                f"fewer than {self._patience.least_rate_bytes_s:.10g} bytes a second over "
-                f"{self._patience.window_s:g} s"
+                f"fewer than {self._policy.least_rate_bytes_s:.10g} bytes a second over "
+                f"{self._policy.window_s:g} s"
             )
-        return TooSlow(f"no answer within {self._patience.timeout_s:g} s")
+        return TooSlow(f"no answer within {self._policy.timeout_s:g} s")
 
 
-class Effort:
-    """What one read has taken so far: its time, and the tries in a row that gained too little."""
+class RetryState:
+    """One read's state: the time spent, and the consecutive attempts below the least rate."""
 
-    def __init__(self, patience: Patience) -> None:
+    def __init__(self, policy: RetryPolicy) -> None:
         """Begin a read."""
         self.failures = 0
-        self._patience = patience
+        self._policy = policy
         self._spent_s = 0.0
-        self._of_try_s = 0.0
-        self._gained = 0
+        self._attempt_s = 0.0
+        self._received = 0
 
-    def pace(self) -> Pace:
-        """Return the pace of the next try."""
-        return Pace(self._patience, left_s=max(0.0, self._patience.longest_read_s - self._spent_s))
+    def attempt(self) -> Attempt:
+        """Return the limits of the next attempt."""
+        left_s = max(0.0, self._policy.longest_read_s - self._spent_s)
+        return Attempt(self._policy, left_s=left_s)
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Count the time of what is done meanwhile."""
-        began_s = self._patience.clock()
+        """Count the time that the block takes."""
+        began_s = self._policy.clock()
         try:
             yield
         finally:
-            self._spend(self._patience.clock() - began_s)
+            spent_s = self._policy.clock() - began_s
+            self._spent_s += spent_s
+            self._attempt_s += spent_s
 
-    def gain(self, count: int) -> None:
-        """Take note of bytes that came."""
-        before, self._gained = self._gained, self._gained + count
-        if before // _BYTES_A_BOUND != self._gained // _BYTES_A_BOUND:
+    def add(self, received: int) -> None:
+        """Count bytes that came."""
+        before, self._received = self._received, self._received + received
+        if before // _BYTES_PER_TIME_LIMIT != self._received // _BYTES_PER_TIME_LIMIT:
             self._spent_s = 0.0
 
-    def goes_on(self, fault: Fault, *, gained: int) -> bool:
-        """Wait before the next try, after one that gained so many bytes; False is to give up."""
-        patience = self._patience
-        is_fair = gained > 0 and gained >= patience.least_rate_bytes_s * self._of_try_s
-        self.failures = 1 if is_fair else self.failures + 1
-        self._of_try_s = 0.0
+    def wait(self, error: TransientError, *, received: int) -> bool:
+        """Wait before the next attempt, after one that brought so many bytes; False gives up."""
+        policy = self._policy
+        is_fast = received > 0 and received >= policy.least_rate_bytes_s * self._attempt_s
+        self.failures = 1 if is_fast else self.failures + 1
+        self._attempt_s = 0.0
         with self.timed():
-            left_s = patience.longest_read_s - self._spent_s
-            return patience.wait(fault, failures=self.failures, left_s=left_s)
+            left_s = policy.longest_read_s - self._spent_s
+            return policy.wait(error, failures=self.failures, left_s=left_s)
 
-    def _spend(self, seconds: float) -> None:
-        self._spent_s += seconds
-        self._of_try_s += seconds
-
-    def told(self, fault: Fault) -> str:
-        """Return what happened, and what was tried, as a message says it."""
-        asked = f", which asks to wait {fault.wait_s:.0f} s" if fault.wait_s else ""
+    def describe(self, error: TransientError) -> str:
+        """Return what happened, and how often it was tried, for a message."""
+        asked = f", which asks to wait {error.wait_s:.0f} s" if error.wait_s else ""
         tries = f"{self.failures} tr{'y' if self.failures == 1 else 'ies'}"
-        return f"{fault}{asked}; {tries}"
+        return f"{error}{asked}; {tries}"

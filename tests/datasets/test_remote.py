@@ -13,7 +13,7 @@ from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources import remote
 from stereogenbench_data.sources.cache import ShardCache
-from stereogenbench_data.sources.retry import Patience
+from stereogenbench_data.sources.retry import RetryPolicy
 from tests.servers.fault import Answer, serving
 from tests.servers.hub import REPOSITORY
 from tests.servers.nginx import nginx_serving
@@ -25,8 +25,8 @@ FIELDS = tuple(name for name in PAIR_FIELDS if name != "__url__")
 @pytest.fixture
 def impatient(monkeypatch):
     """Waits of no time between tries."""
-    patience = functools.partial(Patience, first_wait_s=0.001)
-    monkeypatch.setattr(remote, "Patience", patience)
+    retry = functools.partial(RetryPolicy, first_wait_s=0.001)
+    monkeypatch.setattr(remote, "RetryPolicy", retry)
 
 
 @pytest.fixture
@@ -280,8 +280,8 @@ def test_a_shard_that_is_damaged_itself_is_told_with_its_checksum(shards_served,
 
 
 def test_patience_is_set_where_data_are_opened_and_goes_to_the_workers(shards_served):
-    patience = Patience(attempts=1, first_wait_s=0.0, least_rate_bytes_s=77.0)
-    index = SceneIndex.open(shards_served.url, patience=patience)
+    retry = RetryPolicy(attempts=1, first_wait_s=0.0, least_rate_bytes_s=77.0)
+    index = SceneIndex.open(shards_served.url, retry=retry)
     pairs = StereoPairs(index, fields=("left",), family="IPD_Gaussian")
     shards_served.always["train-IPD_Gaussian-000000.tar"] = Answer(status=503)
 

@@ -10,7 +10,7 @@ from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources import http as web_transport
 from stereogenbench_data.sources.members import read_range, size_of
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import Fault, Patience
+from stereogenbench_data.sources.retry import RetryPolicy, TransientError
 from tests.servers.fault import Answer, serving
 from tests.servers.raw import raw_serving
 
@@ -23,8 +23,8 @@ class Clock:
     def __init__(self):
         self.waits_s = []
 
-    def patience(self, **how):
-        return Patience(sleep=self.waits_s.append, chance=lambda: 0.0, **how)
+    def policy(self, **how):
+        return RetryPolicy(sleep=self.waits_s.append, chance=lambda: 0.0, **how)
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_a_local_file_is_read_by_range_too(tmp_path):
 
 def test_an_answer_cut_short_is_gone_on_with_where_it_ended(served, clock):
     served.answers = [Answer(stop_after=30_000), Answer(stop_after=100_000)]
-    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience())
+    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
 
     assert remote.read(500, 200_500) == DATA[500:200_500]
     assert ranges(served) == [(500, 200_500), (30_500, 200_500), (130_500, 200_500)]
@@ -79,7 +79,7 @@ def test_an_answer_cut_short_is_gone_on_with_where_it_ended(served, clock):
 
 def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, clock):
     served.always["x.tar"] = Answer(status=503)
-    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience(longest_wait_s=3.0))
+    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy(longest_wait_s=3.0))
 
     with pytest.raises(
         StorageError,
@@ -93,7 +93,7 @@ def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, clock):
 @pytest.mark.parametrize("status", [429, 503])
 def test_the_server_says_how_long_to_wait(served, clock, status):
     served.answers = [Answer(status=status, headers={"Retry-After": "7"})]
-    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience())
+    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
 
     assert remote.read(0, 9) == DATA[:9]
     assert clock.waits_s == [7.0]
@@ -104,7 +104,7 @@ def test_the_server_may_say_until_when_to_wait(served, clock):
     served.answers = [
         Answer(status=503, headers={"Retry-After": date}) for date in (dates[0], dates[2], dates[1])
     ]
-    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience())
+    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
 
     with pytest.raises(StorageError, match=r"503 Service Unavailable, which asks to wait \d{9,} s"):
         remote.read(0, 9)
@@ -114,22 +114,22 @@ def test_the_server_may_say_until_when_to_wait(served, clock):
 def test_jitter_shortens_a_wait_by_up_to_a_half():
     waits_s = []
     for chance in (0.0, 0.5, 1.0):
-        patience = Patience(sleep=waits_s.append, chance=lambda chance=chance: chance)
-        patience.wait(Fault("x"), failures=3)
+        retry = RetryPolicy(sleep=waits_s.append, chance=lambda chance=chance: chance)
+        retry.wait(TransientError("x"), failures=3)
 
     assert waits_s == [2.0, 1.5, 1.0]
 
 
-def test_silence_is_a_fault(served, clock):
+def test_silence_is_retried(served, clock):
     served.answers = [Answer(delay_s=1.0)]
-    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience(timeout_s=0.2))
+    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy(timeout_s=0.2))
 
     assert remote.read(0, 9) == DATA[:9]
     assert len(clock.waits_s) == 1
 
 
 def test_a_server_that_is_not_there_is_told_after_some_tries(served, clock):
-    remote = RemoteObject("http://127.0.0.1:1/x.tar", patience=clock.patience(attempts=3))
+    remote = RemoteObject("http://127.0.0.1:1/x.tar", retry=clock.policy(attempts=3))
 
     with pytest.raises(StorageError, match=r"Connection refused.*; 3 tries\)"):
         remote.read(0, 9)
@@ -147,7 +147,7 @@ def test_a_server_that_is_not_there_is_told_after_some_tries(served, clock):
 )
 def test_what_will_not_pass_is_told_at_once(served, clock, status, cure):
     served.always["x.tar"] = Answer(status=status)
-    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience())
+    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
 
     with pytest.raises(StorageError, match=rf"x.tar: the server answers {status} .*\. {cure}"):
         remote.read(0, 9)
@@ -246,9 +246,7 @@ def test_a_login_in_the_url_is_sent_and_never_shown(served):
 
 
 def test_a_query_is_neither_shown_nor_chained(clock):
-    remote = RemoteObject(
-        "http://127.0.0.1:1/x.tar?key=secret", patience=clock.patience(attempts=1)
-    )
+    remote = RemoteObject("http://127.0.0.1:1/x.tar?key=secret", retry=clock.policy(attempts=1))
     with pytest.raises(StorageError) as caught:
         remote.read(0, 9)
 
@@ -260,7 +258,7 @@ def test_a_query_is_neither_shown_nor_chained(clock):
 
 def test_a_url_that_is_none_is_told(clock):
     with pytest.raises(StorageError, match="is no URL: correct it"):
-        RemoteObject("http://a:b:c/x", patience=clock.patience()).read(0, 9)
+        RemoteObject("http://a:b:c/x", retry=clock.policy()).read(0, 9)
 
 
 def test_threads_read_at_the_same_time_over_connections_that_are_used_again(served):
@@ -335,7 +333,7 @@ def test_a_file_that_is_replaced_between_two_ranges_is_told(
 def test_a_file_that_is_replaced_within_one_read_is_told(served, clock):
     served.validators = {"ETag": '"a"'}
     served.answers = [Answer(stop_after=30_000)]
-    remote = RemoteObject(f"{served.url}/x.tar", patience=clock.patience())
+    remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
     chunks = remote.chunks(0, 200_000)
     next(chunks)
     served.validators = {"ETag": '"b"'}
@@ -437,7 +435,7 @@ def a_trickling_length_of_a_chunk(start, stop):
     ],
 )
 def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, reason):
-    patience = Patience(
+    retry = RetryPolicy(
         attempts=2, first_wait_s=0.001, timeout_s=0.4, window_s=0.2, least_rate_bytes_s=1e6
     )
     with (
@@ -445,11 +443,11 @@ def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, 
         pytest.raises(
             StorageError,
             match=rf"x.tar: cannot be read, at byte \d+ of 65536 \({reason}; 2 tries\)[^(]*"
-            r".*Patience\(...\)\), which has least_rate_bytes_s=1000000 over window_s=0.2, "
+            r".*RetryPolicy\(...\)\), which has least_rate_bytes_s=1000000 over window_s=0.2, "
             r"timeout_s=0.4, longest_read_s=600 now",
         ),
     ):
-        RemoteObject(f"{url}/x.tar", patience=patience).read(0, 65536)
+        RemoteObject(f"{url}/x.tar", retry=retry).read(0, 65536)
 
 
 def test_a_read_has_a_bound_in_all_whatever_it_gains():
@@ -459,14 +457,14 @@ def test_a_read_has_a_bound_in_all_whatever_it_gains():
             yield DATA[place : place + 100]
             yield 0.02
 
-    patience = Patience(least_rate_bytes_s=0.0, longest_read_s=0.3)
+    retry = RetryPolicy(least_rate_bytes_s=0.0, longest_read_s=0.3)
     with (
         raw_serving(slow) as url,
         pytest.raises(
             StorageError, match=r"a read may take 0.3 s; 1 try\).*longest_read_s=0.3 now"
         ),
     ):
-        RemoteObject(f"{url}/x.tar", patience=patience).read(0, 65536)
+        RemoteObject(f"{url}/x.tar", retry=retry).read(0, 65536)
 
 
 def test_waits_count_into_the_bound(served):
@@ -476,9 +474,9 @@ def test_waits_count_into_the_bound(served):
     def sleep(seconds):
         now_s[0] += seconds
 
-    patience = Patience(attempts=99, longest_read_s=100.0, sleep=sleep, clock=lambda: now_s[0])
+    retry = RetryPolicy(attempts=99, longest_read_s=100.0, sleep=sleep, clock=lambda: now_s[0])
     with pytest.raises(StorageError, match=r"which asks to wait 40 s; 3 tries\)"):
-        RemoteObject(f"{served.url}/x.tar", patience=patience).read(0, 9)
+        RemoteObject(f"{served.url}/x.tar", retry=retry).read(0, 9)
     assert now_s == [80.0]
 
 
@@ -489,18 +487,18 @@ def test_a_steady_server_above_the_least_rate_is_read_to_the_end():
             yield DATA[place : min(place + 4096, stop)]
             yield 0.01
 
-    patience = Patience(window_s=5.0, least_rate_bytes_s=1000.0, attempts=1)
+    retry = RetryPolicy(window_s=5.0, least_rate_bytes_s=1000.0, attempts=1)
     with raw_serving(steady) as url:
-        assert RemoteObject(f"{url}/x.tar", patience=patience).read(7, 65536) == DATA[7:65536]
+        assert RemoteObject(f"{url}/x.tar", retry=retry).read(7, 65536) == DATA[7:65536]
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
     [("attempts", 0), ("window_s", 0.0), ("longest_read_s", -1.0), ("timeout_s", float("nan"))],
 )
-def test_patience_without_an_end_is_refused(name, value):
-    with pytest.raises(StorageError, match=rf"Patience: {name} must be above 0, got {value}"):
-        Patience(**{name: value})
+def test_a_retry_policy_without_an_end_is_refused(name, value):
+    with pytest.raises(StorageError, match=rf"RetryPolicy: {name} must be above 0, got {value}"):
+        RetryPolicy(**{name: value})
 
 
 @pytest.mark.parametrize(
@@ -513,7 +511,7 @@ def test_a_retry_after_that_is_none_is_no_error_of_its_own(clock, told):
         )
 
     with raw_serving(busy) as url, pytest.raises(StorageError, match=r"the server answers 503 x"):
-        RemoteObject(f"{url}/x.tar", patience=clock.patience(attempts=2)).read(0, 9)
+        RemoteObject(f"{url}/x.tar", retry=clock.policy(attempts=2)).read(0, 9)
 
 
 @pytest.mark.parametrize("told", ["\u00b2\u00b2", "9" * 5000, "-5", "0x10", ""])

@@ -15,7 +15,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources import filesystems
 from stereogenbench_data.sources.members import read_range, size_of
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import Patience
+from stereogenbench_data.sources.retry import RetryPolicy
 from tests.servers.fault import Answer
 from tests.servers.fixtures import BUCKET
 from tests.servers.hub import COMMIT, REPOSITORY, HubHandler
@@ -113,7 +113,7 @@ def test_a_hub_that_sends_too_much_is_refused(hub, small_shards):
     url = f"hf://datasets/{REPOSITORY}/{shard_of(small_shards).name}"
     hub.answers = [Answer(whole=True)]
 
-    with pytest.raises(StorageError, match=r"sent more than the 9 bytes asked for from byte 0 on"):
+    with pytest.raises(StorageError, match=r"sent more than the 9 bytes"):
         read_range(url, 0, 9)
 
 
@@ -159,7 +159,7 @@ def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_told(s3):
         aws_access_key_id="key", aws_secret_access_key="word",
     )  # fmt: skip
     store.put_object(Bucket=BUCKET, Key="shards/changing.tar", Body=b"0" * 1000)
-    remote = RemoteObject(f"{s3}/changing.tar", patience=Patience(attempts=1))
+    remote = RemoteObject(f"{s3}/changing.tar", retry=RetryPolicy(attempts=1))
     assert remote.read(0, 9) == b"0" * 9
     store.put_object(Bucket=BUCKET, Key="shards/changing.tar", Body=b"1" * 1000)
 
@@ -195,7 +195,7 @@ def test_a_file_system_that_does_not_come_back_is_left(monkeypatch):
     files.pipe_file("/shard.tar", b"0123456789")
     done = threading.Event()
     monkeypatch.setattr(files, "open", lambda *args, **how: done.wait())
-    remote = RemoteObject("memory://shard.tar", patience=Patience(longest_read_s=0.2))
+    remote = RemoteObject("memory://shard.tar", retry=RetryPolicy(longest_read_s=0.2))
 
     with pytest.raises(StorageError, match=r"a read may take 0.2 s; 1 try\).*longest_read_s=0.2"):
         remote.read(0, 9)
@@ -217,7 +217,7 @@ def test_a_file_that_a_file_system_tells_otherwise_is_told_as_replaced(monkeypat
         return file
 
     monkeypatch.setattr(files, "open", opened)
-    remote = RemoteObject("memory://shard.tar", patience=Patience(attempts=1))
+    remote = RemoteObject("memory://shard.tar", retry=RetryPolicy(attempts=1))
 
     assert remote.read(0, 3) + remote.read(3, 6) == b"012345"
     with pytest.raises(ShardError, match=r"was replaced in its store .*: its ETag was a and is b"):
@@ -238,7 +238,7 @@ def test_a_file_system_that_fails_is_asked_again(monkeypatch):
 
     monkeypatch.setattr(files, "open", opened)
     remote = RemoteObject(
-        "memory://shard.tar", patience=Patience(sleep=waits_s.append, chance=lambda: 0.0)
+        "memory://shard.tar", retry=RetryPolicy(sleep=waits_s.append, chance=lambda: 0.0)
     )
 
     assert remote.read(2, 6) == b"2345"
