@@ -16,7 +16,7 @@ from stereogenbench_data.audit.contract_scoring import scored
 from stereogenbench_data.audit.contract_views import SceneViews, Shot
 from stereogenbench_data.errors import ExtraError, SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.sources.atomic_write import writing_output
+from stereogenbench_data.sources.files import open_output
 
 _ENDINGS: Final = (".png", ".pdf", ".svg", ".jpg")
 _NOT_KNOWN: Final = 255
@@ -64,7 +64,7 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
         _draw_curves(wide, views, shots, diagnosis, units_m=np.sort([*_WIDE_M, *found_m * _NEAR]))
         _draw_curves(near, views, shots, diagnosis, units_m=found_m * _NEAR)
         _draw_rivals(others, diagnosis)
-    with writing_output(path) as file:
+    with open_output(path) as file:
         figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=90)
 
 

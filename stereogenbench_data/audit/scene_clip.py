@@ -24,7 +24,7 @@ from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.samples.load import Sample
 from stereogenbench_data.samples.picture import Picture, anaglyph
 from stereogenbench_data.schema.records import Scene
-from stereogenbench_data.sources.atomic_write import writing_output
+from stereogenbench_data.sources.files import open_output
 
 CLIP_FIELDS: Final = ("left", "right", "disparity", "valid", "baseline_m")
 CLIP_SUFFIXES: Final = (".mp4", ".gif")
@@ -125,7 +125,7 @@ def write_clip(
     if write is None:
         raise SelectionError(f"{path}: a clip is {' or '.join(CLIP_SUFFIXES)}, by its ending.")
     try:
-        with writing_output(path) as file:
+        with open_output(path) as file:
             write(file, _counted(pages, frames=frames, progress=progress), rate_hz)
     except av.FFmpegError as error:
         # PyAV says only that writing to the file object failed; why is what it came upon.

@@ -11,7 +11,7 @@ from stereogenbench_data.audit.statistics import ADJACENT, FOCAL_EDGES_MM, branc
 from stereogenbench_data.errors import ExtraError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
-from stereogenbench_data.sources.atomic_write import writing_whole
+from stereogenbench_data.sources.files import open_atomic
 
 _BINS: Final = 40
 _COLOURS: Final = {"IPD_Gaussian": "#4477aa", "Uniform": "#ee6677", "Pairwise_Uniform": "#228833"}
@@ -100,5 +100,5 @@ def _axes(figure: Any) -> Iterator[Any]:
 
 
 def _save(figure: Any, path: Path) -> None:
-    with writing_whole(path) as file:
+    with open_atomic(path) as file:
         figure.savefig(file, format="png", dpi=100)

@@ -23,7 +23,7 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     METADATA_FILES,
 )
-from stereogenbench_data.sources.atomic_write import write_whole
+from stereogenbench_data.sources.files import write_atomic
 
 CARD_NAME: Final = "README.md"
 MARK: Final = "<!-- made by stereogenbench card -->"
@@ -61,7 +61,7 @@ def write_card(index: SceneIndex, folder: Path, *, repository: str) -> Path:
                 f"{path}: is there and was not made by this package: move it away, or add "
                 f"{MARK!r} to it if it may be replaced."
             )
-        write_whole(path, text.encode())
+        write_atomic(path, text.encode())
     except OSError as error:
         raise DescriptorError(
             f"{path}: cannot be written ({error.strerror or error}). "

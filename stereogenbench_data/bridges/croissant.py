@@ -21,7 +21,7 @@ from stereogenbench_data.bridges.croissant_tables import write_tables
 from stereogenbench_data.bridges.croissant_terms import CONTEXT, CROISSANT, RAI, Node
 from stereogenbench_data.errors import DescriptorError, cure_of
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.sources.atomic_write import write_whole
+from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import shown
 
 
@@ -89,7 +89,7 @@ def write_descriptor(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(descriptor, indent=1, ensure_ascii=False) + "\n"
-        write_whole(path, text.encode())
+        write_atomic(path, text.encode())
     except OSError as error:
         raise DescriptorError(
             f"{path}: cannot be written ({error.strerror or error}). "

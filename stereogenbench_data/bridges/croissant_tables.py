@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from stereogenbench_data.errors import DescriptorError, cure_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import CAMERA_PAIRS, baseline_bin
-from stereogenbench_data.sources.atomic_write import write_whole, writing_whole
+from stereogenbench_data.sources.files import open_atomic, write_atomic
 
 SCENES: Final = "scenes.parquet"
 PAIRS: Final = "pairs.parquet"
@@ -59,11 +59,11 @@ def write_tables(index: SceneIndex, folder: Path) -> list[WrittenTable]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, table in tables.items():
-            with writing_whole(folder / name) as file:
+            with open_atomic(folder / name) as file:
                 pq.write_table(table, file, compression="zstd")
         if len(index.shards) > MOST_SHARD_FILES:
             listed = "".join(f"{path}\n" for path in sorted(index.shards))
-            write_whole(folder / SHARD_LIST, listed.encode())
+            write_atomic(folder / SHARD_LIST, listed.encode())
             names.append(SHARD_LIST)
     except OSError as error:
         raise DescriptorError(

@@ -29,10 +29,10 @@ def write_report(path: Path, text: str) -> None:
         OSError: If it cannot be written; then the file that was there is as before, unless it is
             a device or a pipe.
     """
-    from stereogenbench_data.sources.atomic_write import writing_output
+    from stereogenbench_data.sources.files import open_output
 
     content = text.encode(errors="replace")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with writing_output(path) as file:
+        with open_output(path) as file:
             file.write(content)

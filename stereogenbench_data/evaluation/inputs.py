@@ -35,7 +35,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Request, SampleLoader
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Address, Selection
-from stereogenbench_data.sources.atomic_write import write_whole
+from stereogenbench_data.sources.files import write_atomic
 
 INPUTS_JSON: Final = "inputs.json"
 CAMERA_JSON: Final = "camera.json"
@@ -148,7 +148,7 @@ def _begin(root: Path, told: Mapping[str, Any]) -> None:
                 raise EvaluationError(
                     f"{root}: is not empty and holds no {INPUTS_JSON}: choose a new folder."
                 )
-            write_whole(path, json.dumps(told).encode())
+            write_atomic(path, json.dumps(told).encode())
         there = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         if isinstance(error, EvaluationError):

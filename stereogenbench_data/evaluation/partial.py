@@ -19,7 +19,7 @@ from stereogenbench_data.evaluation.frame_scores import PairScores
 from stereogenbench_data.evaluation.frechet import Spread
 from stereogenbench_data.evaluation.predictions import Pair, pair_name
 from stereogenbench_data.evaluation.scoring import SceneScores
-from stereogenbench_data.sources.atomic_write import write_whole
+from stereogenbench_data.sources.files import write_atomic
 
 Stamps = Mapping[tuple[str, Pair], str]
 
@@ -54,7 +54,7 @@ class PartialResults:
                         f"{folder}: holds scenes without {STATE_JSON}, which tells what they are "
                         f"of. Remove the folder, or choose another."
                     )
-                write_whole(folder / STATE_JSON, json.dumps(ours, indent=1).encode())
+                write_atomic(folder / STATE_JSON, json.dumps(ours, indent=1).encode())
         except OSError as error:
             raise StorageError(
                 f"{folder}: partial results cannot be kept there ({error.strerror or error}). "
@@ -111,8 +111,8 @@ class PartialResults:
             if arrays:
                 packed = BytesIO()
                 np.savez(packed, **arrays)
-                write_whole(path.with_suffix(".npz"), packed.getvalue())
-            write_whole(path, json.dumps(document, allow_nan=False).encode())
+                write_atomic(path.with_suffix(".npz"), packed.getvalue())
+            write_atomic(path, json.dumps(document, allow_nan=False).encode())
         except OSError as error:
             raise StorageError(
                 f"{path}: the scores of {scene} cannot be written ({error.strerror or error}). "

@@ -13,7 +13,7 @@ from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS, HEAVY
 from stereogenbench_data.evaluation.reference import reference_rows
 from stereogenbench_data.evaluation.results import CONTROL, Scores, require_comparable
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
-from stereogenbench_data.sources.atomic_write import writing_whole
+from stereogenbench_data.sources.files import open_atomic
 
 _SIZE_IN: Final = (9.0, 4.2)
 _DPI: Final = 120
@@ -49,7 +49,7 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
         path = folder / f"{column}_by_baseline.png"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with writing_whole(path) as file:
+            with open_atomic(path) as file:
                 figure.savefig(file, format="png", dpi=_DPI)
         except OSError as error:
             raise StorageError(

@@ -17,7 +17,7 @@ from stereogenbench_data.evaluation.results import CONTROL, Scores
 from stereogenbench_data.evaluation.table_rows import Table
 from stereogenbench_data.evaluation.tiers import TIERS
 from stereogenbench_data.schema.problems import counted, markdown_text
-from stereogenbench_data.sources.atomic_write import write_whole
+from stereogenbench_data.sources.files import write_atomic
 
 Verdict = Mapping[bool | None, str]
 
@@ -107,7 +107,7 @@ def write_report(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in written.items():
-            write_whole(folder / name, text.encode())
+            write_atomic(folder / name, text.encode())
     except OSError as error:
         raise StorageError(
             f"{folder}: the report cannot be written ({error.strerror or error}). "

@@ -22,7 +22,7 @@ from stereogenbench_data.errors import StorageError, cure_of
 from stereogenbench_data.index.arrow_arrays import as_numpy
 from stereogenbench_data.index.rows import SCHEMA
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.sources.atomic_write import writing_whole
+from stereogenbench_data.sources.files import open_atomic
 from stereogenbench_data.sources.location import (
     is_remote,
     local_path,
@@ -89,7 +89,7 @@ def write_index_file(path: Path, table: pa.Table, description: Mapping[str, Any]
     described = table.replace_schema_metadata({_METADATA_KEY: head})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with writing_whole(path) as file:
+        with open_atomic(path) as file:
             pq.write_table(described, file, compression="zstd")
     except OSError as error:
         raise StorageError(

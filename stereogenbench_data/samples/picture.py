@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from stereogenbench_data.errors import FieldError
 from stereogenbench_data.samples.load import Sample
-from stereogenbench_data.sources.atomic_write import writing_output
+from stereogenbench_data.sources.files import open_output
 
 Picture = UInt8[np.ndarray, "h w 3"]
 
@@ -97,7 +97,7 @@ def write_png(path: Path, picture: Picture) -> None:
     Raises:
         OSError: If it cannot be written; then the file that was there is as before.
     """
-    with writing_output(path) as file:
+    with open_output(path) as file:
         Image.fromarray(picture).save(file, format="PNG")
 
 

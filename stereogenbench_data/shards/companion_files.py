@@ -11,7 +11,7 @@ from typing import Final
 
 from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.sources.atomic_write import write_whole
+from stereogenbench_data.sources.files import write_atomic
 
 WIDS_NAME: Final = "shards.json"
 DALI_FOLDER: Final = "dali"
@@ -51,7 +51,7 @@ def write_foreign_indexes(index: SceneIndex, *, out: Path) -> None:
     try:
         for path, content in foreign_indexes(index).items():
             (out / path).parent.mkdir(exist_ok=True)
-            write_whole(out / path, content)
+            write_atomic(out / path, content)
     except OSError as error:
         raise ShardError(
             f"{error.filename or out}: cannot be written ({error.strerror or error}). "

@@ -18,7 +18,7 @@ from stereogenbench_data.index.stale import scenes_listed
 from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import METADATA_FILES
-from stereogenbench_data.sources.atomic_write import writing_whole
+from stereogenbench_data.sources.files import open_atomic
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.members import open_local, require_own_files
 from stereogenbench_data.sources.remote import RemoteObject
@@ -200,7 +200,7 @@ def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> No
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         crc32 = 0
-        with writing_whole(place) as file:
+        with open_atomic(place) as file:
             for data in _until(stop, _chunks(index, member)):
                 file.write(data)
                 crc32 = zlib.crc32(data, crc32)

@@ -12,7 +12,7 @@ from pathlib import Path
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.shards.plan import PlannedMember, PlannedShard
-from stereogenbench_data.sources.atomic_write import PARTS, write_whole
+from stereogenbench_data.sources.files import PARTS, write_atomic
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +119,7 @@ def write_note(task: ShardTask, note: ShardNote) -> None:
         "sources": [[seen.size, seen.modified_ns, seen.crc32] for seen in note.sources],
         "rows": note.rows,
     }
-    write_whole(task.note, json.dumps(told).encode())
+    write_atomic(task.note, json.dumps(told).encode())
 
 
 def find_packed(task: ShardTask) -> PackedShard | None:

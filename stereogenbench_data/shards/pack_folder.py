@@ -9,7 +9,7 @@ from stereogenbench_data.index.table import INDEX_NAME
 from stereogenbench_data.shards.plan import ShardPlan
 from stereogenbench_data.shards.tar import read_members
 from stereogenbench_data.shards.writer import UNFINISHED
-from stereogenbench_data.sources.atomic_write import PARTS, write_whole
+from stereogenbench_data.sources.files import PARTS, write_atomic
 
 _PLAN_NOTE: Final = "plan.json"
 
@@ -31,7 +31,7 @@ def take_folder(plan: ShardPlan, out: Path) -> None:
     if not note.exists():
         _require_own_shards(plan, out)
         note.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(note, json.dumps(told).encode())
+        write_atomic(note, json.dumps(told).encode())
     try:
         found = json.loads(note.read_bytes())
     except ValueError:

@@ -21,7 +21,7 @@ from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
-from stereogenbench_data.sources.atomic_write import held_alone
+from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.members import open_local
 from stereogenbench_data.sources.ranged_file import MemberFile
@@ -114,7 +114,7 @@ def unpack(
     found: dict[str, str] = {}
     try:
         out.mkdir(parents=True, exist_ok=True)
-        with held_alone(out / _LOCK) as is_ours:
+        with try_locked(out / _LOCK) as is_ours:
             if not is_ours:
                 raise ShardError(
                     f"{out}: another process is unpacking into this folder. Wait for it, or "

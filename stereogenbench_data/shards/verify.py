@@ -28,7 +28,7 @@ from stereogenbench_data.shards.verify_shard import (
     check_shard,
 )
 from stereogenbench_data.shards.writer import UNFINISHED
-from stereogenbench_data.sources.atomic_write import PARTS
+from stereogenbench_data.sources.files import PARTS
 from stereogenbench_data.sources.location import shown
 
 Progress = Callable[[int, int], None]

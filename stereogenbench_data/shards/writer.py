@@ -38,7 +38,7 @@ from stereogenbench_data.shards.tar import (
     read_checksums,
     read_members,
 )
-from stereogenbench_data.sources.atomic_write import alone
+from stereogenbench_data.sources.files import open_exclusive
 
 UNFINISHED: Final = ".tmp"
 
@@ -71,7 +71,7 @@ def pack_task(task: ShardTask, after_bytes: AfterBytes) -> ShardOutcome:
     if done is not None:
         return ShardOutcome(done, "kept")
     try:
-        with alone(_unfinished_of(task)) as file:
+        with open_exclusive(_unfinished_of(task)) as file:
             done = find_packed(task) or found_whole(task, after_bytes)
             if done is not None:
                 return ShardOutcome(done, "kept")

@@ -17,7 +17,6 @@ import json
 import os
 import re
 import time
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -25,8 +24,7 @@ from typing import Any, Final
 
 from stereogenbench_data.errors import ShardError, StorageError, cure_of
 from stereogenbench_data.schema.records import Member
-from stereogenbench_data.sources.atomic_write import write_whole
-from stereogenbench_data.sources.locks import locked
+from stereogenbench_data.sources.files import copy_with_crc32, locked, try_locked, write_atomic
 from stereogenbench_data.sources.ranged_file import FileSlice
 from stereogenbench_data.sources.remote import RemoteObject
 
@@ -133,7 +131,7 @@ class ShardCache:
                 f"folder, or delete it."
             )
         if not names:
-            write_whole(tag, _TAG_TEXT)
+            write_atomic(tag, _TAG_TEXT)
         if not tag.read_bytes().startswith(_SIGNATURE):
             raise StorageError(
                 f"{tag}: was not written by this package. Choose another folder, or delete it."
@@ -226,7 +224,7 @@ class ShardCache:
                 used -= size
                 continue
             # A part is left alone while someone writes it, that is while its lock is taken.
-            with locked(self._locks / path.name[:2], when_taken="skip") as is_held:
+            with try_locked(self._locks / path.name[:2]) as is_held:
                 if is_held:
                     path.unlink(missing_ok=True)
                     used -= size
@@ -302,11 +300,9 @@ def _key(member: Member, *, where: str, revision: str) -> str:
 
 def _fetch(part: Path, member: Member, *, remote: RemoteObject) -> int:
     """Write a member's bytes to the disk and return their crc32."""
-    crc32 = 0
     with part.open("r+b") as file:
-        for data in remote.chunks(member.offset, member.offset + member.size):
-            file.write(data)
-            crc32 = zlib.crc32(data, crc32)
+        chunks = remote.chunks(member.offset, member.offset + member.size)
+        crc32 = copy_with_crc32(chunks, file.write)
         file.flush()
         os.fsync(file.fileno())
     return crc32

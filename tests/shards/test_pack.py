@@ -28,7 +28,7 @@ from stereogenbench_data.shards.pack import OversizedSceneWarning, pack, prepare
 from stereogenbench_data.shards.plan import PlannedMember, PlannedShard, plan_shards
 from stereogenbench_data.shards.verify import verify
 from stereogenbench_data.shards.writer import pack_shard, pack_task
-from stereogenbench_data.sources.locks import locked
+from stereogenbench_data.sources.files import locked
 from tests.servers.tools import small_disk
 
 ONE_EACH = 250_000

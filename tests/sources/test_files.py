@@ -1,21 +1,30 @@
 """Files written whole or not at all: what killed writers left goes, what living ones have stays."""
 
 import errno
+import fcntl
 import multiprocessing
 import os
 import subprocess
 import sys
+import threading
 
 import pytest
 
-from stereogenbench_data.sources.atomic_write import write_whole, writing_output, writing_whole
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.sources.files import (
+    locked,
+    open_atomic,
+    open_output,
+    try_locked,
+    write_atomic,
+)
 
 WRITER = """
 import sys, time
 from pathlib import Path
-from stereogenbench_data.sources.atomic_write import writing_whole
+from stereogenbench_data.sources.files import open_atomic
 
-with writing_whole(Path(sys.argv[1])) as file:
+with open_atomic(Path(sys.argv[1])) as file:
     file.write(b"half of it")
     file.flush()
     print("begun", flush=True)
@@ -45,14 +54,14 @@ def test_what_a_killed_writer_left_is_removed_by_the_next_one(writer, tmp_path):
     writer.wait()
     assert names(tmp_path) == [".notes.json.unfinished"]
 
-    write_whole(tmp_path / "notes.json", b"whole")
+    write_atomic(tmp_path / "notes.json", b"whole")
 
     assert names(tmp_path) == ["notes.json"]
     assert (tmp_path / "notes.json").read_bytes() == b"whole"
 
 
 def test_what_a_living_writer_has_is_left_alone(writer, tmp_path):
-    write_whole(tmp_path / "notes.json", b"whole")
+    write_atomic(tmp_path / "notes.json", b"whole")
 
     assert names(tmp_path) == [".notes.json.unfinished", "notes.json"]
     assert writer.poll() is None
@@ -63,14 +72,14 @@ def test_an_error_leaves_the_file_as_it_was_and_names_it(tmp_path):
     path.write_bytes(b"before")
 
     def fail():
-        with writing_whole(path) as file:
+        with open_atomic(path) as file:
             file.write(b"half")
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(OSError, match="No space left"):
         fail()
     with pytest.raises(FileNotFoundError, match=r"gone/notes\.json'"):
-        write_whole(tmp_path / "gone" / "notes.json", b"")
+        write_atomic(tmp_path / "gone" / "notes.json", b"")
 
     assert names(tmp_path) == ["notes.json"]
     assert path.read_bytes() == b"before"
@@ -82,7 +91,7 @@ def test_nothing_is_written_through_links_that_lie_where_unfinished_files_do(tmp
     (tmp_path / ".notes.json.unfinished").symlink_to(other)
     os.link(other, tmp_path / ".notes.json.unfinished1")
 
-    write_whole(tmp_path / "notes.json", b"whole")
+    write_atomic(tmp_path / "notes.json", b"whole")
 
     assert other.read_bytes() == b"kept"
     assert names(tmp_path) == ["notes.json", "other"]
@@ -91,7 +100,7 @@ def test_nothing_is_written_through_links_that_lie_where_unfinished_files_do(tmp
 def test_a_link_that_the_user_named_is_followed(tmp_path):
     (tmp_path / "report.md").symlink_to(tmp_path / "real.md")
 
-    with writing_output(tmp_path / "report.md") as file:
+    with open_output(tmp_path / "report.md") as file:
         file.write(b"text")
 
     assert (tmp_path / "report.md").is_symlink()
@@ -100,7 +109,7 @@ def test_a_link_that_the_user_named_is_followed(tmp_path):
 
 def _write_often(path, number):
     for _ in range(30):
-        write_whole(path, bytes([number]) * 1000)
+        write_atomic(path, bytes([number]) * 1000)
 
 
 def test_writers_of_one_file_at_once_leave_one_whole_file(tmp_path):
@@ -116,3 +125,72 @@ def test_writers_of_one_file_at_once_leave_one_whole_file(tmp_path):
     assert names(tmp_path) == ["notes.json"]
     assert len(path.read_bytes()) == 1000
     assert len(set(path.read_bytes())) == 1
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from stereogenbench_data.sources.files import locked
+
+with locked(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def _is_free(lock):
+    with try_locked(lock) as is_held:
+        return is_held
+
+
+def test_a_lock_is_held_against_other_threads(tmp_path):
+    found = []
+    with locked(tmp_path / "lock"):
+        thread = threading.Thread(target=lambda: found.append(_is_free(tmp_path / "lock")))
+        thread.start()
+        thread.join()
+
+    assert found == [False]
+    assert _is_free(tmp_path / "lock")
+
+
+def test_a_lock_is_freed_when_its_process_is_killed(tmp_path):
+    command = [sys.executable, "-c", HOLDER, tmp_path / "lock"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"held\n"
+        assert not _is_free(tmp_path / "lock")
+        threading.Timer(0.2, process.kill).start()
+
+        with locked(tmp_path / "lock"):
+            assert process.wait() != 0
+
+
+def test_a_lock_is_freed_though_a_forked_process_has_its_file_open(tmp_path):
+    ended = multiprocessing.get_context("fork").Event()
+    with locked(tmp_path / "lock"):
+        child = multiprocessing.get_context("fork").Process(target=ended.wait)
+        child.start()
+    try:
+        assert _is_free(tmp_path / "lock")
+    finally:
+        ended.set()
+        child.join()
+
+
+def test_a_file_system_without_locks_is_named_where_locks_are_needed(tmp_path, monkeypatch):
+    def unsupported(handle, operation):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", unsupported)
+    with (
+        pytest.raises(StorageError, match=r"/lock: .*\(No locks available\)\. Choose another"),
+        locked(tmp_path / "lock"),
+    ):
+        pass
+    assert _is_free(tmp_path / "lock")
+
+
+def test_a_lock_leaves_what_is_in_its_file(tmp_path):
+    (tmp_path / "lock").write_text("17")
+    with locked(tmp_path / "lock"), try_locked(tmp_path / "lock"):
+        assert (tmp_path / "lock").read_text() == "17"
