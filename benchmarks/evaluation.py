@@ -31,8 +31,8 @@ from stereogenbench_data.evaluation.one_thread import one_thread
 from stereogenbench_data.evaluation.predictions import frame_name, item_name
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
 from stereogenbench_data.evaluation.running import Extent
-from stereogenbench_data.samples.load import resized_nearest
 from stereogenbench_data.samples.streams import Streams
+from stereogenbench_data.samples.views import resized_nearest
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.members import MemberSource

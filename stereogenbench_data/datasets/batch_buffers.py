@@ -34,7 +34,7 @@ from torch.utils.data import get_worker_info
 
 from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.datasets.tensors import collate
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import Sample
 
 Buffers = Literal["reused", "fresh"]
 """Whether the memory of batches is reused once nobody holds it."""

@@ -37,15 +37,12 @@ from stereogenbench_data.samples.derive import RECTIFIED_PX
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,
     DEFAULT_VIEW_FIELDS,
-)
-from stereogenbench_data.samples.load import (
-    Request,
     Sample,
-    SampleLoader,
-    Transform,
 )
+from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.needed import require_videos
 from stereogenbench_data.samples.places import Room, fresh_room
+from stereogenbench_data.samples.request import Request, Transform
 from stereogenbench_data.samples.whole_depth import require_whole_depth
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters

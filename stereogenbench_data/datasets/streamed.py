@@ -19,7 +19,8 @@ from stereogenbench_data.datasets.loader import split_options
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.errors import StateError
-from stereogenbench_data.samples.load import Sample, Transform
+from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.samples.request import Transform
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.sources.cache import ShardCache

@@ -6,9 +6,12 @@ front of that, in the fields that depend on the target.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import FieldError
+
+Sample = dict[str, Any]
+"""A flat dict of arrays (tensors, once in torch's hands) and texts, by the names of fields."""
 
 Stream = Literal["source_rgb", "target_rgb", "source_depth", "target_depth"]
 

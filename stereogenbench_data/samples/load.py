@@ -6,7 +6,6 @@ from copy import copy
 from typing import Any, Final, Literal
 
 import numpy as np
-from jaxtyping import Shaped
 
 from stereogenbench_data.errors import MediaError, SchemaError, ShardError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
@@ -23,10 +22,11 @@ from stereogenbench_data.samples.derive import (
     PairSample,
     SceneFacts,
 )
+from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.places import Places, Room, fresh_room
-from stereogenbench_data.samples.request import Clip, Request, Sample, Transform
+from stereogenbench_data.samples.request import Clip, Request
 from stereogenbench_data.samples.streams import OPEN_STREAMS, Streams
-from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.samples.views import StoredDepth, Views, resized_nearest
 from stereogenbench_data.schema.parse import parse_trajectory
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
@@ -38,8 +38,6 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.members import MemberSource
-
-__all__ = ["Clip", "Request", "Sample", "SampleLoader", "Transform", "resized_nearest"]
 
 KEPT_POSES: Final = 32
 """Of how many scenes the poses are kept (46 kB a scene of 81 frames)."""
@@ -348,21 +346,6 @@ class SampleLoader:
         place = places.of(name, number, shape=value.shape, dtype=value.dtype)
         if not np.may_share_memory(value, place):
             np.copyto(place, value)
-
-
-def resized_nearest(
-    maps: Shaped[np.ndarray, "*batch h w"], *, size: tuple[int, int]
-) -> Shaped[np.ndarray, "*batch h2 w2"]:
-    """Return maps at another size by the nearest pixel centre, never averaged across an edge.
-
-    Pixel i of n takes the source pixel that holds the centre (i + 0.5) * source / n: what torch
-    calls nearest-exact.
-    """
-    rows, columns = (
-        np.minimum((np.arange(wanted) + 0.5) * found / wanted, found - 1).astype(np.intp)
-        for wanted, found in zip(size, maps.shape[-2:], strict=True)
-    )
-    return np.ascontiguousarray(maps[..., rows[:, None], columns])
 
 
 def _sample_key(views: Views, facts: SceneFacts, *, frames: tuple[int, ...]) -> str:

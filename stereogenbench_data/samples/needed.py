@@ -4,7 +4,7 @@ import numpy as np
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import Request
+from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.plan import Plan
 

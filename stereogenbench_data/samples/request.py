@@ -1,7 +1,7 @@
 """What is asked of every sample, and what may change one on its way."""
 
 from dataclasses import dataclass
-from typing import Any, Final, Literal, Protocol, runtime_checkable
+from typing import Final, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from stereogenbench_data.samples.fields import (
 from stereogenbench_data.samples.views import Views
 from stereogenbench_data.schema.records import DepthEncoding
 
-Sample = dict[str, Any]
 Clip = Literal["frame", "clip"]
 
 
