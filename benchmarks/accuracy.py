@@ -19,7 +19,7 @@ from benchmarks.ways import (
 )
 from stereogenbench_data.geometry.disparity import disparity_error_px
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import resized_nearest
+from stereogenbench_data.samples.views import resized_nearest
 
 CASES: Final = 240
 PIXELS: Final = (8, 256)

@@ -31,7 +31,6 @@ from stereogenbench_data.evaluation.one_thread import one_thread
 from stereogenbench_data.evaluation.predictions import frame_name, item_name
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
 from stereogenbench_data.evaluation.running import Extent
-from stereogenbench_data.samples.load import resized_nearest
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import depth_name, rgb_name
@@ -161,8 +160,8 @@ def _decode(extent: Extent, predictions: Path) -> None:
         for frame in wanted.frames:
             for camera in wanted.pair:
                 streams.rgb(scene, rgb_name(camera), frame, size=wanted.size)
-                units = streams.depth_units(scene, depth_name(camera), frame, encoding=encoding)
-                resized_nearest(units, size=wanted.size)
+                name = depth_name(camera)
+                streams.read_stored_depth(scene, name, frame, encoding=encoding, size=wanted.size)
             with Image.open(folder / frame_name(frame)) as picture:
                 np.ascontiguousarray(np.asarray(picture).transpose(2, 0, 1))
 

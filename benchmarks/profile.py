@@ -48,7 +48,7 @@ _SPANS: Final[tuple[tuple[str, str, str | Label], ...]] = (
     ("stereogenbench_data.media.decoder", "Decoder._register", "checking"),
     ("stereogenbench_data.samples.streams", "read_rgb", "colour conversion"),
     ("stereogenbench_data.samples.streams", "read_depth_units", _depth),
-    ("stereogenbench_data.samples.load", "SampleLoader._write_fields", "geometry"),
+    ("stereogenbench_data.samples.writer", "SampleWriter.write", "geometry"),
     ("stereogenbench_data.datasets.batch_buffers", "collate", "collation"),
     ("torch.utils.data._utils.fetch", "_MapDatasetFetcher.fetch", "glue"),
 )

@@ -10,7 +10,7 @@ from stereogenbench_data.audit.picture_check import reduced_size
 from stereogenbench_data.audit.reprojection import MeasuredDepth
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
-from stereogenbench_data.media.depth import depth_frame_index, depth_m_from_units, measured
+from stereogenbench_data.media.depth import depth_frame_index, depth_m_from_units
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding, Scene
@@ -99,14 +99,17 @@ class SceneFiles:
         index = depth_frame_index(frame, encoding=encoding, frames=self.scene.frames)
         if index is None:
             return None
-        units = self.streams.depth_units(self.scene, depth_name(camera), index, encoding=encoding)
-        pixel_format = self.streams.pixel_format(self.scene, depth_name(camera))
-        known = measured(units, encoding=encoding, pixel_format=pixel_format)
-        depth_m = depth_m_from_units(
-            units, measured=known, encoding=encoding, intrinsics=self.intrinsics
+        stored = self.streams.read_stored_depth(
+            self.scene, depth_name(camera), index, encoding=encoding
         )
-        known &= np.isfinite(depth_m)
-        return units, MeasuredDepth(
+        depth_m = depth_m_from_units(
+            stored.units,
+            measured=stored.measured,
+            encoding=encoding,
+            intrinsics=self.intrinsics,
+        )
+        known = stored.measured & np.isfinite(depth_m)
+        return stored.units, MeasuredDepth(
             np.where(known, depth_m, 0).astype(np.float64),
             known,
             step_m=encoding.known_unit_m,

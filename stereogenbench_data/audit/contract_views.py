@@ -13,7 +13,6 @@ from stereogenbench_data.audit.contract_hypotheses import LAGS, Flip, Structure
 from stereogenbench_data.audit.contract_matching import Luma, match_rows
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
-from stereogenbench_data.media.depth import measured
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
@@ -126,14 +125,13 @@ class SceneViews:
         if (frame, file) in self._depths:
             return self._depths[frame, file]
         name = depth_name(file)
-        units = self._streams.depth_units(self.scene, name, frame, encoding=self.encoding)
+        stored = self._streams.read_stored_depth(self.scene, name, frame, encoding=self.encoding)
+        units = stored.units
         expected = (self.intrinsics.height_px, self.intrinsics.width_px)
         _require_size(units.shape, expected, where=f"{self.scene.id.key}/{name}")
-        pixel_format = self._streams.pixel_format(self.scene, name)
-        known = measured(units, encoding=self.encoding, pixel_format=pixel_format)
         if (len(self._depths) + 1) * units.size * 3 > _MOST_DEPTH_BYTES and self._depths:
             self._depths.pop(next(iter(self._depths)))
-        self._depths[frame, file] = units, known & (units > 0)
+        self._depths[frame, file] = units, stored.measured & (units > 0)
         return self._depths[frame, file]
 
     def _numbers(self, shot: Shot, *, frame: int, file: int) -> dict[Flip, _Numbers]:

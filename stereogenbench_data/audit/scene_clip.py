@@ -21,7 +21,7 @@ from stereogenbench_data.audit.scene_reader import SceneReader
 from stereogenbench_data.audit.scene_sheet import tile_width
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.picture import Picture, anaglyph
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.sources.files import open_output

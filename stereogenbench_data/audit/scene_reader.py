@@ -8,7 +8,9 @@ from jaxtyping import UInt8
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import Request, Sample, SampleLoader
+from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.pairs import require_pairs

@@ -21,7 +21,7 @@ from stereogenbench_data.audit.drawing import (
 )
 from stereogenbench_data.audit.scene_reader import SceneReader
 from stereogenbench_data.geometry.camera import rig_intrinsics
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.picture import Picture, anaglyph
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT

@@ -1,7 +1,7 @@
 """From tensors back to arrays, for libraries that pass samples between processes by themselves."""
 
 from stereogenbench_data.errors import FieldError
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import Sample
 
 
 def to_arrays(sample: Sample) -> Sample:

@@ -7,8 +7,7 @@ from stereogenbench_data.bridges.arrays import to_arrays
 from stereogenbench_data.bridges.scene_bytes import SampleOptions, samples_of
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.errors import ExtraError, SelectionError, StorageError
-from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
 from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     METADATA_FILES,

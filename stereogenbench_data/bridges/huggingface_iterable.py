@@ -10,7 +10,7 @@ from torch.utils.data import get_worker_info
 
 from stereogenbench_data.bridges.arrays import to_arrays
 from stereogenbench_data.datasets.mapped import StereoPairs
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import Sample
 
 
 class SampleIterable(IterableDataset):  # type: ignore[misc]  # datasets ships no types

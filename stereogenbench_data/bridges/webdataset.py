@@ -11,8 +11,7 @@ from typing import Any, Unpack
 
 from stereogenbench_data.bridges.scene_bytes import SampleOptions, samples_of
 from stereogenbench_data.errors import SelectionError, StorageError
-from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
 
 
 class SceneDecoder:

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from stereogenbench_data.errors import FieldError
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import Sample
 
 
 def to_raft_stereo(sample: Sample) -> tuple[torch.Tensor, ...]:

@@ -26,7 +26,7 @@ import multiprocessing
 import os
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Literal, NamedTuple, Self
+from typing import Any, Final, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 import torch
@@ -34,7 +34,9 @@ from torch.utils.data import get_worker_info
 
 from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.datasets.tensors import collate
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.samples.writer import Allocate
 
 Buffers = Literal["reused", "fresh"]
 """Whether the memory of batches is reused once nobody holds it."""
@@ -49,8 +51,6 @@ _ALIGNED: Final = 64
 
 _WORKERS, _SENT, _RETIRED = 0, 1, 2
 """Whose a slot is: the worker's, the process's that trains, or for good a held batch's."""
-
-Allocate = Callable[[str, tuple[int, ...], Any], Any]
 
 
 class BatchArrays:
@@ -109,7 +109,14 @@ class BatchBuffers:
     """
 
     def __init__(self, kind: Buffers = "reused") -> None:
-        """Begin with none."""
+        """Begin with none.
+
+        Raises:
+            SelectionError: If there is no such kind.
+        """
+        if kind not in get_args(Buffers):
+            known = ", ".join(map(repr, get_args(Buffers)))
+            raise SelectionError(f"buffers must be one of {known}, got {kind!r}.")
         self.kind = kind
         self._free: dict[str, list[np.ndarray]] = {}
         self._slots: _WorkerSlots | None = None

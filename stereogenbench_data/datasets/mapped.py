@@ -2,23 +2,14 @@
 
 import copy
 import operator
-import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal, Self, Unpack
+from typing import Final, Literal, Self, Unpack, get_args
 
 import numpy as np
 import torch
 from torch.utils.data import Dataset
 
-from stereogenbench_data.datasets.asked import (
-    Check,
-    requested,
-    require_buffers,
-    require_cameras,
-    require_check,
-    require_seed,
-)
 from stereogenbench_data.datasets.batch_buffers import BatchArrays, BatchBuffers, Buffers
 from stereogenbench_data.datasets.batches import EpochBatch, EpochBatches
 from stereogenbench_data.datasets.frameworks import accelerates_epoch
@@ -31,22 +22,17 @@ from stereogenbench_data.datasets.loader import (
 from stereogenbench_data.datasets.open_videos import scenes_at_once, videos_to_keep
 from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.datasets.tensors import to_tensors
-from stereogenbench_data.errors import FieldError, SelectionError
+from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.derive import RECTIFIED_PX
+from stereogenbench_data.samples.checks import check_samples
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,
     DEFAULT_VIEW_FIELDS,
-)
-from stereogenbench_data.samples.load import (
-    Request,
     Sample,
-    SampleLoader,
-    Transform,
 )
-from stereogenbench_data.samples.needed import require_videos
-from stereogenbench_data.samples.places import Room, fresh_room
-from stereogenbench_data.samples.whole_depth import require_whole_depth
+from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.request import Request, Transform, parse_request
+from stereogenbench_data.samples.writer import Allocate, new_array
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.plan import Plan, Selection, plan_pairs, plan_views
@@ -54,6 +40,10 @@ from stereogenbench_data.selection.windows import FramesSpec
 from stereogenbench_data.sources.cache import ShardCache
 
 Data = str | Path | SceneIndex
+
+Check = Literal["read", "opened", "metadata"]
+"""Which videos are compared with their checksums: see `StereoPairs`."""
+
 _FOLLOWS: Final = -1
 """Stands for the epoch of the dataset that a loader was made from."""
 
@@ -71,12 +61,10 @@ class _MappedScenes(Dataset[Sample]):
         check: Check,
         buffers: Buffers,
     ) -> None:
-        require_videos(index, plan, request)
-        require_whole_depth(index, plan, request)
-        _warn_of_odd_scenes(index, plan, request)
+        check_samples(index, plan, request)
         self.index = index
         self.plan = plan
-        opened = _opens_checked(require_check(check), plan)
+        opened = _opens_checked(check, plan)
         self._loader = SampleLoader(
             index,
             request,
@@ -84,7 +72,7 @@ class _MappedScenes(Dataset[Sample]):
             check="opened" if opened else "metadata",
             frames="shared" if (np.diff(plan.first_pair) > 1).any() else "used once",
         )
-        self.buffers = BatchBuffers(require_buffers(buffers))
+        self.buffers = BatchBuffers(buffers)
         self._streams = request.streams
         self._access: Literal["random", "in order"] = "random"
         # The epoch, and how often it was set. Shared memory, because workers that persist over
@@ -177,8 +165,8 @@ class _MappedScenes(Dataset[Sample]):
             sample["is_padding"] = is_padding
         return sample
 
-    def _sample(self, number: int, epoch: int, room: Room = fresh_room) -> Sample:
-        """Return a sample of arrays, written where the room says."""
+    def _sample(self, number: int, epoch: int, allocate: Allocate = new_array) -> Sample:
+        """Return a sample of arrays, written into what is allocated for them."""
         number = operator.index(number)
         count = len(self.plan)
         if not -count <= number < count:
@@ -190,7 +178,7 @@ class _MappedScenes(Dataset[Sample]):
             address,
             clip="clip" if self.plan.windows.is_clip else "frame",
             generator=np.random.default_rng(seeds),
-            room=room,
+            allocate=allocate,
         )
         if self._access == "in order" and self.plan.is_last_of_scene(number):
             self._loader.release(address.row)
@@ -260,39 +248,6 @@ class _MappedScenes(Dataset[Sample]):
         )
 
 
-class OddSceneWarning(UserWarning):
-    """Selected scenes are not what the release promises: the message says how and which."""
-
-
-def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None:
-    """Warn where rigs are not rectified, or where a scene's cameras state several depth units."""
-    needs = {request.known[name].needs_poses for name in request.fields}
-    rows = plan.scene_rows
-    if "unless rectified" in needs:
-        residuals_px = index.column("rig_residual_px")[rows]
-        _warn(
-            index, rows[residuals_px > RECTIFIED_PX],
-            f"are not rectified (by up to {residuals_px.max(initial=0):.3g} px): their pixels are "
-            "projected through the poses, and no field holds what that moves up or down",
-        )  # fmt: skip
-    if request.streams & {"source_depth", "target_depth"} and not (
-        request.depth and request.depth.unit_m
-    ):
-        units_m = index.column("depth_unit_m")[rows]
-        _warn(
-            index, rows[(units_m != units_m[:, :1]).any(axis=1)],
-            "state other units of depth for some cameras than for others: if a tag is missing or "
-            "wrong, pass DepthEncoding(unit_m=...)",
-        )  # fmt: skip
-
-
-def _warn(index: SceneIndex, rows: Any, what: str) -> None:
-    if len(rows):
-        keys = ", ".join(index.column("key")[rows[:3]])
-        text = f"{index.where}: {len(rows)} selected scenes {what}. The first: {keys}."
-        warnings.warn(text, OddSceneWarning, stacklevel=5)
-
-
 class StereoPairs(_MappedScenes):
     """Stereo pairs of StereoGenBench scenes, as a map-style torch dataset.
 
@@ -352,8 +307,8 @@ class StereoPairs(_MappedScenes):
                 codec, chroma) and the depth contract does not accept it.
         """
         index = open_index(data)
-        plan = plan_pairs(index, seed=require_seed(seed), **selection)
-        request = requested(
+        plan = plan_pairs(index, seed=seed, **selection)
+        request = parse_request(
             "pairs",
             "stacked" if selection.get("pairs") == "sweep" else "single",
             fields=fields,
@@ -411,7 +366,7 @@ class SceneViews(_MappedScenes):
             StorageError: If the data are not there, or hold broken scenes (all are named).
         """
         each = isinstance(cameras, str) and cameras == "each"
-        request = requested(
+        request = parse_request(
             "views",
             "single" if each else "stacked",
             fields=fields,
@@ -419,21 +374,26 @@ class SceneViews(_MappedScenes):
             depth=depth,
             transform=transform,
         )
-        if request.transform is not None and request.transform.swaps_views:
-            raise FieldError("SceneViews takes no flip: it swaps the two views of a pair.")
         index = open_index(data)
         plan = plan_views(
             index,
-            cameras="each" if each else require_cameras(cameras),
+            cameras=cameras,
             frames=frames,
-            seed=require_seed(seed),
+            seed=seed,
             filters=filters,
         )
         super().__init__(index, plan, request, cache=cache, check=check, buffers=buffers)
 
 
 def _opens_checked(check: Check, plan: Plan) -> bool:
-    """Return whether videos are compared with their checksums when they are opened."""
+    """Return whether videos are compared with their checksums when they are opened.
+
+    Raises:
+        SelectionError: If the check is none of those.
+    """
+    if check not in get_args(Check):
+        known = ", ".join(map(repr, get_args(Check)))
+        raise SelectionError(f"check must be one of {known}, got {check!r}.")
     frames = int(plan.frame_counts[0])
     clip = len(plan.windows.window(0, frames=frames, draw=(0,)))
     is_mostly_read = 2 * clip * plan.windows.count(frames) >= frames

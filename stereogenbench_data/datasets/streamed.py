@@ -5,7 +5,6 @@ from typing import Any, Unpack
 
 from torch.utils.data import IterableDataset, get_worker_info
 
-from stereogenbench_data.datasets.asked import Check
 from stereogenbench_data.datasets.batch_buffers import BatchArrays, Buffers
 from stereogenbench_data.datasets.batches import (
     EpochBatch,
@@ -16,10 +15,11 @@ from stereogenbench_data.datasets.batches import (
 )
 from stereogenbench_data.datasets.frameworks import require_shared_once
 from stereogenbench_data.datasets.loader import split_options
-from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.datasets.mapped import Check, Data, StereoPairs
 from stereogenbench_data.datasets.shared import shared_full
 from stereogenbench_data.errors import StateError
-from stereogenbench_data.samples.load import Sample, Transform
+from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.samples.request import Transform
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.sources.cache import ShardCache

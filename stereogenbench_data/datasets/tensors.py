@@ -8,7 +8,7 @@ import torch
 from torch.utils.data import default_collate
 
 from stereogenbench_data.errors import FieldError
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import Sample
 
 
 def to_tensors(sample: Sample) -> Sample:

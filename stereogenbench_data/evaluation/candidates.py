@@ -19,7 +19,7 @@ from stereogenbench_data.evaluation.predictions import (
 )
 from stereogenbench_data.evaluation.tiers import Tier
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import Sample
 
 Method = Callable[[dict[str, Any]], Any]
 """Takes a batch of a tier's inputs, frames of one pair in order, and returns the right views:

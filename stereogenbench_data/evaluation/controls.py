@@ -20,7 +20,9 @@ from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.evaluation.results import CONTROL, Scores
 from stereogenbench_data.evaluation.running import Run
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import Request, Sample, SampleLoader
+from stereogenbench_data.samples.fields import Sample
+from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.plan import Address
 

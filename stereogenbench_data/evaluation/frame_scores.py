@@ -17,7 +17,7 @@ from stereogenbench_data.evaluation.predictions import scaled_rgb
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
 from stereogenbench_data.evaluation.protocols import KeypointMatcher
 from stereogenbench_data.evaluation.scale import fit_scale
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import Sample
 
 
 @dataclass(slots=True)

@@ -32,7 +32,8 @@ from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtoc
 from stereogenbench_data.evaluation.running import Progress, no_progress
 from stereogenbench_data.evaluation.tiers import Tier, require_tier
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import Request, SampleLoader
+from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Address, Selection
 from stereogenbench_data.sources.files import write_atomic

@@ -20,8 +20,9 @@ from stereogenbench_data.evaluation.predictions import Pair, PredictionFault, Wa
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools, tools_of
 from stereogenbench_data.evaluation.protocols import KeypointMatcher, Keypoints, Settings
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.fields import PAIR_FIELDS
-from stereogenbench_data.samples.load import Request, Sample, SampleLoader
+from stereogenbench_data.samples.fields import PAIR_FIELDS, Sample
+from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.request import Request
 from stereogenbench_data.selection.plan import Address
 
 Faults = Literal["raise", "count"]

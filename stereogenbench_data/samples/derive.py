@@ -1,6 +1,5 @@
 """From decoded views to the fields of a sample: each is worked out once, and only if asked for."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Literal
@@ -41,19 +40,21 @@ Motions = Float64[np.ndarray, "t 4 4"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneFacts:
-    """What a sample needs of its scene beside the pictures.
+    """What is known of a sample beside its pictures.
 
     Attributes:
         scene: The row of the index.
         encodings: The depth contract of each camera.
         poses: The poses, or None where nothing needs them.
         url: The file or folder that holds the scene.
+        frames: All frames of the sample.
     """
 
     scene: Scene
     encodings: dict[int, DepthEncoding]
     poses: CameraPoses | None
     url: str
+    frames: tuple[int, ...]
 
     @property
     def is_rectified(self) -> bool:
@@ -283,6 +284,16 @@ class PairSample:
         intrinsics = self.views.intrinsics
         return len(self.views.frames), intrinsics.height_px, intrinsics.width_px
 
+    @property
+    def key(self) -> str:
+        """Scene, cameras and frames: scene/00-01/017, or scene/00-01/016-031 for a clip."""
+        cameras = f"{self.views.source:02d}"
+        if self.views.targets:
+            cameras += "-" + "+".join(f"{target:02d}" for target in self.views.targets)
+        first, last = self.facts.frames[0], self.facts.frames[-1]
+        shown = f"{first:03d}" if first == last else f"{first:03d}-{last:03d}"
+        return f"{self.facts.scene.id.key}/{cameras}/{shown}"
+
     def world_from(self, camera: int) -> Motions:
         """Return a camera's poses at the sample's frames."""
         poses = self.facts.camera_poses()
@@ -290,55 +301,3 @@ class PairSample:
             [poses.world_from_cam(frame, camera) for frame in self.views.frames]
         )
         return _as_seen(transforms, self.views)
-
-
-Builder = Callable[[PairSample], Any]
-
-PAIR_BUILDERS: Final[dict[str, Builder]] = {
-    "left": lambda s: s.views.pictures[s.views.source],
-    "right": lambda s: s.views.pictures[s.target],
-    "valid": lambda s: s.ahead.stored.measured[:, None],
-    "visible": lambda s: s.ahead.visible(s.back)[:, None],
-    "visible_from_left": lambda s: s.ahead.visible_from_source[:, None],
-    "disparity_error": lambda s: s.ahead.disparity_error[:, None],
-    "depth": lambda s: s.ahead.depth_m[:, None],
-    "depth_right": lambda s: s.back.depth_m[:, None],
-    "valid_right": lambda s: s.back.stored.measured[:, None],
-    "visible_right": lambda s: s.back.visible(s.ahead)[:, None],
-    "warped_right": lambda s: s.ahead.splatted[0],
-    "hole": lambda s: s.ahead.hole[:, None],
-    "intrinsics": lambda s: s.views.intrinsics.matrix(),
-    "baseline_m": lambda s: np.float64(s.ahead.baseline_m),
-    "right_from_left": lambda s: s.ahead.target_from_source,
-    "world_from_left": lambda s: s.world_from(s.views.source),
-    "frame_index": lambda s: np.array(s.views.frames, dtype=np.int64),
-    "pair": lambda s: np.array([s.views.source, s.target], dtype=np.int64),
-}
-
-PAIR_WRITERS: Final[dict[str, Callable[[PairSample, MapF32], None]]] = {
-    "disparity": lambda s, out: s.ahead.write_disparity(out),
-    "disparity_right": lambda s, out: s.back.write_disparity(out, sign=-1),
-}
-"""What writes maps that are too large to be made first and copied then, into (t, h, w) float32."""
-
-VIEW_BUILDERS: Final[dict[str, Builder]] = {
-    "image": lambda s: s.views.pictures[s.target],
-    "depth": PAIR_BUILDERS["depth_right"],
-    "valid": PAIR_BUILDERS["valid_right"],
-    "intrinsics": PAIR_BUILDERS["intrinsics"],
-    "focal_mm": lambda s: np.float64(s.facts.scene.rig.focal_mm),
-    "world_from_cam": lambda s: s.world_from(s.target),
-    "first_from_cam": lambda s: s.back.target_from_source,
-    "camera": lambda s: np.int64(s.target),
-    "frame_index": PAIR_BUILDERS["frame_index"],
-}
-
-TEXT_BUILDERS: Final[dict[str, Callable[[SceneFacts], str]]] = {
-    "scene": lambda facts: facts.scene.id.key,
-    "family": lambda facts: facts.scene.id.family,
-    "map": lambda facts: facts.scene.id.map_name,
-    "split": lambda facts: facts.scene.id.split,
-    "subset": lambda facts: facts.scene.id.subset or "",
-    "caption": lambda facts: facts.scene.caption,
-    "__url__": lambda facts: facts.url,
-}

@@ -1,14 +1,20 @@
-"""The fields of a sample, as data: name, shape, dtype, unit, meaning, and what each is made from.
+"""The fields of a sample: the one table that says what each is, what it needs and how it is made.
 
 Shapes are of one frame. A clip puts a time axis T in front; a sweep puts an axis of targets in
-front of that, in the fields that depend on the target.
+front of that, in the fields that depend on the target. A new field is a new row here.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Final, Literal
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+import numpy as np
 
 from stereogenbench_data.errors import FieldError
+from stereogenbench_data.samples.derive import MapF32, PairSample
+
+Sample = dict[str, Any]
+"""A flat dict of arrays (tensors, once in torch's hands) and texts, by the names of fields."""
 
 Stream = Literal["source_rgb", "target_rgb", "source_depth", "target_depth"]
 
@@ -24,139 +30,218 @@ class Field:
     """One field of a sample.
 
     Attributes:
-        shape: The shape of one frame, in words.
+        name: Its key in the sample.
         dtype: The numpy dtype, or "str".
-        meaning: What it holds, with its unit.
+        shape: The shape of one frame, in words.
+        meaning: What it holds, with its unit: one sentence of the documentation.
+        make: Returns the field of one target, of the frames at hand: an array, with a time axis in
+            front where ``per_frame``, or a text.
+        write: Writes it into float32 (t, h, w) instead: for maps too large to be copied.
         streams: The videos that it is made from.
-        needs_poses: "always", or "unless rectified": only where the rig is not, or "never".
+        needs_poses: "always", "unless rectified" (only where the rig is not), or "never".
         per_target: Whether a sweep has one for each target.
         per_frame: Whether a clip has one for each frame.
+        shows: Whose picture it is, exactly as decoded, so that it can be decoded into the field.
     """
 
-    shape: str
+    name: str
     dtype: str
+    shape: str
     meaning: str
+    make: Callable[[PairSample], Any] | None = field(default=None, repr=False)
+    write: Callable[[PairSample, MapF32], None] | None = field(default=None, repr=False)
     streams: frozenset[Stream] = NOTHING
     needs_poses: Literal["always", "unless rectified", "never"] = "never"
     per_target: bool = False
     per_frame: bool = True
+    shows: Literal["source", "target"] | None = None
 
 
-def _map(dtype: str, meaning: str, streams: frozenset[Stream]) -> Field:
-    """Return a field of the projection from source to target."""
-    return Field("(1,H,W)", dtype, meaning, streams, "unless rectified", per_target=True)
+def _table(*fields: Field) -> dict[str, Field]:
+    return {each.name: each for each in fields}
 
 
-PAIR_FIELDS: Final[dict[str, Field]] = {
-    "left": Field("(3,H,W)", "uint8", "RGB of the first view", SOURCE_RGB),
-    "right": Field("(3,H,W)", "uint8", "RGB of the second view", TARGET_RGB, per_target=True),
-    "disparity": _map(
-        "float32", "px at this resolution, x_right = x_left - d; 0 where not valid", SOURCE_DEPTH
+PAIR_FIELDS: Final[dict[str, Field]] = _table(
+    Field(
+        "left", "uint8", "(3,H,W)", "RGB of the first view",
+        make=lambda s: s.views.pictures[s.views.source],
+        streams=SOURCE_RGB, shows="source",
     ),
-    "valid": Field("(1,H,W)", "bool", "depth was measured there", SOURCE_DEPTH),
-    "visible": _map(
-        "bool",
+    Field(
+        "right", "uint8", "(3,H,W)", "RGB of the second view",
+        make=lambda s: s.views.pictures[s.target],
+        streams=TARGET_RGB, per_target=True, shows="target",
+    ),
+    Field(
+        "disparity", "float32", "(1,H,W)",
+        "px at this resolution, x_right = x_left - d; 0 where not valid",
+        write=lambda s, out: s.ahead.write_disparity(out),
+        streams=SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
+    ),
+    Field(
+        "valid", "bool", "(1,H,W)", "depth was measured there",
+        make=lambda s: s.ahead.stored.measured[:, None],
+        streams=SOURCE_DEPTH,
+    ),
+    Field(
+        "visible", "bool", "(1,H,W)",
         "valid, inside the second view and not hidden there, by the second view's own depth",
-        SOURCE_DEPTH | TARGET_DEPTH,
+        make=lambda s: s.ahead.visible(s.back)[:, None],
+        streams=SOURCE_DEPTH | TARGET_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
-    "visible_from_left": _map(
-        "bool",
+    Field(
+        "visible_from_left", "bool", "(1,H,W)",
         "the same by the first view's depth alone: blind to what only the second view sees",
-        SOURCE_DEPTH,
+        make=lambda s: s.ahead.visible_from_source[:, None],
+        streams=SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
-    "disparity_error": _map(
-        "float32", "bound on the error of disparity from the depth's quantum, px", SOURCE_DEPTH
+    Field(
+        "disparity_error", "float32", "(1,H,W)",
+        "bound on the error of disparity from the depth's quantum, px",
+        make=lambda s: s.ahead.disparity_error[:, None],
+        streams=SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
-    "depth": Field(
-        "(1,H,W)", "float32", "m along the optical axis; 0 where not valid", SOURCE_DEPTH
+    Field(
+        "depth", "float32", "(1,H,W)", "m along the optical axis; 0 where not valid",
+        make=lambda s: s.ahead.depth_m[:, None],
+        streams=SOURCE_DEPTH,
     ),
-    "depth_right": Field(
-        "(1,H,W)", "float32", "depth of the second view", TARGET_DEPTH, per_target=True
+    Field(
+        "depth_right", "float32", "(1,H,W)", "depth of the second view",
+        make=lambda s: s.back.depth_m[:, None],
+        streams=TARGET_DEPTH, per_target=True,
     ),
-    "disparity_right": _map(
-        "float32", "of the second view's pixels, x_left = x_right + d", TARGET_DEPTH
+    Field(
+        "disparity_right", "float32", "(1,H,W)",
+        "of the second view's pixels, x_left = x_right + d",
+        write=lambda s, out: s.back.write_disparity(out, sign=-1),
+        streams=TARGET_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
-    "valid_right": Field(
-        "(1,H,W)",
-        "bool",
-        "depth of the second view was measured there",
-        TARGET_DEPTH,
-        per_target=True,
+    Field(
+        "valid_right", "bool", "(1,H,W)", "depth of the second view was measured there",
+        make=lambda s: s.back.stored.measured[:, None],
+        streams=TARGET_DEPTH, per_target=True,
     ),
-    "visible_right": _map(
-        "bool", "pixels of the second view that the first one sees", SOURCE_DEPTH | TARGET_DEPTH
+    Field(
+        "visible_right", "bool", "(1,H,W)", "pixels of the second view that the first one sees",
+        make=lambda s: s.back.visible(s.ahead)[:, None],
+        streams=SOURCE_DEPTH | TARGET_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
-    "warped_right": Field(
-        "(3,H,W)",
-        "uint8",
+    Field(
+        "warped_right", "uint8", "(3,H,W)",
         "the first view splatted into the second, nearest wins; 0 in holes",
-        SOURCE_RGB | SOURCE_DEPTH,
-        "unless rectified",
-        per_target=True,
+        make=lambda s: s.ahead.splatted[0],
+        streams=SOURCE_RGB | SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
-    "hole": _map("bool", "pixels of warped_right on which nothing landed", SOURCE_DEPTH),
-    "intrinsics": Field(
-        "(3,3)", "float64", "of every view, px, after resizing and cropping", per_frame=False
+    Field(
+        "hole", "bool", "(1,H,W)", "pixels of warped_right on which nothing landed",
+        make=lambda s: s.ahead.hole[:, None],
+        streams=SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
-    "baseline_m": Field(
-        "()",
-        "float64",
-        "m; negative if the second view is to the left",
-        per_target=True,
+    Field(
+        "intrinsics", "float64", "(3,3)", "of every view, px, after resizing and cropping",
+        make=lambda s: s.views.intrinsics.matrix(),
         per_frame=False,
     ),
-    "right_from_left": Field(
-        "(4,4)",
-        "float64",
+    Field(
+        "baseline_m", "float64", "()", "m; negative if the second view is to the left",
+        make=lambda s: np.float64(s.ahead.baseline_m),
+        per_target=True, per_frame=False,
+    ),
+    Field(
+        "right_from_left", "float64", "(4,4)",
         "first camera's coordinates to the second's, m, x right y down z ahead",
+        make=lambda s: s.ahead.target_from_source,
+        needs_poses="always", per_target=True,
+    ),
+    Field(
+        "world_from_left", "float64", "(4,4)", "first camera's coordinates to the world's, m",
+        make=lambda s: s.world_from(s.views.source),
         needs_poses="always",
-        per_target=True,
     ),
-    "world_from_left": Field(
-        "(4,4)", "float64", "first camera's coordinates to the world's, m", needs_poses="always"
+    Field(
+        "frame_index", "int64", "()", "number of the frame in its video",
+        make=lambda s: np.array(s.views.frames, dtype=np.int64),
     ),
-    "frame_index": Field("()", "int64", "number of the frame in its video"),
-    "pair": Field("(2,)", "int64", "numbers of the two cameras", per_target=True, per_frame=False),
-    "scene": Field("", "str", "key of the scene", per_frame=False),
-    "family": Field("", "str", "baseline family", per_frame=False),
-    "map": Field("", "str", "map", per_frame=False),
-    "split": Field("", "str", "train or eval", per_frame=False),
-    "subset": Field("", "str", "seen_map or unseen_map; empty for train", per_frame=False),
-    "caption": Field(
-        "", "str", "machine-written description; empty where there is none", per_frame=False
+    Field(
+        "pair", "int64", "(2,)", "numbers of the two cameras",
+        make=lambda s: np.array([s.views.source, s.target], dtype=np.int64),
+        per_target=True, per_frame=False,
     ),
-    "__key__": Field("", "str", "scene, cameras and frame", per_frame=False),
-    "__url__": Field("", "str", "file or folder that holds the scene", per_frame=False),
-}
+    Field(
+        "scene", "str", "", "key of the scene",
+        make=lambda s: s.facts.scene.id.key, per_frame=False,
+    ),
+    Field(
+        "family", "str", "", "baseline family",
+        make=lambda s: s.facts.scene.id.family, per_frame=False,
+    ),
+    Field("map", "str", "", "map", make=lambda s: s.facts.scene.id.map_name, per_frame=False),
+    Field(
+        "split", "str", "", "train or eval",
+        make=lambda s: s.facts.scene.id.split, per_frame=False,
+    ),
+    Field(
+        "subset", "str", "", "seen_map or unseen_map; empty for train",
+        make=lambda s: s.facts.scene.id.subset or "", per_frame=False,
+    ),
+    Field(
+        "caption", "str", "", "machine-written description; empty where there is none",
+        make=lambda s: s.facts.scene.caption, per_frame=False,
+    ),
+    Field(
+        "__key__", "str", "", "scene, cameras and frame",
+        make=lambda s: s.key, per_frame=False,
+    ),
+    Field(
+        "__url__", "str", "", "file or folder that holds the scene",
+        make=lambda s: s.facts.url, per_frame=False,
+    ),
+)  # fmt: skip
 
-VIEW_FIELDS: Final[dict[str, Field]] = {
-    "image": Field("(3,H,W)", "uint8", "RGB", SOURCE_RGB | TARGET_RGB, per_target=True),
-    "depth": Field(
-        "(1,H,W)", "float32", "m along the optical axis; 0 where not valid",
-        SOURCE_DEPTH | TARGET_DEPTH, per_target=True,
+VIEW_FIELDS: Final[dict[str, Field]] = _table(
+    Field(
+        "image", "uint8", "(3,H,W)", "RGB",
+        make=lambda s: s.views.pictures[s.target],
+        streams=SOURCE_RGB | TARGET_RGB, per_target=True, shows="target",
     ),
-    "valid": Field(
-        "(1,H,W)", "bool", "depth was measured there", SOURCE_DEPTH | TARGET_DEPTH, per_target=True
+    Field(
+        "depth", "float32", "(1,H,W)", "m along the optical axis; 0 where not valid",
+        make=lambda s: s.back.depth_m[:, None],
+        streams=SOURCE_DEPTH | TARGET_DEPTH, per_target=True,
     ),
-    "intrinsics": PAIR_FIELDS["intrinsics"],
-    "focal_mm": Field("()", "float64", "focal length, mm", per_frame=False),
-    "world_from_cam": Field(
-        "(4,4)", "float64", "camera's coordinates to the world's, m", needs_poses="always",
-        per_target=True,
+    Field(
+        "valid", "bool", "(1,H,W)", "depth was measured there",
+        make=lambda s: s.back.stored.measured[:, None],
+        streams=SOURCE_DEPTH | TARGET_DEPTH, per_target=True,
     ),
-    "first_from_cam": Field(
-        "(4,4)", "float64", "camera's coordinates to the first camera's, m", needs_poses="always",
-        per_target=True,
+    PAIR_FIELDS["intrinsics"],
+    Field(
+        "focal_mm", "float64", "()", "focal length, mm",
+        make=lambda s: np.float64(s.facts.scene.rig.focal_mm), per_frame=False,
     ),
-    "camera": Field("()", "int64", "number of the camera", per_target=True, per_frame=False),
-    **{
-        name: PAIR_FIELDS[name]
+    Field(
+        "world_from_cam", "float64", "(4,4)", "camera's coordinates to the world's, m",
+        make=lambda s: s.world_from(s.target),
+        needs_poses="always", per_target=True,
+    ),
+    Field(
+        "first_from_cam", "float64", "(4,4)", "camera's coordinates to the first camera's, m",
+        make=lambda s: s.back.target_from_source,
+        needs_poses="always", per_target=True,
+    ),
+    Field(
+        "camera", "int64", "()", "number of the camera",
+        make=lambda s: np.int64(s.target), per_target=True, per_frame=False,
+    ),
+    *(
+        PAIR_FIELDS[name]
         for name in (
             "frame_index", "scene", "family", "map", "split", "subset", "caption", "__key__",
             "__url__",
         )
-    },
-}  # fmt: skip
+    ),
+)  # fmt: skip
 
 DEFAULT_PAIR_FIELDS: Final = (
     "left", "right", "disparity", "valid", "intrinsics", "baseline_m", "frame_index", "pair",

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from stereogenbench_data.errors import FieldError
-from stereogenbench_data.samples.load import Sample
+from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.sources.files import open_output
 
 Picture = UInt8[np.ndarray, "h w 3"]

@@ -1,23 +1,28 @@
 """What is asked of every sample, and what may change one on its way."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from stereogenbench_data.samples.derive import PAIR_BUILDERS, VIEW_BUILDERS, Builder
+from stereogenbench_data.errors import FieldError
 from stereogenbench_data.samples.fields import (
     PAIR_FIELDS,
     VIEW_FIELDS,
     Field,
     Stream,
+    require_fields,
     streams_of,
 )
 from stereogenbench_data.samples.views import Views
 from stereogenbench_data.schema.records import DepthEncoding
 
-Sample = dict[str, Any]
+LARGEST_SIDE_PX: Final = 16384
+
 Clip = Literal["frame", "clip"]
+Kind = Literal["pairs", "views"]
+Layout = Literal["single", "stacked"]
 
 
 @runtime_checkable
@@ -52,9 +57,9 @@ class Request:
         transform: What changes the views before fields are derived, or None.
     """
 
-    kind: Literal["pairs", "views"]
+    kind: Kind
     fields: tuple[str, ...]
-    layout: Literal["single", "stacked"]
+    layout: Layout
     size: tuple[int, int] | None = None
     depth: DepthEncoding | None = None
     transform: Transform | None = None
@@ -63,11 +68,6 @@ class Request:
     def known(self) -> dict[str, Field]:
         """The table of fields of this kind of sample."""
         return PAIR_FIELDS if self.kind == "pairs" else VIEW_FIELDS
-
-    @property
-    def builders(self) -> dict[str, Builder]:
-        """What builds each field that is not text."""
-        return PAIR_BUILDERS if self.kind == "pairs" else VIEW_BUILDERS
 
     @property
     def streams(self) -> frozenset[Stream]:
@@ -84,3 +84,65 @@ SWAPPED: Final[dict[Stream, Stream]] = {
     "source_depth": "target_depth",
     "target_depth": "source_depth",
 }
+
+
+def parse_request(
+    kind: Kind,
+    layout: Layout,
+    *,
+    fields: Iterable[str],
+    size: Any,
+    depth: Any,
+    transform: Any,
+) -> Request:
+    """Return what a user asks of every sample.
+
+    Raises:
+        FieldError: If a field does not exist; if the size is not two whole numbers of 1 to 16384;
+            if the depth contract is none; or if the transform cannot be called, does not say
+            whether it swaps the views, or swaps those of a sample that is no pair.
+    """
+    return Request(
+        kind=kind,
+        fields=require_fields(fields, known=PAIR_FIELDS if kind == "pairs" else VIEW_FIELDS),
+        layout=layout,
+        size=_require_size(size),
+        depth=_require_depth(depth),
+        transform=_require_transform(transform, kind=kind),
+    )
+
+
+def _require_size(size: Any) -> tuple[int, int] | None:
+    if size is None:
+        return None
+    try:
+        height, width = (int(side) for side in size)
+        whole = (height, width) == tuple(size)
+    except (TypeError, ValueError):
+        whole = False
+    if not whole or not (0 < height <= LARGEST_SIDE_PX and 0 < width <= LARGEST_SIDE_PX):
+        raise FieldError(
+            f"size must be (height, width) of 1 to {LARGEST_SIDE_PX} pixels, got {size!r}."
+        )
+    return height, width
+
+
+def _require_depth(depth: Any) -> DepthEncoding | None:
+    if depth is not None and not isinstance(depth, DepthEncoding):
+        raise FieldError(f"depth must be a DepthEncoding(...), got {depth!r}.")
+    return depth
+
+
+def _require_transform(transform: Any, *, kind: Kind) -> Transform | None:
+    if transform is None:
+        return None
+    says = isinstance(getattr(transform, "swaps_views", None), bool)
+    if not says or not callable(transform) or isinstance(transform, type):
+        raise FieldError(
+            f"a transform is called with (views, generator) and has an attribute swaps_views, True "
+            f"or False; got {transform!r}."
+        )
+    if kind == "views" and transform.swaps_views:
+        raise FieldError("SceneViews takes no flip: it swaps the two views of a pair.")
+    checked: Transform = transform
+    return checked

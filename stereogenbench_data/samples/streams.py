@@ -14,14 +14,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import UInt8, UInt16
+from jaxtyping import UInt8
 
 from stereogenbench_data.errors import MediaError, StorageError
-from stereogenbench_data.media.depth import open_depth, read_depth_units
+from stereogenbench_data.media.depth import measured, open_depth, read_depth_units
 from stereogenbench_data.media.video import VideoReader, read_rgb, require_pixel_aspect
+from stereogenbench_data.samples.views import StoredDepth, resized_nearest
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
 from stereogenbench_data.sources.members import MemberSource
@@ -33,6 +34,18 @@ OPEN_STREAMS: Final = 24
 _inherited: Final[list[object]] = []
 """Readers that came over a fork. They share file offsets with the parent, so they are neither read
 nor closed here: the operating system takes them back when the process ends."""
+
+
+class StreamStats(NamedTuple):
+    """What a pool has open.
+
+    Attributes:
+        open: How many videos.
+        limit: How many at the most.
+    """
+
+    open: int
+    limit: int
 
 
 @dataclass(slots=True)
@@ -74,9 +87,9 @@ class Streams:
         with self._stream(scene, name) as stream:
             key = (index, size)
             if key not in stream.last:
-                room = _unused(stream.last, height_width=size)
+                unused = _unused(stream.last, height_width=size)
                 stream.last = {}
-                picture = read_rgb(stream.reader, index, size=size, out=room, content="colour")
+                picture = read_rgb(stream.reader, index, size=size, out=unused, content="colour")
                 stream.last[key] = _read_only(picture)
             kept: UInt8[np.ndarray, "3 h w"] = stream.last[key]
             return kept
@@ -96,10 +109,23 @@ class Streams:
             size = (out.shape[-2], out.shape[-1])
             read_rgb(stream.reader, index, size=size, out=out, content="colour")
 
-    def depth_units(
-        self, scene: Scene, name: str, index: int, *, encoding: DepthEncoding
-    ) -> UInt16[np.ndarray, "h w"]:
-        """Return one depth frame of a scene's video as stored numbers.
+    def read_stored_depth(
+        self,
+        scene: Scene,
+        name: str,
+        index: int,
+        *,
+        encoding: DepthEncoding,
+        size: tuple[int, int] | None = None,
+    ) -> StoredDepth:
+        """Return one depth frame of a scene's video, (h, w): stored numbers, where measured.
+
+        Args:
+            scene: The scene.
+            name: The video, such as "cam_00_depth.mkv".
+            index: Which frame of the file; `depth_frame_index` tells which an RGB frame needs.
+            encoding: The depth contract.
+            size: (height, width) to take the nearest pixels of, None for the stored size.
 
         Raises:
             StorageError: If the video cannot be read.
@@ -109,19 +135,17 @@ class Streams:
             if index not in stream.last:
                 units = read_depth_units(stream.reader, index, encoding=encoding)
                 stream.last = {index: _read_only(units)}
-            kept: UInt16[np.ndarray, "h w"] = stream.last[index]
-            return kept
+            units = stream.last[index]
+            pixel_format = stream.reader.facts.pixel_format
+        if size is not None:
+            units = resized_nearest(units, size=size)
+        return StoredDepth(units, measured(units, encoding=encoding, pixel_format=pixel_format))
 
-    def pixel_format(self, scene: Scene, name: str) -> str:
-        """Return the pixel format of a scene's video.
-
-        Raises:
-            StorageError: If the video cannot be read.
-            MediaError: If its header does not tell.
-        """
-        with self._stream(scene, name) as stream:
-            pixel_format: str = stream.reader.facts.pixel_format
-            return pixel_format
+    @property
+    def stats(self) -> "StreamStats":
+        """What this process has open."""
+        is_own = os.getpid() == self._process
+        return StreamStats(open=len(self._open) if is_own else 0, limit=self._limit)
 
     def keep(self, limit: int) -> None:
         """Keep at most so many videos open from now on."""
@@ -154,7 +178,7 @@ class Streams:
                 while len(self._open) >= self._limit:
                     self._open.popitem(last=False)[1].close()
                 file = self._source.open(scene, name)
-                with _cause_told(file):
+                with _cause_raised(file):
                     label = self._source.label(scene, name)
                     kind = open_depth if name in PACKED_DEPTH_NAMES.values() else VideoReader
                     reader = kind(file, name=label, frames=scene.frames)
@@ -167,7 +191,7 @@ class Streams:
             self._open.move_to_end(place)
             stream = self._open[place]
             try:
-                with _cause_told(stream.file):
+                with _cause_raised(stream.file):
                     yield stream
             except (MediaError, StorageError):
                 self._open.pop(place).close()
@@ -191,12 +215,12 @@ def _require_size(reader: Any, scene: Scene, *, name: str) -> None:
         found = reader.size_px
     else:
         found = (reader.facts.width_px, reader.facts.height_px)
-    told = (scene.rig.image_width_px, scene.rig.image_height_px)
-    if found != told:
+    indexed = (scene.rig.image_width_px, scene.rig.image_height_px)
+    if found != indexed:
         raise MediaError(
             f"{name}: holds pictures of {found[0]}x{found[1]} pixels where the index says "
-            f"{told[0]}x{told[1]}. The video or the index was replaced or altered: fetch them "
-            f"again, or run `stereogenbench index` again."
+            f"{indexed[0]}x{indexed[1]}. The video or the index was replaced or altered: fetch "
+            "them again, or run `stereogenbench index` again."
         )
     if isinstance(reader, VideoReader):
         require_pixel_aspect(reader.pixel_aspect, scene.rig, name=name)
@@ -240,7 +264,7 @@ _REFERENCES_HERE: Final = _references_here()
 
 
 @contextmanager
-def _cause_told(file: Path | MemberFile) -> Iterator[None]:
+def _cause_raised(file: Path | MemberFile) -> Iterator[None]:
     """Where a video failed because its bytes could not be fetched, raise that; close the file."""
     try:
         yield

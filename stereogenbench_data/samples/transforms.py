@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from stereogenbench_data.errors import FieldError
-from stereogenbench_data.samples.load import Transform, resized_nearest
-from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.samples.request import Transform
+from stereogenbench_data.samples.views import StoredDepth, Views, resized_nearest
 
 Generator = np.random.Generator
 

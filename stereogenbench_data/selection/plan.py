@@ -132,8 +132,10 @@ def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selectio
     """Return the plan of a selection of pair samples.
 
     Raises:
-        SelectionError: If nothing matches, naming what left nothing and what there is.
+        SelectionError: If nothing matches, naming what left nothing and what there is; or if the
+            seed is not a whole number from 0.
     """
+    seed = _require_seed(seed)
     options: dict[str, Any] = dict(selection)
     windows = parse_frames(options.pop("frames", "first"))
     balance, limit = options.pop("balance", None), options.pop("limit", None)
@@ -158,7 +160,7 @@ def plan_pairs(index: SceneIndex, *, seed: int = 0, **selection: Unpack[Selectio
 def plan_views(
     index: SceneIndex,
     *,
-    cameras: Sequence[int] | Literal["each"],
+    cameras: Sequence[int] | Literal["all", "each"],
     frames: FramesSpec,
     seed: int,
     filters: SceneFilters,
@@ -169,18 +171,43 @@ def plan_views(
     sample has a source and no target.
 
     Raises:
-        SelectionError: If nothing matches, naming what left nothing and what there is.
+        SelectionError: If nothing matches, naming what left nothing and what there is; or if a
+            camera does not exist or is given twice, or the seed is not a whole number from 0.
     """
-    rows = filter_scenes(index, filters)
-    if isinstance(cameras, str):
+    seed = _require_seed(seed)
+    if isinstance(cameras, str) and cameras == "each":
         views = np.arange(CAMERA_COUNT, dtype=np.int8)[:, None]
     else:
-        views = np.array([cameras], dtype=np.int8)
+        views = np.array([_require_cameras(cameras)], dtype=np.int8)
+    rows = filter_scenes(index, filters)
     views = np.tile(views, (len(rows), 1))
     pairs = PairList(
         row=np.repeat(rows, len(views) // len(rows)), source=views[:, 0], targets=views[:, 1:]
     )
     return _plan(index, pairs, windows=parse_frames(frames), seed=seed)
+
+
+def _require_cameras(cameras: Any) -> tuple[int, ...]:
+    """Return camera numbers, in the order given."""
+    if isinstance(cameras, str) and cameras == "all":
+        return tuple(range(CAMERA_COUNT))
+    found: tuple[Any, ...] = (cameras,)
+    if isinstance(cameras, Sequence | np.ndarray):
+        found = tuple(np.asarray(cameras, dtype=object).tolist())
+    whole = all(isinstance(camera, int | np.integer) for camera in found)
+    there = frozenset(range(CAMERA_COUNT))
+    if not (whole and found and len(set(found)) == len(found) and set(found) <= there):
+        raise SelectionError(
+            f"cameras must be 'all', 'each' or different numbers of 0 to {CAMERA_COUNT - 1}, "
+            f"got {cameras!r}."
+        )
+    return tuple(int(camera) for camera in found)
+
+
+def _require_seed(seed: Any) -> int:
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise SelectionError(f"seed must be a whole number from 0, got {seed!r}.")
+    return int(seed)
 
 
 def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) -> Plan:

@@ -18,8 +18,8 @@ from stereogenbench_data import (
     StereoPairs,
     StorageError,
 )
-from stereogenbench_data.datasets.mapped import OddSceneWarning
 from stereogenbench_data.index.table import IncompleteSceneWarning
+from stereogenbench_data.samples.checks import OddSceneWarning
 from stereogenbench_data.synthesis import ExportContract, SynthRequest, synthesise
 
 FIELDS = ("left", "right", "disparity", "visible", "right_from_left")

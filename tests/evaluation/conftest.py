@@ -10,7 +10,8 @@ from PIL import Image
 from stereogenbench_data.evaluation.predictions import frame_name, item_name
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import Request, SampleLoader
+from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.request import Request
 from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 

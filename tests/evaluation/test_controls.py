@@ -14,7 +14,8 @@ from stereogenbench_data.evaluation.aggregate import cell
 from stereogenbench_data.evaluation.controls import CONTROLS, derangement, wrong_camera
 from stereogenbench_data.evaluation.relations import relations
 from stereogenbench_data.evaluation.sgbm import Sgbm
-from stereogenbench_data.samples.load import Request, SampleLoader
+from stereogenbench_data.samples.load import SampleLoader
+from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.selection.plan import Address
 from tests.evaluation.conftest import SIZE

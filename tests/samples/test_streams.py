@@ -106,11 +106,14 @@ def test_another_size_is_another_picture(data):
 
 
 def test_stored_depth_comes_back_as_it_was_written(data):
-    pool = pool_of(data)
-    units = pool.depth_units(data.scene(0), DEPTH, 0, encoding=DepthEncoding(0.001))
+    pool, encoding = pool_of(data), DepthEncoding(0.001)
+    stored = pool.read_stored_depth(data.scene(0), DEPTH, 0, encoding=encoding)
+    small = pool.read_stored_depth(data.scene(0), DEPTH, 0, encoding=encoding, size=(16, 32))
 
-    assert units.dtype == np.uint16
-    assert pool.pixel_format(data.scene(0), DEPTH) == "gray16le"
+    assert stored.units.dtype == np.uint16
+    assert np.array_equal(stored.measured, (stored.units != 0) & (stored.units != 65535))
+    assert np.array_equal(small.units, stored.units[2::4, 1::2])
+    assert np.array_equal(small.measured, stored.measured[2::4, 1::2])
     pool.close()
 
 

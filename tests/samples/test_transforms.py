@@ -24,8 +24,7 @@ from stereogenbench_data import (
     StereoPairs,
 )
 from stereogenbench_data.geometry.camera import Intrinsics
-from stereogenbench_data.samples.load import resized_nearest
-from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.samples.views import StoredDepth, Views, resized_nearest
 
 FIELDS = (
     "left", "right", "disparity", "valid", "visible", "depth", "disparity_right", "valid_right",

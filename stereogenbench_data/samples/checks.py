@@ -1,0 +1,138 @@
+"""Checks before the first sample: are the videos there, is depth whole, is anything odd."""
+
+import warnings
+from collections.abc import Iterator
+from typing import Any, NoReturn
+
+import numpy as np
+
+from stereogenbench_data.errors import MediaError, StorageError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.depth import require_depth_stream
+from stereogenbench_data.samples.derive import RECTIFIED_PX
+from stereogenbench_data.samples.request import Request
+from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name
+from stereogenbench_data.selection.plan import Plan
+
+
+class OddSceneWarning(UserWarning):
+    """Selected scenes are not what the release promises: the message says how and which."""
+
+
+def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
+    """Check, by the index alone, that the samples of a plan can be made as requested.
+
+    Warns with `OddSceneWarning` where rigs are not rectified, or where a scene's cameras state
+    several units of depth.
+
+    Raises:
+        StorageError: If the index lacks a video that a sample needs; it names the first scene and
+            the cameras.
+        MediaError: If depth that a sample needs is stored by a codec or pixel format that loses
+            depth, and the request's depth contract does not accept it; it names the first file.
+    """
+    _require_videos(index, plan, request)
+    if request.streams & {"source_depth", "target_depth"}:
+        _require_whole_depth(index, plan, request)
+    _warn_of_odd_scenes(index, plan, request)
+
+
+def _require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:
+    """Refuse samples of videos that the index does not have: some cameras alone were downloaded."""
+    partial = index.video_counts()[plan.scene_rows] < 2 * CAMERA_COUNT
+    for place in np.flatnonzero(partial).tolist():
+        row = int(plan.scene_rows[place])
+        pairs = slice(plan.first_pair[place], plan.first_pair[place + 1])
+        sources = set(plan.pairs.source[pairs].tolist())
+        targets = set(plan.pairs.targets[pairs].ravel().tolist()) - {-1}
+        needed = {
+            f"cam_{camera:02d}_{stream.partition('_')[2]}"
+            for stream in request.streams
+            for camera in (sources if stream.startswith("source") else targets)
+        }
+        scene = index.scene(row)
+        missing = sorted(needed - {name.partition(".")[0] for name in scene.members})
+        if missing:
+            there = sorted({name[4:6] for name in scene.members if name.startswith("cam_")})
+            raise StorageError(
+                f"{index.where}: {scene.id.key} has no {', '.join(missing)}; videos of cameras "
+                f"{', '.join(there) or 'none'} were fetched. Choose pairs of these, or download "
+                "the others too."
+            )
+
+
+def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None:
+    encoding = request.depth or DepthEncoding()
+    units_told = index.column("depth_unit_source") != "unreadable"
+    stored = np.stack([index.column("depth_codec"), index.column("depth_pixel_format")], axis=-1)
+    whole = np.zeros(units_told.shape, dtype=bool)
+    for codec, pixel_format in set(map(tuple, stored.reshape(-1, 2))):
+        try:
+            require_depth_stream(
+                codec=codec, pixel_format=pixel_format, encoding=encoding, name="depth"
+            )
+        except MediaError:
+            continue
+        whole |= (stored == (codec, pixel_format)).all(axis=-1)
+    usable = whole & (units_told | (encoding.unit_m is not None))
+    if usable.all():
+        return
+    for row, camera in _depth_reads(plan, request):
+        if not usable[row, camera]:
+            _refuse_depth(index.scene(row), camera, encoding=encoding)
+
+
+def _depth_reads(plan: Plan, request: Request) -> Iterator[tuple[int, int]]:
+    """Yield the (row, camera) of every depth video that samples need."""
+    pairs = plan.pairs
+    if "source_depth" in request.streams:
+        yield from zip(pairs.row.tolist(), pairs.source.tolist(), strict=True)
+    if "target_depth" in request.streams:
+        for row, targets in zip(pairs.row.tolist(), pairs.targets.tolist(), strict=True):
+            yield from ((row, target) for target in targets if target >= 0)
+
+
+def _refuse_depth(scene: Scene, camera: int, *, encoding: DepthEncoding) -> NoReturn:
+    held = scene.held_name(depth_name(camera))
+    name = scene.members[held].path
+    if not name.endswith(held):
+        name = f"{name}: {scene.id.key}.{held}"
+    require_depth_stream(
+        codec=scene.depth_codec[camera],
+        pixel_format=scene.depth_pixel_format[camera],
+        encoding=encoding,
+        name=name,
+    )
+    raise MediaError(
+        f"{name}: its tags do not tell one positive number of metres in a stored unit of depth. "
+        "Correct the tags, or pass DepthEncoding(unit_m=...)."
+    )
+
+
+def _warn_of_odd_scenes(index: SceneIndex, plan: Plan, request: Request) -> None:
+    needs = {request.known[name].needs_poses for name in request.fields}
+    rows = plan.scene_rows
+    if "unless rectified" in needs:
+        residuals_px = index.column("rig_residual_px")[rows]
+        _warn(
+            index, rows[residuals_px > RECTIFIED_PX],
+            f"are not rectified (by up to {residuals_px.max(initial=0):.3g} px): their pixels are "
+            "projected through the poses, and no field holds what that moves up or down",
+        )  # fmt: skip
+    if request.streams & {"source_depth", "target_depth"} and not (
+        request.depth and request.depth.unit_m
+    ):
+        units_m = index.column("depth_unit_m")[rows]
+        _warn(
+            index, rows[(units_m != units_m[:, :1]).any(axis=1)],
+            "state other units of depth for some cameras than for others: if a tag is missing or "
+            "wrong, pass DepthEncoding(unit_m=...)",
+        )  # fmt: skip
+
+
+def _warn(index: SceneIndex, rows: Any, what: str) -> None:
+    if len(rows):
+        keys = ", ".join(index.column("key")[rows[:3]])
+        text = f"{index.where}: {len(rows)} selected scenes {what}. The first: {keys}."
+        warnings.warn(text, OddSceneWarning, stacklevel=6)

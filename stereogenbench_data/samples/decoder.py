@@ -1,0 +1,288 @@
+"""The decoder: from a sample's address to its `Views`, reading no more than the fields need."""
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from copy import copy
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from stereogenbench_data.errors import MediaError, SchemaError, ShardError
+from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.depth import depth_frame_index
+from stereogenbench_data.samples.derive import RECTIFIED_PX, SceneFacts
+from stereogenbench_data.samples.request import Request
+from stereogenbench_data.samples.streams import OPEN_STREAMS, Streams, StreamStats
+from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.schema.parse import parse_trajectory
+from stereogenbench_data.schema.records import DepthEncoding, Scene
+from stereogenbench_data.schema.release import (
+    CAMERA_COUNT,
+    TRAJECTORY_JSON,
+    depth_name,
+    rgb_name,
+)
+from stereogenbench_data.selection.plan import Address
+from stereogenbench_data.sources.members import MemberSource
+
+KEPT_POSES: Final = 32
+"""Of how many scenes the poses are kept (46 kB a scene of 81 frames)."""
+
+KEPT_SCENES: Final = 256
+"""Of how many scenes the row of the index is kept."""
+
+
+class SampleDecoder:
+    """Decodes what a request needs of a sample.
+
+    Rows of the index, poses, open videos and their current frames are kept for later samples.
+    Threads may share a decoder.
+    """
+
+    def __init__(
+        self,
+        index: SceneIndex,
+        request: Request,
+        *,
+        source: MemberSource,
+        frames: Literal["shared", "used once"],
+    ) -> None:
+        """Prepare to decode; nothing is opened yet.
+
+        Args:
+            index: The scenes.
+            request: What is needed of them.
+            source: Where their files are.
+            frames: Whether several samples may show a frame of a camera, which is kept for them.
+        """
+        self._index = index
+        self._request = request
+        self._source = source
+        self._frames = frames
+        self._needs = request.streams
+        poses = {request.known[name].needs_poses for name in request.fields}
+        self._poses_needed: Literal["always", "unless rectified", "never"] = "never"
+        if poses - {"never"}:
+            self._poses_needed = "always" if "always" in poses else "unless rectified"
+        # A transform may write into what it is given.
+        self._is_changed = request.transform is not None
+        self._most_videos = OPEN_STREAMS
+        self._streams = Streams(source)
+        self._scenes: OrderedDict[int, Scene] = OrderedDict()
+        self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
+        self._depths: OrderedDict[tuple[int, int], tuple[int, StoredDepth]] = OrderedDict()
+
+    @property
+    def stats(self) -> StreamStats:
+        """What this process has open."""
+        return self._streams.stats
+
+    @property
+    def decodes_in_place(self) -> bool:
+        """Whether pictures can be decoded where they will stay: nobody else needs or changes them.
+
+        Then `decode` takes ``out``.
+        """
+        return self._frames == "used once" and not self._is_changed
+
+    def apart(self) -> "SampleDecoder":
+        """Return a decoder of the same samples with open videos of its own."""
+        apart = copy(self)
+        apart._streams = Streams(self._source)
+        apart._scenes, apart._depths, apart._poses = OrderedDict(), OrderedDict(), OrderedDict()
+        return apart
+
+    def keep_open(self, videos: int) -> None:
+        """Keep up to so many videos open, in this process and in copies of this decoder."""
+        self._streams.keep(videos)
+        self._most_videos = videos
+
+    def release(self, row: int) -> None:
+        """Close the videos of a scene that has been read to its end."""
+        self._streams.release(self.scene(row))
+        self._scenes.pop(row, None)
+        for camera in range(CAMERA_COUNT):
+            self._depths.pop((row, camera), None)
+
+    def close(self) -> None:
+        """Close the videos that are open in this process."""
+        self._streams.close()
+        self._scenes.clear()
+        self._depths.clear()
+
+    def scene(self, row: int) -> Scene:
+        """Return a scene of the index; those of the last rows asked for are kept."""
+        scene = self._scenes.get(row)
+        if scene is None:
+            scene = self._scenes[row] = self._index.scene(row)
+            if len(self._scenes) > KEPT_SCENES:
+                self._scenes.popitem(last=False)
+        return scene
+
+    def decode(
+        self, address: Address, *, frames: slice, out: Mapping[int, Any] | None = None
+    ) -> tuple[Views, SceneFacts]:
+        """Return the views of a sample, of some of its frames, and what is known of its scene.
+
+        What was decoded from a cache that was damaged since is decoded again.
+
+        Args:
+            address: The sample.
+            frames: Which of its frames: one, or with a transform any number.
+            out: Where `decodes_in_place`: by camera, the (t, 3, h, w) uint8 arrays to decode into.
+
+        Raises:
+            StorageError: If a file is missing or is not the one that was indexed.
+            MediaError: If a video does not decode to what the index says.
+            SchemaError: If the trajectory does not follow the format.
+        """
+        scene = self.scene(address.row)
+        try:
+            return self._decode(scene, address, frames=frames, out=out or {})
+        except (MediaError, SchemaError, ShardError):
+            names = [
+                *(rgb_name(camera) for camera in self._cameras(address, "rgb")),
+                *(depth_name(camera) for camera in self._cameras(address, "depth")),
+                TRAJECTORY_JSON,
+            ]
+            if not self._source.drop_damaged(scene, map(scene.held_name, names)):
+                raise
+            self.close()
+            return self._decode(scene, address, frames=frames, out=out or {})
+
+    def _decode(
+        self, scene: Scene, address: Address, *, frames: slice, out: Mapping[int, Any]
+    ) -> tuple[Views, SceneFacts]:
+        numbers = address.frames[frames]
+        encodings = {
+            camera: self._encoding(scene, camera) for camera in {address.source, *address.targets}
+        }
+        intrinsics = rig_intrinsics(scene.rig)
+        if self._request.size is not None:
+            height, width = self._request.size
+            intrinsics = intrinsics.resized(width_px=width, height_px=height)
+        views = Views(
+            source=address.source,
+            targets=address.targets,
+            frames=numbers,
+            pictures=self._pictures(
+                scene,
+                self._cameras(address, "rgb"),
+                numbers,
+                shape=(len(numbers), 3, intrinsics.height_px, intrinsics.width_px),
+                out=out,
+            ),
+            depths={
+                camera: self._depth(scene, address.row, camera, numbers, encodings[camera])
+                for camera in self._cameras(address, "depth")
+            },
+            intrinsics=intrinsics,
+        )
+        return views, SceneFacts(
+            scene,
+            encodings,
+            self._camera_poses(scene),
+            url=self._source.url(scene, rgb_name(address.source)),
+            frames=address.frames,
+        )
+
+    def _cameras(self, address: Address, suffix: Literal["rgb", "depth"]) -> list[int]:
+        """Return the cameras whose colour or depth is needed."""
+        cameras = [address.source] if f"source_{suffix}" in self._needs else []
+        if f"target_{suffix}" in self._needs:
+            cameras.extend(address.targets)
+        return list(dict.fromkeys(cameras))
+
+    def _encoding(self, scene: Scene, camera: int) -> DepthEncoding:
+        contract = self._request.depth or DepthEncoding()
+        source = scene.depth_unit_source[camera]
+        if source == "unreadable":
+            return contract
+        return contract.with_file_unit(scene.depth_unit_m[camera], source=source)
+
+    def _pictures(
+        self,
+        scene: Scene,
+        cameras: list[int],
+        frames: tuple[int, ...],
+        *,
+        shape: tuple[int, ...],
+        out: Mapping[int, Any],
+    ) -> dict[int, Any]:
+        pictures = {camera: out[camera] for camera in cameras if camera in out}
+        if self._is_changed:
+            pictures = {camera: np.empty(shape, dtype=np.uint8) for camera in cameras}
+        for number, frame in enumerate(frames):
+            for camera in cameras:
+                name = rgb_name(camera)
+                if self._frames == "used once" and camera in pictures:
+                    self._streams.write_rgb(scene, name, frame, out=pictures[camera][number])
+                    continue
+                kept = self._streams.rgb(scene, name, frame, size=self._request.size)
+                if camera in pictures:
+                    pictures[camera][number] = kept
+                else:
+                    # Without a transform frames come one by one: the kept picture is all of it.
+                    pictures[camera] = kept[None]
+        return pictures
+
+    def _depth(
+        self,
+        scene: Scene,
+        row: int,
+        camera: int,
+        frames: tuple[int, ...],
+        encoding: DepthEncoding,
+    ) -> StoredDepth:
+        """Return a camera's stored depth over frames; that of its last frame is kept."""
+        if len(frames) > 1:
+            parts = [self._stored(scene, camera, frame, encoding=encoding) for frame in frames]
+            return StoredDepth(
+                units=np.concatenate([part.units for part in parts]),
+                measured=np.concatenate([part.measured for part in parts]),
+            )
+        key, frame = (row, camera), frames[0]
+        # Taken out and put back: another thread may ask for another frame of this camera.
+        kept = self._depths.pop(key, None)
+        if kept is None or kept[0] != frame:
+            kept = (frame, self._stored(scene, camera, frame, encoding=encoding))
+        self._depths[key] = kept
+        if len(self._depths) > self._most_videos:
+            self._depths.popitem(last=False)
+        stored = kept[1]
+        if self._is_changed:
+            return StoredDepth(stored.units.copy(), stored.measured.copy())
+        return stored
+
+    def _stored(
+        self, scene: Scene, camera: int, frame: int, *, encoding: DepthEncoding
+    ) -> StoredDepth:
+        """Return a camera's stored depth at a frame of its pictures, (1, h, w)."""
+        size = self._request.size
+        index = depth_frame_index(frame, encoding=encoding, frames=scene.frames)
+        if index is None:
+            height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
+            return StoredDepth(
+                np.zeros((1, height, width), dtype=np.uint16),
+                np.zeros((1, height, width), dtype=bool),
+            )
+        stored = self._streams.read_stored_depth(
+            scene, depth_name(camera), index, encoding=encoding, size=size
+        )
+        return StoredDepth(stored.units[None], stored.measured[None])
+
+    def _camera_poses(self, scene: Scene) -> CameraPoses | None:
+        rectified = scene.rig_residual_px <= RECTIFIED_PX
+        if self._poses_needed == "never" or (rectified and self._poses_needed != "always"):
+            return None
+        poses = self._poses.get(scene.id.key)
+        if poses is None:
+            text = self._source.read(scene, TRAJECTORY_JSON)
+            where = self._source.label(scene, TRAJECTORY_JSON)
+            poses = CameraPoses.from_trajectory(parse_trajectory(text, where=where))
+            self._poses[scene.id.key] = poses
+            if len(self._poses) > KEPT_POSES:
+                self._poses.popitem(last=False)
+        return poses
