@@ -9,11 +9,11 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from stereogenbench_data.audit.contract import DoctorReport, scene_task
-from stereogenbench_data.audit.contract_diagnosis import SceneDiagnosis
-from stereogenbench_data.audit.contract_hypotheses import Structure
-from stereogenbench_data.audit.contract_scoring import scored
-from stereogenbench_data.audit.contract_views import SceneViews, Shot
+from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis
+from stereogenbench_data.audit.contract.doctor import DoctorReport, scene_task
+from stereogenbench_data.audit.contract.hypotheses import Structure
+from stereogenbench_data.audit.contract.matching import SceneViews, Shot
+from stereogenbench_data.audit.contract.scoring import scored
 from stereogenbench_data.errors import ExtraError, SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.atomic_write import writing_output

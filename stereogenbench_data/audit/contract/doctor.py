@@ -3,7 +3,7 @@
 Pixels that are found again along the rows of the other picture give disparity without any depth.
 Every hypothesis on the contract predicts another disparity for them; the pictures are compared
 at that disparity, on the same pixels for all. The declared contract is changed as little as the
-pictures ask for, and where two fit alike it is said that they do.
+pictures ask for. Where two contracts fit alike, the report names both.
 
 What cannot be seen: unit, focal length and baselines enter disparity as one quotient, so that a
 wrong one looks like a wrong other, and two may make up for each other.
@@ -17,10 +17,9 @@ from typing import Final
 
 import numpy as np
 
-from stereogenbench_data.audit.contract_diagnosis import SceneDiagnosis
-from stereogenbench_data.audit.contract_search import diagnose_scene
-from stereogenbench_data.audit.contract_verdict import Verdict, grouped, judge
-from stereogenbench_data.audit.contract_views import SceneViews
+from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnose_scene
+from stereogenbench_data.audit.contract.matching import SceneViews
+from stereogenbench_data.audit.contract.verdict import Verdict, grouped, judge
 from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex

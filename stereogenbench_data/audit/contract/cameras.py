@@ -17,11 +17,10 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from stereogenbench_data.audit.contract_fit import voted_scale
-from stereogenbench_data.audit.contract_hypotheses import Question, Structure
-from stereogenbench_data.audit.contract_matching import Luma, match_rows
-from stereogenbench_data.audit.contract_scoring import Pair, Scored, sampled
-from stereogenbench_data.audit.contract_views import SceneViews, Shot
+from stereogenbench_data.audit.contract.fitting import voted_scale
+from stereogenbench_data.audit.contract.hypotheses import Question, Structure
+from stereogenbench_data.audit.contract.matching import Luma, SceneViews, Shot, match_rows
+from stereogenbench_data.audit.contract.scoring import Pair, Scored, sampled
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 LEAST_SHARE: Final = 0.5
