@@ -18,7 +18,7 @@ from stereogenbench_data.audit.contract.fitting import (
     voted_agreement,
 )
 from stereogenbench_data.audit.contract.hypotheses import QUESTIONS, Question, Structure
-from stereogenbench_data.audit.contract.matching import SceneViews, Shot, disparity_px, spread_px
+from stereogenbench_data.audit.contract.matching import SceneFrames, Shot, disparity_px, spread_px
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
     Evidence,
@@ -177,7 +177,7 @@ class Search:
     """Contracts of one scene, each fitted once."""
 
     def __init__(
-        self, views: SceneViews, shots: Sequence[Shot], *, least_log_scale: float = LEAST_LOG_SCALE
+        self, views: SceneFrames, shots: Sequence[Shot], *, least_log_scale: float = LEAST_LOG_SCALE
     ) -> None:
         """Take what the contracts are judged by, and how far off a unit may be."""
         self._views = views
@@ -448,7 +448,7 @@ def _checked(
     return best, check
 
 
-def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
+def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
     """Return what a scene's pictures say about its declared contract.
 
     Raises:

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from stereogenbench_data.audit.contract.hypotheses import Structure
-from stereogenbench_data.audit.contract.matching import Points, SceneViews, Shot
+from stereogenbench_data.audit.contract.matching import Points, SceneFrames, Shot
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
     Pair,
@@ -67,7 +67,9 @@ class Term:
         return 1 if self.shot.left < self.shot.right else -1
 
 
-def fitted(views: SceneViews, shots: Sequence[Shot], structure: Structure, *, free: Free) -> Scored:
+def fitted(
+    views: SceneFrames, shots: Sequence[Shot], structure: Structure, *, free: Free
+) -> Scored:
     """Return a structure with the scale and offsets that explain the pictures best."""
     terms = fit_terms(views, shots, structure)
     if free == "nothing" or not terms:
@@ -77,7 +79,7 @@ def fitted(views: SceneViews, shots: Sequence[Shot], structure: Structure, *, fr
     return scored(views, shots, structure, scale=scale, offsets_px=offsets_px, scale_error=error)
 
 
-def fit_terms(views: SceneViews, shots: Sequence[Shot], structure: Structure) -> list[Term]:
+def fit_terms(views: SceneFrames, shots: Sequence[Shot], structure: Structure) -> list[Term]:
     """Return the shots of which a structure tells anything, with what it predicts."""
     terms = []
     for shot in shots:
@@ -90,7 +92,7 @@ def fit_terms(views: SceneViews, shots: Sequence[Shot], structure: Structure) ->
     return terms
 
 
-def voted_agreement(views: SceneViews, shots: Sequence[Shot], structure: Structure) -> float:
+def voted_agreement(views: SceneFrames, shots: Sequence[Shot], structure: Structure) -> float:
     """Return how many matches a structure explains at the scale that most of them agree on."""
     terms = fit_terms(views, shots, structure)
     if not terms:
@@ -175,7 +177,7 @@ def _densest(values: Points) -> float:
 
 
 def _refined(
-    views: SceneViews,
+    views: SceneFrames,
     terms: Sequence[Term],
     scale: float,
     offsets_px: dict[Pair, float],
@@ -217,7 +219,7 @@ def _moved(term: Term, scale: float, step: Points, unknowns: Sequence[object]) -
 
 
 def _equations(
-    views: SceneViews,
+    views: SceneFrames,
     terms: Sequence[Term],
     scale: float,
     offsets_px: dict[Pair, float],
@@ -310,7 +312,7 @@ class RayPower:
         return self.power, math.hypot(1.96 * self.error, _RAY_BIAS)
 
 
-def ray_power(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> RayPower:
+def ray_power(views: SceneFrames, shots: Sequence[Shot], contract: Scored) -> RayPower:
     """Return the power that fits a contract's pictures best, scale and its offsets fitted too."""
     terms = fit_terms(views, shots, contract.structure)
     pairs = list(contract.offsets_px)

@@ -5,7 +5,7 @@ the same row of the other picture. So no range of disparities is assumed, and no
 locked to, whatever the depth claims. Matches that hold in both directions are kept. numpy alone
 does it: a row's comparisons are one product of matrices.
 
-`SceneViews` holds one scene's pictures and stored depth, and predicts by a hypothesis which
+`SceneFrames` holds one scene's pictures and stored depth, and predicts by a hypothesis which
 disparity each matched pixel should have.
 """
 
@@ -221,7 +221,7 @@ class Shot:
         return offset_px if self.left < self.right else -offset_px
 
 
-class SceneViews:
+class SceneFrames:
     """One scene's pictures and depth, each decoded once."""
 
     def __init__(self, scene: Scene, streams: Streams, *, encoding: DepthEncoding) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from stereogenbench_data.audit.contract.hypotheses import Structure
-from stereogenbench_data.audit.contract.matching import SIDE_CELLS, Luma, Points, SceneViews, Shot
+from stereogenbench_data.audit.contract.matching import SIDE_CELLS, Luma, Points, SceneFrames, Shot
 
 LEAST_DB: Final = 0.15
 """A smaller mean difference is not believed, however sure: interpolation and codecs make such."""
@@ -178,7 +178,7 @@ def sampled(
 
 
 def differences(
-    views: SceneViews, shot: Shot, disparity_px: Points
+    views: SceneFrames, shot: Shot, disparity_px: Points
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], np.ndarray]:
     """Return right less left at a disparity, the mean slope of both, and what lands inside."""
     band = views.band(shot.frame, shot.right)
@@ -187,7 +187,7 @@ def differences(
 
 
 def scored(
-    views: SceneViews,
+    views: SceneFrames,
     shots: Sequence[Shot],
     structure: Structure,
     *,
@@ -275,7 +275,7 @@ def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:
     return mean
 
 
-def agreement(views: SceneViews, shots: Sequence[Shot], contract: Scored) -> float:
+def agreement(views: SceneFrames, shots: Sequence[Shot], contract: Scored) -> float:
     """Return the share of matches that a contract explains to a pixel; nan if it tells of none."""
     near, told = 0, 0
     for shot in shots:
