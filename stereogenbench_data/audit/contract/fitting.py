@@ -71,8 +71,8 @@ def fitted(
     views: SceneFrames, shots: Sequence[Shot], structure: Structure, *, free: Free
 ) -> Scored:
     """Return a structure with the scale and offsets that explain the pictures best."""
-    terms = fit_terms(views, shots, structure)
-    if free == "nothing" or not terms:
+    terms = [] if free == "nothing" else fit_terms(views, shots, structure)
+    if not terms:
         return scored(views, shots, structure)
     scale, offsets_px = _start(terms, free=free)
     scale, offsets_px, error = _refined(views, terms, scale, offsets_px, free=free)

@@ -10,7 +10,7 @@ disparity each matched pixel should have.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
@@ -68,30 +68,46 @@ class Matches:
 
 
 def match_rows(left: Luma, right: Luma) -> Matches:
-    """Return what a left picture has in common with the right one of a rectified pair.
+    """Return what a left picture has in common with the right one of a rectified pair."""
+    return match_pairs({0: left, 1: right}, [(0, 1)])[0, 1]
+
+
+def match_pairs(
+    pictures: Mapping[int, Luma], pairs: Sequence[tuple[int, int]]
+) -> dict[tuple[int, int], Matches]:
+    """Return what the left and the right picture of each pair have in common.
 
     Large pictures are matched at 512 columns or fewer, and then disparity is good to half a pixel
-    of the full size; else to about 0.2 pixels.
+    of the full size; else to about 0.2 pixels. The patches of a row are cut once for all pairs.
 
     Args:
-        left: (h, w) grey levels.
-        right: (h, w) grey levels of the other view, rows aligned.
+        pictures: (h, w) grey levels of views by number, all of one size, rows aligned.
+        pairs: Numbers of the left and the right picture.
     """
-    factor = -(-left.shape[1] // _WIDEST_PX)
-    small_left, small_right = (_reduced(picture, factor=factor) for picture in (left, right))
-    height = small_left.shape[0]
-    if min(small_left.shape) <= 2 * _RADIUS_PX:
-        return _gathered([], factor=factor, textured=0)
+    height, width = next(iter(pictures.values())).shape
+    factor = -(-width // _WIDEST_PX)
+    small = {number: _reduced(picture, factor=factor) for number, picture in pictures.items()}
+    height, width = height // factor, width // factor
+    if min(height, width) <= 2 * _RADIUS_PX:
+        return {pair: _gathered([], factor=factor, textured=0) for pair in pairs}
     inner = np.arange(_RADIUS_PX, height - _RADIUS_PX)
     rows = inner[np.unique(np.linspace(0, len(inner) - 1, min(_ROWS, len(inner))).astype(int))]
-    found, textured = [], 0
+    found: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray, np.ndarray]]]
+    found = {pair: [] for pair in pairs}
+    textured = dict.fromkeys(pairs, 0)
+    left_numbers = {left for left, _ in pairs}
     for row in rows:
-        here, is_textured = _patches(small_left, row)
-        there, _ = _patches(small_right, row)
-        textured += int(is_textured.sum())
-        columns, disparity_px = _match_row(_product(here, there), is_textured)
-        found.append((np.full(len(columns), row), columns + _RADIUS_PX, disparity_px))
-    return _gathered(found, factor=factor, textured=textured)
+        windows = {number: _windows(picture, row) for number, picture in small.items()}
+        patches = {number: _normalised(each) for number, each in windows.items()}
+        has_texture = {number: _has_texture(windows[number]) for number in left_numbers}
+        for left, right in pairs:
+            is_textured = has_texture[left]
+            textured[left, right] += int(is_textured.sum())
+            columns, disparity_px = _match_row(_product(patches[left], patches[right]), is_textured)
+            found[left, right].append(
+                (np.full(len(columns), row), columns + _RADIUS_PX, disparity_px)
+            )
+    return {pair: _gathered(found[pair], factor=factor, textured=textured[pair]) for pair in pairs}
 
 
 def _reduced(picture: Luma, *, factor: int) -> Luma:
@@ -102,17 +118,31 @@ def _reduced(picture: Luma, *, factor: int) -> Luma:
     return reduced
 
 
-def _patches(picture: Luma, row: int) -> tuple[Float32[np.ndarray, "columns pixels"], np.ndarray]:
-    """Return the normalised patches of a row's inner columns, and which of them have texture."""
+def _windows(picture: Luma, row: int) -> Float32[np.ndarray, "columns side side"]:
+    """Return the patches around a row's inner columns, as views of the picture."""
     band = picture[row - _RADIUS_PX : row + _RADIUS_PX + 1]
     side = 2 * _RADIUS_PX + 1
+    windows: Float32[np.ndarray, "columns side side"]
     windows = sliding_window_view(band, (side, side))[0]
+    return windows
+
+
+def _has_texture(windows: Float32[np.ndarray, "columns side side"]) -> Bool[np.ndarray, " columns"]:
     slopes = np.diff(windows, axis=-1)
+    textured: Bool[np.ndarray, " columns"]
     textured = np.sqrt((slopes**2).mean(axis=(1, 2))) >= _LEAST_SLOPE
+    return textured
+
+
+def _normalised(
+    windows: Float32[np.ndarray, "columns side side"],
+) -> Float32[np.ndarray, "columns pixels"]:
+    """Return patches with mean 0 and length 1."""
     flat = windows.reshape(len(windows), -1)
     flat = flat - flat.mean(axis=1, keepdims=True)
     length = np.linalg.norm(flat, axis=1, keepdims=True)
-    return flat / np.maximum(length, 1e-3), textured
+    normalised: Float32[np.ndarray, "columns pixels"] = flat / np.maximum(length, 1e-3)
+    return normalised
 
 
 def _product(
@@ -134,15 +164,17 @@ def _match_row(
     columns = np.flatnonzero(textured)
     scores = correlation[columns]
     best = scores.argmax(axis=1)
-    top = scores.max(axis=1, initial=-1.0)
+    each = np.arange(len(columns))
+    top = scores[each, best]
     back = correlation.argmax(axis=0)[best]
-    near = np.abs(np.arange(width) - best[:, None]) <= _NEAR_PX
-    second = np.where(near, -1.0, scores).max(axis=1, initial=-1.0)
+    # A copy of the rows is masked near the best place: what is left is the second best.
+    for step in range(-_NEAR_PX, _NEAR_PX + 1):
+        scores[each, np.clip(best + step, 0, width - 1)] = -1.0
+    second = scores.max(axis=1)
     keep = (top >= _LEAST_CORRELATION) & (top - second >= _LEAST_LEAD)
     keep &= (np.abs(back - columns) <= 1) & (best > 0) & (best < width - 1)
-    columns, best, scores = columns[keep], best[keep], scores[keep]
-    each = np.arange(len(best))
-    before, peak, after = (scores[each, best + step] for step in (-1, 0, 1))
+    columns, best = columns[keep], best[keep]
+    before, peak, after = (correlation[columns, best + step] for step in (-1, 0, 1))
     curvature = before - 2 * peak + after
     shift = np.where(curvature < 0, (before - after) / np.where(curvature < 0, 2 * curvature, 1), 0)
     return columns, (columns - best - np.clip(shift, -0.5, 0.5)).astype(np.float32)
@@ -315,12 +347,14 @@ class SceneFrames:
 
         The pairs are those that stand beside each other by a structure's order of cameras.
         """
-        return [
-            shot
-            for frame in chosen_frames(self.scene.frames, count=frames)
-            for left, right in self.chosen_pairs(structure or Structure())
-            for shot in self._both_ways(frame, left, right)
-        ]
+        pairs = self.chosen_pairs(structure or Structure())
+        files = dict.fromkeys(itertools.chain.from_iterable(pairs))
+        shots: list[Shot] = []
+        for frame in chosen_frames(self.scene.frames, count=frames):
+            found = match_pairs({file: self.band(frame, file) for file in files}, pairs)
+            for (left, right), matches in found.items():
+                shots += self._both_ways(frame, left, right, matches)
+        return shots
 
     def chosen_pairs(self, structure: Structure) -> list[tuple[int, int]]:
         """Return pairs in which every camera stands beside others: next to it, and next but one.
@@ -344,10 +378,9 @@ class SceneFrames:
             key=lambda file: self.scene.lateral_m[structure.camera_of(file, content="rgb")],
         )
 
-    def _both_ways(self, frame: int, left: int, right: int) -> tuple[Shot, Shot]:
+    def _both_ways(self, frame: int, left: int, right: int, matches: Matches) -> tuple[Shot, Shot]:
         """Return one set of matches from both sides, so that either camera's depth is tested."""
         here, there = self.band(frame, left), self.band(frame, right)
-        matches = match_rows(here, there)
         keep = np.arange(len(matches.rows))
         if len(keep) > _MOST_POINTS:
             chosen = np.random.default_rng(0).choice(keep, _MOST_POINTS, replace=False)
