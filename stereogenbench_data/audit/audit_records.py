@@ -442,7 +442,7 @@ class Untested:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class AuditRow:
     """A line of the audit's table: texts, in the paper's words where it has the line."""
 
     check: str
@@ -476,7 +476,7 @@ class AuditReport:
     frames: int
     seed: int
     limits: AuditLimits
-    rows: tuple[Row, ...]
+    rows: tuple[AuditRow, ...]
     findings: tuple[Finding, ...]
     untested: tuple[Untested, ...]
     notes: tuple[str, ...]

@@ -12,10 +12,10 @@ from stereogenbench_data.audit.audit_records import (
     QUANTITIES,
     AuditLimits,
     AuditReport,
+    AuditRow,
     CameraAudit,
     Finding,
     PairAudit,
-    Row,
     SceneAudit,
     ToleranceAudit,
     Untested,
@@ -39,7 +39,7 @@ def table_rows(
     *,
     findings: Sequence[Finding],
     untested: Sequence[Untested],
-) -> tuple[Row, ...]:
+) -> tuple[AuditRow, ...]:
     """Return the table of an audit over scenes."""
     return (
         *_rig_rows(scenes, limits),
@@ -52,11 +52,11 @@ def table_rows(
     )
 
 
-def _rig_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
+def _rig_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
     rigs = [scene.rig for scene in scenes]
     recorded = sum(rig.intrinsics_recorded for rig in rigs)
     told = f"{recorded} numbers recorded in px" if recorded else "none recorded in px"
-    yield Row(
+    yield AuditRow(
         "intrinsics",
         f"largest deviation of fx, fy, cx, cy from f / s W ({told})",
         f"{_number(_largest(rig.intrinsics_px for rig in rigs))} px",
@@ -69,7 +69,7 @@ def _rig_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row
     ):
         mean_cm = _mean(getattr(rig, mean) for rig in rigs)
         largest_cm = _largest(getattr(rig, most) for rig in rigs)
-        yield Row(
+        yield AuditRow(
             "pose/baseline",
             f"pose-derived less recorded, {name}: mean / largest",
             f"{_number(mean_cm)} cm / {_number(largest_cm)} cm",
@@ -78,14 +78,14 @@ def _rig_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row
         )
     turned_deg = _largest(rig.rotation_deg for rig in rigs)
     turned_px = _largest(rig.rotation_px for rig in rigs)
-    yield Row(
+    yield AuditRow(
         "rig rotation",
         "largest turn of a camera against camera 0, and what it moves",
         f"{_number(turned_deg)} deg / {_number(turned_px)} px",
         "",
         f"{limits.rectified_px:g} px",
     )
-    yield Row(
+    yield AuditRow(
         "lateral residual",
         "largest shift by cameras off the rig's line",
         f"{_number(_largest(rig.lateral_px for rig in rigs))} px",
@@ -94,11 +94,11 @@ def _rig_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row
     )
 
 
-def _depth_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
+def _depth_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
     cameras = [camera for scene in scenes for camera in scene.cameras]
     valid = _mean(camera.valid_depth for camera in cameras)
     least = _least(camera.least_valid_depth.value for camera in cameras)
-    yield Row(
+    yield AuditRow(
         "depth validity",
         "mean valid-depth ratio over audited frames and cameras (least of a picture)",
         f"{_percent(valid)} ({_percent(least)})",
@@ -107,7 +107,7 @@ def _depth_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[R
     )
     units = _distinct(camera.depth_unit_m for camera in cameras)
     steps = _distinct(camera.depth_step_units * camera.depth_unit_m for camera in cameras)
-    yield Row(
+    yield AuditRow(
         "depth quantum",
         f"step of stored depth, estimated from the numbers (unit: {units})",
         steps,
@@ -115,7 +115,7 @@ def _depth_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[R
     )
 
 
-def _reprojection_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
+def _reprojection_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
     primary = [scene.pairs[0] for scene in scenes]
     long = _named_pairs(scenes, [LONG_PAIR])
     long_name = f"{LONG_PAIR[0]}-{LONG_PAIR[1]}"
@@ -127,7 +127,7 @@ def _reprojection_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Ite
             median_px, p95_px = pooled_px(audits, 0.5), pooled_px(audits, 0.95)
             kept = _percent(_ratio(sum(each.kept for each in audits), comparable))
             is_limited = name == "primary pair" and tolerance is TOLERANCES[-1]
-            yield Row(
+            yield AuditRow(
                 "reprojection",
                 f"{name}, {tolerance.name}: median / 95th percentile (pixels kept)",
                 f"{_number(median_px)} px / {_number(p95_px)} px ({kept})",
@@ -137,7 +137,7 @@ def _reprojection_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Ite
     adjacent = _named_pairs(scenes, ADJACENT_PAIRS)
     for name, pairs in (("primary pair", primary), ("adjacent pairs", adjacent), (long_name, long)):
         agreement = _ratio(sum(p.agreeing for p in pairs), sum(p.unhidden for p in pairs))
-        yield Row(
+        yield AuditRow(
             "agreement",
             f"{name}: pixels that nothing hides whose two depths agree (least of a scene)",
             f"{_percent(agreement)} ({_percent(_least(p.agreement for p in pairs))})",
@@ -169,13 +169,15 @@ _SIZES: Final = (
 
 def _alignment_rows(
     scenes: Sequence[SceneAudit], limits: AuditLimits, untested: Sequence[Untested]
-) -> Iterator[Row]:
+) -> Iterator[AuditRow]:
     found = [scene.alignment for scene in scenes]
     pairs = [pair for each in found for pair in each.pairs]
     moved = [_ratio(each.moved_through, each.moved_smooth) for each in found]
     gains = [gain for each in found for _, _, gain in each.lags]
 
-    def row(check: str, quantity: str, ours: str, limit: str, whats: Sequence[str] = ()) -> Row:
+    def row(
+        check: str, quantity: str, ours: str, limit: str, whats: Sequence[str] = ()
+    ) -> AuditRow:
         names = {QUANTITIES[what] for what in whats} or {""}
         blind = [each for each in untested if each.check == check and each.quantity in names]
         if blind and len(scenes) == 1:
@@ -183,7 +185,7 @@ def _alignment_rows(
         elif blind:
             keys = {each.scene for each in blind}
             ours = f"{ours}; not testable in {len(keys)} of {counted(len(scenes), 'scene')}"
-        return Row(check, quantity, ours, "", limit)
+        return AuditRow(check, quantity, ours, "", limit)
 
     yield row(
         "depth consistency", "points of smooth surfaces that another camera sees through, most",
@@ -212,7 +214,7 @@ def _alignment_rows(
     )  # fmt: skip
 
 
-def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
+def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
     for name, count_of in (("RGB", _rgb_frames), ("depth", _depth_frames)):
         counts = [count for scene in scenes for camera in scene.cameras
                   if (count := count_of(camera)) >= 0]  # fmt: skip
@@ -220,7 +222,7 @@ def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[R
         found = [max(0, count_of(camera)) for scene in scenes for camera in scene.cameras]
         missing = sum(max(0, most - got) for most, got in zip(expected, found, strict=True))
         span = _span(counts)
-        yield Row(
+        yield AuditRow(
             "frames",
             f"{name} frames in all (of a video), missing",
             f"{sum(counts):,} ({span}), {missing:,} missing",
@@ -237,7 +239,7 @@ def _depth_frames(camera: CameraAudit) -> int:
     return camera.depth_frames
 
 
-def _picture_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Row]:
+def _picture_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
     cameras = [camera for scene in scenes for camera in scene.cameras]
     for check, quantity, value, limit in (
         (
@@ -259,9 +261,9 @@ def _picture_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator
             f"{limits.change:g}",
         ),
     ):
-        yield Row("pictures", f"{check}: {quantity}", f"{_number(value)} of 255", "", limit)
+        yield AuditRow("pictures", f"{check}: {quantity}", f"{_number(value)} of 255", "", limit)
     hidden = _largest(camera.occluder.value for camera in cameras)
-    yield Row(
+    yield AuditRow(
         "pictures",
         "occluder: largest share of a picture hidden from its border",
         _percent(hidden),
@@ -270,14 +272,14 @@ def _picture_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator
     )
 
 
-def _finding_rows(findings: Sequence[Finding]) -> Iterator[Row]:
+def _finding_rows(findings: Sequence[Finding]) -> Iterator[AuditRow]:
     checks = dict.fromkeys([*_CHECKS, *(finding.check for finding in findings)])
     told = [
         f"{check} {count}"
         for check in checks
         if (count := len({each.scene for each in findings if each.check == check}))
     ]
-    yield Row("findings", "scenes with", ", ".join(told) or "none", "none", "none")
+    yield AuditRow("findings", "scenes with", ", ".join(told) or "none", "none", "none")
 
 
 def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:

@@ -19,7 +19,7 @@ from stereogenbench_data.audit.audit_records import (
 )
 from stereogenbench_data.audit.audit_table import table_rows
 from stereogenbench_data.audit.findings import broken_finding, findings_of, untested_of
-from stereogenbench_data.audit.scene_audit import SceneTask, audit_scene, spread_frames
+from stereogenbench_data.audit.scene_audit import AuditTask, audit_scene, spread_frames
 from stereogenbench_data.engine.process_pool import run_tasks
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import walk
@@ -256,9 +256,9 @@ def _audited(
     return [found[scene.id.key] for scene in scenes]
 
 
-def _task(index: SceneIndex, scene: Scene, request: AuditRequest) -> SceneTask:
+def _task(index: SceneIndex, scene: Scene, request: AuditRequest) -> AuditTask:
     places = {member.path for member in scene.members.values()}
-    return SceneTask(
+    return AuditTask(
         root=index.root,
         retry=index.retry,
         shards={path: index.shards[path] for path in places if path in index.shards},

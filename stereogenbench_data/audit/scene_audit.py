@@ -4,19 +4,21 @@ Nothing that a scene's files hold stops the audit: what cannot be read is noted,
 measured.
 """
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal, ParamSpec, TypeVar
 
 import numpy as np
 
 from stereogenbench_data.audit.alignment import AlignmentCheck, band
 from stereogenbench_data.audit.audit_records import At, CameraAudit, RigAudit, SceneAudit
-from stereogenbench_data.audit.audited_files import SceneFiles
 from stereogenbench_data.audit.picture_check import (
     MOVED_SHARE,
     LightCheck,
     PayloadCheck,
     border_occluder,
+    reduced_size,
     subject_m,
 )
 from stereogenbench_data.audit.reprojection import (
@@ -29,8 +31,12 @@ from stereogenbench_data.audit.reprojection import (
 )
 from stereogenbench_data.audit.rig_check import motion_px, rig_audit
 from stereogenbench_data.engine.process_pool import AfterBytes
+from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.media.depth import depth_frame_index, depth_m_from_units
+from stereogenbench_data.media.video import probe
+from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.document import parse_object
 from stereogenbench_data.schema.parse import parse_trajectory
 from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
@@ -45,6 +51,122 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.retry import RetryPolicy
 
+Result = TypeVar("Result")
+Arguments = ParamSpec("Arguments")
+
+
+class AuditedFiles:
+    """A scene's metadata, frame counts and decoded frames.
+
+    Attributes:
+        problems: File name to what was wrong with it.
+    """
+
+    def __init__(self, source: MemberSource, scene: Scene, *, contract: DepthEncoding) -> None:
+        """Prepare to read; nothing is opened yet."""
+        self.problems: dict[str, str] = {}
+        self.scene = scene
+        self.source = source
+        self.contract = contract
+        self.streams = Streams(source)
+        self.intrinsics = rig_intrinsics(scene.rig)
+
+    def close(self) -> None:
+        """Close the open videos."""
+        self.streams.close()
+
+    def attempt(
+        self,
+        name: str,
+        read: Callable[Arguments, Result],
+        *args: Arguments.args,
+        **kwargs: Arguments.kwargs,
+    ) -> Result | None:
+        """Return what is read of a file, None once anything about it was wrong."""
+        if name in self.problems:
+            return None
+        try:
+            return read(*args, **kwargs)
+        except (StereoGenBenchError, OSError) as error:
+            self.problems[name] = str(error)
+            return None
+
+    def text(self, name: str) -> bytes:
+        """Return a metadata file's bytes."""
+        self._require_member(name)
+        return self.source.read(self.scene, name)
+
+    def _require_member(self, name: str) -> None:
+        if self.scene.held_name(name) not in self.scene.members:
+            raise StorageError("is missing: the index knows no such file of this scene")
+
+    def counted(self, camera: int) -> tuple[int, int]:
+        """Return how many frames a camera's two videos have, -1 where they cannot be opened."""
+        rgb, depth = rgb_name(camera), depth_name(camera)
+        found = (
+            self.attempt(rgb, self._probed, rgb, "later"),
+            self.attempt(depth, self._probed, depth, "needed"),
+        )
+        return -1 if found[0] is None else found[0], -1 if found[1] is None else found[1]
+
+    def _probed(self, name: str, pixel_format: Literal["needed", "later"]) -> int:
+        self._require_member(name)
+        held = self.scene.held_name(name)
+        opened = self.source.open(self.scene, held)
+        label = self.source.label(self.scene, held)
+        try:
+            return probe(opened, name=label, pixel_format=pixel_format).frames
+        finally:
+            close = getattr(opened, "close", None)
+            if close is not None:
+                close()
+
+    def picture(self, camera: int, frame: int) -> Any:
+        """Return a frame as (3, h, w) uint8, at the size at which light and motion are judged."""
+        rig = self.scene.rig
+        size = reduced_size(rig.image_height_px, rig.image_width_px)
+        return self.streams.rgb(self.scene, rgb_name(camera), frame, size=size)
+
+    def depth(self, camera: int, frame: int) -> tuple[Any, MeasuredDepth] | None:
+        """Return stored numbers and depth, None where the contract has no picture for a frame."""
+        encoding = self._encoding(camera)
+        index = depth_frame_index(frame, encoding=encoding, frames=self.scene.frames)
+        if index is None:
+            return None
+        stored = self.streams.read_stored_depth(
+            self.scene, depth_name(camera), index, encoding=encoding
+        )
+        depth_m = depth_m_from_units(
+            stored.units,
+            measured=stored.measured,
+            encoding=encoding,
+            intrinsics=self.intrinsics,
+        )
+        known = stored.measured & np.isfinite(depth_m)
+        return stored.units, MeasuredDepth(
+            np.where(known, depth_m, 0).astype(np.float64),
+            known,
+            step_m=encoding.known_unit_m,
+            form=encoding.form,
+        )
+
+    def _encoding(self, camera: int) -> DepthEncoding:
+        source = self.scene.depth_unit_source[camera]
+        if source == "unreadable":
+            if self.contract.unit_m is None:
+                raise MediaError(
+                    "its tags do not tell one positive number of metres in a stored unit of depth"
+                )
+            return self.contract
+        return self.contract.with_file_unit(self.scene.depth_unit_m[camera], source=source)
+
+    def unit_m(self, camera: int) -> float:
+        """Return metres in a stored unit of a camera's depth, nan where its tags contradict."""
+        if self.scene.depth_unit_source[camera] == "unreadable" and self.contract.unit_m is None:
+            return math.nan
+        return self._encoding(camera).known_unit_m
+
+
 LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
 """The non-adjacent pair that the paper audits beside the primary one."""
 
@@ -52,7 +174,7 @@ _METADATA: Final = (BASELINE_JSON, TRAJECTORY_JSON)
 
 
 @dataclass(frozen=True, slots=True)
-class SceneTask:
+class AuditTask:
     """What is to be audited; travels to worker processes.
 
     Attributes:
@@ -87,7 +209,7 @@ def spread_frames(frames: int, wanted: int) -> tuple[int, ...]:
     return tuple(round(step * (frames - 1) / (wanted - 1)) for step in range(wanted))
 
 
-def audit_scene(task: SceneTask, after_bytes: AfterBytes) -> SceneAudit:
+def audit_scene(task: AuditTask, after_bytes: AfterBytes) -> SceneAudit:
     """Return what is found of a scene; nothing that is wrong with it is raised.
 
     Args:
@@ -100,14 +222,14 @@ def audit_scene(task: SceneTask, after_bytes: AfterBytes) -> SceneAudit:
 class _SceneCheck:
     """The state of one scene's audit: open videos, and what was found so far."""
 
-    def __init__(self, task: SceneTask) -> None:
+    def __init__(self, task: AuditTask) -> None:
         self.scene = task.scene
         self.frames = spread_frames(task.scene.frames, task.frames)
         self.intrinsics = rig_intrinsics(task.scene.rig)
         source = MemberSource(
             task.root, shards=task.shards, revision=task.revision, retry=task.retry
         )
-        self.files = SceneFiles(source, task.scene, contract=task.depth or DepthEncoding())
+        self.files = AuditedFiles(source, task.scene, contract=task.depth or DepthEncoding())
         self.light = [LightCheck() for _ in range(CAMERA_COUNT)]
         self.payload = [PayloadCheck() for _ in range(CAMERA_COUNT)]
         self.occluders = [(At(0.0), "")] * CAMERA_COUNT

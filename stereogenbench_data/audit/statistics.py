@@ -20,7 +20,7 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.pairs import PAIR_NUMBER
 
-ADJACENT: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
+ADJACENT_COLUMNS: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
 FOCAL_EDGES_MM: Final = np.arange(15.0, 86.0, 5.0)
 """Edges of the focal histogram, around the paper's 18 to 85 mm; two more bins are beyond them."""
 
@@ -29,7 +29,7 @@ _SUBSETS: Final = ("", "seen_map", "unseen_map")
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class Distribution:
     """How some numbers are spread; the standard deviation divides by their count."""
 
     count: int
@@ -40,7 +40,7 @@ class Spread:
     median: float
 
     @classmethod
-    def of(cls, values: Float64[np.ndarray, "*any"]) -> "Spread":
+    def of(cls, values: Float64[np.ndarray, "*any"]) -> "Distribution":
         """Return the spread of one or more numbers."""
         return cls(
             count=int(values.size),
@@ -75,10 +75,10 @@ class FamilyStatistics:
     family: str
     scenes: int
     maps: dict[str, int]
-    adjacent_cm: Spread
-    all_pairs_cm: Spread
+    adjacent_cm: Distribution
+    all_pairs_cm: Distribution
     bins: dict[str, tuple[int, int, int]]
-    focal_mm: Spread
+    focal_mm: Distribution
     focal_counts: tuple[int, ...]
 
 
@@ -172,10 +172,10 @@ def _family(
         family=family,
         scenes=len(rows),
         maps=dict(zip(names.tolist(), counts.tolist(), strict=True)),
-        adjacent_cm=Spread.of(baselines_cm[:, ADJACENT]),
-        all_pairs_cm=Spread.of(baselines_cm),
-        bins=_bins(primary_cm, baselines_cm[:, ADJACENT], baselines_cm),
-        focal_mm=Spread.of(focal_mm),
+        adjacent_cm=Distribution.of(baselines_cm[:, ADJACENT_COLUMNS]),
+        all_pairs_cm=Distribution.of(baselines_cm),
+        bins=_bins(primary_cm, baselines_cm[:, ADJACENT_COLUMNS], baselines_cm),
+        focal_mm=Distribution.of(focal_mm),
         focal_counts=tuple(np.histogram(focal_mm, edges)[0].tolist()),
     )
 

@@ -30,10 +30,9 @@ from stereogenbench_data.cli.writing import writing
 from stereogenbench_data.schema.problems import counted
 
 if TYPE_CHECKING:
-    from stereogenbench_data.audit.contract import DoctorReport
-    from stereogenbench_data.audit.contract_answers import Answer
-    from stereogenbench_data.audit.contract_statistics import Gain
-    from stereogenbench_data.audit.contract_verdict import Verdict
+    from stereogenbench_data.audit.contract.doctor import DoctorReport
+    from stereogenbench_data.audit.contract.scoring import Gain
+    from stereogenbench_data.audit.contract.verdict import Answer, Verdict
 
 
 QUOTIENT_MEANS = (
@@ -88,8 +87,8 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     others. -o writes a picture. The exit status is 0 if the declared contract fits or nothing can
     be told, 1 if another one is clearly better or a camera does not fit, 2 if it could not be done.
     """
-    from stereogenbench_data.audit.contract import diagnose
-    from stereogenbench_data.audit.contract_picture import draw_report, require_picture_file
+    from stereogenbench_data.audit.contract.doctor import diagnose
+    from stereogenbench_data.audit.contract.picture import draw_report, require_picture_file
     from stereogenbench_data.schema.records import DepthEncoding
 
     if out is not None:
@@ -158,7 +157,7 @@ def _verdict_lines(verdict: "Verdict", report: "DoctorReport") -> list[str]:
 
 
 def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
-    from stereogenbench_data.audit.contract_verdict import encoding_line
+    from stereogenbench_data.audit.contract.verdict import encoding_line
 
     lines = [f"WRONG: {fault}." for fault in verdict.faults]
     if any(answer.status == "wrong" for answer in verdict.answers):
@@ -242,7 +241,7 @@ def _json(report: "DoctorReport") -> str:
 
 
 def _verdict_document(verdict: "Verdict") -> dict[str, Any]:
-    from stereogenbench_data.audit.contract_verdict import encoding_line
+    from stereogenbench_data.audit.contract.verdict import encoding_line
 
     encoding = verdict.encoding
     return asdict(verdict) | {"paste": None if encoding is None else encoding_line(encoding)}

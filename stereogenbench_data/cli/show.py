@@ -75,7 +75,7 @@ def show(  # noqa: PLR0913 - one parameter an option
         if clip:
             _write_clip(reader, row, target, pair=cameras, size=size)
         else:
-            from stereogenbench_data.audit.scene_sheet import scene_sheet
+            from stereogenbench_data.audit.scene_pictures import scene_sheet
             from stereogenbench_data.samples.picture import write_png
 
             write_png(target, scene_sheet(reader, row, pair=cameras, frame=frame, tile_px=size))
@@ -90,7 +90,7 @@ def _write_clip(
     pair: tuple[int, int] | None,
     size: int | None,
 ) -> None:
-    from stereogenbench_data.audit.scene_clip import clip_pages, write_clip
+    from stereogenbench_data.audit.scene_pictures import clip_pages, write_clip
 
     scene = reader.index.scene(row)
     with progress_bar("drawing", unit="frames") as progress:

@@ -54,10 +54,13 @@ def stats(  # noqa: PLR0913 - one parameter an option
     Only the index is read. With --compare always the exit status is 1 if a figure differs from
     the paper's.
     """
-    from stereogenbench_data.audit.paper_comparison import compared, release_sized_splits
     from stereogenbench_data.audit.paper_figures import SPLITS
     from stereogenbench_data.audit.statistics import statistics
-    from stereogenbench_data.audit.statistics_table import statistics_markdown
+    from stereogenbench_data.audit.statistics_report import (
+        compared,
+        release_sized_splits,
+        statistics_markdown,
+    )
 
     index = open_data(data, root=data_root)
     filters = scene_filters(
@@ -78,7 +81,7 @@ def stats(  # noqa: PLR0913 - one parameter an option
     text = json.dumps(document, indent=1)
     markdown = statistics_markdown(found, lines)
     if plots is not None:
-        from stereogenbench_data.audit.statistics_plots import write_plots
+        from stereogenbench_data.audit.statistics_report import write_plots
 
         with writing(plots):
             written = write_plots(index, plots, **filters)

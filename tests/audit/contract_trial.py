@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from stereogenbench_data.audit.contract import diagnose
-from stereogenbench_data.audit.contract_verdict import Verdict, encoding_line
+from stereogenbench_data.audit.contract.doctor import diagnose
+from stereogenbench_data.audit.contract.verdict import Verdict, encoding_line
 from stereogenbench_data.synthesis import ExportContract, SynthRequest, synthesise
 from tests.audit.corruption import (
     as_inverse,

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from stereogenbench_data import DepthEncoding, SceneIndex, SelectionError, StereoPairs
-from stereogenbench_data.audit.browser.catalogue import Catalogue
-from stereogenbench_data.audit.browser.choice import Choice, parse_choice
+from stereogenbench_data.audit.browser.catalogue import Catalogue, Choice, parse_choice
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
 
 SCENE = "train/Uniform/SynthStage/scene_000001"

@@ -7,17 +7,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereogenbench_data.audit.contract import diagnose
-from stereogenbench_data.audit.contract_answers import TOPICS, offset_words
-from stereogenbench_data.audit.contract_cameras import CameraCheck, CameraFigures
-from stereogenbench_data.audit.contract_diagnosis import Rival, SceneDiagnosis
-from stereogenbench_data.audit.contract_hypotheses import LAGS, Structure
-from stereogenbench_data.audit.contract_lengths import QUOTIENT, Unit
-from stereogenbench_data.audit.contract_matching import match_rows
-from stereogenbench_data.audit.contract_ray import RayPower
-from stereogenbench_data.audit.contract_statistics import Evidence, interval, pooled
-from stereogenbench_data.audit.contract_verdict import encoding_line, grouped, judge
-from stereogenbench_data.audit.contract_views import relative_step
+from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraFigures
+from stereogenbench_data.audit.contract.diagnosis import Rival, SceneDiagnosis
+from stereogenbench_data.audit.contract.doctor import diagnose
+from stereogenbench_data.audit.contract.fitting import RayPower
+from stereogenbench_data.audit.contract.hypotheses import LAGS, Structure
+from stereogenbench_data.audit.contract.matching import match_rows, relative_step
+from stereogenbench_data.audit.contract.scoring import Evidence, interval, pooled
+from stereogenbench_data.audit.contract.verdict import (
+    QUOTIENT,
+    TOPICS,
+    Unit,
+    encoding_line,
+    grouped,
+    judge,
+    offset_words,
+)
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_PAIRS

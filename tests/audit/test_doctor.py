@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from stereogenbench_data.audit.contract_verdict import encoding_line
+from stereogenbench_data.audit.contract.verdict import encoding_line
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.schema.records import DepthEncoding
 from tests.audit.corruption import copied, rewrite_one_depth, scaled

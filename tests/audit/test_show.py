@@ -6,11 +6,25 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data import SceneIndex, SelectionError, StereoPairs
-from stereogenbench_data.audit.colour_scale import ColourScale, scale_of
-from stereogenbench_data.audit.drawing import Page, disparity_rows, fitted, resized, scale_rows
-from stereogenbench_data.audit.scene_clip import clip_pages, write_clip
+from stereogenbench_data.audit.drawing import (
+    ColourScale,
+    Page,
+    disparity_rows,
+    fitted,
+    resized,
+    scale_of,
+    scale_rows,
+)
+from stereogenbench_data.audit.scene_pictures import (
+    HIDDEN,
+    LEFT,
+    RIGHT,
+    clip_pages,
+    scene_sheet,
+    tile_width,
+    write_clip,
+)
 from stereogenbench_data.audit.scene_reader import SceneReader
-from stereogenbench_data.audit.scene_sheet import HIDDEN, LEFT, RIGHT, scene_sheet, tile_width
 from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED, anaglyph
 
 SCENE = "train/Uniform/SynthStage/scene_000001"

@@ -13,10 +13,13 @@ from typer.testing import CliRunner
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.audit import paper_figures
-from stereogenbench_data.audit.paper_comparison import compared, release_sized_splits
 from stereogenbench_data.audit.statistics import FOCAL_EDGES_MM, statistics
-from stereogenbench_data.audit.statistics_plots import write_plots
-from stereogenbench_data.audit.statistics_table import statistics_markdown
+from stereogenbench_data.audit.statistics_report import (
+    compared,
+    release_sized_splits,
+    statistics_markdown,
+    write_plots,
+)
 from stereogenbench_data.cli.stats import stats
 from stereogenbench_data.errors import ExtraError, SelectionError
 from stereogenbench_data.schema.release import CAMERA_PAIRS, FAMILIES, TRAIN_MAPS, UNSEEN_MAPS

@@ -10,7 +10,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
-from stereogenbench_data.audit.browser.service import Answer, Service
+from stereogenbench_data.audit.browser.service import Response, Service
 from stereogenbench_data.errors import SelectionError, StereoGenBenchError
 
 LOOPBACK: Final = "127.0.0.1"
@@ -65,7 +65,7 @@ class PageServer(ThreadingHTTPServer):
         return f"http://{LOOPBACK}:{self.server_address[1]}/"
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer in a thread of its own; where too many are open, the longest silent one goes."""
+        """Response in a thread of its own; where too many are open, the longest silent one goes."""
         while not self._places.acquire(blocking=False):
             if not self._end_longest_silent():
                 self.shutdown_request(request)
@@ -105,7 +105,7 @@ class PageServer(ThreadingHTTPServer):
         return True
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Answer one connection, and make room for another."""
+        """Response one connection, and make room for another."""
         try:
             super().process_request_thread(request, client_address)
         finally:
@@ -124,15 +124,15 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = _SILENT_S
 
     def do_GET(self) -> None:
-        """Answer a question."""
+        """Response a question."""
         self._answer_alone(body="send")
 
     def do_HEAD(self) -> None:
-        """Answer a question without its content."""
+        """Response a question without its content."""
         self._answer_alone(body="leave out")
 
     def _answer_alone(self, *, body: str) -> None:
-        """Answer, and keep the connection from being ended meanwhile."""
+        """Response, and keep the connection from being ended meanwhile."""
         self.server.end_waiting(self.connection)
         try:
             self._answer(body=body)
@@ -184,7 +184,7 @@ class _Handler(BaseHTTPRequestHandler):
             return "another site's page asked for this"
         return ""
 
-    def _send(self, status: HTTPStatus, answer: Answer, *, body: str) -> None:
+    def _send(self, status: HTTPStatus, answer: Response, *, body: str) -> None:
         with suppress(ConnectionError, TimeoutError):
             self.send_response(status)
             for name, value in _HEADERS.items():
@@ -200,5 +200,5 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(answer.content)
 
 
-def _told(message: str) -> Answer:
-    return Answer(json.dumps({"error": message}).encode(), "application/json")
+def _told(message: str) -> Response:
+    return Response(json.dumps({"error": message}).encode(), "application/json")

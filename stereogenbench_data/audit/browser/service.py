@@ -11,10 +11,9 @@ from typing import Any, Final
 import numpy as np
 from PIL import Image
 
-from stereogenbench_data.audit.browser.catalogue import Catalogue
-from stereogenbench_data.audit.browser.choice import parse_choice
+from stereogenbench_data.audit.browser.catalogue import Catalogue, parse_choice
+from stereogenbench_data.audit.scene_pictures import HIDDEN
 from stereogenbench_data.audit.scene_reader import SceneReader
-from stereogenbench_data.audit.scene_sheet import HIDDEN
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED
 
@@ -35,7 +34,7 @@ _MAP_FIELDS: Final = ("disparity", "valid", "depth")
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Response:
     """What is sent back: bytes, what they are, and whether the browser may keep them."""
 
     content: bytes
@@ -51,7 +50,7 @@ class Service:
         self._catalogue = catalogue
         self._reader = reader
         self._started = secrets.token_hex(4)
-        self._routes: dict[str, Callable[[Query], Answer]] = {
+        self._routes: dict[str, Callable[[Query], Response]] = {
             "/api/about": self._about,
             "/api/choice": self._choice,
             "/api/scenes": self._scenes,
@@ -64,7 +63,7 @@ class Service:
             "/visible.u8": self._visible,
         }
 
-    def answer(self, path: str, query: Query) -> Answer | None:
+    def answer(self, path: str, query: Query) -> Response | None:
         """Return the answer to a path, None where there is none.
 
         Raises:
@@ -75,11 +74,11 @@ class Service:
         if path in STATIC:
             name, kind = STATIC[path]
             place = resources.files("stereogenbench_data.audit.browser") / "static" / name
-            return Answer(place.read_bytes(), kind)
+            return Response(place.read_bytes(), kind)
         route = self._routes.get(path)
         return None if route is None else route(query)
 
-    def _about(self, query: Query) -> Answer:
+    def _about(self, query: Query) -> Response:
         colours = {
             "stops": COLOUR_STOPS.tolist(),
             "not_measured": list(NOT_MEASURED),
@@ -87,41 +86,41 @@ class Service:
         }
         return _json(self._catalogue.about() | {"colours": colours, "started": self._started})
 
-    def _choice(self, query: Query) -> Answer:
+    def _choice(self, query: Query) -> Response:
         return _json(self._catalogue.summary(parse_choice(query)))
 
-    def _scenes(self, query: Query) -> Answer:
+    def _scenes(self, query: Query) -> Response:
         first, count = _whole(query, "first"), _whole(query, "count")
         return _json(self._catalogue.listed(parse_choice(query), first=first, count=count))
 
-    def _scene(self, query: Query) -> Answer:
+    def _scene(self, query: Query) -> Response:
         return _json(self._catalogue.scene(_text(query, "key"), parse_choice(query)))
 
-    def _line(self, query: Query) -> Answer:
+    def _line(self, query: Query) -> Response:
         key, _, pair, frame = self._moment(query)
         return _json({"line": self._catalogue.sample_line(key, pair=pair, frame=frame)})
 
-    def _picture(self, query: Query, name: str) -> Answer:
+    def _picture(self, query: Query, name: str) -> Response:
         _, row, pair, frame = self._moment(query)
         sample = self._reader.pair(row, pair=pair, frame=frame, fields=(name,))
         out = io.BytesIO()
         picture = Image.fromarray(np.ascontiguousarray(sample[name].transpose(1, 2, 0)))
         picture.save(out, format="JPEG", quality=_JPEG_QUALITY, subsampling=0)
-        return Answer(out.getvalue(), "image/jpeg", keep=True)
+        return Response(out.getvalue(), "image/jpeg", keep=True)
 
-    def _map(self, query: Query, name: str) -> Answer:
+    def _map(self, query: Query, name: str) -> Response:
         """Return a map as little-endian float32, row by row, nan where nothing was measured."""
         _, row, pair, frame = self._moment(query)
         sample = self._reader.pair(row, pair=pair, frame=frame, fields=_MAP_FIELDS)
         told = np.where(sample["valid"], sample[name], np.float32(np.nan)).astype("<f4")
-        return Answer(told.tobytes(), "application/octet-stream", keep=True)
+        return Response(told.tobytes(), "application/octet-stream", keep=True)
 
-    def _visible(self, query: Query) -> Answer:
+    def _visible(self, query: Query) -> Response:
         """Return one byte a pixel, 1 where the right camera sees it too."""
         _, row, pair, frame = self._moment(query)
         sample = self._reader.pair(row, pair=pair, frame=frame, fields=("visible",))
         told = sample["visible"].astype(np.uint8).tobytes()
-        return Answer(told, "application/octet-stream", keep=True)
+        return Response(told, "application/octet-stream", keep=True)
 
     def _moment(self, query: Query) -> tuple[str, int, tuple[int, int], int]:
         key = _text(query, "key")
@@ -129,8 +128,8 @@ class Service:
         return key, self._catalogue.row(key), pair, _whole(query, "frame")
 
 
-def _json(value: Any) -> Answer:
-    return Answer(json.dumps(value, allow_nan=False).encode(), "application/json")
+def _json(value: Any) -> Response:
+    return Response(json.dumps(value, allow_nan=False).encode(), "application/json")
 
 
 def _text(query: Query, name: str) -> str:

@@ -17,11 +17,10 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from stereogenbench_data.audit.contract_fit import voted_scale
-from stereogenbench_data.audit.contract_hypotheses import Question, Structure
-from stereogenbench_data.audit.contract_matching import Luma, match_rows
-from stereogenbench_data.audit.contract_scoring import Pair, Scored, sampled
-from stereogenbench_data.audit.contract_views import SceneViews, Shot
+from stereogenbench_data.audit.contract.fitting import voted_scale
+from stereogenbench_data.audit.contract.hypotheses import Question, Structure
+from stereogenbench_data.audit.contract.matching import Luma, SceneFrames, Shot, match_rows
+from stereogenbench_data.audit.contract.scoring import Pair, Scored, sampled
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 LEAST_SHARE: Final = 0.5
@@ -132,7 +131,7 @@ class CameraComparison:
     """A scene's cameras at one contract."""
 
     def __init__(
-        self, views: SceneViews, shots: Sequence[Shot], contract: Scored, *, depth_step: float
+        self, views: SceneFrames, shots: Sequence[Shot], contract: Scored, *, depth_step: float
     ) -> None:
         """Take shots from both sides by turns, and a contract with its scale fitted."""
         self._views = views
@@ -551,7 +550,7 @@ _READINGS: Final[dict[Question, str]] = {
 
 
 def row_terms(
-    views: SceneViews, shot: Shot
+    views: SceneFrames, shot: Shot
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Return how far lower the left picture lies at each match: numerator and denominator.
 

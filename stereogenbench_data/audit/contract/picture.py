@@ -9,11 +9,11 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from stereogenbench_data.audit.contract import DoctorReport, scene_task
-from stereogenbench_data.audit.contract_diagnosis import SceneDiagnosis
-from stereogenbench_data.audit.contract_hypotheses import Structure
-from stereogenbench_data.audit.contract_scoring import scored
-from stereogenbench_data.audit.contract_views import SceneViews, Shot
+from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis
+from stereogenbench_data.audit.contract.doctor import DoctorReport, scene_task
+from stereogenbench_data.audit.contract.hypotheses import Structure
+from stereogenbench_data.audit.contract.matching import SceneFrames, Shot
+from stereogenbench_data.audit.contract.scoring import scored
 from stereogenbench_data.errors import ExtraError, SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.files import open_output
@@ -55,7 +55,7 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     figure = _figure_class()(figsize=(14, 13.5), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(2, 1))
     with closing(task.streams()) as streams:
-        views = SceneViews(task.scene, streams, encoding=report.declared)
+        views = SceneFrames(task.scene, streams, encoding=report.declared)
         shots = views.shots(frames=task.frames)
         figure.suptitle(f"{diagnosis.key}: {_title(diagnosis)}", fontsize=12)
         _draw_views(above.subplots(2, 3).ravel(), views, shots, diagnosis)
@@ -102,7 +102,7 @@ def _title(diagnosis: SceneDiagnosis) -> str:
 
 
 def _draw_views(
-    axes: Sequence[Any], views: SceneViews, shots: Sequence[Shot], diagnosis: SceneDiagnosis
+    axes: Sequence[Any], views: SceneFrames, shots: Sequence[Shot], diagnosis: SceneDiagnosis
 ) -> None:
     shot = max(shots, key=lambda shot: (shot.left, shot.right) == views.primary)
     left, right = (
@@ -133,7 +133,7 @@ def _draw_views(
 
 
 def _warped(
-    views: SceneViews,
+    views: SceneFrames,
     shot: Shot,
     structure: Structure,
     right: UInt8[np.ndarray, "h w 3"],
@@ -177,7 +177,7 @@ def _difference(
 
 def _draw_curves(
     axis: Any,
-    views: SceneViews,
+    views: SceneFrames,
     shots: Sequence[Shot],
     diagnosis: SceneDiagnosis,
     *,
@@ -211,7 +211,7 @@ def _draw_curves(
 
 
 def _score_db(
-    views: SceneViews, shots: Sequence[Shot], structure: Structure, *, scale: float
+    views: SceneFrames, shots: Sequence[Shot], structure: Structure, *, scale: float
 ) -> float:
     errors = scored(views, shots, structure, scale=scale).errors
     shares = [

@@ -3,7 +3,7 @@
 Pixels that are found again along the rows of the other picture give disparity without any depth.
 Every hypothesis on the contract predicts another disparity for them; the pictures are compared
 at that disparity, on the same pixels for all. The declared contract is changed as little as the
-pictures ask for, and where two fit alike it is said that they do.
+pictures ask for. Where two contracts fit alike, the report names both.
 
 What cannot be seen: unit, focal length and baselines enter disparity as one quotient, so that a
 wrong one looks like a wrong other, and two may make up for each other.
@@ -17,10 +17,9 @@ from typing import Final
 
 import numpy as np
 
-from stereogenbench_data.audit.contract_diagnosis import SceneDiagnosis
-from stereogenbench_data.audit.contract_search import diagnose_scene
-from stereogenbench_data.audit.contract_verdict import Verdict, grouped, judge
-from stereogenbench_data.audit.contract_views import SceneViews
+from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnose_scene
+from stereogenbench_data.audit.contract.matching import SceneFrames
+from stereogenbench_data.audit.contract.verdict import Verdict, grouped, judge
 from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
@@ -61,7 +60,7 @@ class DoctorReport:
 
 
 @dataclass(frozen=True, slots=True)
-class SceneTask:
+class DiagnosisTask:
     """One scene to be judged, in whatever process."""
 
     scene: Scene
@@ -134,28 +133,28 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
     return DoctorReport(index.where, encoding, tuple(found), verdicts, left_out)
 
 
-def scene_task(data: SceneIndex, key: str, *, encoding: DepthEncoding) -> SceneTask:
+def scene_task(data: SceneIndex, key: str, *, encoding: DepthEncoding) -> DiagnosisTask:
     """Return the task that judges one scene by one frame."""
     (row,) = filter_scenes(data, {"scenes": key})
     return _task(data, int(row), frames=1, encoding=encoding)
 
 
-def _task(index: SceneIndex, row: int, *, frames: int, encoding: DepthEncoding) -> SceneTask:
+def _task(index: SceneIndex, row: int, *, frames: int, encoding: DepthEncoding) -> DiagnosisTask:
     scene = index.scene(row)
     paths = {member.path for member in scene.members.values()}
     shards = {path: facts for path, facts in index.shards.items() if path in paths}
-    return SceneTask(scene, index.root, shards, index.digest, frames, encoding, index.retry)
+    return DiagnosisTask(scene, index.root, shards, index.digest, frames, encoding, index.retry)
 
 
-def _diagnoses(tasks: list[SceneTask], *, workers: int | None) -> Iterator[SceneDiagnosis]:
+def _diagnoses(tasks: list[DiagnosisTask], *, workers: int | None) -> Iterator[SceneDiagnosis]:
     with closing(
         run_tasks(_diagnose, tasks, workers=workers, after_bytes=lambda _: None)
     ) as results:
         yield from results
 
 
-def _diagnose(task: SceneTask, after_bytes: AfterBytes) -> SceneDiagnosis:
+def _diagnose(task: DiagnosisTask, after_bytes: AfterBytes) -> SceneDiagnosis:
     after_bytes(0)
     with closing(task.streams()) as streams:
-        views = SceneViews(task.scene, streams, encoding=task.encoding)
+        views = SceneFrames(task.scene, streams, encoding=task.encoding)
         return diagnose_scene(views, frames=task.frames)

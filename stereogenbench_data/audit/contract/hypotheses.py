@@ -1,4 +1,4 @@
-"""What may be wrong with a depth contract: a table of questions, and what each answer changes."""
+"""What may be wrong with a depth contract: questions, and hypotheses that answer them."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, get_args

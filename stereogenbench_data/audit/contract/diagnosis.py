@@ -1,31 +1,148 @@
-"""The contract that explains one scene: the declared one, changed as little as the pictures ask."""
+"""One scene's diagnosis: the declared contract, changed as little as the pictures ask.
+
+`Search` fits each hypothesis once and takes the contract with the fewest changes that no further
+change clearly improves; `diagnose_scene` says what that one explains and what it leaves open.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from stereogenbench_data.audit.contract_cameras import CameraCheck, CameraComparison
-from stereogenbench_data.audit.contract_diagnosis import (
-    BIAS_PX,
-    LEAST_LOG_SCALE,
-    LEAST_OFFSET_PX,
-    Rival,
-    SceneDiagnosis,
-    allowed_log_scale,
+from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraComparison
+from stereogenbench_data.audit.contract.fitting import (
+    Free,
+    RayPower,
+    fitted,
+    ray_power,
+    voted_agreement,
 )
-from stereogenbench_data.audit.contract_fit import Free, fitted, voted_agreement
-from stereogenbench_data.audit.contract_hypotheses import QUESTIONS, Structure
-from stereogenbench_data.audit.contract_ray import RayPower, ray_power
-from stereogenbench_data.audit.contract_rig import crossed_pair, focal_ratios
-from stereogenbench_data.audit.contract_scoring import Scored, agreement, evidence, scored
-from stereogenbench_data.audit.contract_statistics import LEAST_ERRORS, Evidence
-from stereogenbench_data.audit.contract_views import (
-    SceneViews,
-    Shot,
-    disparity_px,
-    spread_px,
+from stereogenbench_data.audit.contract.hypotheses import QUESTIONS, Question, Structure
+from stereogenbench_data.audit.contract.matching import SceneFrames, Shot, disparity_px, spread_px
+from stereogenbench_data.audit.contract.scoring import (
+    LEAST_ERRORS,
+    Evidence,
+    Pair,
+    Scored,
+    agreement,
+    evidence,
+    scored,
 )
+from stereogenbench_data.schema.records import Rig, Scene
+
+LEAST_LOG_SCALE: Final = 0.01
+"""A unit that is off by less is not called wrong."""
+BIAS_PX: Final = 0.1
+"""By how much disparity may be off however many pixels agree: interpolation on small pictures."""
+LEAST_OFFSET_PX: Final = 0.3
+_NOTHING: Final = Evidence(math.nan, math.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class Rival:
+    """Another answer to one question, all else as in the best contract but for the scale.
+
+    ``behind`` is by how much the best contract is better.
+    """
+
+    question: Question
+    answer: Any
+    behind: Evidence
+
+
+@dataclass(frozen=True, slots=True)
+class SceneDiagnosis:
+    """What one scene's pictures say about its depth contract.
+
+    Attributes:
+        key: The scene.
+        views: How many views (a pair in a frame) were compared.
+        pairs: The pairs.
+        matches: Pixels that were found in both pictures of a view.
+        textured: Pixels that were looked for.
+        unit_m: The declared unit of the primary pair's left depth, in metres.
+        unit_source: Where it comes from: "tag", "default", "user" or "unreadable".
+        focal_ratios: In words, other readings of focal length and sensor, and what disparity
+            each gives over that of the width; those that give the same are left out.
+        recorded_pair: The primary pair as it is recorded, if its left camera stands to the right
+            of the other by the poses; None if it does not.
+        declared: The declared answers.
+        best: The answers of the best contract.
+        changed: What else the best contract changes: the scale, the offset, or both.
+        scale: Found over declared disparity, fitted with the best contract's answers.
+        scale_error: Standard error of log(scale).
+        other_kind_scale: Scale with the other kind of depth, all else as in the best contract.
+        offsets_px: Constant disparity of each pair at the best contract.
+        gain: By how much the best contract beats the declared one.
+        parallax: By how much it beats no disparity at all.
+        agreement: Share of the matches of neighbouring cameras that the best contract explains.
+        rivals: The other answers.
+        equals: Contracts with as few changes that are not clearly worse, in words.
+        disparity_px: Root mean square of the disparities found.
+        spread_px: Root mean square of the same, less the mean of each view.
+        depth_step: How far apart neighbouring stored depths lie, as a share.
+        check: What the best contract leaves to explain, camera by camera.
+        problem: Why nothing could be told; empty where something could.
+    """
+
+    key: str
+    views: int
+    pairs: tuple[Pair, ...]
+    matches: int
+    textured: int
+    unit_m: float
+    unit_source: str
+    focal_ratios: dict[str, float]
+    recorded_pair: Pair | None
+    declared: Structure
+    best: Structure
+    changed: Free = "nothing"
+    scale: float = 1.0
+    scale_error: float = math.inf
+    other_kind_scale: float = math.nan
+    offsets_px: dict[Pair, float] = field(default_factory=dict)
+    gain: Evidence = _NOTHING
+    parallax: Evidence = _NOTHING
+    agreement: float = math.nan
+    rivals: tuple[Rival, ...] = ()
+    equals: tuple[tuple[Structure, Free, float], ...] = ()
+    disparity_px: float = math.inf
+    spread_px: float = math.inf
+    depth_step: float = 0.0
+    check: CameraCheck = field(default_factory=CameraCheck)
+    problem: str = ""
+
+
+def allowed_log_scale(depth_step: float) -> float:
+    """Return by how much log(unit) may be off without being called wrong.
+
+    Coarse depth moves the mean of 1 / depth by the order of its step squared, where it was rounded;
+    a quarter of a step allows for some that was cut off.
+    """
+    return max(LEAST_LOG_SCALE, depth_step / 4 + depth_step**2)
+
+
+def focal_ratios(rig: Rig) -> dict[str, float]:
+    """Return other readings of a rig's focal length, each over f / sensor width * width."""
+    by_pixels = rig.image_height_px / rig.image_width_px
+    by_sensor = rig.sensor_width_mm / rig.sensor_height_mm
+    readings = {
+        "f / sensor height * picture height": by_pixels * by_sensor,
+        "f / sensor height * picture width": by_sensor,
+        "f / sensor width * picture height": by_pixels,
+    }
+    told: dict[str, float] = {}
+    for words, ratio in readings.items():
+        if all(abs(math.log(ratio / other)) > LEAST_LOG_SCALE for other in (1.0, *told.values())):
+            told[words] = ratio
+    return told
+
+
+def crossed_pair(scene: Scene) -> Pair | None:
+    """Return the recorded primary pair if its cameras stand in the other order by the poses."""
+    left, right = scene.rig.primary_pair
+    return (left, right) if scene.lateral_m[left] > scene.lateral_m[right] else None
+
 
 _COARSEST_STEP: Final = 0.5
 """With depths further apart, as a share, nothing is told."""
@@ -60,7 +177,7 @@ class Search:
     """Contracts of one scene, each fitted once."""
 
     def __init__(
-        self, views: SceneViews, shots: Sequence[Shot], *, least_log_scale: float = LEAST_LOG_SCALE
+        self, views: SceneFrames, shots: Sequence[Shot], *, least_log_scale: float = LEAST_LOG_SCALE
     ) -> None:
         """Take what the contracts are judged by, and how far off a unit may be."""
         self._views = views
@@ -331,7 +448,7 @@ def _checked(
     return best, check
 
 
-def diagnose_scene(views: SceneViews, *, frames: int) -> SceneDiagnosis:
+def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
     """Return what a scene's pictures say about its declared contract.
 
     Raises:

@@ -1,16 +1,25 @@
-"""The pictures and stored depth of one scene that its depth contract is judged by."""
+"""What the pictures of a scene have in common, found without any depth.
+
+Rows of two rectified pictures are correlated: every pixel of a row is compared with every pixel of
+the same row of the other picture. So no range of disparities is assumed, and no near optimum is
+locked to, whatever the depth claims. Matches that hold in both directions are kept. numpy alone
+does it: a row's comparisons are one product of matrices.
+
+`SceneFrames` holds one scene's pictures and stored depth, and predicts by a hypothesis which
+disparity each matched pixel should have.
+"""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16
+from numpy.lib.stride_tricks import sliding_window_view
 
-from stereogenbench_data.audit.contract_hypotheses import LAGS, Flip, Structure
-from stereogenbench_data.audit.contract_matching import Luma, match_rows
+from stereogenbench_data.audit.contract.hypotheses import LAGS, Flip, Structure
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.samples.streams import Streams
@@ -21,6 +30,171 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
+
+_WIDEST_PX: Final = 512
+_ROWS: Final = 64
+_RADIUS_PX: Final = 4
+_LEAST_CORRELATION: Final = 0.75
+_LEAST_LEAD: Final = 0.04
+"""How much better than the second best place, more than `_NEAR_PX` away, a match must be."""
+_NEAR_PX: Final = 3
+_LEAST_SLOPE: Final = 2.0
+"""Root mean square of the horizontal slope in a patch, in grey levels a pixel: texture."""
+_BLOCK: Final = 2**18
+"""Multiplications in one product of matrices. BLAS starts threads for more; in several processes
+on a busy machine they wait for one another (25 times slower, measured)."""
+
+Luma = Float32[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """Pixels of a left picture that were found again in the right one.
+
+    Attributes:
+        rows: (n,) rows.
+        columns: (n,) columns.
+        disparity_px: (n,) how far to the left each was found, negative for to the right.
+        textured: How many pixels were looked for.
+        grain_px: Size of the pixels that were compared.
+    """
+
+    rows: Int64[np.ndarray, " n"]
+    columns: Int64[np.ndarray, " n"]
+    disparity_px: Float32[np.ndarray, " n"]
+    textured: int
+    grain_px: float = 1.0
+
+
+def match_rows(left: Luma, right: Luma) -> Matches:
+    """Return what a left picture has in common with the right one of a rectified pair."""
+    return match_pairs({0: left, 1: right}, [(0, 1)])[0, 1]
+
+
+def match_pairs(
+    pictures: Mapping[int, Luma], pairs: Sequence[tuple[int, int]]
+) -> dict[tuple[int, int], Matches]:
+    """Return what the left and the right picture of each pair have in common.
+
+    Large pictures are matched at 512 columns or fewer, and then disparity is good to half a pixel
+    of the full size; else to about 0.2 pixels. The patches of a row are cut once for all pairs.
+
+    Args:
+        pictures: (h, w) grey levels of views by number, all of one size, rows aligned.
+        pairs: Numbers of the left and the right picture.
+    """
+    height, width = next(iter(pictures.values())).shape
+    factor = -(-width // _WIDEST_PX)
+    small = {number: _reduced(picture, factor=factor) for number, picture in pictures.items()}
+    height, width = height // factor, width // factor
+    if min(height, width) <= 2 * _RADIUS_PX:
+        return {pair: _gathered([], factor=factor, textured=0) for pair in pairs}
+    inner = np.arange(_RADIUS_PX, height - _RADIUS_PX)
+    rows = inner[np.unique(np.linspace(0, len(inner) - 1, min(_ROWS, len(inner))).astype(int))]
+    found: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray, np.ndarray]]]
+    found = {pair: [] for pair in pairs}
+    textured = dict.fromkeys(pairs, 0)
+    left_numbers = {left for left, _ in pairs}
+    for row in rows:
+        windows = {number: _windows(picture, row) for number, picture in small.items()}
+        patches = {number: _normalised(each) for number, each in windows.items()}
+        has_texture = {number: _has_texture(windows[number]) for number in left_numbers}
+        for left, right in pairs:
+            is_textured = has_texture[left]
+            textured[left, right] += int(is_textured.sum())
+            columns, disparity_px = _match_row(_product(patches[left], patches[right]), is_textured)
+            found[left, right].append(
+                (np.full(len(columns), row), columns + _RADIUS_PX, disparity_px)
+            )
+    return {pair: _gathered(found[pair], factor=factor, textured=textured[pair]) for pair in pairs}
+
+
+def _reduced(picture: Luma, *, factor: int) -> Luma:
+    """Return the means of blocks of factor x factor pixels."""
+    height, width = (side // factor * factor for side in picture.shape)
+    blocks = picture[:height, :width].reshape(height // factor, factor, width // factor, factor)
+    reduced: Luma = blocks.mean(axis=(1, 3), dtype=np.float32)
+    return reduced
+
+
+def _windows(picture: Luma, row: int) -> Float32[np.ndarray, "columns side side"]:
+    """Return the patches around a row's inner columns, as views of the picture."""
+    band = picture[row - _RADIUS_PX : row + _RADIUS_PX + 1]
+    side = 2 * _RADIUS_PX + 1
+    windows: Float32[np.ndarray, "columns side side"]
+    windows = sliding_window_view(band, (side, side))[0]
+    return windows
+
+
+def _has_texture(windows: Float32[np.ndarray, "columns side side"]) -> Bool[np.ndarray, " columns"]:
+    slopes = np.diff(windows, axis=-1)
+    textured: Bool[np.ndarray, " columns"]
+    textured = np.sqrt((slopes**2).mean(axis=(1, 2))) >= _LEAST_SLOPE
+    return textured
+
+
+def _normalised(
+    windows: Float32[np.ndarray, "columns side side"],
+) -> Float32[np.ndarray, "columns pixels"]:
+    """Return patches with mean 0 and length 1."""
+    flat = windows.reshape(len(windows), -1)
+    flat = flat - flat.mean(axis=1, keepdims=True)
+    length = np.linalg.norm(flat, axis=1, keepdims=True)
+    normalised: Float32[np.ndarray, "columns pixels"] = flat / np.maximum(length, 1e-3)
+    return normalised
+
+
+def _product(
+    here: Float32[np.ndarray, "left pixels"], there: Float32[np.ndarray, "right pixels"]
+) -> Float32[np.ndarray, "left right"]:
+    """Return here @ there.T, a few rows at a time."""
+    few = max(1, _BLOCK // there.size)
+    product = np.empty((len(here), len(there)), dtype=np.float32)
+    for start in range(0, len(here), few):
+        np.matmul(here[start : start + few], there.T, out=product[start : start + few])
+    return product
+
+
+def _match_row(
+    correlation: Float32[np.ndarray, "left right"], textured: np.ndarray
+) -> tuple[Int64[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
+    """Return the columns that match one place well, alone and both ways, and their disparity."""
+    width = correlation.shape[1]
+    columns = np.flatnonzero(textured)
+    scores = correlation[columns]
+    best = scores.argmax(axis=1)
+    each = np.arange(len(columns))
+    top = scores[each, best]
+    back = correlation.argmax(axis=0)[best]
+    # A copy of the rows is masked near the best place: what is left is the second best.
+    for step in range(-_NEAR_PX, _NEAR_PX + 1):
+        scores[each, np.clip(best + step, 0, width - 1)] = -1.0
+    second = scores.max(axis=1)
+    keep = (top >= _LEAST_CORRELATION) & (top - second >= _LEAST_LEAD)
+    keep &= (np.abs(back - columns) <= 1) & (best > 0) & (best < width - 1)
+    columns, best = columns[keep], best[keep]
+    before, peak, after = (correlation[columns, best + step] for step in (-1, 0, 1))
+    curvature = before - 2 * peak + after
+    shift = np.where(curvature < 0, (before - after) / np.where(curvature < 0, 2 * curvature, 1), 0)
+    return columns, (columns - best - np.clip(shift, -0.5, 0.5)).astype(np.float32)
+
+
+def _gathered(
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], *, factor: int, textured: int
+) -> Matches:
+    """Put rows together and return to the full size, where a block's centre is a pixel or near."""
+    empty = (np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
+    rows, columns, disparity_px = (
+        np.concatenate(part) for part in zip(*[empty, *found], strict=True)
+    )
+    return Matches(
+        rows=rows.astype(np.int64) * factor + factor // 2,
+        columns=columns.astype(np.int64) * factor + factor // 2,
+        disparity_px=(disparity_px * factor).astype(np.float32),
+        textured=textured,
+        grain_px=float(factor),
+    )
+
 
 Points = Float64[np.ndarray, " n"]
 _Numbers = tuple[UInt16[np.ndarray, " n"], Bool[np.ndarray, " n"]]
@@ -78,7 +252,7 @@ class Shot:
         return offset_px if self.left < self.right else -offset_px
 
 
-class SceneViews:
+class SceneFrames:
     """One scene's pictures and depth, each decoded once."""
 
     def __init__(self, scene: Scene, streams: Streams, *, encoding: DepthEncoding) -> None:
@@ -171,12 +345,14 @@ class SceneViews:
 
         The pairs are those that stand beside each other by a structure's order of cameras.
         """
-        return [
-            shot
-            for frame in chosen_frames(self.scene.frames, count=frames)
-            for left, right in self.chosen_pairs(structure or Structure())
-            for shot in self._both_ways(frame, left, right)
-        ]
+        pairs = self.chosen_pairs(structure or Structure())
+        files = dict.fromkeys(itertools.chain.from_iterable(pairs))
+        shots: list[Shot] = []
+        for frame in chosen_frames(self.scene.frames, count=frames):
+            found = match_pairs({file: self.band(frame, file) for file in files}, pairs)
+            for (left, right), matches in found.items():
+                shots += self._both_ways(frame, left, right, matches)
+        return shots
 
     def chosen_pairs(self, structure: Structure) -> list[tuple[int, int]]:
         """Return pairs in which every camera stands beside others: next to it, and next but one.
@@ -200,10 +376,9 @@ class SceneViews:
             key=lambda file: self.scene.lateral_m[structure.camera_of(file, content="rgb")],
         )
 
-    def _both_ways(self, frame: int, left: int, right: int) -> tuple[Shot, Shot]:
+    def _both_ways(self, frame: int, left: int, right: int, matches: Matches) -> tuple[Shot, Shot]:
         """Return one set of matches from both sides, so that either camera's depth is tested."""
         here, there = self.band(frame, left), self.band(frame, right)
-        matches = match_rows(here, there)
         keep = np.arange(len(matches.rows))
         if len(keep) > _MOST_POINTS:
             chosen = np.random.default_rng(0).choice(keep, _MOST_POINTS, replace=False)

@@ -1,0 +1,646 @@
+"""From the diagnoses of scenes to an answer for each question, and the contract to paste.
+
+Questions are answered one by one: on the hypothesis (kind, form, lag, order, flip), on a constant
+offset, and on the lengths. Of these disparity shows one quotient, unit / (focal length x baseline).
+`judge` puts the answers together; `grouped` decides which scenes are judged together.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from stereogenbench_data.audit.contract.cameras import LEAST_SHARE
+from stereogenbench_data.audit.contract.diagnosis import (
+    BIAS_PX,
+    LEAST_LOG_SCALE,
+    LEAST_OFFSET_PX,
+    Rival,
+    SceneDiagnosis,
+    allowed_log_scale,
+)
+from stereogenbench_data.audit.contract.hypotheses import LAGS, QUESTIONS, Question, Structure
+from stereogenbench_data.audit.contract.scoring import LEAST_ERRORS, Gain, interval, pooled
+from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.schema.release import CAMERA_COUNT
+
+Status = Literal["confirmed", "not contradicted", "wrong", "cannot tell", "not seen alone"]
+"""Confirmed: a 95 % interval keeps every rival that was asked about away by a stated margin, in
+every scene. Not contradicted: the declared answer fits best, and some rival is not kept away."""
+
+TOPICS: Final[dict[Question, str]] = {
+    "kind": "depth along",
+    "form": "stored is",
+    "frame_lag": "frame lag",
+    "order": "left and right",
+    "flip": "flip of depth",
+}
+CAMERAS_DIFFER: Final = "not told while cameras do not fit, see below"
+_WORDS: Final[dict[Any, str]] = {
+    "planar": "the optical axis",
+    "ray": "the ray",
+    "inverse": "inverse depth",
+}
+_OFFSET_SPREAD: Final = 0.1
+"""Share by which one camera's shift may differ from pair to pair."""
+_MOST_NAMED: Final = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The answer to one question.
+
+    Attributes:
+        topic: What is asked.
+        declared: What the data declare.
+        found: What the pictures say; empty where they do not tell.
+        status: Whether that confirms what is declared.
+        behind: By how much the next best answer is worse, where that can be said in dB: in the
+            scene in which it comes nearest.
+        note: Why, in words; may be empty.
+        is_sure: Whether every rival that was asked about is kept away by the margin.
+    """
+
+    topic: str
+    declared: str
+    found: str
+    status: Status
+    behind: Gain | None = None
+    note: str = ""
+    is_sure: bool = False
+
+
+def has_doubts(scenes: Sequence[SceneDiagnosis]) -> bool:
+    """Tell whether some camera of some scene does not fit, so that no contract is told."""
+    return any(scene.check.faults or scene.check.unexplained for scene in scenes)
+
+
+def structure_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> Answer:
+    """Return the answer to one question of structure, and how far the next best is behind.
+
+    What is declared is confirmed only where the other answers were tested, and lost, in every
+    scene. Of lags the two next to it are enough: how well a lag fits falls with its distance from
+    the right one.
+    """
+    first = scenes[0]
+    declared, best = (getattr(part, question) for part in (first.declared, first.best))
+    blank = Answer(TOPICS[question], said(declared), "", "cannot tell", note=first.problem)
+    if first.problem:
+        return blank
+    if has_doubts(scenes):
+        return replace(blank, note=CAMERAS_DIFFER)
+    rivals = [rival for rival in first.rivals if rival.question == question]
+    gains = {rival.answer: behind(scenes, rival) for rival in rivals}
+    tested = {answer: gain for answer, gain in gains.items() if not math.isnan(gain.mean_db)}
+    close = [answer for answer, gain in tested.items() if not gain.is_clear]
+    untested = [answer for answer in gains if answer not in tested]
+    lacking = [
+        answer for answer in untested
+        if question != "frame_lag" or min(abs(answer - lag) for lag in [best, *close]) == 1
+    ]  # fmt: skip
+    every = {rival.answer: _each(scenes, rival) for rival in rivals if rival.answer in tested}
+    nearest = min(
+        (gain for each in every.values() for gain in each), key=lambda gain: gain.low_db,
+        default=None,
+    )  # fmt: skip
+    doubtful = [answer for answer, each in every.items() if not all(g.is_excluded for g in each)]
+    is_sure = not (close or lacking or doubtful) and bool(tested)
+    words = _words_beside(best, close, untested, question=question)
+    if best == "as recorded" and question == "order" and first.recorded_pair is not None:
+        left, right = first.recorded_pair
+        named, told = f"primary: left {left}, right {right}", f"left {right}, right {left}"
+        note = "by poses and pictures alike"
+        return Answer(TOPICS[question], named, told, "wrong", nearest, note)
+    if question == "order" and best.startswith("depth of") and changes(first, "offset"):
+        note = f"a shifted picture, which is not where its depth is, looks like {said(best)}"
+        return replace(blank, behind=gains.get(declared), note=note)
+    if best == declared:
+        if close or lacking or not tested:
+            return replace(blank, behind=nearest, note=words)
+        if not is_sure:
+            note = f"not kept away by the margin: {_named(doubtful)}"
+            note = f"{note}; {words}" if words else note
+            return replace(
+                blank, found=said(best), status="not contradicted", behind=nearest, note=note
+            )
+        shape = next(
+            (g.shape for each in every.values() for g in each if g.by_shape and g.shape), None
+        )
+        if shape is not None:
+            words = f"by shape: the ray's power is {shape[0]:.2f} ± {shape[1]:.2f} (0 axis, 1 ray)"
+        return replace(
+            blank, found=said(best), status="confirmed", behind=nearest, note=words, is_sure=True
+        )
+    # To be called wrong the declared answer must be behind; to be pasted, by the margin too.
+    if declared in close or not (declared in gains and _is_behind(gains[declared])):
+        note = f"{said(best)} fits best, but not surely better"
+        return replace(blank, behind=gains[declared], note=f"{note}; {words}" if words else note)
+    others = [answer for answer in [*close, *lacking, *doubtful] if answer != declared]
+    found = " or ".join(said(answer) for answer in dict.fromkeys([best, *others]))
+    at_end = question == "frame_lag" and abs(best) == max(LAGS)
+    return replace(
+        blank, found=f"{found} or beyond" if at_end else found, status="wrong",
+        behind=gains.get(declared), note=words, is_sure=is_sure and not at_end,
+    )  # fmt: skip
+
+
+def _each(scenes: Sequence[SceneDiagnosis], rival: Rival) -> list[Gain]:
+    """Return by how much each scene's own best contract is better than another answer."""
+    return [
+        pooled([other.behind])
+        for scene in scenes
+        for other in scene.rivals
+        if (other.question, other.answer) == (rival.question, rival.answer)
+    ]
+
+
+def _is_behind(gain: Gain) -> bool:
+    return gain.by_shape or gain.low_db > 0
+
+
+def _named(answers: Sequence[Any]) -> str:
+    words = ", ".join(said(answer) for answer in answers[:_MOST_NAMED])
+    more = len(answers) - _MOST_NAMED
+    return f"{words} and {more} more" if more > 0 else words
+
+
+def _words_beside(
+    best: Any, close: Sequence[Any], untested: Sequence[Any], *, question: Question
+) -> str:
+    """Return which answers fit as well as the best one, and of which nothing is known."""
+    words = []
+    if close:
+        words.append(f"fit alike: {_named([best, *close])}")
+    if untested:
+        want = "frames" if question == "frame_lag" else "depth where it would be"
+        words.append(f"not tested, for want of {want}: {', '.join(map(said, untested))}")
+    if question == "frame_lag" and abs(best) == max(LAGS):
+        words.append("lags beyond are not asked about")
+    return "; ".join(words)
+
+
+def behind(scenes: Sequence[SceneDiagnosis], rival: Rival) -> Gain:
+    """Return by how much the scenes' best contract is better than another answer."""
+    return pooled([
+        other.behind
+        for scene in scenes
+        for other in scene.rivals
+        if (other.question, other.answer) == (rival.question, rival.answer)
+        and scene.best == scenes[0].best
+    ])  # fmt: skip
+
+
+def said(answer: Any) -> str:
+    """Return an answer in words."""
+    return _WORDS.get(answer, f"{answer}")
+
+
+def changes(scene: SceneDiagnosis, length: str) -> bool:
+    """Tell whether a scene's best contract fits the scale, or the offset."""
+    return scene.changed in (length, "both")
+
+
+def offset_answer(scenes: Sequence[SceneDiagnosis]) -> Answer:
+    """Return whether disparity is off by a constant, and by which.
+
+    No interval is known for it, so that nothing is confirmed.
+    """
+    first = scenes[0]
+    topic = "disparity offset"
+    if first.problem:
+        return Answer(topic, "0 px", "", "cannot tell", note=first.problem)
+    if has_doubts(scenes):
+        return Answer(topic, "0 px", "", "cannot tell", note=CAMERAS_DIFFER)
+    if changes(first, "offset"):
+        gain = pooled([scene.gain for scene in scenes])
+        note = "or pictures of another moment, which look alike where little moves"
+        return Answer(topic, "0 px", offset_words(first.offsets_px), "wrong", gain, note)
+    largest_px = max((abs(px) for scene in scenes for px in scene.offsets_px.values()), default=0.0)
+    if largest_px > LEAST_OFFSET_PX or math.isnan(first.agreement):
+        note = f"fits up to {largest_px:.2g} px, none clearly better than 0"
+        return Answer(topic, "0 px", "", "cannot tell", note=note)
+    return Answer(topic, "0 px", f"0 px (all pairs within {largest_px:.2f})", "not contradicted")
+
+
+def offset_words(offsets_px: dict[tuple[int, int], float]) -> str:
+    """Return constant disparities in words: of all pairs, of one camera, or pair by pair."""
+    values = list(offsets_px.values())
+    if max(values) - min(values) < LEAST_OFFSET_PX:
+        return f"{np.mean(values):+.2f} px for every pair"
+    for camera in range(6):
+        # A picture shifted to the right by s adds s to the disparity of its own pixels, and takes
+        # s from pairs in which it is the right one.
+        shifts = [
+            px * (1 if pair[0] == camera else -1)
+            for pair, px in offsets_px.items()
+            if camera in pair
+        ]
+        others = [px for pair, px in offsets_px.items() if camera not in pair]
+        alike = bool(shifts) and max(shifts) - min(shifts) < max(
+            LEAST_OFFSET_PX, _OFFSET_SPREAD * abs(float(np.mean(shifts)))
+        )
+        if alike and max(map(abs, others), default=0.0) < LEAST_OFFSET_PX:
+            return f"camera {camera}'s picture is {np.mean(shifts):+.2f} px to the right"
+    return ", ".join(f"{px:+.2f} px for {a}-{b}" for (a, b), px in offsets_px.items())
+
+
+_BIAS: Final = 0.002
+"""Share by which quotients may be off however many pixels agree: interpolation, rounding."""
+MARGIN: Final = 0.02
+"""A quotient is confirmed if its 95 % interval lies within this share of what is declared."""
+_LEAST_TOLERANCE: Final = 0.005
+
+QUOTIENT: Final = "unit / (focal length x baseline)"
+UNIT: Final = "metres a unit"
+FOCAL: Final = "focal length"
+_ALONE: Final = "not seen alone: only the quotient above is"
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """Metres in a stored unit of depth, if focal length and baselines are right.
+
+    Attributes:
+        metres: The value.
+        uncertainty: Half its 95 % interval, as a share.
+    """
+
+    metres: float
+    uncertainty: float
+
+    @property
+    def rounded_m(self) -> float:
+        """The shortest decimal number within 0.2 %."""
+        for digits in range(1, 5):
+            short = float(f"{self.metres:.{digits - 1}e}")
+            if abs(short / self.metres - 1) <= 0.002:
+                return short
+        return float(f"{self.metres:.4e}")
+
+
+def common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
+    """Return the unit that scenes agree on, weighted by how sure each is."""
+    told = [scene for scene in scenes if math.isfinite(scene.scale_error)]
+    coarse = max(allowed_log_scale(scene.depth_step) for scene in scenes)
+    seen_px = max(
+        # An offset leaves to the scale what is no offset.
+        scene.spread_px if changes(scene, "offset") else scene.disparity_px
+        for scene in scenes
+    )
+    bias = coarse if coarse > LEAST_LOG_SCALE else max(_BIAS, BIAS_PX / seen_px)
+    if not told:
+        return Unit(scenes[0].unit_m / scenes[0].scale, math.inf)
+    logs = np.array([math.log(scene.unit_m / scene.scale) for scene in told])
+    errors = np.array([max(scene.scale_error, 1e-4) for scene in told])
+    weights = errors**-2.0 / (errors**-2.0).sum()
+    half = 1.96 * float(np.sqrt((weights**2 * errors**2).sum()))
+    if len(told) > 2:
+        _, low, high = interval([float(log) for log in logs])
+        half = max(half, (high - low) / 2)
+    return Unit(math.exp(float(weights @ logs)), math.hypot(half, bias))
+
+
+def length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer, ...]:
+    """Return the answers on the quotient, on the unit and on the focal length.
+
+    Of the last two nothing is ever told by itself.
+    """
+    first = scenes[0]
+    where = {"tag": "by the files' tag", "default": "by default", "user": "as given"}
+    declared = f"{first.unit_m:g} m, {where.get(first.unit_source, 'tags unreadable')}"
+    quotient = _quotient(scenes, unit)
+    if first.problem:
+        blank = (
+            Answer(topic, "", "", "cannot tell", note=first.problem) for topic in (UNIT, FOCAL)
+        )
+        return quotient, *blank
+    found = ""
+    if quotient.found:
+        found = f"{unit.metres:.5g} m ± {unit.uncertainty:.2%} if the rest is right"
+    return (
+        quotient,
+        Answer(UNIT, declared, found, "not seen alone", note=_ALONE),
+        Answer(FOCAL, "from the sensor's width", "", "not seen alone", note=_ALONE),
+    )
+
+
+def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
+    first = scenes[0]
+    blank = Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=first.problem)
+    if first.problem:
+        return blank
+    if has_doubts(scenes):
+        return Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=CAMERAS_DIFFER)
+    found = f"{unit.metres / first.unit_m:.5g} x declared ± {unit.uncertainty:.2%}"
+    if first.best.form != first.declared.form:
+        note = f"numbers of another form: {said(first.best.form)} has a unit of its own"
+        return Answer(QUOTIENT, "1 x declared", found, "cannot tell", note=note)
+    if changes(first, "scale"):
+        gain = pooled([scene.gain for scene in scenes])
+        if kind_explains_scale(scenes):
+            note = f"{found} if depth is along {said(first.best.kind)}, as declared if it is not"
+            return Answer(QUOTIENT, "1 x declared", "", "cannot tell", gain, note)
+        if unit.uncertainty > abs(math.log(unit.metres / first.unit_m)):
+            note = f"{found} fits best, but is not surely another"
+            return Answer(QUOTIENT, "1 x declared", "", "cannot tell", gain, note)
+        note = "the unit, the focal length or the baselines: they are not told apart"
+        return Answer(QUOTIENT, "1 x declared", found, "wrong", gain, note)
+    doubt = _doubt(first, unit, found=found)
+    if doubt:
+        return Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=doubt)
+    if first.unit_source == "unreadable":
+        return Answer(QUOTIENT, "tags unreadable", found, "cannot tell")
+    note = f"the 95 % interval lies within {MARGIN:.0%} of what is declared"
+    return Answer(QUOTIENT, "1 x declared", found, "confirmed", note=note)
+
+
+def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
+    """Return why a quotient that nothing is clearly better than is not confirmed, if so."""
+    off = abs(math.log(unit.metres / first.unit_m))
+    is_coarse = allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE
+    why = "depth is stored in too large steps" if is_coarse else "too little parallax"
+    if unit.uncertainty > MARGIN:
+        return f"known to {unit.uncertainty:.0%} alone: {why}"
+    if off > LEAST_LOG_SCALE:
+        return f"{found} fits best, but is not clearly better{': ' + why if is_coarse else ''}"
+    if off > max(unit.uncertainty, _LEAST_TOLERANCE):
+        return f"{found} fits best; less than {LEAST_LOG_SCALE:.0%} is not called wrong"
+    if off + unit.uncertainty > MARGIN:
+        return f"{found}: the 95 % interval reaches beyond {MARGIN:.0%}"
+    return ""
+
+
+def length_choices(scenes: Sequence[SceneDiagnosis], unit: Unit, pasted: str) -> tuple[str, ...]:
+    """Return what would each by itself explain the quotient, none of them certain.
+
+    ``pasted`` is the contract with the unit that it would take if the rest is right.
+    """
+    first = scenes[0]
+    factor = first.unit_m / unit.metres
+    words = [f"if focal length and baselines are right: {pasted}"]
+    if first.best.form == first.declared.form:
+        focal = (
+            f"if unit and baselines are right: a focal length of {factor:.4g} x what is recorded"
+        )
+        reading = _focal_reading(scenes, unit)
+        if reading:
+            focal += f", as {reading} gives"
+        words += [
+            focal,
+            f"if unit and focal length are right: baselines of {factor:.4g} x those of the poses",
+        ]
+    return tuple(words)
+
+
+def kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
+    """Tell whether the other kind of depth explains all that a scale does, and is not ruled out."""
+    first = scenes[0]
+    if first.best != first.declared or first.changed != "scale":
+        return False
+    if any(behind(scenes, rival).is_clear for rival in first.rivals if rival.question == "kind"):
+        return False
+    return all(
+        abs(math.log(scene.other_kind_scale))
+        <= allowed_log_scale(scene.depth_step) + LEAST_ERRORS * min(scene.scale_error, 1.0)
+        for scene in scenes
+        if scene.other_kind_scale > 0
+    )
+
+
+def _focal_reading(scenes: Sequence[SceneDiagnosis], unit: Unit) -> str | None:
+    """Return another reading of the sensor that gives the quotient found, if one does."""
+    first = scenes[0]
+    tolerance = max(LEAST_ERRORS * unit.uncertainty / 1.96, _LEAST_TOLERANCE)
+    may_be = [
+        words
+        for words in first.focal_ratios
+        if all(
+            abs(math.log(scene.scale / scene.focal_ratios.get(words, 1.0))) <= tolerance
+            for scene in scenes
+        )
+    ]
+    return min(
+        may_be,
+        key=lambda words: abs(math.log(first.scale / first.focal_ratios[words])),
+        default=None,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What scenes with the same contract say together.
+
+    Attributes:
+        scenes: Their keys.
+        answers: One for each question.
+        gain: By how much the best contract is better than the declared one.
+        agreement: Share of the matches of neighbouring cameras that the best contract explains.
+        encoding: The contract to use in place of the declared one; None where there is none, or
+            none that is sure: nothing is given for what explains less than half of the matches, for
+            a unit (the quotient of lengths alone is seen), or while single cameras do not fit.
+        quotient: Unit / (focal length x baseline) over what is declared; nan where not told.
+        quotient_error: Half its 95 % interval, as a share.
+        choices: What would each by itself explain that quotient, in words; empty where it is right.
+        faults: What is wrong with single cameras, in words.
+        tested_cameras: Those whose depth was tested in every scene.
+        untested_cameras: Those whose depth was not, in some scene.
+        unexplained_cameras: Those whose depth explains less than half of their matches somewhere.
+        beside: What a `DepthEncoding` cannot express, and other words of advice.
+        is_wrong: Whether another contract is clearly better, or a camera does not fit.
+        fits: Whether the declared contract was found to fit, all cameras tested.
+    """
+
+    scenes: tuple[str, ...]
+    answers: tuple[Answer, ...]
+    gain: Gain
+    agreement: float
+    encoding: DepthEncoding | None
+    quotient: float
+    quotient_error: float
+    choices: tuple[str, ...]
+    faults: tuple[str, ...]
+    tested_cameras: tuple[int, ...]
+    untested_cameras: tuple[int, ...]
+    unexplained_cameras: tuple[int, ...]
+    beside: tuple[str, ...]
+    is_wrong: bool
+    fits: bool
+
+
+def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdict:
+    """Return the verdict on scenes that have one best contract.
+
+    Args:
+        scenes: One or more scenes with the same changes; of those without a word to say
+            (``problem``) there must be no other.
+        declared: The contract that was asked about; its unit is None where files tell it.
+    """
+    first = scenes[0]
+    unit = common_unit(scenes)
+    structure = [structure_answer(scenes, question) for question in QUESTIONS]
+    quotient, *lengths = length_answers(scenes, unit)
+    offset = offset_answer(scenes)
+    answers = (quotient, *lengths, *structure, offset)
+    faults = tuple(
+        f"{scene.key}: {fault}" if len(scenes) > 1 else fault
+        for scene in scenes
+        for fault in scene.check.faults
+    )
+    untested = {camera for scene in scenes for camera in scene.check.untested}
+    unexplained = {camera for scene in scenes for camera in scene.check.unexplained}
+    wrong = [answer for answer in answers if answer.status == "wrong"]
+    explains = not (first.problem or unexplained) and all(
+        scene.check.agreement >= LEAST_SHARE for scene in scenes
+    )
+    is_told = bool(quotient.found)
+    pasted = _pasted(first, declared, unit_m=declared.unit_m)
+    is_sure = (
+        bool(wrong)
+        and explains
+        and not (faults or untested)
+        and all(answer.is_sure for answer in wrong)
+        and quotient.status == "confirmed"
+        and pasted != declared
+    )
+    choices: tuple[str, ...] = ()
+    if is_told and quotient.status != "confirmed" and explains and not faults:
+        with_unit = _pasted(first, declared, unit_m=unit.rounded_m)
+        choices = length_choices(scenes, unit, encoding_line(with_unit))
+    return Verdict(
+        scenes=tuple(scene.key for scene in scenes),
+        answers=answers,
+        gain=pooled([scene.gain for scene in scenes]),
+        agreement=float(np.nanmean([scene.agreement for scene in scenes]))
+        if not first.problem
+        else math.nan,
+        encoding=pasted if is_sure else None,
+        quotient=unit.metres / first.unit_m if is_told else math.nan,
+        quotient_error=unit.uncertainty if is_told else math.nan,
+        choices=choices,
+        faults=faults,
+        tested_cameras=tuple(c for c in range(CAMERA_COUNT) if c not in untested),
+        untested_cameras=tuple(sorted(untested)),
+        unexplained_cameras=tuple(sorted(unexplained)),
+        beside=tuple(_beside(scenes, answers)),
+        is_wrong=bool(wrong or faults),
+        fits=explains and not (wrong or faults or untested)
+        and all(answer.status != "cannot tell" for answer in (quotient, *structure)),
+    )  # fmt: skip
+
+
+def _pasted(
+    first: SceneDiagnosis, declared: DepthEncoding, *, unit_m: float | None
+) -> DepthEncoding:
+    """Return the contract with the answers that were found, and a unit where one is given."""
+    return replace(
+        declared, unit_m=unit_m, kind=first.best.kind, form=first.best.form,
+        frame_lag=first.best.frame_lag,
+    )  # fmt: skip
+
+
+def encoding_line(encoding: DepthEncoding) -> str:
+    """Return the Python expression of a contract, defaults left out."""
+    default = replace(encoding, unit_m=None, kind="planar", form="depth", frame_lag=0)
+    told = [
+        f"{field.name}={getattr(encoding, field.name)!r}"
+        for field in fields(encoding)
+        if getattr(encoding, field.name) != getattr(default, field.name)
+    ]
+    return f"DepthEncoding({', '.join(told)})"
+
+
+def _beside(scenes: Sequence[SceneDiagnosis], answers: Sequence[Answer]) -> list[str]:
+    """Return what is to be said that no `DepthEncoding` says."""
+    first = scenes[0]
+    wrong = {answer.topic for answer in answers if answer.status == "wrong"}
+    lines = []
+    if TOPICS["flip"] in wrong:
+        lines.append(f"Depth is flipped ({first.best.flip}ly turned over): store it anew.")
+    if first.best.order != first.declared.order and TOPICS["order"] in wrong:
+        lines.append(f"Files: {first.best.order}. Rename the files, or correct the metadata.")
+    if first.recorded_pair is not None and TOPICS["order"] in wrong:
+        lines.append("baseline.json names the primary pair's cameras the wrong way round.")
+    if "disparity offset" in wrong:
+        lines.append(
+            f"Constant disparity: {offset_words(first.offsets_px)}. Shift the pictures, or record "
+            "each camera's principal point."
+        )
+    if not first.problem and allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE:
+        lines.append(
+            f"Stored depth is coarse: its steps are {first.depth_step:.1%} of it or more in a "
+            "quarter of the picture, and the quotient is no better known."
+        )
+    if kind_explains_scale(scenes):
+        (other,) = first.best.alternatives("kind")
+        lines.append(f"Fits alike: depth along {said(other.kind)}, the unit as declared.")
+    if has_doubts(scenes):
+        return lines
+    for structure, free, scale in dict.fromkeys(
+        other for scene in scenes[:1] for other in scene.equals
+    ):
+        lines.append(f"Fits alike: {_contract_words(structure, first, free=free, scale=scale)}.")
+    return lines
+
+
+def _contract_words(structure: Structure, first: SceneDiagnosis, *, free: str, scale: float) -> str:
+    words = [
+        f"{TOPICS[question]} {said(getattr(structure, question))}"
+        for question in structure.changes_from(first.declared)
+    ]
+    if free in ("scale", "both"):
+        words.append(f"{QUOTIENT} {1 / scale:.4g} x declared")
+    if free in ("offset", "both"):
+        words.append("an offset for each pair")
+    return ", ".join(words)
+
+
+def grouped(scenes: Sequence[SceneDiagnosis]) -> list[list[SceneDiagnosis]]:
+    """Return scenes in groups with one contract, the largest first; what tells nothing joins.
+
+    Scenes for which the declared contract holds join those for which another is better where
+    their own pictures do not rule that one out.
+    """
+    told = [scene for scene in scenes if not scene.problem]
+    if not told:
+        return [list(scenes)] if scenes else []
+    groups: list[list[SceneDiagnosis]] = []
+    by_gain = sorted(told, key=lambda scene: (not _is_changed(scene), -scene.gain.mean_db))
+    for scene in by_gain:
+        home = next((group for group in groups if _fits(scene, group[0])), None)
+        if home is None:
+            groups.append([scene])
+        else:
+            home.append(scene)
+    return sorted(groups, key=len, reverse=True)
+
+
+def _is_changed(scene: SceneDiagnosis) -> bool:
+    return scene.best != scene.declared or scene.changed != "nothing"
+
+
+def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
+    """Tell whether a scene may have the contract of another."""
+    if scene.declared != leader.declared:
+        return False
+    if has_doubts([scene, leader]):
+        # What is wrong with single cameras of a scene is its own.
+        return False
+    error = allowed_log_scale(max(scene.depth_step, leader.depth_step))
+    error += LEAST_ERRORS * min(scene.scale_error, 1.0)
+    if _is_changed(scene):
+        units = (found.unit_m / found.scale for found in (scene, leader))
+        same_unit = abs(math.log(next(units) / next(units))) <= error
+        return scene.best == leader.best and scene.changed == leader.changed and same_unit
+    if not _is_changed(leader):
+        return True
+    if changes(leader, "offset"):
+        return False
+    ruled_out = {
+        (rival.question, rival.answer) for rival in scene.rivals if rival.behind.is_clear()
+    }
+    changed = leader.best.changes_from(leader.declared)
+    if any((question, getattr(leader.best, question)) in ruled_out for question in changed):
+        return False
+    return bool(changed) or abs(math.log(scene.scale / leader.scale)) <= error

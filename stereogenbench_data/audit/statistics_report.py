@@ -1,0 +1,355 @@
+"""Statistics as a report: against the paper's figures, as Markdown, and as histograms."""
+
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Unpack
+
+import numpy as np
+from jaxtyping import Float64
+
+from stereogenbench_data.audit.paper_figures import (
+    ADJACENT,
+    ADJACENT_TABLE,
+    ALL_PAIRS,
+    ALL_PAIRS_TABLE,
+    BINS,
+    BINS_TABLE,
+    COUNTS,
+    COUNTS_TABLE,
+    EVAL_MAPS,
+    EVAL_MAPS_TABLE,
+    FOCAL_MM,
+    SHORT_PAIRS,
+    SHORT_PAIRS_MAP,
+    SPLITS,
+    TRAIN_MAPS_TABLE,
+    map_counts,
+)
+from stereogenbench_data.audit.statistics import (
+    ADJACENT_COLUMNS,
+    FOCAL_EDGES_MM,
+    Distribution,
+    FamilyStatistics,
+    Statistics,
+    branch_rows,
+)
+from stereogenbench_data.errors import ExtraError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.problems import markdown_text
+from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.sources.files import open_atomic
+
+_RELEASE_SIZED: Final = 0.1
+"""By which share a split's number of scenes may differ from the paper's to be compared with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One figure of the paper beside ours, both as texts with as many digits as the paper tells."""
+
+    table: str
+    item: str
+    paper: str
+    ours: str
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the two are the same."""
+        return self.paper == self.ours
+
+
+def release_sized_splits(found: Statistics) -> tuple[str, ...]:
+    """Return the splits that have about as many scenes as the paper's, within a tenth."""
+    scenes = dict.fromkeys(SPLITS, 0)
+    for branch in found.branches:
+        scenes[branch.split] = scenes.get(branch.split, 0) + branch.scenes
+    return tuple(
+        split
+        for split, count in SPLITS.items()
+        if abs(scenes[split] - count) <= _RELEASE_SIZED * count
+    )
+
+
+def compared(found: Statistics, *, splits: tuple[str, ...] = tuple(SPLITS)) -> tuple[Line, ...]:
+    """Return every figure of the paper's tables on some splits beside that of the statistics."""
+    lines = [
+        *_count_lines(found),
+        *_baseline_lines(found),
+        *_short_lines(found),
+        *_bin_lines(found),
+        *_focal_lines(found),
+        *_map_lines(found),
+    ]
+    return tuple(line for split, line in lines if split in splits)
+
+
+def _count_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+    ours = {(each.split, each.subset, each.family): each.scenes for each in found.families}
+    for place in dict.fromkeys([*COUNTS, *ours]):
+        item = "scenes, " + " ".join(part for part in place if part)
+        yield place[0], Line(COUNTS_TABLE, item, str(COUNTS.get(place, 0)), str(ours.get(place, 0)))
+    for split, count in SPLITS.items():
+        total = sum(each.scenes for each in found.branches if each.split == split)
+        yield split, Line(COUNTS_TABLE, f"scenes, {split} total", str(count), str(total))
+
+
+def _baseline_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+    branches = {(each.split, each.family): each for each in found.branches}
+    for table, kind, figures in (
+        (ADJACENT_TABLE, "adjacent", ADJACENT), (ALL_PAIRS_TABLE, "all pairs", ALL_PAIRS),
+    ):  # fmt: skip
+        for (split, family), told in figures.items():
+            branch = branches.get((split, family))
+            for name, paper in told.items():
+                item = f"{kind}, {split} {family}: {name}" + (" (cm)" if name != "count" else "")
+                yield (
+                    split,
+                    Line(table, item, paper, _as_told(_distribution(branch, kind), name, paper)),
+                )
+
+
+def _distribution(branch: FamilyStatistics | None, kind: str) -> Distribution | None:
+    if branch is None:
+        return None
+    return branch.adjacent_cm if kind == "adjacent" else branch.all_pairs_cm
+
+
+def _as_told(spread: Distribution | None, name: str, paper: str) -> str:
+    """Return a figure with as many decimals as the paper's, a dash where there is none."""
+    if spread is None:
+        return "-"
+    decimals = len(paper.partition(".")[2])
+    return f"{getattr(spread, name):.{decimals}f}"
+
+
+def _short_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+    short, item = found.short_pairs, "Pairwise_Uniform below 10 cm: "
+    for name, paper, ours in (
+        ("baselines", str(SHORT_PAIRS["baselines"]), str(short.baselines)),
+        ("scenes", str(SHORT_PAIRS["scenes"]), str(short.scenes)),
+        ("maps", SHORT_PAIRS_MAP, ", ".join(short.maps) or "-"),
+    ):
+        yield "train", Line(ALL_PAIRS_TABLE, item + name, paper, ours)
+
+
+def _bin_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+    bins = {
+        name: primary
+        for each in found.families
+        if (each.split, each.subset, each.family) == ("eval", "seen_map", "Uniform")
+        for name, (primary, _, _) in each.bins.items()
+    }
+    for name in dict.fromkeys([*BINS, *(name for name, count in bins.items() if count)]):
+        item = f"scenes by primary baseline, eval seen_map Uniform, {name} cm"
+        yield "eval", Line(BINS_TABLE, item, str(BINS.get(name, 0)), str(bins.get(name, 0)))
+
+
+def _focal_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+    low, high = FOCAL_MM
+    told = f"{low:g} to {high:g}"
+    for split in SPLITS:
+        spreads = [each.focal_mm for each in found.branches if each.split == split]
+        if not spreads:
+            continue
+        least, most = min(each.min for each in spreads), max(each.max for each in spreads)
+        ours = told if low <= least and most <= high else f"{least:g} to {most:g}"
+        item = f"focal lengths within (mm), {split}"
+        yield split, Line("appendix on generation parameters", item, told, ours)
+
+
+def _map_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
+    paper = map_counts()
+    ours = {
+        (each.split, each.family, name): count
+        for each in found.branches
+        for name, count in each.maps.items()
+    }
+    for place in dict.fromkeys([*paper, *ours]):
+        split, family, name = place
+        table = TRAIN_MAPS_TABLE if split == "train" else EVAL_MAPS_TABLE
+        item = f"scenes, {split} {family} {name}"
+        yield split, Line(table, item, str(paper.get(place, 0)), str(ours.get(place, 0)))
+    subsets = {
+        name: each.subset for each in found.families if each.split == "eval" for name in each.maps
+    }
+    for name, (subset, _, _) in EVAL_MAPS.items():
+        item = f"subset of {name}"
+        yield "eval", Line(EVAL_MAPS_TABLE, item, subset, subsets.get(name, "-"))
+
+
+_BAR: Final = 40
+
+
+def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
+    """Return statistics as Markdown, with the paper's figures beside, where given."""
+    text = [
+        f"# Statistics of {markdown_text(str(found.root))}",
+        *_section("Scenes", _count_rows(found)),
+        *_section("Adjacent baselines (cm)", _spread_rows(found.branches, "adjacent")),
+        *_section("Baselines of all 15 pairs (cm)", _spread_rows(found.branches, "all pairs")),
+        *_section("Pairs by baseline (cm): primary / adjacent / all", _bin_rows(found.families)),
+        *_section("Scenes by focal length (mm)", _focal_rows(found.branches)),
+        *_section("Scenes by map", _map_rows(found.branches)),
+    ]
+    if lines:
+        agreeing = sum(line.agrees for line in lines)
+        title = f"Against the paper: {agreeing} of {len(lines)} figures agree"
+        text += _section(title, _paper_rows(lines))
+    return "\n".join(text) + "\n"
+
+
+def _paper_rows(lines: Sequence[Line]) -> Iterator[Sequence[str]]:
+    """Yield the compared figures, those that differ first."""
+    yield ("", "figure", "paper", "here", "source")
+    for line in sorted(lines, key=lambda each: each.agrees):
+        mark = "same" if line.agrees else "**differs**"
+        yield (mark, line.item, line.paper, line.ours, line.table)
+
+
+def _section(title: str, rows: Iterable[Sequence[str]]) -> list[str]:
+    return ["", f"## {title}", "", *_table(rows)]
+
+
+def _table(rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    for place, row in enumerate(rows):
+        yield f"| {' | '.join(map(markdown_text, row))} |"
+        if place == 0:
+            yield "|" + "---|" * len(row)
+
+
+def _count_rows(found: Statistics) -> Iterator[Sequence[str]]:
+    yield ("split", "subset", "family", "scenes")
+    for each in found.families:
+        yield (each.split, each.subset or "-", each.family, f"{each.scenes:,}")
+    for split in dict.fromkeys(each.split for each in found.branches):
+        total = sum(each.scenes for each in found.branches if each.split == split)
+        yield (split, "", "total", f"{total:,}")
+    yield ("all", "", "total", f"{found.scenes:,}")
+
+
+def _spread_rows(branches: Sequence[FamilyStatistics], kind: str) -> Iterator[Sequence[str]]:
+    yield ("split", "family", "count", "min", "max", "mean", "std", "median")
+    for each in branches:
+        spread = each.adjacent_cm if kind == "adjacent" else each.all_pairs_cm
+        lengths = (spread.min, spread.max, spread.mean, spread.std, spread.median)
+        cells = (f"{length:.4f}" for length in lengths)
+        yield (each.split, each.family, f"{spread.count:,}", *cells)
+
+
+def _bin_rows(families: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:
+    names = list(dict.fromkeys(name for each in families for name in each.bins))
+    names.sort(key=lambda name: float(name[1:].partition(",")[0]))
+    yield ("split", "subset", "family", *names)
+    for each in families:
+        cells = [
+            " / ".join(f"{count:,}" for count in each.bins.get(name, (0, 0, 0))) for name in names
+        ]
+        yield (each.split, each.subset or "-", each.family, *cells)
+
+
+def _focal_rows(branches: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:
+    yield ("focal length", *(f"{each.split} {each.family}" for each in branches), "all")
+    totals = [sum(counts) for counts in zip(*(each.focal_counts for each in branches), strict=True)]
+    edges = [f"{edge:g}" for edge in FOCAL_EDGES_MM]
+    names = [f"below {edges[0]}", *map(" to ".join, itertools.pairwise(edges)),
+             f"above {edges[-1]}"]  # fmt: skip
+    for place, (name, total) in enumerate(zip(names, totals, strict=True)):
+        if total or 0 < place < len(names) - 1:
+            bar = "#" * round(_BAR * total / max(totals))
+            counts = [f"{each.focal_counts[place]:,}" for each in branches]
+            yield (name, *counts, f"{total:,} {bar}".rstrip())
+
+
+def _map_rows(branches: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:
+    yield ("map", *(f"{each.split} {each.family}" for each in branches))
+    for name in sorted({name for each in branches for name in each.maps}):
+        yield (name, *(f"{each.maps[name]:,}" if name in each.maps else "-" for each in branches))
+
+
+_BINS: Final = 40
+_COLOURS: Final = {"IPD_Gaussian": "#4477aa", "Uniform": "#ee6677", "Pairwise_Uniform": "#228833"}
+_COLUMNS: Final = 3
+_HEADROOM: Final = 1.3
+"""Room above the bars for the legend."""
+_INCHES: Final = (4.2, 3.2)
+
+
+def write_plots(
+    index: SceneIndex, folder: Path, **filters: Unpack[SceneFilters]
+) -> tuple[Path, Path]:
+    """Write ``baselines.png`` and ``focal_lengths.png`` into a folder, which is made if need be.
+
+    A panel shows the adjacent baselines of a split's family, of Pairwise_Uniform those of all 15
+    pairs, with the mean dashed and the median dotted.
+
+    Raises:
+        ExtraError: If matplotlib is not installed.
+        SelectionError: If no scene passes the filters.
+
+    Source: the StereoGenBench paper, figure of the realized baseline distributions.
+    """
+    rows = filter_scenes(index, filters)
+    panels = [
+        (f"{split} {family}", family, index.column("baselines_cm")[chosen],
+         index.column("focal_mm")[chosen])
+        for split, family, chosen in branch_rows(index, rows)
+    ]  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    baselines, focals = folder / "baselines.png", folder / "focal_lengths.png"
+    figure = _figure(len(panels))
+    for axes, (title, family, baselines_cm, _) in zip(figure.axes, panels, strict=False):
+        is_pairwise = family == "Pairwise_Uniform"
+        shown_cm = baselines_cm if is_pairwise else baselines_cm[:, ADJACENT_COLUMNS]
+        what = "all pairs" if is_pairwise else "adjacent"
+        _histogram(axes, shown_cm.ravel(), bins=_BINS, colour=_COLOURS.get(family, "#777777"))
+        axes.set(title=f"{title}, {what}", xlabel="baseline (cm)", ylabel="pairs")
+    _save(figure, baselines)
+    figure = _figure(len(panels))
+    for axes, (title, family, _, focal_mm) in zip(figure.axes, panels, strict=False):
+        outer = [focal_mm.min(), focal_mm.max()]
+        beyond = [each for each in outer if not FOCAL_EDGES_MM[0] <= each <= FOCAL_EDGES_MM[-1]]
+        edges = np.union1d(FOCAL_EDGES_MM, beyond)
+        _histogram(axes, focal_mm, bins=edges, colour=_COLOURS.get(family, "#777777"))
+        axes.set(title=title, xlabel="focal length (mm)", ylabel="scenes")
+    _save(figure, focals)
+    return baselines, focals
+
+
+def _histogram(axes: Any, values: Float64[np.ndarray, " n"], *, bins: Any, colour: str) -> None:
+    axes.hist(values, bins=bins, color=colour, edgecolor="white", linewidth=0.3)
+    mean, median = float(values.mean()), float(np.median(values))
+    axes.axvline(mean, color="black", linestyle="--", linewidth=1, label=f"mean {mean:.2f}")
+    axes.axvline(median, color="black", linestyle=":", linewidth=1.4, label=f"median {median:.2f}")
+    axes.set_ylim(top=axes.get_ylim()[1] * _HEADROOM)
+    axes.legend(
+        title=f"n = {len(values):,}",
+        loc="upper right",
+        fontsize=8,
+        title_fontsize=8,
+        ncols=2,
+        framealpha=1,
+    )
+
+
+def _figure(panels: int) -> Any:
+    """Return a figure with room for panels; the unused ones are blank."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ExtraError(
+            "plots need matplotlib: pip install 'stereogenbench-data[plots]'."
+        ) from error
+    columns = min(_COLUMNS, panels)
+    rows = -(-panels // columns)
+    figure = Figure(figsize=(_INCHES[0] * columns, _INCHES[1] * rows), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat[panels:]:
+        axes.set_axis_off()
+    return figure
+
+
+def _save(figure: Any, path: Path) -> None:
+    with open_atomic(path) as file:
+        figure.savefig(file, format="png", dpi=100)
