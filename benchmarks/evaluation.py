@@ -24,13 +24,12 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.results import Spread
-from stereogenbench_data.evaluation import scoring
-from stereogenbench_data.evaluation.candidates import PredictionFolder
+from stereogenbench_data.evaluation import scene_scores as scoring
 from stereogenbench_data.evaluation.evaluate import selected
-from stereogenbench_data.evaluation.one_thread import one_thread
-from stereogenbench_data.evaluation.predictions import frame_name, item_name
+from stereogenbench_data.evaluation.predictions import PredictionFolder, frame_name, item_name
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
 from stereogenbench_data.evaluation.running import Extent
+from stereogenbench_data.evaluation.scene_scores import one_thread
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import depth_name, rgb_name

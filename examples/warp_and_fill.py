@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from stereogenbench_data import evaluate, export_inputs
-from stereogenbench_data.evaluation.render import markdown
+from stereogenbench_data.evaluation.report import markdown
 from stereogenbench_data.evaluation.tables import bin_table
 
 SHARDS = Path(__file__).parents[1] / "shards"

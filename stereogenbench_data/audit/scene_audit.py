@@ -38,7 +38,6 @@ from stereogenbench_data.media.depth import depth_frame_index, depth_m_from_unit
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.document import parse_object
-from stereogenbench_data.schema.parse import parse_trajectory
 from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
@@ -48,6 +47,7 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
+from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.retry import RetryPolicy
 

@@ -85,8 +85,7 @@ def controls(  # noqa: PLR0913 - one parameter an option
     relations between them hold; the exit status is 1 if one does not. The report goes to --out
     [evaluation/controls], and a stopped run goes on if it is run again.
     """
-    from stereogenbench_data.evaluation.controls import score_controls
-    from stereogenbench_data.evaluation.relations import relations
+    from stereogenbench_data.evaluation.controls import relations, score_controls
     from stereogenbench_data.evaluation.report import document, page, write_report
     from stereogenbench_data.evaluation.tables import branch_table, control_table, explaining_table
 

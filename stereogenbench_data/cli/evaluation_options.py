@@ -147,8 +147,8 @@ def protocol_of(  # noqa: PLR0913 - one parameter an option
     device: str,
 ) -> "EvaluationProtocol":
     """Return the protocol that options ask for."""
-    from stereogenbench_data.evaluation.backends import Where
     from stereogenbench_data.evaluation.columns import require_metrics
+    from stereogenbench_data.evaluation.models.registry import Where
     from stereogenbench_data.evaluation.protocol import EvaluationProtocol
     from stereogenbench_data.schema.records import DepthEncoding
 

@@ -8,18 +8,17 @@ from typing import Any, Final, TypedDict, Unpack
 
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.aggregate import PairMeans, grouped, tally
-from stereogenbench_data.evaluation.candidates import (
+from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, grouped, tally
+from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
+from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance, Spread, frechet_distance
+from stereogenbench_data.evaluation.partial import PartialResults
+from stereogenbench_data.evaluation.predictions import (
     CalledMethod,
     Candidate,
     Method,
     PredictionFolder,
 )
-from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
-from stereogenbench_data.evaluation.frechet import FrechetDistance, Spread, frechet_distance
-from stereogenbench_data.evaluation.partial import PartialResults
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, tools_of
-from stereogenbench_data.evaluation.results import Labels, Scores
 from stereogenbench_data.evaluation.running import (
     Extent,
     Progress,

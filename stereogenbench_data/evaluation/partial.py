@@ -15,10 +15,9 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
-from stereogenbench_data.evaluation.frame_scores import PairScores
-from stereogenbench_data.evaluation.frechet import Spread
+from stereogenbench_data.evaluation.metrics.frechet import Spread
 from stereogenbench_data.evaluation.predictions import Pair, pair_name
-from stereogenbench_data.evaluation.scoring import SceneScores
+from stereogenbench_data.evaluation.scene_scores import PairScores, SceneScores
 from stereogenbench_data.sources.files import write_atomic
 
 Stamps = Mapping[tuple[str, Pair], str]

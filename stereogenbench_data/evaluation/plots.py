@@ -8,10 +8,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from stereogenbench_data.errors import ExtraError, StorageError, cure_of
-from stereogenbench_data.evaluation.aggregate import PairMeans, cell, grouped
+from stereogenbench_data.evaluation.aggregate import (
+    CONTROL,
+    PairMeans,
+    Scores,
+    cell,
+    grouped,
+    require_comparable,
+)
 from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS, HEAVY_TAILED
 from stereogenbench_data.evaluation.reference import reference_rows
-from stereogenbench_data.evaluation.results import CONTROL, Scores, require_comparable
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
 from stereogenbench_data.sources.files import open_atomic
 

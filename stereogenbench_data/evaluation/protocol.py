@@ -7,14 +7,6 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.backends import (
-    Where,
-    load_image_features,
-    load_keypoint_matcher,
-    load_pair_metric,
-    load_stereo_matcher,
-    load_video_features,
-)
 from stereogenbench_data.evaluation.columns import (
     COLUMNS,
     IMAGE_DISTANCES,
@@ -23,17 +15,33 @@ from stereogenbench_data.evaluation.columns import (
     columns_of,
     require_metrics,
 )
-from stereogenbench_data.evaluation.matching import match_settings
-from stereogenbench_data.evaluation.patches import PATCH_SETTINGS
-from stereogenbench_data.evaluation.pixels import PSNR_SETTINGS, SSIM_SETTINGS
-from stereogenbench_data.evaluation.protocols import (
+from stereogenbench_data.evaluation.metrics.matching import match_settings
+from stereogenbench_data.evaluation.metrics.pixels import (
+    PATCH_SETTINGS,
+    PSNR_SETTINGS,
+    SSIM_SETTINGS,
+)
+from stereogenbench_data.evaluation.metrics.scale import (
+    FitMethod,
+    fits_of,
+    require_fit,
+    scale_settings,
+)
+from stereogenbench_data.evaluation.models.interfaces import (
     ImageFeatures,
     KeypointMatcher,
     PairMetric,
     StereoMatcher,
     VideoFeatures,
 )
-from stereogenbench_data.evaluation.scale import FitMethod, fits_of, require_fit, scale_settings
+from stereogenbench_data.evaluation.models.registry import (
+    Where,
+    load_image_features,
+    load_keypoint_matcher,
+    load_pair_metric,
+    load_stereo_matcher,
+    load_video_features,
+)
 from stereogenbench_data.schema.records import DepthEncoding
 
 PAPER_SIZE: Final = (480, 832)

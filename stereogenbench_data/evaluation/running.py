@@ -8,11 +8,10 @@ from typing import Final
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.candidates import Candidate
 from stereogenbench_data.evaluation.partial import PartialResults
-from stereogenbench_data.evaluation.predictions import Pair, PredictionFault, Wanted
+from stereogenbench_data.evaluation.predictions import Candidate, Pair, PredictionFault, Wanted
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.evaluation.scoring import SceneScores, SceneWork, score_scene
+from stereogenbench_data.evaluation.scene_scores import SceneScores, SceneWork, score_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.selection.plan import Plan

@@ -16,7 +16,6 @@ from stereogenbench_data.samples.derive import RECTIFIED_PX, SceneFacts
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.streams import OPEN_STREAMS, Streams, StreamStats
 from stereogenbench_data.samples.views import StoredDepth, Views
-from stereogenbench_data.schema.parse import parse_trajectory
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
@@ -24,6 +23,7 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
+from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.sources.members import MemberSource
 

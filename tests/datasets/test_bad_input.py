@@ -20,7 +20,8 @@ from stereogenbench_data import (
 )
 from stereogenbench_data.index.table import IncompleteSceneWarning
 from stereogenbench_data.samples.checks import OddSceneWarning
-from stereogenbench_data.synthesis import ExportContract, SynthRequest, synthesise
+from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis.request import ExportContract
 
 FIELDS = ("left", "right", "disparity", "visible", "right_from_left")
 

@@ -9,8 +9,11 @@ import pytest
 import torch
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
-from stereogenbench_data.evaluation import backends
-from stereogenbench_data.evaluation.backends import (
+from stereogenbench_data.evaluation.models import registry as backends
+from stereogenbench_data.evaluation.models.dedode import DESCRIPTOR, DETECTOR
+from stereogenbench_data.evaluation.models.i3d import I3D
+from stereogenbench_data.evaluation.models.inception import INCEPTION
+from stereogenbench_data.evaluation.models.registry import (
     Where,
     load_image_features,
     load_keypoint_matcher,
@@ -18,10 +21,7 @@ from stereogenbench_data.evaluation.backends import (
     load_stereo_matcher,
     load_video_features,
 )
-from stereogenbench_data.evaluation.dedode import DESCRIPTOR, DETECTOR
-from stereogenbench_data.evaluation.i3d import I3D
-from stereogenbench_data.evaluation.inception import INCEPTION
-from stereogenbench_data.evaluation.weights import read_weights, weights_path
+from stereogenbench_data.evaluation.models.weights import read_weights, weights_path
 
 LOADERS = {
     "KEYPOINT_MATCHERS": load_keypoint_matcher,
@@ -87,7 +87,7 @@ def test_a_missing_package_is_named_with_its_extra_and_its_weights(
     monkeypatch, tmp_path, load, name, package
 ):
     monkeypatch.setitem(sys.modules, package, None)
-    monkeypatch.setattr("stereogenbench_data.evaluation.perceptual.find_spec", lambda _: None)
+    monkeypatch.setattr("stereogenbench_data.evaluation.models.lpips.find_spec", lambda _: None)
 
     with pytest.raises(ExtraError, match=rf"pip install 'stereogenbench-data\[{name}\]'") as caught:
         load(name, Where(weights=tmp_path))

@@ -105,7 +105,7 @@ def test_controls_that_hold_end_with_0(scenes, tmp_path):
 
 
 def test_controls_that_do_not_hold_end_with_1(scenes, tmp_path, monkeypatch):
-    from stereogenbench_data.evaluation import relations
+    from stereogenbench_data.evaluation import controls as relations
 
     broken = relations.Relation("up is up", False, "down")  # noqa: FBT003
     monkeypatch.setattr(relations, "relations", lambda results: [broken])

@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol, score_controls
 from stereogenbench_data.evaluation.aggregate import cell
-from stereogenbench_data.evaluation.controls import CONTROLS, derangement, wrong_camera
-from stereogenbench_data.evaluation.relations import relations
-from stereogenbench_data.evaluation.sgbm import Sgbm
+from stereogenbench_data.evaluation.controls import CONTROLS, derangement, relations, wrong_camera
+from stereogenbench_data.evaluation.models.opencv import Sgbm
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.release import CAMERA_PAIRS

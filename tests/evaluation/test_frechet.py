@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.linalg import sqrtm
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.frechet import Spread, frechet_distance
+from stereogenbench_data.evaluation.metrics.frechet import Spread, frechet_distance
 
 
 def distance(one: np.ndarray, two: np.ndarray) -> float:

@@ -8,14 +8,14 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.matching import (
+from stereogenbench_data.evaluation.metrics.matching import (
     match_error,
     match_settings,
     mutual_matches,
     target_matches,
 )
-from stereogenbench_data.evaluation.protocols import KeypointMatcher, Keypoints
-from stereogenbench_data.evaluation.sift import Sift
+from stereogenbench_data.evaluation.models.interfaces import KeypointMatcher, Keypoints
+from stereogenbench_data.evaluation.models.opencv import Sift
 
 
 def view(number: int, *, height: int = 8, width: int = 9) -> np.ndarray:

@@ -11,10 +11,14 @@ import pytest
 import torch
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.i3d import I3D, I3dFeatures, InflatedInception
-from stereogenbench_data.evaluation.inception import INCEPTION, Inception, InceptionFeatures
-from stereogenbench_data.evaluation.perceptual import TRUNK, Lpips, PerceptualDistance
-from stereogenbench_data.evaluation.protocols import ImageFeatures, PairMetric, VideoFeatures
+from stereogenbench_data.evaluation.models.i3d import I3D, I3dFeatures, InflatedInception
+from stereogenbench_data.evaluation.models.inception import INCEPTION, Inception, InceptionFeatures
+from stereogenbench_data.evaluation.models.interfaces import (
+    ImageFeatures,
+    PairMetric,
+    VideoFeatures,
+)
+from stereogenbench_data.evaluation.models.lpips import TRUNK, Lpips, PerceptualDistance
 from tests.evaluation.known_weights import known_pictures, known_state
 
 

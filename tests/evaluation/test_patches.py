@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.patches import PATCH_SETTINGS, outside_window, patch_psnr
+from stereogenbench_data.evaluation.metrics.pixels import PATCH_SETTINGS, outside_window, patch_psnr
 
 FLOOR_DB = 10 * math.log10(255**2 * 12)
 

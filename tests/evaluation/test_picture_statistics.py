@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.frechet import Spread, frechet_distance
-from stereogenbench_data.evaluation.picture_statistics import ColourStatistics, MotionStatistics
-from stereogenbench_data.evaluation.protocols import ImageFeatures, VideoFeatures
+from stereogenbench_data.evaluation.metrics.frechet import Spread, frechet_distance
+from stereogenbench_data.evaluation.models.interfaces import ImageFeatures, VideoFeatures
+from stereogenbench_data.evaluation.models.picture_statistics import (
+    ColourStatistics,
+    MotionStatistics,
+)
 
 
 def test_tiles_and_differences_are_those_worked_by_hand():

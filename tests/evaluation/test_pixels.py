@@ -11,7 +11,12 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
-from stereogenbench_data.evaluation.pixels import PSNR_SETTINGS, SSIM_SETTINGS, psnr_db, ssim
+from stereogenbench_data.evaluation.metrics.pixels import (
+    PSNR_SETTINGS,
+    SSIM_SETTINGS,
+    psnr_db,
+    ssim,
+)
 
 pictures = arrays(np.uint8, (3, 13, 17))
 

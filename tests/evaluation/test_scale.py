@@ -10,11 +10,11 @@ from PIL import Image
 from scipy.stats import linregress
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.frame_scores import PairScorer, TargetFrame
+from stereogenbench_data.evaluation.metrics.scale import fit_scale, scale_settings
+from stereogenbench_data.evaluation.models.interfaces import StereoMatcher
+from stereogenbench_data.evaluation.models.opencv import Sgbm
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
-from stereogenbench_data.evaluation.protocols import StereoMatcher
-from stereogenbench_data.evaluation.scale import fit_scale, scale_settings
-from stereogenbench_data.evaluation.sgbm import Sgbm
+from stereogenbench_data.evaluation.scene_scores import PairScorer, TargetFrame
 
 METHODS = ("filtered", "least_squares", "theil_sen")
 SIZE = (20, 30)

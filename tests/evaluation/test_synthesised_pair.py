@@ -6,13 +6,11 @@ import pytest
 import torch
 
 from stereogenbench_data import StereoPairs
-from stereogenbench_data.evaluation.matching import match_error, target_matches
-from stereogenbench_data.evaluation.patches import outside_window, patch_psnr
-from stereogenbench_data.evaluation.picture_statistics import ColourStatistics
-from stereogenbench_data.evaluation.pixels import psnr_db, ssim
-from stereogenbench_data.evaluation.scale import fit_scale
-from stereogenbench_data.evaluation.sgbm import Sgbm
-from stereogenbench_data.evaluation.sift import Sift
+from stereogenbench_data.evaluation.metrics.matching import match_error, target_matches
+from stereogenbench_data.evaluation.metrics.pixels import outside_window, patch_psnr, psnr_db, ssim
+from stereogenbench_data.evaluation.metrics.scale import fit_scale
+from stereogenbench_data.evaluation.models.opencv import Sgbm, Sift
+from stereogenbench_data.evaluation.models.picture_statistics import ColourStatistics
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,9 @@ import json
 import pytest
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol, tables_of, write_report
-from stereogenbench_data.evaluation.aggregate import PairMeans, tally
-from stereogenbench_data.evaluation.frechet import FrechetDistance
-from stereogenbench_data.evaluation.render import latex, markdown
-from stereogenbench_data.evaluation.report import document
-from stereogenbench_data.evaluation.results import Scores
+from stereogenbench_data.evaluation.aggregate import PairMeans, Scores, tally
+from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
+from stereogenbench_data.evaluation.report import document, latex, markdown
 from stereogenbench_data.evaluation.tables import bin_table, branch_table, stratum_table
 
 PAPERS = EvaluationProtocol()

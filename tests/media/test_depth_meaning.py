@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import (
     depth_frame_index,
     depth_m_from_units,
     measured,
     resolve_encoding,
 )
-from stereogenbench_data.media.video import StreamFacts
 from stereogenbench_data.schema.records import DepthEncoding
 
 

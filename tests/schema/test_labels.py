@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.parse import parse_complete, parse_description, parse_scene_key
+from stereogenbench_data.schema.labels import parse_complete, parse_description, parse_scene_key
 from stereogenbench_data.schema.records import Description, SceneId, SceneLabels
 
 

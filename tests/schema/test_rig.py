@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.parse import parse_rig
 from stereogenbench_data.schema.records import Rig
+from stereogenbench_data.schema.rig import parse_rig
 from stereogenbench_data.schema.spellings import SPELLINGS
 
 BASELINES_CM = (6.5, 13.25, 19.0, 26.0, 32.5, 6.75, 12.5, 19.5, 26.0, 5.75, 12.75, 19.25)

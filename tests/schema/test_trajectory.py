@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.parse import parse_trajectory
 from stereogenbench_data.schema.spellings import SPELLINGS
+from stereogenbench_data.schema.trajectory import parse_trajectory
 
 
 def parsed(document):

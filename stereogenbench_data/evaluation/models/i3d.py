@@ -13,9 +13,8 @@ from torch import nn
 from torch.nn import functional
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.pictures import require_clips
-from stereogenbench_data.evaluation.protocols import Clips, Settings
-from stereogenbench_data.evaluation.weights import (
+from stereogenbench_data.evaluation.models.interfaces import Clips, Settings, require_clips
+from stereogenbench_data.evaluation.models.weights import (
     Weights,
     fingerprint,
     load_into,

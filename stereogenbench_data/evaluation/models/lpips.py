@@ -11,9 +11,8 @@ from torch import nn
 from torch.nn import functional
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
-from stereogenbench_data.evaluation.pictures import require_batch
-from stereogenbench_data.evaluation.protocols import Pictures, Settings
-from stereogenbench_data.evaluation.weights import (
+from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings, require_batch
+from stereogenbench_data.evaluation.models.weights import (
     Weights,
     fetch,
     fingerprint,

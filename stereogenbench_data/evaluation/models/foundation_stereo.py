@@ -15,9 +15,8 @@ import torch
 from jaxtyping import Float32
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
-from stereogenbench_data.evaluation.pictures import require_pictures
-from stereogenbench_data.evaluation.protocols import Picture, Settings
-from stereogenbench_data.evaluation.weights import (
+from stereogenbench_data.evaluation.models.interfaces import Picture, Settings, require_pictures
+from stereogenbench_data.evaluation.models.weights import (
     Weights,
     fingerprint,
     install,

@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Bool, Int64
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.pictures import require_pictures
-from stereogenbench_data.evaluation.protocols import (
+from stereogenbench_data.evaluation.models.interfaces import (
     KeypointMatcher,
     Keypoints,
     Picture,
     Settings,
+    require_pictures,
 )
 
 EPIPOLAR_PX: Final = 2.0

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.protocols import Settings, StereoMatcher
+from stereogenbench_data.evaluation.models.interfaces import Settings, StereoMatcher
 
 FitMethod = Literal["filtered", "least_squares", "theil_sen"]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.protocols import (
+from stereogenbench_data.evaluation.models.interfaces import (
     ImageFeatures,
     KeypointMatcher,
     PairMetric,
@@ -95,25 +95,25 @@ def _loaded(
 
 
 def _sift(where: Where) -> KeypointMatcher:
-    from stereogenbench_data.evaluation.sift import Sift
+    from stereogenbench_data.evaluation.models.opencv import Sift
 
     return Sift()
 
 
 def _dedode(where: Where) -> KeypointMatcher:
-    from stereogenbench_data.evaluation.dedode import DeDoDeMatcher
+    from stereogenbench_data.evaluation.models.dedode import DeDoDeMatcher
 
     return DeDoDeMatcher(weights=where.weights, device=where.device)
 
 
 def _sgbm(where: Where) -> StereoMatcher:
-    from stereogenbench_data.evaluation.sgbm import Sgbm
+    from stereogenbench_data.evaluation.models.opencv import Sgbm
 
     return Sgbm()
 
 
 def _foundation_stereo(where: Where) -> StereoMatcher:
-    from stereogenbench_data.evaluation.foundation_stereo import FoundationStereoMatcher
+    from stereogenbench_data.evaluation.models.foundation_stereo import FoundationStereoMatcher
 
     return FoundationStereoMatcher(
         checkout=where.checkout, weights=where.weights, device=where.device
@@ -121,31 +121,31 @@ def _foundation_stereo(where: Where) -> StereoMatcher:
 
 
 def _lpips(where: Where) -> PairMetric:
-    from stereogenbench_data.evaluation.perceptual import Lpips
+    from stereogenbench_data.evaluation.models.lpips import Lpips
 
     return Lpips(weights=where.weights, device=where.device)
 
 
 def _colour_statistics(where: Where) -> ImageFeatures:
-    from stereogenbench_data.evaluation.picture_statistics import ColourStatistics
+    from stereogenbench_data.evaluation.models.picture_statistics import ColourStatistics
 
     return ColourStatistics()
 
 
 def _inception(where: Where) -> ImageFeatures:
-    from stereogenbench_data.evaluation.inception import InceptionFeatures
+    from stereogenbench_data.evaluation.models.inception import InceptionFeatures
 
     return InceptionFeatures(weights=where.weights, device=where.device)
 
 
 def _motion_statistics(where: Where) -> VideoFeatures:
-    from stereogenbench_data.evaluation.picture_statistics import MotionStatistics
+    from stereogenbench_data.evaluation.models.picture_statistics import MotionStatistics
 
     return MotionStatistics()
 
 
 def _i3d(where: Where) -> VideoFeatures:
-    from stereogenbench_data.evaluation.i3d import I3dFeatures
+    from stereogenbench_data.evaluation.models.i3d import I3dFeatures
 
     return I3dFeatures(weights=where.weights, device=where.device)
 

@@ -10,8 +10,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.pictures import require_batch, require_clips
-from stereogenbench_data.evaluation.protocols import Clips, Picture, Pictures, Settings
+from stereogenbench_data.evaluation.models.interfaces import (
+    Clips,
+    Picture,
+    Pictures,
+    Settings,
+    require_batch,
+    require_clips,
+)
 
 _GRID: Final = 4
 _STEPS_PX: Final = (1, 2, 4)

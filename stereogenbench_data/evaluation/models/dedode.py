@@ -12,10 +12,14 @@ import torch
 from jaxtyping import Int64
 
 from stereogenbench_data.errors import ExtraError
-from stereogenbench_data.evaluation.matching import KEYPOINTS, RATIO, mutual_matches
-from stereogenbench_data.evaluation.pictures import require_pictures
-from stereogenbench_data.evaluation.protocols import Keypoints, Picture, Settings
-from stereogenbench_data.evaluation.weights import (
+from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
+from stereogenbench_data.evaluation.models.interfaces import (
+    Keypoints,
+    Picture,
+    Settings,
+    require_pictures,
+)
+from stereogenbench_data.evaluation.models.weights import (
     Weights,
     fetch,
     fingerprint,
