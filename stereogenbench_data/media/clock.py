@@ -16,7 +16,7 @@ import av
 from av.container import InputContainer
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.container import frames_by_duration
+from stereogenbench_data.media.container import exact, frames_by_duration
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +67,10 @@ def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | Non
     ``frames`` frames at one rate. Of Matroska only the duration can be compared.
     """
     stream = container.streams.video[0]
-    if stream.start_time is None or not stream.average_rate or not stream.time_base:
+    rate, time_base = exact(stream.average_rate), exact(stream.time_base)
+    if stream.start_time is None or rate is None or time_base is None:
         return None
-    step = 1 / (stream.average_rate * stream.time_base)
+    step = 1 / (rate * time_base)
     if stream.frames == 0:
         agrees = frames_by_duration(container) == frames
     else:

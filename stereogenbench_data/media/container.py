@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Final, Literal, Protocol, runtime_checkable
+from typing import Any, Final, Literal, Protocol, runtime_checkable
 
 import av
 from av.container import InputContainer
@@ -35,9 +35,28 @@ class BinaryFile(Protocol):
 
 VideoFile = str | Path | BinaryFile
 
+
+@runtime_checkable
+class Ratio(Protocol):
+    """A `Fraction`, or the `AVRational` that PyAV 19 gives in its place."""
+
+    @property
+    def numerator(self) -> int:
+        """The number above."""
+
+    @property
+    def denominator(self) -> int:
+        """The number below."""
+
+
 _OPTIONS: Final = {"format_whitelist": "mov,matroska"}
 _UNDECODED: Final = {**_OPTIONS, "probesize": "32", "skip_frame": "all"}
 """FFmpeg decodes the first picture of H.264 only to learn its pixel format: not with these."""
+
+# PyAV 18 raises on tags that are not UTF-8 unless told otherwise; PyAV 19 never does (`text_tags`).
+_TAG_ERRORS: Final[dict[str, Any]] = (
+    {"metadata_errors": "replace"} if int(av.__version__.partition(".")[0]) < 19 else {}
+)
 
 _COLOURS: Final = 3
 _LEAST_BITS: Final = 8
@@ -123,9 +142,12 @@ def open_container(
 
 def _open(file: VideoFile, *, options: dict[str, str]) -> InputContainer:
     if isinstance(file, str | Path):
-        return av.open(f"file:{file}", mode="r", options=options, metadata_errors="replace")
-    file.seek(0)
-    return av.open(file, mode="r", options=options, metadata_errors="replace")
+        place: str | BinaryFile = f"file:{file}"
+    else:
+        file.seek(0)
+        place = file
+    container: InputContainer = av.open(place, mode="r", options=options, **_TAG_ERRORS)
+    return container
 
 
 def _require_file(path: Path, *, name: str) -> None:
@@ -140,6 +162,27 @@ def _require_file(path: Path, *, name: str) -> None:
         ) from error
     if size == 0:
         raise MediaError(f"{name}: is empty (0 bytes at {path}): fetch it again.")
+
+
+def exact(ratio: Ratio | None) -> Fraction | None:
+    """Return a rate, time base or aspect as a fraction, None where the file does not tell it.
+
+    PyAV 18 gives None for a value that is not set, PyAV 19 a ratio of zero or with a zero below,
+    and it rounds the product of two of its ratios.
+    """
+    return Fraction(ratio.numerator, ratio.denominator) if ratio else None
+
+
+def text_tags(metadata: Mapping[str, str]) -> dict[str, str]:
+    """Return the tags of a container or stream, with a replacement character for what is not UTF-8.
+
+    PyAV 19 gives such bytes as surrogates, which cannot be printed.
+    """
+    return {_text(key): _text(value) for key, value in metadata.items()}
+
+
+def _text(tag: str) -> str:
+    return tag.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
 
 def stream_facts(
@@ -174,10 +217,10 @@ def stream_facts(
         width_px=context.width,
         height_px=context.height,
         frames=frames,
-        frame_rate_hz=float(stream.average_rate or 0),
-        tags=merged_tags(container.metadata, stream.metadata),
+        frame_rate_hz=float(exact(stream.average_rate) or 0),
+        tags=merged_tags(text_tags(container.metadata), text_tags(stream.metadata)),
         is_colour=is_colour,
-        pixel_aspect=float(stream.sample_aspect_ratio or 0),
+        pixel_aspect=float(exact(stream.sample_aspect_ratio) or 0),
         container=container.format.name,
     )
 
@@ -212,8 +255,9 @@ def frames_by_duration(container: InputContainer) -> int | None:
     Matroska's duration, as FFmpeg writes it, is the time at which the last frame ends.
     """
     stream = container.streams.video[0]
-    rate, time_base, start = stream.average_rate, stream.time_base, stream.start_time
-    if container.duration is None or start is None or not rate or not time_base:
+    rate, time_base = exact(stream.average_rate), exact(stream.time_base)
+    start = stream.start_time
+    if container.duration is None or start is None or rate is None or time_base is None:
         return None
     count = rate * (Fraction(container.duration, _MICROSECONDS) - start * time_base)
     whole = round(count)

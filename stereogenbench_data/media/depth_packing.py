@@ -15,7 +15,7 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt16
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.container import VideoFile, open_container
+from stereogenbench_data.media.container import VideoFile, exact, open_container, text_tags
 from stereogenbench_data.media.depth import ANY_DEPTH, read_depth_units, require_depth_stream
 from stereogenbench_data.media.depth_frame_file import (
     StoredClip,
@@ -69,13 +69,13 @@ def packed_depth(
             chunk = compressed_chunk(units.tobytes())
             frame = reader.frame(index)
             pts.append(_ticks(frame, name=name))
-            time_base = frame.time_base or time_base
+            time_base = exact(frame.time_base) or time_base
             chunks.append(chunk)
             _require_same(units, chunk, index=index, name=name)
             after_frame()
     with open_container(video, name=name) as container:
         stream = container.streams.video[0]
-        rate = stream.average_rate or 1 / (time_base * max(pts[-1], 1))
+        rate = exact(stream.average_rate) or 1 / (time_base * max(pts[-1], 1))
         clip = StoredClip(
             width_px=facts.width_px,
             height_px=facts.height_px,
@@ -84,8 +84,8 @@ def packed_depth(
             rate=(rate.numerator, rate.denominator),
             time_base=(time_base.numerator, time_base.denominator),
             pts=tuple(pts),
-            tags=dict(container.metadata),
-            stream_tags=dict(stream.metadata),
+            tags=text_tags(container.metadata),
+            stream_tags=text_tags(stream.metadata),
         )
     content = frame_file(clip, chunks)
     with DepthFrames(io.BytesIO(content), name=name, frames=frames) as packed:
@@ -172,15 +172,16 @@ def _require_same_video(packed: DepthFrames, target: Path) -> None:
         for index, pts in enumerate(clip.pts):
             frame = reader.frame(index)
             units = read_depth_units(reader, index, encoding=_ANY_BITS)
-            shown_s = None if frame.time_base is None else (frame.pts or 0) * frame.time_base
+            tick_s = exact(frame.time_base)
+            shown_s = None if tick_s is None else (frame.pts or 0) * tick_s
             if not np.array_equal(units, packed.units(index)):
                 raise _not_unpacked(name, f"frame {index} has other numbers")
             if shown_s != pts * Fraction(*clip.time_base):
                 raise _not_unpacked(name, f"frame {index} is shown at {shown_s} s")
     with open_container(target, name=str(target)) as container:
         for found, told in (
-            (container.metadata, clip.tags),
-            (container.streams.video[0].metadata, clip.stream_tags),
+            (text_tags(container.metadata), clip.tags),
+            (text_tags(container.streams.video[0].metadata), clip.stream_tags),
         ):
             lost = {key for key in told if found.get(key) != told[key]}
             lost -= {key for key in lost if key.lower() in _WRITERS_TAGS}

@@ -28,6 +28,7 @@ from stereogenbench_data.media.clock import (
 from stereogenbench_data.media.container import (
     StreamFacts,
     VideoFile,
+    exact,
     frames_by_duration,
     is_colour_format,
     open_container,
@@ -173,7 +174,7 @@ class VideoReader:
             context = container.streams.video[0].codec_context
             self.size_px = (context.width, context.height)
             """Width and height by the header; 0 where it does not tell."""
-            self.pixel_aspect = float(container.streams.video[0].sample_aspect_ratio or 0)
+            self.pixel_aspect = float(exact(container.streams.video[0].sample_aspect_ratio) or 0)
             """Width of a pixel in heights of one by the header; 0 where it does not tell."""
             coded_chroma = has_coded_chroma(context.codec.canonical_name, context.extradata)
             self._is_coded_grey = coded_chroma is False

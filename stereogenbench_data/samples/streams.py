@@ -6,10 +6,10 @@ anew if it is asked for again.
 """
 
 import os
-import sys
 import threading
+import weakref
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -48,11 +48,34 @@ class StreamStats(NamedTuple):
     limit: int
 
 
+class _PictureMemory:
+    """Memory for one picture at a time, written again once nobody has the picture before.
+
+    New memory costs more than what is written into it: the system clears it first. That nobody has
+    a picture, or a view or tensor of it, is told by a weak reference, on every interpreter. Where
+    an interpreter frees objects late, the next picture gets memory of its own.
+    """
+
+    def __init__(self) -> None:
+        self._memory = memoryview(b"")
+        self._last: Callable[[], object] = lambda: None
+
+    def picture(self, *, height: int, width: int) -> UInt8[np.ndarray, "3 h w"]:
+        """Return an array to write a picture into, of any content."""
+        if self._last() is not None or self._memory.nbytes != 3 * height * width:
+            self._memory = np.empty(3 * height * width, dtype=np.uint8).data
+        # All views of the picture are based on this array, and none on what is below it.
+        base = np.frombuffer(self._memory, dtype=np.uint8)
+        self._last = weakref.ref(base)
+        return base.reshape(3, height, width)
+
+
 @dataclass(slots=True)
 class _Stream:
     reader: Any  # a VideoReader or, of depth that blosc2 packed, DepthFrames
     file: Path | MemberFile
     last: dict[Any, Any] = field(default_factory=dict)
+    memory: _PictureMemory = field(default_factory=_PictureMemory)
 
     def close(self) -> None:
         self.reader.close()
@@ -87,9 +110,10 @@ class Streams:
         with self._stream(scene, name) as stream:
             key = (index, size)
             if key not in stream.last:
-                unused = _unused(stream.last, height_width=size)
                 stream.last = {}
-                picture = read_rgb(stream.reader, index, size=size, out=unused, content="colour")
+                height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
+                out = stream.memory.picture(height=height, width=width)
+                picture = read_rgb(stream.reader, index, size=size, out=out, content="colour")
                 stream.last[key] = _read_only(picture)
             kept: UInt8[np.ndarray, "3 h w"] = stream.last[key]
             return kept
@@ -229,38 +253,6 @@ def _require_size(reader: Any, scene: Scene, *, name: str) -> None:
 def _read_only(picture: Any) -> Any:
     picture.flags.writeable = False
     return picture
-
-
-def _unused(last: dict[Any, Any], *, height_width: tuple[int, int] | None) -> Any:
-    """Return the array of the last picture to be written again, where nobody else has it.
-
-    Memory that is new costs more than what is written into it: the system clears it first.
-    """
-    for key in last:
-        picture = last[key]
-        if (
-            key[1] == height_width
-            and picture.base is None
-            and sys.getrefcount(picture) == _REFERENCES_HERE
-        ):
-            picture.flags.writeable = True
-            return picture
-    return None
-
-
-def _references_here() -> int:
-    """Return how many references `_unused` sees to a picture that nobody else has.
-
-    Interpreters differ: some count the one that a function borrows, some do not.
-    """
-    last = {(0, None): np.empty(1)}
-    for key in last:
-        picture = last[key]
-        return sys.getrefcount(picture)
-    return 0
-
-
-_REFERENCES_HERE: Final = _references_here()
 
 
 @contextmanager

@@ -47,6 +47,22 @@ def test_a_tag_of_the_stream_does_not_hide_the_containers(clips):
     assert (facts.tags["scale"], facts.tags["stream.scale"]) == ("1", "2")
 
 
+@pytest.mark.parametrize("suffix", ["mp4", "mkv"])
+def test_a_tag_that_is_not_utf8_can_be_read_and_printed(clips, tmp_path, suffix):
+    told = clips.rgb(f"comment.{suffix}", *GROUPS_OF_12, "-metadata", "comment=cafX 10 cm")
+    path = tmp_path / told.name
+    path.write_bytes(told.read_bytes().replace(b"cafX", b"caf\xe9"))
+
+    assert probe(path, name="clip").tags["comment"] == "caf\N{REPLACEMENT CHARACTER} 10 cm"
+
+
+def test_the_rate_of_a_film_is_exact(clips):
+    path = clips.rgb("film.mkv", *GROUPS_OF_12, rate="24000/1001")
+    facts = probe(path, name="clip")
+
+    assert (facts.frames, facts.frame_rate_hz) == (48, 24000 / 1001)
+
+
 @pytest.mark.parametrize("flags", ["-movflags +faststart", ""])
 def test_probing_an_mp4_reads_its_header_and_first_frame(clips, flags):
     path = clips.rgb(

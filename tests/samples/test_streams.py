@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.index.table import SceneIndex
@@ -81,6 +82,40 @@ def test_a_picture_that_somebody_holds_is_not_written_again(data):
         pool.rgb(scene, RGB[1], frame, size=None)
 
     assert all(np.array_equal(one[0], other) for one, other in zip(held, expected, strict=True))
+    pool.close()
+
+
+@pytest.mark.parametrize(
+    "held",
+    [
+        pytest.param(lambda picture: picture, id="itself"),
+        pytest.param(lambda picture: picture[0, 1:], id="a view"),
+        pytest.param(lambda picture: picture.view()[None].transpose(), id="a view of a view"),
+        pytest.param(memoryview, id="its buffer"),
+        pytest.param(lambda picture: torch.from_numpy(picture), id="a tensor"),
+        pytest.param(lambda picture: np.asarray(memoryview(picture)), id="an array of its buffer"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:The given NumPy array is not writable")
+def test_what_is_held_of_a_picture_stays_as_it_was(data, held):
+    pool, scene = pool_of(data), data.scene(0)
+    kept = [held(pool.rgb(scene, RGB[0], frame, size=None)) for frame in range(4)]
+    fresh = pool_of(data)
+
+    for frame, one in enumerate(kept):
+        assert np.array_equal(one, held(fresh.rgb(scene, RGB[0], frame, size=None)))
+    pool.close()
+    fresh.close()
+
+
+def test_the_memory_of_a_dropped_picture_is_written_again(data):
+    pool, scene = pool_of(data), data.scene(0)
+    places = {
+        pool.rgb(scene, RGB[0], frame, size=None).__array_interface__["data"][0]
+        for frame in range(4)
+    }
+
+    assert len(places) == 1
     pool.close()
 
 
