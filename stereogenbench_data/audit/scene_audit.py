@@ -32,7 +32,6 @@ from stereogenbench_data.engine.process_pool import AfterBytes
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.schema.document import parse_object
-from stereogenbench_data.schema.parse import parse_trajectory
 from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
@@ -42,6 +41,7 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
+from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.retry import Patience
 

@@ -16,7 +16,6 @@ from stereogenbench_data.schema.parse import (
     parse_complete,
     parse_rig,
     parse_scene_key,
-    parse_trajectory,
 )
 from stereogenbench_data.schema.records import Rig, Scene, SceneLabels
 from stereogenbench_data.schema.release import (
@@ -26,6 +25,7 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     TRAJECTORY_JSON,
 )
+from stereogenbench_data.schema.trajectory import parse_trajectory
 
 Difference = tuple[str, str]
 """The file's name, empty for the scene's own path, and what it tells against the index."""

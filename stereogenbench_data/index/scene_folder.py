@@ -40,7 +40,6 @@ from stereogenbench_data.schema.parse import (
     parse_description,
     parse_rig,
     parse_scene_key,
-    parse_trajectory,
 )
 from stereogenbench_data.schema.records import (
     DepthEncoding,
@@ -64,6 +63,7 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
+from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.sources.ranged_file import MemberFile
 
 ValidDepth = Literal["skip", "sample"]

@@ -27,7 +27,6 @@ from stereogenbench_data.samples.places import Places, Room, fresh_room
 from stereogenbench_data.samples.request import Clip, Request, Sample, Transform
 from stereogenbench_data.samples.streams import OPEN_STREAMS, Streams
 from stereogenbench_data.samples.views import StoredDepth, Views
-from stereogenbench_data.schema.parse import parse_trajectory
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
@@ -35,6 +34,7 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
+from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.members import MemberSource

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.scene_folder import describe_scene
-from stereogenbench_data.schema.parse import parse_rig, parse_trajectory
+from stereogenbench_data.schema.parse import parse_rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
+from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.synthesis import ExportContract, SynthRequest
 
 OPENCV_FROM_UNREAL = np.array([[0, 1, 0], [0, 0, -1], [1, 0, 0]])
