@@ -27,7 +27,7 @@ from stereogenbench_data.index.journal import RecordJournal
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.scene_files import files_of
 from stereogenbench_data.index.table import INDEX_NAME, IncompleteSceneWarning, SceneIndex
-from stereogenbench_data.schema.labels import parse_scene_key
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.sources.filesystems import MissingObject

@@ -17,7 +17,7 @@ from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
-from stereogenbench_data.schema.labels import parse_scene_key
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import METADATA_FILES, PACKED_DEPTH_NAMES, VIDEO_FILES
 from stereogenbench_data.selection.pairs import PairsSpec
 from stereogenbench_data.selection.windows import FramesSpec

@@ -19,7 +19,7 @@ from stereogenbench_data.index.scene_folder import (
     stamp_of,
 )
 from stereogenbench_data.media.depth import require_depth_stream
-from stereogenbench_data.schema.labels import parse_scene_key
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.schema.release import TRAIN_MAPS, depth_name

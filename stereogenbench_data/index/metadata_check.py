@@ -12,7 +12,11 @@ from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import lateral_offsets_m, rectification_residual_px
 from stereogenbench_data.index.scene_folder import caption_of, merged_labels
-from stereogenbench_data.schema.labels import parse_complete, parse_scene_key
+from stereogenbench_data.schema.parse import (
+    parse_complete,
+    parse_rig,
+    parse_scene_key,
+)
 from stereogenbench_data.schema.records import Rig, Scene, SceneLabels
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
@@ -21,7 +25,6 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     TRAJECTORY_JSON,
 )
-from stereogenbench_data.schema.rig import parse_rig
 from stereogenbench_data.schema.trajectory import parse_trajectory
 
 Difference = tuple[str, str]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from stereogenbench_data.errors import SchemaError, StorageError, cure_of
-from stereogenbench_data.schema.labels import parse_scene_key
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
     COMPLETE_JSON,

@@ -4,7 +4,7 @@ from typing import Final
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.release_tree import LAYOUT, SceneFolders
-from stereogenbench_data.schema.labels import parse_scene_key
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.sources.location import joined, shown
 from stereogenbench_data.sources.remote import RemoteObject
 

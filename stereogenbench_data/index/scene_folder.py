@@ -35,7 +35,12 @@ from stereogenbench_data.media.depth import (
 )
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.document import parse_text
-from stereogenbench_data.schema.labels import parse_complete, parse_description, parse_scene_key
+from stereogenbench_data.schema.parse import (
+    parse_complete,
+    parse_description,
+    parse_rig,
+    parse_scene_key,
+)
 from stereogenbench_data.schema.records import (
     DepthEncoding,
     DepthUnitSource,
@@ -58,7 +63,6 @@ from stereogenbench_data.schema.release import (
     depth_name,
     rgb_name,
 )
-from stereogenbench_data.schema.rig import parse_rig
 from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.sources.ranged_file import MemberFile
 

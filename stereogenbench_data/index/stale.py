@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.labels import parse_scene_key
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import COMPLETE_JSON, VIDEO_FILES
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SchemaError
-from stereogenbench_data.schema.labels import parse_complete, parse_description, parse_scene_key
+from stereogenbench_data.schema.parse import parse_complete, parse_description, parse_scene_key
 from stereogenbench_data.schema.records import Description, SceneId, SceneLabels
 
 
@@ -29,16 +29,16 @@ def test_a_key_tells_split_subset_family_and_map(key, split, subset):
 @pytest.mark.parametrize(
     ("key", "match"),
     [
-        ("train/Uniform/Map/scene_1.5", "holds a dot.*Rename the folder"),
-        ("train/Uniform/../scene_1", "holds a dot"),
-        ("train/Uniform/Mäp/scene_1", "'Mäp' cannot be a folder"),
-        ("train/Uniform//scene_1", "'' cannot be a folder"),
-        ("train/Uniform/a\\b/scene_1", "cannot be a folder"),
-        ("train/Uniform/a\n/scene_1", "cannot be a folder"),
+        ("train/Uniform/Map/scene_1.5", "contains a dot.*Rename the folder"),
+        ("train/Uniform/../scene_1", "contains a dot"),
+        ("train/Uniform/Mäp/scene_1", "'Mäp' is not a valid folder"),
+        ("train/Uniform//scene_1", "'' is not a valid folder"),
+        ("train/Uniform/a\\b/scene_1", "is not a valid folder"),
+        ("train/Uniform/a\n/scene_1", "is not a valid folder"),
         ("train/Uniform/scene_1", "train/<family>/<map>/<scene>.*found 3 folders"),
         ("eval/Uniform/Map/scene_1", "eval/<subset>/<family>/<map>/<scene>.*found 4 folders"),
         ("test/Uniform/Map/scene_1", "start with 'test'"),
-        ("", "'' cannot be a folder"),
+        ("", "'' is not a valid folder"),
     ],
 )
 def test_a_path_of_another_form_is_refused(key, match):
@@ -76,7 +76,7 @@ def test_every_identifier_of_a_wrong_type_is_told():
 
 
 def test_half_a_character_is_refused():
-    with pytest.raises(SchemaError, match=r"\$\.map_name: holds half a character"):
+    with pytest.raises(SchemaError, match=r"\$\.map_name: contains half a character"):
         parse_complete(b'{"map_name": "\\ud800"}', where="m.json")
 
 
@@ -87,6 +87,14 @@ def test_a_description_is_read():
     assert parse_description(text, where="d.json") == Description(
         "A yard.", "A yard with a wall.", "outdoor", "yard", ("yard", "wall")
     )
+
+
+def test_a_caption_under_an_unknown_key_is_refused():
+    with pytest.raises(SchemaError, match=r"d\.json: .*problem") as caught:
+        parse_description(b'{"caption": "A yard.", "tags": []}', where="d.json")
+
+    assert "$.caption: is not a known key and may stand for short_caption" in str(caught.value)
+    assert "the keys here are: caption, tags" in str(caught.value)
 
 
 def test_an_empty_description_has_empty_texts():

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.labels import parse_scene_key
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Member, ShardFacts
 from stereogenbench_data.shards.companion_files import write_foreign_indexes
 from stereogenbench_data.shards.pack import pack

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.scene_folder import describe_scene
+from stereogenbench_data.schema.parse import parse_rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.schema.rig import parse_rig
 from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.synthesis import SynthRequest
 from stereogenbench_data.synthesis.request import ExportContract
