@@ -19,7 +19,7 @@ from stereogenbench_data import (
     StorageError,
 )
 from stereogenbench_data.datasets.mapped import OddSceneWarning
-from stereogenbench_data.index.table import IncompleteSceneWarning
+from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.synthesis import ExportContract, SynthRequest, synthesise
 
 FIELDS = ("left", "right", "disparity", "visible", "right_from_left")
