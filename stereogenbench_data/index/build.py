@@ -14,7 +14,12 @@ from types import TracebackType
 from typing import Any, Final, Literal, TextIO
 
 from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
-from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError, cure_of
+from stereogenbench_data.errors import (
+    MediaError,
+    StereoGenBenchError,
+    StorageError,
+    describe_os_error,
+)
 from stereogenbench_data.index.rows import SCHEMA, row_of, scene_of
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
@@ -94,10 +99,9 @@ class Journal:
         except (FileNotFoundError, NotADirectoryError):
             lines = []
         except OSError as error:
-            raise StorageError(
-                f"{path}: the journal of an earlier run cannot be read ({error.strerror}). "
-                + cure_of(error, "Remove it, or write the result to another folder.")
-            ) from error
+            what = f"{path}: the journal of an earlier run cannot be read"
+            cure = "Remove it, or write the result to another folder."
+            raise StorageError(describe_os_error(what, error, cure)) from error
         self._is_same = bool(lines) and lines[0] == self._head
         self._known = _parse_lines(lines[1:]) if self._is_same else {}
 
@@ -125,10 +129,9 @@ class Journal:
             self._file.write(f"{line}\n")
             self._file.flush()
         except OSError as error:
-            raise StorageError(
-                f"{self._path}: the journal cannot be written ({error.strerror}). "
-                + cure_of(error, "Write the result to another folder.")
-            ) from error
+            what = f"{self._path}: the journal cannot be written"
+            cure = "Write the result to another folder."
+            raise StorageError(describe_os_error(what, error, cure)) from error
 
     def delete(self) -> None:
         """Remove the file: what it holds was written elsewhere."""

@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from stereogenbench_data.errors import StorageError, cure_of
+from stereogenbench_data.errors import StorageError, cure_of, describe_os_error
 from stereogenbench_data.index.arrow import as_numpy
 from stereogenbench_data.index.rows import SCHEMA, row_of
 from stereogenbench_data.schema.records import Scene, ShardFacts
@@ -123,8 +123,9 @@ def write_index_file(path: Path, table: pa.Table, head: IndexHead) -> None:
             pq.write_table(described, file, compression="zstd")
     except OSError as error:
         raise StorageError(
-            f"{path}: the index cannot be written ({error.strerror or error}). "
-            + cure_of(error, "Choose another place with --out.")
+            describe_os_error(
+                f"{path}: the index cannot be written", error, "Choose another place with --out."
+            )
         ) from error
 
 

@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.errors import MediaError, SchemaError, StorageError, cure_of
+from stereogenbench_data.errors import MediaError, SchemaError, StorageError, describe_os_error
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import (
@@ -143,10 +143,8 @@ class LocalSceneFolder:
             with os.scandir(self._folder) as entries:
                 found = {entry.name: entry.stat() for entry in entries if entry.name in _FILES}
         except OSError as error:
-            raise StorageError(
-                f"{self._folder}: cannot be read ({error.strerror}). "
-                + cure_of(error, "Fetch the scene again.")
-            ) from error
+            what = f"{self._folder}: cannot be read"
+            raise StorageError(describe_os_error(what, error, "Fetch the scene again.")) from error
         return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
 
     def read(self, name: str) -> bytes:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.errors import SchemaError, StorageError, cure_of
+from stereogenbench_data.errors import SchemaError, StorageError, describe_os_error
 from stereogenbench_data.schema.labels import parse_scene_key
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
@@ -93,7 +93,7 @@ def _search(root: Path) -> Iterator[tuple[Path, str]]:
             files = {entry.name for entry in listed}
             folders = [e.name for e in listed if not e.name.startswith(".") and _is_folder(e)]
         except OSError as error:
-            yield folder, f"cannot be searched ({error.strerror}). {cure_of(error, _SEARCHABLE)}"
+            yield folder, describe_os_error("cannot be searched", error, _SEARCHABLE)
             continue
         if files & _SCENE_FILES or (is_place_of_scene and not folders):
             yield folder, ""
