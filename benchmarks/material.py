@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.reencoded import DRAWN_CRF, OTHER_CRFS, reencode_tree
-from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
+from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member, Scene, SceneId
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, IMAGE_SIZE_PX, SEEN_MAP_FOLDER
 from stereogenbench_data.shards.pack import pack

@@ -19,8 +19,8 @@ StereoGenBenchError
 Each takes one message: so a DataLoader worker's error is rebuilt as itself in the main process.
 A message shows URLs without logins and queries, whatever it was made of.
 
-What to do about an error of the operating system follows from its number, wherever it is met: see
-`cure_of`.
+What to do about an error of the operating system follows from its number, wherever it occurs:
+`cure_of` holds the one table, and `describe_os_error` makes the message.
 """
 
 import errno
@@ -93,6 +93,23 @@ _CURES: Final = {
     errno.ESTALE: "The network drive was mounted anew or the file replaced: run it again.",
     errno.ELOOP: "Links lead in a circle: remove them.",
 }
+
+
+DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""Numbers of errors that mean a full disk or quota."""
+
+NOT_WRITABLE: Final = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
+"""Numbers of errors that mean a place that may only be read."""
+
+
+def describe_os_error(what: str, error: OSError, otherwise: str = "") -> str:
+    """Return what failed, the system's reason and the cure of `cure_of`, as one message.
+
+    >>> full = OSError(errno.ENOSPC, "No space left on device")
+    >>> describe_os_error("a.tar: cannot be written", full, "Choose another folder.")
+    'a.tar: cannot be written (No space left on device). Make room, or choose another place.'
+    """
+    return f"{what} ({error.strerror or error}). {cure_of(error, otherwise)}".rstrip()
 
 
 def cure_of(error: OSError, otherwise: str = "") -> str:

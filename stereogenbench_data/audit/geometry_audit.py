@@ -22,11 +22,12 @@ from stereogenbench_data.audit.findings import broken_finding, findings_of, unte
 from stereogenbench_data.audit.scene_audit import AuditTask, audit_scene, spread_frames
 from stereogenbench_data.engine.process_pool import run_tasks
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
-from stereogenbench_data.index.build import walk
-from stereogenbench_data.index.journal import RecordJournal
+from stereogenbench_data.index.build import Journal, walk
+from stereogenbench_data.index.open import IncompleteSceneWarning
+from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
-from stereogenbench_data.index.scene_files import files_of
-from stereogenbench_data.index.table import INDEX_NAME, IncompleteSceneWarning, SceneIndex
+from stereogenbench_data.index.scene_folder import open_scene_folder
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
@@ -127,7 +128,7 @@ def audit(
     *,
     workers: int | None = None,
     progress: Progress | None = None,
-    journal: RecordJournal | None = None,
+    journal: Journal | None = None,
     **filters: Unpack[SceneFilters],
 ) -> AuditReport:
     """Measure whether data are right: the paper's geometry audit, and its quality checks.
@@ -230,7 +231,7 @@ def _audited(
     *,
     workers: int | None,
     progress: Progress | None,
-    journal: RecordJournal | None,
+    journal: Journal | None,
 ) -> list[SceneAudit]:
     """Return what was found of each scene, in their order."""
     total = sum(len(spread_frames(scene.frames, request.frames)) for scene in scenes)
@@ -269,7 +270,7 @@ def _task(index: SceneIndex, scene: Scene, request: AuditRequest) -> AuditTask:
     )
 
 
-def audit_journal(path: Path, index: SceneIndex, request: AuditRequest) -> RecordJournal:
+def audit_journal(path: Path, index: SceneIndex, request: AuditRequest) -> Journal:
     """Return the journal of an audit.
 
     That of another root, depth contract or choice of frames is begun anew; limits, filters and
@@ -284,10 +285,10 @@ def audit_journal(path: Path, index: SceneIndex, request: AuditRequest) -> Recor
         "frames": request.frames,
         "depth": repr(request.depth),
     }
-    return RecordJournal(path, work=work)
+    return Journal(path, work=work)
 
 
-def _known(journal: RecordJournal, stamps: Mapping[str, str]) -> dict[str, SceneAudit]:
+def _known(journal: Journal, stamps: Mapping[str, str]) -> dict[str, SceneAudit]:
     """Return what earlier runs found of scenes that have not changed since."""
     known: dict[str, SceneAudit] = {}
     for key, stamp in stamps.items():
@@ -305,7 +306,7 @@ def _stamp(index: SceneIndex, scene: Scene) -> str:
     told: list[Any] = [row_of(scene)]
     if not index.shards and not is_remote(index.root):
         try:
-            told.append(files_of(index.root, scene.id.key).stamps())
+            told.append(open_scene_folder(index.root, scene.id.key).stamps())
         except StorageError as error:
             told.append(str(error))
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:32]

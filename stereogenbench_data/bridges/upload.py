@@ -11,7 +11,8 @@ from stereogenbench_data.bridges import about
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant import Publication, write_descriptor
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
-from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
+from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.sources.filesystems import network_errors
 from stereogenbench_data.sources.location import local_path

@@ -53,9 +53,8 @@ def index(  # noqa: PLR0913 - one parameter an option
     are listed and left out. Broken ones too, and then the exit status is 1. With --split,
     --family or --map only such scenes are read.
     """
-    from stereogenbench_data.index.build import walk
-    from stereogenbench_data.index.journal import Journal
-    from stereogenbench_data.index.parquet import root_told
+    from stereogenbench_data.index.build import SceneJournal, walk
+    from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.sources.location import is_remote, local_path, shown
 
@@ -74,12 +73,12 @@ def index(  # noqa: PLR0913 - one parameter an option
         )
     if target.exists() and not target.is_file():
         raise typer.BadParameter(f"{target} is no regular file, which an index would replace.")
-    root_told(root, beside=target.parent)  # before hours of work, whether it may be written
+    recorded_root(root, beside=target.parent)  # before hours of work, whether it may be written
     done_before = target.with_name(f"{target.name}.journal")
     try:
         with (
             writing(done_before),
-            Journal(done_before, walk=f"{_whole(root)} valid_depth={mode}") as journal,
+            SceneJournal(done_before, walk=f"{_whole(root)} valid_depth={mode}") as journal,
             progress_bar("indexing", unit="scenes") as progress,
         ):
             report = walk(

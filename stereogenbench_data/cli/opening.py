@@ -26,7 +26,8 @@ def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
     """
     from stereogenbench_data.errors import StorageError
     from stereogenbench_data.index.build import walk
-    from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
+    from stereogenbench_data.index.parquet import INDEX_NAME
+    from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.sources.location import is_remote, local_path
 
     folder = None if is_remote(data) else local_path(data)
@@ -49,8 +50,9 @@ def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
 
 def _opened(data: str, root: str | None) -> "SceneIndex":
     """Return an index that exists; its warnings are said as a command says things."""
+    from stereogenbench_data.index.open import IncompleteSceneWarning
     from stereogenbench_data.index.stale import StaleIndexWarning
-    from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
+    from stereogenbench_data.index.table import SceneIndex
 
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always", IncompleteSceneWarning)

@@ -20,7 +20,8 @@ def complete_from(values: Iterable[str]) -> Callable[[str], list[str]]:
 def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
     """Return the keys of scenes that begin with what was typed, where DATA has an index."""
     from stereogenbench_data.errors import StereoGenBenchError
-    from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
+    from stereogenbench_data.index.parquet import INDEX_NAME
+    from stereogenbench_data.index.table import SceneIndex
 
     # Before an option without its value yet, the arguments are parsed but not assigned.
     data = Path(str(context.params.get("data") or next(iter(context.args), "")))

@@ -53,8 +53,9 @@ def pack(  # noqa: PLR0913 - one parameter an option
     sizes and times of change and reads metadata again; `stereogenbench verify` reads every byte.
     With --part, run the same command once for each I; whichever is finished last writes the index.
     """
+    from stereogenbench_data.index.open import IncompleteSceneWarning
     from stereogenbench_data.index.stale import StaleIndexWarning
-    from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
+    from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.schema.problems import counted, plain_line
     from stereogenbench_data.shards.pack import pack as pack_locally
     from stereogenbench_data.shards.plan import parse_size

@@ -1,23 +1,34 @@
-"""From a released tree to its scenes: all described, in parallel, none left out in silence."""
+"""From a released tree to its scenes: all described, in parallel, none left out in silence.
 
+A journal keeps what was described, so that a killed run goes on where it stopped: one JSON object a
+line, of which the first says what the work is, and each other one holds a scene's value and a stamp
+of its files. A line that a kill cut short is passed over, and its scene is read again.
+"""
+
+import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from types import TracebackType
+from typing import Any, Final, Literal, TextIO
 
 from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
-from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
-from stereogenbench_data.index.journal import Journal
-from stereogenbench_data.index.release_tree import SceneFolders, find_scene_folders
-from stereogenbench_data.index.remote_tree import find_remote_scenes
-from stereogenbench_data.index.scene_files import files_of
+from stereogenbench_data.errors import (
+    MediaError,
+    StereoGenBenchError,
+    StorageError,
+    describe_os_error,
+)
+from stereogenbench_data.index.rows import SCHEMA, row_of, scene_of
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     ValidDepth,
     describe_scene,
+    open_scene_folder,
     stamp_of,
 )
+from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes, find_scene_folders
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.problems import counted
@@ -28,6 +39,7 @@ from stereogenbench_data.sources.location import is_remote, shown
 Progress = Callable[[int, int], None]
 
 _NAMED: Final = 6
+_JOURNAL_FORMAT: Final = 2
 POOL_FROM: Final = 64
 """How many scenes there must be for worker processes to be worth their start."""
 
@@ -64,12 +76,131 @@ class _Outcome:
     reason: str = ""
 
 
+class Journal:
+    """JSON values by scene, on disk; leaving its block keeps the file, `delete` removes it."""
+
+    def __init__(self, path: Path, *, work: Mapping[str, Any]) -> None:
+        """Read what a journal holds; that of other work is begun anew.
+
+        Nothing is written before the first value is added.
+
+        Args:
+            path: The journal's file.
+            work: What the work is, as JSON: two runs that say the same share their values.
+
+        Raises:
+            StorageError: If the file is there and cannot be read.
+        """
+        self._path = path
+        self._file: TextIO | None = None
+        self._head = json.dumps({"journal": _JOURNAL_FORMAT, **work})
+        try:
+            lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        except (FileNotFoundError, NotADirectoryError):
+            lines = []
+        except OSError as error:
+            what = f"{path}: the journal of an earlier run cannot be read"
+            cure = "Remove it, or write the result to another folder."
+            raise StorageError(describe_os_error(what, error, cure)) from error
+        self._is_same = bool(lines) and lines[0] == self._head
+        self._known = _parse_lines(lines[1:]) if self._is_same else {}
+
+    def __len__(self) -> int:
+        """The number of scenes that earlier runs have done."""
+        return len(self._known)
+
+    def value(self, key: str, *, stamp: str) -> Any:
+        """Return what was noted of a scene; None if nothing was, or its files have changed."""
+        known = self._known.get(key)
+        return known[1] if known is not None and known[0] == stamp else None
+
+    def note(self, key: str, value: Any, *, stamp: str) -> None:
+        """Note a scene's value, any JSON but null, so that it outlives this process.
+
+        Raises:
+            StorageError: If the file cannot be written.
+        """
+        line = json.dumps({"key": key, "stamp": stamp, "value": value})
+        try:
+            if self._file is None:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                self._file = self._path.open("a" if self._is_same else "w", encoding="utf-8")
+                self._file.write("\n" if self._is_same else f"{self._head}\n")
+            self._file.write(f"{line}\n")
+            self._file.flush()
+        except OSError as error:
+            what = f"{self._path}: the journal cannot be written"
+            cure = "Write the result to another folder."
+            raise StorageError(describe_os_error(what, error, cure)) from error
+
+    def delete(self) -> None:
+        """Remove the file: what it holds was written elsewhere."""
+        self._close()
+        self._path.unlink(missing_ok=True)
+
+    def _close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def __enter__(self) -> "Journal":
+        """Return the journal itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file, and keep it."""
+        self._close()
+
+
+class SceneJournal(Journal):
+    """A journal of scenes that were described."""
+
+    def __init__(self, path: Path, *, walk: str) -> None:
+        """Read what a journal of this walk holds; see `Journal`."""
+        super().__init__(path, work={"walk": walk, "columns": SCHEMA.names})
+
+    def __enter__(self) -> "SceneJournal":
+        """Return the journal itself."""
+        return self
+
+    def find(self, key: str, *, stamp: str) -> Scene | None:
+        """Return a scene described before, None if it was not or its files have changed."""
+        row = self.value(key, stamp=stamp)
+        try:
+            return None if row is None else scene_of(row)
+        except (ValueError, KeyError, TypeError, IndexError, AttributeError):
+            return None
+
+    def add(self, scene: Scene, *, stamp: str) -> None:
+        """Note a scene, so that it outlives this process.
+
+        Raises:
+            StorageError: If the file cannot be written.
+        """
+        self.note(scene.id.key, row_of(scene), stamp=stamp)
+
+
+def _parse_lines(lines: list[str]) -> dict[str, tuple[str, Any]]:
+    known: dict[str, tuple[str, Any]] = {}
+    for line in lines:
+        try:
+            entry: Any = json.loads(line)
+            known[str(entry["key"])] = (entry["stamp"], entry["value"])
+        except (ValueError, KeyError, TypeError):
+            continue
+    return known
+
+
 def walk(
     root: str | Path,
     *,
     workers: int | None = None,
     progress: Progress | None = None,
-    journal: Journal | None = None,
+    journal: SceneJournal | None = None,
     valid_depth: ValidDepth = "skip",
     wanted: Callable[[SceneId], bool] | None = None,
 ) -> TreeReport:
@@ -99,7 +230,7 @@ def walk(
     if progress is not None:
         progress(len(outcomes), total)
     pending = [key for key in folders.keys if key not in outcomes]
-    task = _Task(str(root), valid_depth)
+    task = _DescribeTask(str(root), valid_depth)
     for outcome in _described(task, pending, workers):
         outcomes[outcome.key] = outcome
         if journal is not None and outcome.scene is not None:
@@ -111,8 +242,8 @@ def walk(
 
 
 def _chosen(
-    root: str | Path, folders: SceneFolders, wanted: Callable[[SceneId], bool]
-) -> SceneFolders:
+    root: str | Path, folders: FoundScenes, wanted: Callable[[SceneId], bool]
+) -> FoundScenes:
     keys = tuple(key for key in folders.keys if wanted(parse_scene_key(key)))
     if not keys:
         there = sorted({key.rpartition("/")[0] for key in folders.keys})
@@ -121,11 +252,11 @@ def _chosen(
             f"{shown(str(root))}: none of its {counted(len(folders.keys), 'scene')} is asked for; "
             f"there are scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
         )
-    return SceneFolders(keys, folders.refused)
+    return FoundScenes(keys, folders.refused)
 
 
 @dataclass(frozen=True, slots=True)
-class _Task:
+class _DescribeTask:
     """Describes a scene by its key; travels to worker processes."""
 
     root: str
@@ -133,7 +264,7 @@ class _Task:
 
     def __call__(self, key: str) -> _Outcome:
         try:
-            stamp = stamp_of(files_of(self.root, key).stamps())
+            stamp = stamp_of(open_scene_folder(self.root, key).stamps())
             scene = describe_scene(self.root, key, valid_depth=self.valid_depth)
         except IncompleteScene as error:
             return _Outcome(key, "incomplete", reason=str(error))
@@ -142,11 +273,13 @@ class _Task:
         return _Outcome(key, "whole", scene, stamp)
 
 
-def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> dict[str, _Outcome]:
+def _reused(
+    root: str | Path, keys: Iterable[str], journal: SceneJournal | None
+) -> dict[str, _Outcome]:
     outcomes: dict[str, _Outcome] = {}
     for key in keys if journal is not None and len(journal) else ():
         try:
-            stamp = stamp_of(files_of(root, key).stamps())
+            stamp = stamp_of(open_scene_folder(root, key).stamps())
         except StorageError:
             continue
         scene = journal.find(key, stamp=stamp) if journal is not None else None
@@ -155,13 +288,13 @@ def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> d
     return outcomes
 
 
-def _described(task: _Task, keys: list[str], workers: int | None) -> Iterator[_Outcome]:
+def _described(task: _DescribeTask, keys: list[str], workers: int | None) -> Iterator[_Outcome]:
     items = [(task, key) for key in keys]
     few = len(keys) < POOL_FROM
     return run_tasks(_describe, items, workers=1 if few else workers, after_bytes=_ignore)
 
 
-def _describe(item: tuple[_Task, str], after_bytes: AfterBytes) -> _Outcome:
+def _describe(item: tuple[_DescribeTask, str], after_bytes: AfterBytes) -> _Outcome:
     task, key = item
     after_bytes(0)
     return task(key)
@@ -171,7 +304,7 @@ def _ignore(count: int) -> None:
     """Take no note of bytes: scenes are counted."""
 
 
-def _report(root: str | Path, folders: SceneFolders, outcomes: list[_Outcome]) -> TreeReport:
+def _report(root: str | Path, folders: FoundScenes, outcomes: list[_Outcome]) -> TreeReport:
     ids = [parse_scene_key(key) for key in folders.keys]
     maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
     found = [outcome.scene for outcome in outcomes if outcome.scene is not None]

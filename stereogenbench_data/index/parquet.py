@@ -10,7 +10,8 @@ import math
 import os
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,18 +19,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from stereogenbench_data.errors import StorageError, cure_of
-from stereogenbench_data.index.arrow_arrays import as_numpy
-from stereogenbench_data.index.rows import SCHEMA
+from stereogenbench_data.errors import StorageError, cure_of, describe_os_error
+from stereogenbench_data.index.arrow import as_numpy
+from stereogenbench_data.index.rows import SCHEMA, row_of
+from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.sources.files import open_atomic
-from stereogenbench_data.sources.location import (
-    is_remote,
-    local_path,
-    shown,
-    why_not_from_a_file,
-)
+from stereogenbench_data.sources.location import is_remote, local_path, shown
 from stereogenbench_data.sources.members import UNSAFE_PATH
+
+INDEX_NAME: Final = "index.parquet"
 
 _OF_RELEASE: Final = "Run `stereogenbench index ROOT` again."
 _OF_SHARDS: Final = (
@@ -38,10 +37,32 @@ _OF_SHARDS: Final = (
 )
 
 _FORMAT: Final = 1
-_LONGEST_ROOT: Final = 300
 _LARGEST: Final = 2**63
 _UNSAFE: Final = re.compile(UNSAFE_PATH)
 _METADATA_KEY: Final = b"stereogenbench_data.index"
+
+
+@dataclass(frozen=True, slots=True)
+class IndexHead:
+    """What an index file says beside its rows.
+
+    Attributes:
+        root: The folder or URL to which the members' paths are relative.
+        digest: The sha256 of the rows, 64 hex digits; empty where it is not known yet.
+        incomplete: Key to reason, for scenes that were not finished when the index was made.
+        broken: Key to what is wrong, for scenes that were left out for it.
+        shards: What is known of each shard, by its path below the root; empty for folders.
+        is_part: Whether it was made of a part of the root on purpose.
+        passed_over: Keys of scenes that the root holds and the index leaves out on purpose.
+    """
+
+    root: str
+    digest: str = ""
+    incomplete: dict[str, str] = field(default_factory=dict)
+    broken: dict[str, str] = field(default_factory=dict)
+    shards: dict[str, ShardFacts] = field(default_factory=dict)
+    is_part: bool = False
+    passed_over: tuple[str, ...] = ()
 
 
 def made_again(where: str) -> str:
@@ -52,8 +73,8 @@ def made_again(where: str) -> str:
     return _OF_RELEASE if next(shards, None) is None else _OF_SHARDS
 
 
-def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Table, dict[str, Any]]:
-    """Return an index file's rows, and what it says of itself.
+def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Table, IndexHead]:
+    """Return the rows of an index file, in one chunk, and its head as it stands there.
 
     Raises:
         StorageError: If it is no index of this version, or was altered.
@@ -61,7 +82,7 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
     try:
         with pq.ParquetFile(file) as parquet:
             metadata = (parquet.schema_arrow.metadata or {}).get(_METADATA_KEY)
-            head = _require_head(metadata, where=where)
+            head = _parse_head(metadata, where=where)
             table = parquet.read().replace_schema_metadata().combine_chunks()
         table.validate(full=True)
     except StorageError:
@@ -79,30 +100,40 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
     return table, head
 
 
-def write_index_file(path: Path, table: pa.Table, description: Mapping[str, Any]) -> None:
-    """Write an index file, whole or not at all.
+def write_index_file(path: Path, table: pa.Table, head: IndexHead) -> None:
+    """Write an index file, whole or not at all; it records its root as `recorded_root` says.
 
     Raises:
         StorageError: If it cannot be written.
     """
-    head = json.dumps({"format": _FORMAT} | dict(description))
-    described = table.replace_schema_metadata({_METADATA_KEY: head})
+    description = {
+        "format": _FORMAT,
+        "root": recorded_root(head.root, beside=path.parent),
+        "digest": head.digest,
+        "incomplete": head.incomplete,
+        "broken": head.broken,
+        "part": head.is_part,
+        "passed_over": list(head.passed_over),
+        "shards": {name: asdict(facts) for name, facts in sorted(head.shards.items())},
+    }
+    described = table.replace_schema_metadata({_METADATA_KEY: json.dumps(description)})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open_atomic(path) as file:
             pq.write_table(described, file, compression="zstd")
     except OSError as error:
         raise StorageError(
-            f"{path}: the index cannot be written ({error.strerror or error}). "
-            + cure_of(error, "Choose another place with --out.")
+            describe_os_error(
+                f"{path}: the index cannot be written", error, "Choose another place with --out."
+            )
         ) from error
 
 
-def root_told(root: str, *, beside: Path) -> str:
-    """Return the root as an index in a folder remembers it.
+def recorded_root(root: str, *, beside: Path) -> str:
+    """Return the root as an index file in a folder records it: "." for that folder.
 
     Raises:
-        StorageError: If it is a URL with something secret in it, which no file shall keep.
+        StorageError: If it is a URL with a login or a query, which may be secret.
     """
     if not is_remote(root):
         whole = local_path(root).resolve()
@@ -115,63 +146,23 @@ def root_told(root: str, *, beside: Path) -> str:
     return root
 
 
-def root_of(path: Path, head: Mapping[str, Any], table: pa.Table) -> str | Path:
-    """Return the data's root: the index's own folder if the data are there, else the recorded.
-
-    The file may be another's, so what it records is opened only where that can do no harm: below
-    the index's own folder, or at a URL of which `why_not_from_a_file` has nothing to say.
+def table_of_scenes(scenes: Iterable[Scene], *, where: str) -> pa.Table:
+    """Return a checked table of scenes, one row each, sorted by key.
 
     Raises:
-        StorageError: If the recorded root needs the user's word, or is no folder.
+        StorageError: If two scenes have one key, or a path leaves the root.
     """
-    beside, recorded = path.parent, str(head["root"])
-    if recorded == "." or not table.num_rows or _are_beside(table, beside):
-        return beside
-    if is_remote(recorded):
-        reason = why_not_from_a_file(recorded)
-        if reason:
-            raise _needs_word(path, recorded, reason)
-        return recorded
-    folder = _folder_told(recorded, beside)
-    if folder is None or not folder.is_relative_to(beside.resolve()):
-        raise _needs_word(path, recorded, "it is outside the index's own folder")
-    if not folder.is_dir():
-        raise StorageError(
-            f"{path}: its data were at {folder}, which is no folder now. Move the index into "
-            f"the data's root, or run `stereogenbench index` again."
-        )
-    return folder
-
-
-def _are_beside(table: pa.Table, folder: Path) -> bool:
-    """Return whether a file of the first scene lies below a folder."""
-    members = table.column("members")[0].as_py()
-    return any((folder / member["path"]).exists() for member in members)
-
-
-def _folder_told(recorded: str, beside: Path) -> Path | None:
-    """Return the folder that a recorded path means, links followed; None if there is none."""
+    rows = sorted((row_of(scene) for scene in scenes), key=lambda row: str(row["key"]))
     try:
-        told = local_path(recorded) if recorded[:5].lower() == "file:" else Path(recorded)
-        return (beside / told).resolve()
-    except (OSError, ValueError, RuntimeError):
-        return None
+        table = pa.Table.from_pylist(rows, schema=SCHEMA)
+    except (pa.ArrowException, UnicodeEncodeError, OverflowError) as error:
+        raise StorageError(f"{where}: a scene does not fit the index: {error}.") from error
+    require_sound(table, where=where)
+    return table
 
 
-def _needs_word(path: Path, recorded: str, reason: str) -> StorageError:
-    told = shown(recorded)
-    is_plain = told.isprintable() and len(told) <= _LONGEST_ROOT
-    place = told if is_plain else repr(told[:_LONGEST_ROOT])
-    return StorageError(
-        f"{path}: its data are not beside it, and it records their root as {place}. A file may not "
-        f"choose such a place ({reason}). If you trust it, name the root yourself: "
-        f"SceneIndex.open({str(path)!r}, root=...), or --root with a command. Or move the index "
-        f"into that root."
-    )
-
-
-def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
-    """Return what an index says of itself, once it is known to be one of this version."""
+def _parse_head(metadata: bytes | None, *, where: str) -> IndexHead:
+    """Return what an index file says beside its rows, if it is one of this version."""
     try:
         head = json.loads(metadata or b"null")
     except (ValueError, RecursionError):
@@ -196,7 +187,16 @@ def _require_head(metadata: bytes | None, *, where: str) -> dict[str, Any]:
         or not isinstance(head.get("passed_over", []), list)
     ):
         raise StorageError(f"{where}: its description of itself was altered. {made_again(where)}")
-    return head
+    return IndexHead(
+        root=head["root"],
+        digest=str(head.get("digest")),
+        incomplete=head["incomplete"],
+        broken=head["broken"],
+        shards={path: ShardFacts(**facts) for path, facts in head["shards"].items()},
+        # An index of an earlier version that lies elsewhere may have been made of a part.
+        is_part=head.get("part", head["root"] != ".") is True,
+        passed_over=tuple(map(str, head.get("passed_over", ()))),
+    )
 
 
 def _are_texts(value: Any) -> bool:

@@ -1,21 +1,23 @@
-"""One scene's folder: whether it is finished, whole and true to itself, and its index row.
+"""One scene's folder: whether it is finished, whole and consistent, and its row of the index.
 
-All that an index says about a scene is found here, from its JSON files and the headers of its
-videos; no picture is decoded, unless the share of measured depth is asked for.
+All that an index says of a scene comes from here: from its JSON files and the headers of its
+videos. No picture is decoded unless the share of measured depth is asked for. The same files are
+compared with a row that was made before by `metadata_differences`.
 """
 
 import hashlib
 import math
+import os
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.errors import MediaError, StorageError
+from stereogenbench_data.errors import MediaError, SchemaError, StorageError, describe_os_error
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import (
@@ -23,7 +25,6 @@ from stereogenbench_data.geometry.rig import (
     lateral_offsets_m,
     rectification_residual_px,
 )
-from stereogenbench_data.index.scene_files import SceneFiles, files_of
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import (
     ANY_DEPTH,
@@ -34,7 +35,7 @@ from stereogenbench_data.media.depth import (
     resolve_encoding,
 )
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
-from stereogenbench_data.schema.document import parse_text
+from stereogenbench_data.schema.document import parse_text, require_text_size
 from stereogenbench_data.schema.parse import (
     parse_complete,
     parse_description,
@@ -57,6 +58,7 @@ from stereogenbench_data.schema.release import (
     COMPLETE_JSON,
     DESCRIPTION_JSON,
     DESCRIPTION_TXT,
+    METADATA_FILES,
     PACKED_DEPTH_NAMES,
     TRAJECTORY_JSON,
     VIDEO_FILES,
@@ -64,7 +66,10 @@ from stereogenbench_data.schema.release import (
     rgb_name,
 )
 from stereogenbench_data.schema.trajectory import parse_trajectory
-from stereogenbench_data.sources.ranged_file import MemberFile
+from stereogenbench_data.sources.location import is_remote, joined
+from stereogenbench_data.sources.members import read_text_file
+from stereogenbench_data.sources.ranged_file import MemberFile, RangedFile
+from stereogenbench_data.sources.remote import RemoteObject
 
 ValidDepth = Literal["skip", "sample"]
 
@@ -74,10 +79,113 @@ _DEVIATION_SHARE: Final = 0.001
 _LEAST_BESIDE: Final = 0.9
 """How much of a baseline must lie along camera 0's x axis: a rig turned by more than 25 degrees
 against the line on which its cameras stand is no lateral rig."""
+_FILES: Final = frozenset({*METADATA_FILES, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
+"""Files of a release; others in a scene's folder are passed over."""
+
+Difference = tuple[str, str]
+"""The file's name, empty for the scene's own path, and what it tells against the index."""
+
+_SAME_M: Final = 1e-6
+_SAME_PX: Final = 1e-3
+_SHOWN_LETTERS: Final = 60
 
 
 class IncompleteScene(StorageError):
     """A scene that is not finished, or of which only the metadata were fetched."""
+
+
+@runtime_checkable
+class SceneFolder(Protocol):
+    """A scene's folder, on this machine or behind a URL, as describing the scene reads it."""
+
+    def stamps(self) -> dict[str, tuple[int, int]]:
+        """Return the size in bytes and the time of change in ns (0 if unknown) of each file.
+
+        Raises:
+            StorageError: If the folder cannot be read.
+        """
+        ...
+
+    def read(self, name: str) -> bytes:
+        """Return a metadata file, whole.
+
+        Raises:
+            StorageError: If it cannot be read.
+            SchemaError: If it is too large for a metadata file.
+        """
+        ...
+
+    def video(self, name: str) -> Path | MemberFile:
+        """Return a video: its path, or an open file that is the caller's to close.
+
+        Raises:
+            StorageError: If it cannot be read.
+        """
+        ...
+
+
+def open_scene_folder(root: str | Path, key: str) -> SceneFolder:
+    """Return the files of the scene with a key below a root, which may be a URL."""
+    return RemoteSceneFolder(str(root), key) if is_remote(root) else LocalSceneFolder(root, key)
+
+
+class LocalSceneFolder:
+    """A scene's folder on this machine."""
+
+    def __init__(self, root: str | Path, key: str) -> None:
+        """Name the folder."""
+        self._folder = Path(root, key)
+        self._key = key
+
+    def stamps(self) -> dict[str, tuple[int, int]]:
+        """Return size and time of change of each file."""
+        try:
+            with os.scandir(self._folder) as entries:
+                found = {entry.name: entry.stat() for entry in entries if entry.name in _FILES}
+        except OSError as error:
+            what = f"{self._folder}: cannot be read"
+            raise StorageError(describe_os_error(what, error, "Fetch the scene again.")) from error
+        return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
+
+    def read(self, name: str) -> bytes:
+        """Return a metadata file."""
+        return read_text_file(self._folder / name, where=f"{self._key}/{name}")
+
+    def video(self, name: str) -> Path:
+        """Return a video's path."""
+        return self._folder / name
+
+
+class RemoteSceneFolder:
+    """A scene's folder behind a URL, of which only what is asked for is fetched."""
+
+    def __init__(self, root: str, key: str) -> None:
+        """Name the folder; nothing is asked of it yet."""
+        self._url = joined(root, key)
+        self._key = key
+        self._sizes: dict[str, int] = {}
+
+    def stamps(self) -> dict[str, tuple[int, int]]:
+        """Return the size of each file; the time of change is not known."""
+        if not self._sizes:
+            entries = RemoteObject(self._url).entries()
+            self._sizes = {
+                name: size
+                for name, size in sorted(entries.items())
+                if name in _FILES and size is not None
+            }
+        return {name: (size, 0) for name, size in self._sizes.items()}
+
+    def read(self, name: str) -> bytes:
+        """Fetch a metadata file."""
+        size, _ = self.stamps()[name]
+        require_text_size(size, where=f"{self._key}/{name}")
+        return RemoteObject(joined(self._url, name)).read(0, size)
+
+    def video(self, name: str) -> MemberFile:
+        """Return a video that is fetched as it is read."""
+        size, _ = self.stamps()[name]
+        return RangedFile(RemoteObject(joined(self._url, name)).read, size=size)
 
 
 def stamp_of(files: Mapping[str, tuple[int, int]]) -> str:
@@ -100,14 +208,14 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         SchemaError: If a metadata file does not follow the format.
         MediaError: If a video is not what its header says.
     """
-    folder = files_of(root, key)
+    folder = open_scene_folder(root, key)
     files = folder.stamps()
     _require_finished(key, files)
-    rig, labels = parse_rig(folder.text(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
-    marked = parse_complete(folder.text(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
-    trajectory = parse_trajectory(folder.text(TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}")
+    rig, labels = parse_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
+    marked = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
+    trajectory = parse_trajectory(folder.read(TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}")
     described: dict[str, bytes] = {
-        name: folder.text(name) for name in (DESCRIPTION_JSON, DESCRIPTION_TXT) if name in files
+        name: folder.read(name) for name in (DESCRIPTION_JSON, DESCRIPTION_TXT) if name in files
     }
     caption = caption_of(described, key=key)
     depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
@@ -145,7 +253,7 @@ def _held(files: Mapping[str, object], name: str) -> str:
     return name if name in files else PACKED_DEPTH_NAMES.get(name, name)
 
 
-def _probed(folder: SceneFiles, key: str, name: str) -> StreamFacts:
+def _probed(folder: SceneFolder, key: str, name: str) -> StreamFacts:
     video, told = folder.video(name), f"{key}/{name}"
     try:
         if name.endswith(".mp4"):
@@ -309,7 +417,7 @@ def _depth_unit(facts: StreamFacts, *, name: str) -> tuple[float, DepthUnitSourc
     return encoding.known_unit_m, "tag" if encoding.source == "tag" else "default"
 
 
-def _valid_ratio(folder: SceneFiles, key: str, frames: int) -> float:
+def _valid_ratio(folder: SceneFolder, key: str, frames: int) -> float:
     shares = []
     encoding = DepthEncoding()
     files = folder.stamps()
@@ -320,3 +428,106 @@ def _valid_ratio(folder: SceneFiles, key: str, frames: int) -> float:
                 known = measured(units, encoding=encoding, pixel_format=reader.facts.pixel_format)
                 shares.append(float(np.mean(known)))
     return float(np.mean(shares))
+
+
+def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Difference]:
+    """Return what a scene's metadata files tell otherwise than its row of an index.
+
+    Compared are path, split, family, map, rig, baselines, labels, caption, number of frames, the
+    cameras' places and the rig's residual; not what the videos alone tell.
+
+    Args:
+        scene: The row.
+        texts: File name to bytes; files that are not given are not compared.
+    """
+    found = [*_differing_place(scene)]
+    for names, compare in (
+        ((BASELINE_JSON,), _differing_rig),
+        ((BASELINE_JSON, COMPLETE_JSON), _differing_labels),
+        ((TRAJECTORY_JSON,), _differing_poses),
+        ((), _differing_caption),
+    ):
+        if all(name in texts for name in names):
+            try:
+                found += compare(scene, texts)
+            except SchemaError as error:
+                told = str(error).removeprefix(f"{scene.id.key}/")
+                name, _, reason = told.partition(": ")
+                found.append((name, reason.rstrip(".")))
+    return list(dict.fromkeys(found))
+
+
+def _told(name: str, what: str, found: object, indexed: object) -> Difference:
+    return name, f"tells {what} {_brief(found)}, and by the index it is {_brief(indexed)}"
+
+
+def _brief(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _SHOWN_LETTERS else f"{text[:_SHOWN_LETTERS]}..."
+
+
+def _differing_place(scene: Scene) -> Iterator[Difference]:
+    try:
+        place = parse_scene_key(scene.id.key)
+    except SchemaError as error:
+        yield "", str(error).rstrip(".")
+        return
+    for name in ("split", "subset", "family", "map_name"):
+        found, indexed = getattr(place, name), getattr(scene.id, name)
+        is_told = found is not None or scene.id.split == "train"
+        if is_told and found != indexed:
+            yield "", f"its path tells {name} {found!r}, and by the index it is {indexed!r}"
+
+
+def _differing_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
+    rig, _ = parse_rig(texts[BASELINE_JSON], where=f"{scene.id.key}/{BASELINE_JSON}")
+    for each in fields(Rig):
+        if each.name.startswith("image_") and rig.image_size_source == "default":
+            continue
+        found, indexed = getattr(rig, each.name), getattr(scene.rig, each.name)
+        if not _same(found, indexed):
+            yield _told(BASELINE_JSON, each.name, found, indexed)
+
+
+def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
+    key = scene.id.key
+    _, labels = parse_rig(texts[BASELINE_JSON], where=f"{key}/{BASELINE_JSON}")
+    marked = parse_complete(texts[COMPLETE_JSON], where=f"{key}/{COMPLETE_JSON}")
+    merged = merged_labels(labels, marked)
+    for each in fields(SceneLabels):
+        found, indexed = getattr(merged, each.name), getattr(scene.labels, each.name)
+        if found != indexed:
+            is_marked = getattr(labels, each.name) is None and found is not None
+            yield _told(COMPLETE_JSON if is_marked else BASELINE_JSON, each.name, found, indexed)
+
+
+def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
+    where = f"{scene.id.key}/{TRAJECTORY_JSON}"
+    trajectory = parse_trajectory(texts[TRAJECTORY_JSON], where=where)
+    if trajectory.frame_count != scene.frames:
+        yield _told(TRAJECTORY_JSON, "frames", trajectory.frame_count, scene.frames)
+        return
+    poses = CameraPoses.from_trajectory(trajectory)
+    lateral_m = lateral_offsets_m(poses)
+    if not np.allclose(lateral_m, scene.lateral_m, rtol=0, atol=_SAME_M):
+        places_m = tuple(map(float, lateral_m))
+        yield _told(TRAJECTORY_JSON, "lateral_m", places_m, scene.lateral_m)
+    residual_px = rectification_residual_px(poses, rig_intrinsics(scene.rig))
+    if not math.isclose(residual_px, scene.rig_residual_px, rel_tol=_SAME_PX, abs_tol=_SAME_PX):
+        yield _told(TRAJECTORY_JSON, "rig_residual_px", residual_px, scene.rig_residual_px)
+
+
+def _differing_caption(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
+    names = [name for name in (DESCRIPTION_JSON, DESCRIPTION_TXT) if name in texts]
+    caption = caption_of(texts, key=scene.id.key)
+    if names and caption != scene.caption:
+        yield _told(names[0], "the caption", caption, scene.caption)
+
+
+def _same(found: Any, indexed: Any) -> bool:
+    """Return whether two values are equal, numbers as far as a sum may round them."""
+    if isinstance(found, tuple) and isinstance(indexed, tuple):
+        return len(found) == len(indexed) and all(map(_same, found, indexed))
+    if isinstance(found, float) and isinstance(indexed, float):
+        return math.isclose(found, indexed, rel_tol=1e-9)
+    return bool(found == indexed)

@@ -14,8 +14,9 @@ from threading import Event
 from typing import Final
 
 from stereogenbench_data.errors import StorageError, cure_of
-from stereogenbench_data.index.stale import scenes_listed
-from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
+from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.index.tree import ListedTree
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import METADATA_FILES
 from stereogenbench_data.sources.files import open_atomic
@@ -158,7 +159,7 @@ def download(
         for scene in wanted.scenes
     ]
     here = SceneIndex.from_scenes(scenes, dest)
-    here.passed_over = tuple(sorted(scenes_listed(dest) - {scene.id.key for scene in scenes}))
+    here.passed_over = tuple(sorted(ListedTree(dest).keys - {scene.id.key for scene in scenes}))
     here.write(dest / INDEX_NAME)
     return here
 

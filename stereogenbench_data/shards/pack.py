@@ -11,7 +11,9 @@ from pathlib import Path
 
 from stereogenbench_data.engine.process_pool import run_tasks
 from stereogenbench_data.errors import ShardError, cure_of
-from stereogenbench_data.index.table import INDEX_NAME, SceneIndex, warn_if_stale
+from stereogenbench_data.index.open import warn_if_stale
+from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frame_file import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES

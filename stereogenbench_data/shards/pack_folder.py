@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from stereogenbench_data.errors import ShardError
-from stereogenbench_data.index.table import INDEX_NAME
+from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.shards.plan import ShardPlan
 from stereogenbench_data.shards.tar import read_members
 from stereogenbench_data.shards.writer import UNFINISHED

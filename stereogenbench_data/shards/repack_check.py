@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from stereogenbench_data.errors import ShardError, cure_of
-from stereogenbench_data.index.metadata_check import metadata_differences
+from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import METADATA_FILES
 from stereogenbench_data.shards.manifest import SeenFile, ShardNote, ShardTask, row_digest

@@ -15,7 +15,8 @@ from typing import Final, Literal
 
 from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
-from stereogenbench_data.index.table import SceneIndex, warn_if_stale
+from stereogenbench_data.index.open import warn_if_stale
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.media.video import probe

@@ -11,7 +11,6 @@ changes that time: then its checksum decides whether it is still what was fetche
 last is its time of access.
 """
 
-import errno
 import hashlib
 import json
 import os
@@ -22,7 +21,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-from stereogenbench_data.errors import ShardError, StorageError, cure_of
+from stereogenbench_data.errors import (
+    DISK_FULL,
+    NOT_WRITABLE,
+    ShardError,
+    StorageError,
+    describe_os_error,
+)
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.sources.files import copy_with_crc32, locked, try_locked, write_atomic
 from stereogenbench_data.sources.ranged_file import FileSlice
@@ -38,7 +43,6 @@ _OWN_FILE: Final = re.compile(r"([0-9a-f]{64})\.(member|part)")
 _FULL: Final = 0.9
 """The share of the limit to which a full cache is emptied, so that not every item empties it."""
 
-_READ_ONLY: Final = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
 _FIRST_STAMP_S: Final = 1_000_000_000
 
 
@@ -284,7 +288,7 @@ def _where_writable() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno not in _READ_ONLY:
+        if error.errno not in NOT_WRITABLE:
             raise
 
 
@@ -316,11 +320,8 @@ def _named_errors(folder: Path) -> Iterator[None]:
     except StorageError:
         raise
     except OSError as error:
-        cure = (
-            "Free space, or give the cache a smaller limit."
-            if error.errno in (errno.ENOSPC, errno.EDQUOT)
-            else cure_of(error, "Choose another folder for the cache.")
-        )
+        what = f"{folder}: the cache cannot be read or written"
+        smaller = " Or give the cache a smaller limit." if error.errno in DISK_FULL else ""
         raise StorageError(
-            f"{folder}: the cache cannot be read or written ({error.strerror or error}). {cure}"
+            describe_os_error(what, error, "Choose another folder for the cache.") + smaller
         ) from error

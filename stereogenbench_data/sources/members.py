@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from stereogenbench_data.errors import ShardError, StorageError, cure_of
+from stereogenbench_data.errors import ShardError, StorageError, describe_os_error
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.sources.cache import ShardCache
@@ -41,7 +41,7 @@ def size_of(location: str | Path) -> int:
         return path.stat().st_size
     except OSError as error:
         raise StorageError(
-            f"{path}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
+            describe_os_error(f"{path}: cannot be read", error, "Fetch it again.")
         ) from error
 
 
@@ -61,7 +61,7 @@ def read_range(location: str | Path, start: int, stop: int) -> bytes:
         raise
     except OSError as error:
         raise StorageError(
-            f"{path}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
+            describe_os_error(f"{path}: cannot be read", error, "Fetch it again.")
         ) from error
 
 
@@ -226,9 +226,7 @@ def open_local(
     try:
         file = FileSlice(path, member)
     except OSError as error:
-        raise ShardError(
-            f"{path}: cannot be read ({error.strerror}). {cure_of(error, again)}"
-        ) from error
+        raise ShardError(describe_os_error(f"{path}: cannot be read", error, again)) from error
     found, end = file.status().st_size, member.offset + member.size
     if found < end or (shard is not None and found != shard.size):
         file.close()
@@ -252,11 +250,11 @@ def member_path(root: str | Path, member: Member) -> Path:
     try:
         size_bytes = path.stat().st_size
     except OSError as error:
-        raise StorageError(
-            f"{path}: cannot be read ({error.strerror}), and the index says that it has "
-            f"{member.size} bytes. "
-            + cure_of(error, "Fetch it again, or run `stereogenbench index` again.")
-        ) from error
+        cure = (
+            f"By the index it has {member.size} bytes: fetch it again, or run `stereogenbench "
+            f"index` again."
+        )
+        raise StorageError(describe_os_error(f"{path}: cannot be read", error, cure)) from error
     if size_bytes != member.offset + member.size:
         raise StorageError(
             f"{path}: has {size_bytes} bytes, and the index says "
@@ -329,6 +327,6 @@ def read_text_file(path: Path, *, where: str) -> bytes:
             return path.read_bytes()
     except OSError as error:
         raise StorageError(
-            f"{where}: cannot be read ({error.strerror}). {cure_of(error, 'Fetch it again.')}"
+            describe_os_error(f"{where}: cannot be read", error, "Fetch it again.")
         ) from error
     raise StorageError(f"{where}: is no file. Put the release's own file in its place.")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from stereogenbench_data.errors import SynthesisError, cure_of
-from stereogenbench_data.index.table import warn_if_stale
+from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
 from stereogenbench_data.synthesis.crew import Job, run_jobs
 from stereogenbench_data.synthesis.export import completion_text, metadata_texts

@@ -18,7 +18,7 @@ from stereogenbench_data import (
     StereoPairs,
     StorageError,
 )
-from stereogenbench_data.index.table import IncompleteSceneWarning
+from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.samples.checks import OddSceneWarning
 from stereogenbench_data.synthesis import SynthRequest, synthesise
 from stereogenbench_data.synthesis.request import ExportContract

@@ -11,7 +11,8 @@ from stereogenbench_data.cli.commands import app
 from stereogenbench_data.cli.index import index
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build as walk_module
-from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
+from stereogenbench_data.index.open import IncompleteSceneWarning
+from stereogenbench_data.index.table import SceneIndex
 
 
 @pytest.fixture

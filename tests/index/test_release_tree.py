@@ -5,7 +5,7 @@ import os
 import pytest
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index.release_tree import find_scene_folders, root_of
+from stereogenbench_data.index.tree import find_scene_folders, release_root_of
 
 KEYS = (
     "eval/MapSeenInTrain/Uniform/Car_Dealer/scene_000000",
@@ -163,6 +163,6 @@ def test_a_folder_that_may_not_be_read_is_listed(tree, monkeypatch):
 
 
 def test_the_root_of_a_scenes_folder_is_found_from_its_path(tree):
-    assert root_of(tree / KEYS[0]) == tree
-    assert root_of(tree / KEYS[1]) == tree
-    assert root_of(tree / "mine/scene") is None
+    assert release_root_of(tree / KEYS[0]) == tree
+    assert release_root_of(tree / KEYS[1]) == tree
+    assert release_root_of(tree / "mine/scene") is None

@@ -8,8 +8,8 @@ from typer.testing import CliRunner
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index import table as index_module
-from stereogenbench_data.index.remote_tree import find_remote_scenes
+from stereogenbench_data.index import open as index_module
+from stereogenbench_data.index.tree import find_remote_scenes
 from tests.servers.fault import serving
 from tests.servers.hub import REPOSITORY, HubHandler
 from tests.servers.tools import require_module

@@ -6,10 +6,10 @@ import shutil
 import pytest
 
 from stereogenbench_data.errors import MediaError, SchemaError, StorageError
-from stereogenbench_data.index.scene_files import files_of
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     describe_scene,
+    open_scene_folder,
     stamp_of,
 )
 from stereogenbench_data.schema.records import Member
@@ -219,11 +219,11 @@ def test_a_folder_that_is_gone_is_named(root):
 
 def test_the_stamp_changes_with_a_files_size_and_time(make_scene, root):
     path = make_scene() / "trajectory.json"
-    first = stamp_of(files_of(root, KEY).stamps())
+    first = stamp_of(open_scene_folder(root, KEY).stamps())
 
     os.utime(path, (1, 1))
-    second = stamp_of(files_of(root, KEY).stamps())
+    second = stamp_of(open_scene_folder(root, KEY).stamps())
     path.unlink()
-    third = stamp_of(files_of(root, KEY).stamps())
+    third = stamp_of(open_scene_folder(root, KEY).stamps())
 
     assert len({first, second, third}) == 3

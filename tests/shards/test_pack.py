@@ -21,7 +21,8 @@ from typer.testing import CliRunner
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.engine.process_pool import run_tasks
 from stereogenbench_data.errors import ShardError, StorageError
-from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
+from stereogenbench_data.index.open import IncompleteSceneWarning
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards import writer as shard_writer
 from stereogenbench_data.shards.manifest import ShardTask
 from stereogenbench_data.shards.pack import OversizedSceneWarning, pack, prepare

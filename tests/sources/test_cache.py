@@ -281,7 +281,7 @@ def test_a_full_disk_is_told_and_leaves_nothing(cache, shelf, tmp_path, monkeypa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(cache_module.os, "fsync", full)
-    with pytest.raises(StorageError, match=r"\(No space left on device\). Free space, or give"):
+    with pytest.raises(StorageError, match=r"\(No space left on device\)\. .*smaller limit"):
         cache.open(member(0, 2000), remote=shelf, revision="1")
     assert items(tmp_path) == []
 

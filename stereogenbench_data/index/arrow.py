@@ -1,0 +1,103 @@
+"""Arrow's columns as numpy arrays, and a digest of a table's content.
+
+Arrow's own conversions import pandas where it is installed, which takes longer than opening the
+index of a whole release; these do not.
+"""
+
+import hashlib
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+
+def as_numpy(values: Any) -> np.ndarray:
+    """Return a column of one chunk: numbers, booleans, strings, or lists of a fixed length.
+
+    Args:
+        values: A `pyarrow.Array`.
+
+    Returns:
+        Numbers of the column's own dtype, float64 with nan where some are null; bool; strings as
+        objects, None where null; (n, length) for lists of a fixed length. It may be a view of
+        Arrow's memory, and is then read-only.
+    """
+    kind = values.type
+    if pa.types.is_fixed_size_list(kind):
+        return as_numpy(values.flatten()).reshape(-1, kind.list_size)
+    if pa.types.is_boolean(kind):
+        return as_numpy(values.cast(pa.uint8())).astype(bool)
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        return np.array(values.to_pylist(), dtype=object)
+    numbers = _stored_numbers(values)
+    if not values.null_count:
+        return numbers
+    return np.where(as_numpy(values.is_valid()), numbers.astype(np.float64), np.nan)
+
+
+def _stored_numbers(values: Any) -> np.ndarray:
+    """Return the numbers of a column as a read-only view, with any value where one is null."""
+    dtype = np.dtype(values.type.to_pandas_dtype())
+    if len(values) == 0:
+        return np.empty(0, dtype=dtype)
+    start = values.offset * dtype.itemsize
+    return np.frombuffer(values.buffers()[1], dtype=dtype, count=len(values), offset=start)
+
+
+def _stored_strings(values: Any) -> tuple[np.ndarray, bytes]:
+    """Return the strings of a column: lengths in bytes, (n,) int32, 0 for null, and all bytes."""
+    if len(values) == 0:
+        return np.empty(0, dtype=np.int32), b""
+    _, offsets, content = values.buffers()
+    ends = np.frombuffer(offsets, dtype=np.int32, count=len(values) + 1, offset=4 * values.offset)
+    lengths = np.diff(ends)
+    if values.null_count and lengths[~as_numpy(values.is_valid())].any():
+        encoded = [(text or "").encode() for text in values.to_pylist()]
+        return np.array([len(text) for text in encoded], dtype=np.int32), b"".join(encoded)
+    if content is None:
+        return lengths, b""
+    return lengths, content.slice(int(ends[0]), int(ends[-1] - ends[0])).to_pybytes()
+
+
+def table_digest(table: pa.Table) -> str:
+    """Return a sha256 of all names and values, however they are stored, as 64 hex digits."""
+    digest = hashlib.sha256()
+    for name in sorted(table.column_names):
+        digest.update(name.encode() + b"\0")
+        column = table.column(name).combine_chunks()
+        for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
+            _feed(digest, chunk)
+    return digest.hexdigest()
+
+
+def _feed(digest: "hashlib._Hash", values: Any) -> None:
+    kind = values.type
+    digest.update(np.array([len(values)], dtype="<i8").tobytes())
+    known = as_numpy(values.is_valid()) if values.null_count else np.ones(len(values), dtype=bool)
+    digest.update(np.packbits(known).tobytes())
+    if pa.types.is_struct(kind):
+        for field in values.flatten():
+            _feed(digest, field)
+    elif pa.types.is_list(kind):
+        _feed_numbers(digest, pc.list_value_length(values))
+        _feed(digest, values.flatten())
+    elif pa.types.is_fixed_size_list(kind):
+        _feed(digest, values.flatten())
+    elif pa.types.is_string(kind):
+        lengths, texts = _stored_strings(values)
+        _feed_array(digest, lengths)
+        digest.update(texts)
+    else:
+        _feed_numbers(digest, values)
+
+
+def _feed_numbers(digest: "hashlib._Hash", values: Any) -> None:
+    numbers = _stored_numbers(values)
+    if values.null_count:
+        numbers = np.where(as_numpy(values.is_valid()), numbers, numbers.dtype.type(0))
+    _feed_array(digest, numbers)
+
+
+def _feed_array(digest: "hashlib._Hash", numbers: np.ndarray) -> None:
+    digest.update(numbers.astype(numbers.dtype.newbyteorder("<")).tobytes())

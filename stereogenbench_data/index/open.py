@@ -1,0 +1,278 @@
+"""Opening an index: from a place, whatever it is, to a checked table of scenes.
+
+    a file ─────────────────────┬─ read ── where its data are ── digest ── what is new there
+    a folder with an index file ┘
+    a URL ──────── fetched ─────── read ──────────────────────── digest
+    a folder or URL without one ── its scenes are described
+
+An index file may come from a stranger. What it names is opened only where that can do no harm; for
+any other place the user names the root.
+"""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import pyarrow as pa
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.index.arrow import table_digest
+from stereogenbench_data.index.build import walk
+from stereogenbench_data.index.parquet import (
+    INDEX_NAME,
+    IndexHead,
+    made_again,
+    read_index_file,
+    table_of_scenes,
+)
+from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
+from stereogenbench_data.index.tree import find_remote_scenes
+from stereogenbench_data.sources.filesystems import MissingObject
+from stereogenbench_data.sources.location import (
+    is_remote,
+    joined,
+    local_path,
+    shown,
+    split_name,
+    why_not_from_a_file,
+)
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import RetryPolicy
+
+MAX_INDEX_BYTES: Final = 256 * 2**20
+"""The largest index that is fetched. One of 8,493 scenes has a few megabytes."""
+
+MOST_REMOTE_SCENES: Final = 64
+"""The most scenes behind a URL that are described when a tree without an index is opened."""
+
+_LONGEST_ROOT: Final = 300
+_SHOWN: Final = 10
+
+
+class IncompleteSceneWarning(UserWarning):
+    """Some scenes of the data cannot be used: the message names them and says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedTable:
+    """An index as it was opened.
+
+    Attributes:
+        table: One row a scene, checked; its columns are `rows.SCHEMA`.
+        head: What is known beside the rows; its root is where the data are.
+        stale: What the root holds that the index does not know, or lacks of it, and the cure.
+    """
+
+    table: pa.Table
+    head: IndexHead
+    stale: str = ""
+
+
+def open_table(
+    data: str | Path, *, root: str | Path | None, retry: RetryPolicy | None
+) -> OpenedTable:
+    """Return the scenes of some data; `SceneIndex.open` describes the arguments and the errors.
+
+    Warns of scenes that cannot be used, and of an index that is older than its data, in the name
+    of the caller's caller.
+    """
+    named_root = None if root is None else _require_root(root)
+    if is_remote(data):
+        where = shown(data)
+        opened = _open_url(str(data), root=named_root, retry=retry)
+    else:
+        path = local_path(data)
+        where = str(path)
+        if path.is_dir() and not (path / INDEX_NAME).is_file():
+            _require_no_root(path, named_root)
+            opened = _open_tree(path)
+        elif path.is_dir() or path.is_file():
+            opened = open_file(path / INDEX_NAME if path.is_dir() else path, root=named_root)
+        else:
+            raise StorageError(
+                f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or "
+                f"a folder in the released layout."
+            )
+    left_out = {**opened.head.incomplete, **opened.head.broken}
+    if left_out:
+        warnings.warn(f"{where}: {_listed(left_out)}", IncompleteSceneWarning, stacklevel=3)
+    if opened.stale:
+        warnings.warn(opened.stale, StaleIndexWarning, stacklevel=3)
+    return opened
+
+
+def open_file(path: Path, *, root: str | None) -> OpenedTable:
+    """Return the index in a file, whose data are where the user or, within limits, the file says.
+
+    Raises:
+        StorageError: If it is damaged or not an index of this version, or its data are where only
+            the user may send us.
+    """
+    table, head = read_index_file(path, where=str(path))
+    head = replace(head, root=_recorded_root(path, head, table) if root is None else root)
+    _require_digest(table, head, where=str(path))
+    if is_remote(head.root):
+        return OpenedTable(table, head)
+    return OpenedTable(table, head, stale_message(table, head, index_file=path))
+
+
+def warn_if_stale(root: str | Path) -> None:
+    """Warn if a folder has an index that does not know what was just written into it."""
+    path = local_path(root) / INDEX_NAME
+    if not path.is_file():
+        return
+    try:
+        stale = open_file(path, root=None).stale
+    except StorageError:
+        return  # an index that cannot be read raises an error when it is opened
+    if stale:
+        warnings.warn(stale, StaleIndexWarning, stacklevel=3)
+
+
+def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> OpenedTable:
+    """Fetch an index. Its data lie beside it unless the user names their root."""
+    beside, name = split_name(url)
+    is_folder = not name.endswith(".parquet")
+    if is_folder:
+        beside, url = url.rstrip("/"), joined(url.rstrip("/"), INDEX_NAME)
+    remote = RemoteObject(url, retry=retry)
+    try:
+        size = remote.size()
+    except MissingObject:
+        if not is_folder:
+            raise
+        _require_no_root(shown(beside), root)
+        _require_few_scenes(beside)
+        return _open_tree(beside)
+    if size > MAX_INDEX_BYTES:
+        raise StorageError(
+            f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
+            f"{size:,}. It was not read: is it another file?"
+        )
+    content = pa.BufferReader(remote.read(0, size))
+    table, head = read_index_file(content, where=remote.where)
+    head = replace(head, root=root or beside)
+    _require_digest(table, head, where=remote.where)
+    return OpenedTable(table, head)
+
+
+def _open_tree(root: str | Path) -> OpenedTable:
+    """Describe the scenes of a folder or URL in the released layout."""
+    # In this process: a script without `if __name__ == "__main__"` could start no others.
+    report, where = walk(root, workers=1), shown(root)
+    if report.broken:
+        raise StorageError(
+            f"{where}: {_listed(report.broken)}\nRepair or remove them; or leave them out on "
+            f"purpose: `stereogenbench index {where}` makes an index without them."
+        )
+    if not report.scenes:
+        raise StorageError(f"{where}: no scene is finished: {_listed(report.incomplete)}")
+    head = IndexHead(root=report.root, incomplete=report.incomplete, is_part=report.is_part)
+    return OpenedTable(table_of_scenes(report.scenes, where=where), head)
+
+
+def _require_few_scenes(root: str) -> None:
+    """Refuse a tree behind a URL that is too large to be described each time it is opened."""
+    found = find_remote_scenes(root)
+    if len(found.keys) > MOST_REMOTE_SCENES:
+        raise StorageError(
+            f"{shown(root)}: has no {INDEX_NAME}, and the headers of {len(found.keys)} scenes "
+            "are too many to be fetched each time. Index it once, or the part you need: "
+            f"`stereogenbench index {shown(root)} -o index.parquet --split eval`, and open "
+            "that file."
+        )
+
+
+def _require_digest(table: pa.Table, head: IndexHead, *, where: str) -> None:
+    if table_digest(table) != head.digest:
+        raise StorageError(
+            f"{where}: its rows are not those that were written. {made_again(where)}"
+        )
+
+
+def _require_root(root: str | Path) -> str:
+    """Return the root that the user named: any URL, or a folder."""
+    if is_remote(root):
+        return str(root)
+    folder = local_path(root)
+    if not str(root) or not folder.is_dir():
+        raise StorageError(
+            f"{str(root)!r}: is no folder, and was named as the root of an index's data. Name the "
+            f"folder, or the URL, to which the paths in the index are relative."
+        )
+    return str(folder)
+
+
+def _require_no_root(where: str | Path, root: str | None) -> None:
+    if root is not None:
+        raise StorageError(
+            f"{where}: has no {INDEX_NAME}, and a root was named for the data of one. Leave root "
+            f"out, or pass the index file."
+        )
+
+
+def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
+    """Return the data's root: the index's own folder if the data are there, else the recorded one.
+
+    A recorded root is opened only below the index's own folder, or at a URL that
+    `why_not_from_a_file` allows.
+
+    Raises:
+        StorageError: If the user must name the root, or it is not a folder.
+    """
+    beside, recorded = path.parent, head.root
+    if recorded == "." or not table.num_rows or _are_beside(table, beside):
+        return str(beside)
+    if is_remote(recorded):
+        reason = why_not_from_a_file(recorded)
+        if reason:
+            raise _must_be_named(path, recorded, reason)
+        return recorded
+    folder = _recorded_folder(recorded, beside)
+    if folder is None or not folder.is_relative_to(beside.resolve()):
+        raise _must_be_named(path, recorded, "it is outside the index's own folder")
+    if not folder.is_dir():
+        raise StorageError(
+            f"{path}: its data were at {folder}, which is no folder now. Move the index into "
+            f"the data's root, or run `stereogenbench index` again."
+        )
+    return str(folder)
+
+
+def _are_beside(table: pa.Table, folder: Path) -> bool:
+    """Return whether a file of the first scene lies below a folder."""
+    members = table.column("members")[0].as_py()
+    return any((folder / member["path"]).exists() for member in members)
+
+
+def _recorded_folder(recorded: str, beside: Path) -> Path | None:
+    """Return the folder that a recorded path means, links followed; None if there is none."""
+    try:
+        folder = local_path(recorded) if recorded[:5].lower() == "file:" else Path(recorded)
+        return (beside / folder).resolve()
+    except (OSError, ValueError, RuntimeError):
+        return None
+
+
+def _must_be_named(path: Path, recorded: str, reason: str) -> StorageError:
+    place = shown(recorded)
+    if not place.isprintable() or len(place) > _LONGEST_ROOT:
+        place = repr(place[:_LONGEST_ROOT])
+    return StorageError(
+        f"{path}: its data are not beside it, and it records their root as {place}. A file may not "
+        f"choose such a place ({reason}). If you trust it, name the root yourself: "
+        f"SceneIndex.open({str(path)!r}, root=...), or --root with a command. Or move the index "
+        f"into that root."
+    )
+
+
+def _listed(left_out: Mapping[str, str]) -> str:
+    lines = [
+        reason if key in reason else f"{key}: {reason}" for key, reason in sorted(left_out.items())
+    ]
+    if len(lines) > _SHOWN:
+        lines[_SHOWN:] = [f"and {len(lines) - _SHOWN} more"]
+    count = f"{len(left_out)} scene{'s' if len(left_out) > 1 else ''} cannot be used:"
+    return "\n  ".join([count, *lines])
