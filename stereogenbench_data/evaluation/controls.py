@@ -13,6 +13,7 @@ from typing import Any, Final, Unpack
 import numpy as np
 
 from stereogenbench_data.datasets.mapped import Data
+from stereogenbench_data.engine import LOCAL
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.evaluate import EvaluationOptions, scored, selected
 from stereogenbench_data.evaluation.predictions import Wanted
@@ -188,6 +189,7 @@ def score_controls(
             OtherView(RANDOM_RIGHT, protocol.size, donors=donors),
         ),
         workers=options.get("workers"),
+        engine=options.get("engine", LOCAL),
         beside=donors,
     )
     return scored(extent, run, options=options, tier=CONTROL, about={"seed": seed})

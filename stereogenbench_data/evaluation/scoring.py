@@ -12,7 +12,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from stereogenbench_data.engine.process_pool import AfterBytes
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.evaluation.candidates import Candidate, Views
 from stereogenbench_data.evaluation.frame_scores import PairScorer, PairScores, TargetFrame
 from stereogenbench_data.evaluation.one_thread import one_thread
@@ -57,7 +57,7 @@ SceneScores = dict[tuple[str, Pair], PairScores]
 
 
 def score_scene(
-    work: SceneWork, after_frames: AfterBytes, *, tools: Tools | None = None
+    work: SceneWork, after_frames: Advance, *, tools: Tools | None = None
 ) -> SceneScores:
     """Return the scores of each candidate and pair of a scene.
 

@@ -3,10 +3,11 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
+from stereogenbench_data.engine import LOCAL, Advance, Engine
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.index.journal import Journal
 from stereogenbench_data.index.release_tree import SceneFolders, find_scene_folders
@@ -64,10 +65,11 @@ class _Outcome:
     reason: str = ""
 
 
-def walk(
+def walk(  # noqa: PLR0913 - each is an option of the command
     root: str | Path,
     *,
     workers: int | None = None,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
     journal: Journal | None = None,
     valid_depth: ValidDepth = "skip",
@@ -80,6 +82,7 @@ def walk(
             listed (``hf://datasets/...``, ``s3://...``).
         workers: Processes that read at the same time; None is one a core. With few scenes this
             process reads them all.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with the number of scenes done and that of all, after each.
         journal: Where described scenes are kept, and found again by a later walk.
         valid_depth: "sample" decodes some depth pictures of each scene, to tell the share of
@@ -100,7 +103,7 @@ def walk(
         progress(len(outcomes), total)
     pending = [key for key in folders.keys if key not in outcomes]
     task = _Task(str(root), valid_depth)
-    for outcome in _described(task, pending, workers):
+    for outcome in _described(task, pending, workers, engine):
         outcomes[outcome.key] = outcome
         if journal is not None and outcome.scene is not None:
             journal.add(outcome.scene, stamp=outcome.stamp)
@@ -155,20 +158,19 @@ def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> d
     return outcomes
 
 
-def _described(task: _Task, keys: list[str], workers: int | None) -> Iterator[_Outcome]:
+def _described(
+    task: _Task, keys: list[str], workers: int | None, engine: Engine
+) -> Iterator[_Outcome]:
     items = [(task, key) for key in keys]
-    few = len(keys) < POOL_FROM
-    return run_tasks(_describe, items, workers=1 if few else workers, after_bytes=_ignore)
+    if engine is LOCAL and len(keys) < POOL_FROM:
+        workers = 1
+    return engine.map(_describe, items, name=itemgetter(1), workers=workers)
 
 
-def _describe(item: tuple[_Task, str], after_bytes: AfterBytes) -> _Outcome:
+def _describe(item: tuple[_Task, str], after_bytes: Advance) -> _Outcome:
     task, key = item
     after_bytes(0)
     return task(key)
-
-
-def _ignore(count: int) -> None:
-    """Take no note of bytes: scenes are counted."""
 
 
 def _report(root: str | Path, folders: SceneFolders, outcomes: list[_Outcome]) -> TreeReport:
