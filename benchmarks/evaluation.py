@@ -34,7 +34,8 @@ from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.members import MemberSource
-from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 
 LIMIT = 3.0
 """Scoring may take so many times the decoding, beside what the matchers take."""

@@ -7,7 +7,8 @@ from torch import nn
 
 from stereogenbench_data import Compose, HorizontalFlip, RandomCrop, StereoPairs
 from stereogenbench_data.samples.picture import contact_sheet, write_png
-from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 
 DEMO, SHARDS = Path("demo"), Path(__file__).parents[1] / "shards"
 FIELDS = ("left", "right", "disparity", "valid", "visible", "baseline_m", "pair", "__key__")

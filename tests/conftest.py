@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 
 pytest_plugins = ("tests.servers.fixtures", "tests.servers.scene_fixtures")
 

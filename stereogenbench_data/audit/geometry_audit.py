@@ -20,7 +20,7 @@ from stereogenbench_data.audit.audit_records import (
 from stereogenbench_data.audit.audit_table import table_rows
 from stereogenbench_data.audit.findings import broken_finding, findings_of, untested_of
 from stereogenbench_data.audit.scene_audit import AuditTask, audit_scene, spread_frames
-from stereogenbench_data.engine.process_pool import run_tasks
+from stereogenbench_data.engine import LOCAL, Engine
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import Journal, walk
 from stereogenbench_data.index.open import IncompleteSceneWarning
@@ -79,6 +79,7 @@ def open_for_audit(
     *,
     root: str | Path | None = None,
     workers: int | None = None,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
     **filters: Unpack[SceneFilters],
 ) -> SceneIndex:
@@ -88,6 +89,7 @@ def open_for_audit(
         data: Whatever `SceneIndex.open` opens.
         root: Where the data of an index file are, by the user's word.
         workers: Processes that walk a tree that has no index.
+        engine: Where they are.
         progress: Called with the scenes walked, and all there are.
         **filters: Scenes of a tree that their paths tell to be none of these are not described.
 
@@ -99,6 +101,7 @@ def open_for_audit(
         report = walk(
             data if is_remote(data) else local_path(data),
             workers=workers,
+            engine=engine,
             progress=progress,
             wanted=is_concerned.matches if is_concerned.wanted else None,
         )
@@ -127,6 +130,7 @@ def audit(
     request: AuditRequest | None = None,
     *,
     workers: int | None = None,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
     journal: Journal | None = None,
     **filters: Unpack[SceneFilters],
@@ -140,6 +144,7 @@ def audit(
         data: A released tree, shards, an index file, the URL of either, or an index.
         request: How much is audited, and against what limits.
         workers: Processes that work at the same time; None is one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called now and then with the frames audited, and all there are.
         journal: Where what was found of each scene is kept, so that an audit that was killed
             goes on, see `audit_journal`; None keeps nothing.
@@ -156,13 +161,21 @@ def audit(
     if isinstance(data, SceneIndex):
         index = data
     else:
-        index = open_for_audit(data, workers=workers, **filters)
+        index = open_for_audit(data, workers=workers, engine=engine, **filters)
     is_concerned = _Concerned(filters)
     broken = {key: text for key, text in index.broken.items() if is_concerned(key)}
     incomplete = {key: text for key, text in index.incomplete.items() if is_concerned(key)}
     rows = _chosen(index, request, filters, left_out=broken | incomplete)
     scenes = [index.scene(int(row)) for row in rows]
-    audited = _audited(index, scenes, request, workers=workers, progress=progress, journal=journal)
+    audited = _audited(
+        index,
+        scenes,
+        request,
+        workers=workers,
+        engine=engine,
+        progress=progress,
+        journal=journal,
+    )
     findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
     for scene in audited:
         findings += findings_of(scene, request.limits)
@@ -224,12 +237,13 @@ def _chosen(
     return np.sort(drawn)
 
 
-def _audited(
+def _audited(  # noqa: PLR0913 - options of `audit`
     index: SceneIndex,
     scenes: list[Scene],
     request: AuditRequest,
     *,
     workers: int | None,
+    engine: Engine,
     progress: Progress | None,
     journal: Journal | None,
 ) -> list[SceneAudit]:
@@ -250,7 +264,14 @@ def _audited(
         found = _known(journal, stamps)
     after_frames(sum(len(known.audited_frames) for known in found.values()))
     tasks = [_task(index, scene, request) for scene in scenes if scene.id.key not in found]
-    for audited in run_tasks(audit_scene, tasks, workers=workers, after_bytes=after_frames):
+    results = engine.map(
+        audit_scene,
+        tasks,
+        name=lambda task: task.scene.id.key,
+        workers=workers,
+        advance=after_frames,
+    )
+    for audited in results:
         found[audited.key] = audited
         if journal is not None:
             journal.note(audited.key, plain(asdict(audited)), stamp=stamps[audited.key])

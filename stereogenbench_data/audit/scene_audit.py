@@ -30,7 +30,7 @@ from stereogenbench_data.audit.reprojection import (
     reproject,
 )
 from stereogenbench_data.audit.rig_check import motion_px, rig_audit
-from stereogenbench_data.engine.process_pool import AfterBytes
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
@@ -209,7 +209,7 @@ def spread_frames(frames: int, wanted: int) -> tuple[int, ...]:
     return tuple(round(step * (frames - 1) / (wanted - 1)) for step in range(wanted))
 
 
-def audit_scene(task: AuditTask, after_bytes: AfterBytes) -> SceneAudit:
+def audit_scene(task: AuditTask, after_bytes: Advance) -> SceneAudit:
     """Return what is found of a scene; nothing that is wrong with it is raised.
 
     Args:
@@ -240,7 +240,7 @@ class _SceneCheck:
         self.alignment = AlignmentCheck(self.intrinsics, frames=len(self.frames))
         self.seen: dict[tuple[int, int], tuple[Any, Any]] = {}
 
-    def run(self, after_bytes: AfterBytes) -> SceneAudit:
+    def run(self, after_bytes: Advance) -> SceneAudit:
         """Audit the scene."""
         try:
             rig, poses = self._metadata()

@@ -11,6 +11,7 @@ import typer
 from stereogenbench_data.cli.options import (
     CaptionOption,
     DataArgument,
+    EngineOption,
     FamilyOption,
     FocalOption,
     JsonOption,
@@ -88,6 +89,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
     ] = None,
     as_json: JsonOption = False,
     workers: WorkersOption = None,
+    engine: EngineOption = "local",
 ) -> None:
     """Measure whether data are right, and list what is not.
 
@@ -105,6 +107,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
         open_for_audit,
     )
     from stereogenbench_data.audit.geometry_audit import audit as audited
+    from stereogenbench_data.engine import engine_of
 
     if out is not None and out.is_dir():
         raise typer.BadParameter(f"{out} is a folder: name a file, such as {out / 'audit.md'}.")
@@ -124,16 +127,28 @@ def audit(  # noqa: PLR0913 - one parameter an option
         focal_mm=focal_mm,
         caption=caption,
     )
+    where = engine_of(engine)
     try:
         with progress_bar("reading the index", unit="scenes") as progress:
             index = open_for_audit(
-                data, root=data_root, workers=workers, progress=progress, **filters
+                data,
+                root=data_root,
+                workers=workers,
+                engine=where,
+                progress=progress,
+                **filters,
             )
         notes = journal or _journal(out, data, request)
         kept = audit_journal(notes, index, request)
         with writing(notes), kept, progress_bar("auditing", unit="frames") as progress:
             report = audited(
-                index, request, workers=workers, progress=progress, journal=kept, **filters
+                index,
+                request,
+                workers=workers,
+                engine=where,
+                progress=progress,
+                journal=kept,
+                **filters,
             )
     except KeyboardInterrupt:
         typer.echo("stopped; run the same command again to go on from here", err=True)

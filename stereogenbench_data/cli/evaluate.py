@@ -34,6 +34,7 @@ from stereogenbench_data.cli.options import (
     CaptionOption,
     DataArgument,
     DepthUnitOption,
+    EngineOption,
     FamilyOption,
     FocalOption,
     JsonOption,
@@ -88,6 +89,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     plots: PlotsOption = True,
     as_json: JsonOption = False,
     workers: WorkersOption = None,
+    engine: EngineOption = "local",
 ) -> None:
     """Score a method's right views by the paper's protocol, beside the paper's own rows.
 
@@ -96,6 +98,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     plots) goes to --out [evaluation/NAME-TIER], and so do partial results: a stopped run goes on
     if it is run again.
     """
+    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.evaluation.evaluate import evaluate as evaluated
     from stereogenbench_data.evaluation.report import document, page, write_report
     from stereogenbench_data.evaluation.tables import tables_of
@@ -135,6 +138,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
                 protocol=protocol,
                 out=folder / "partial",
                 workers=workers,
+                engine=engine_of(engine, device=device),
                 allow_missing=allow_missing,
                 progress=progress,
                 pairs=parse_pairs(pairs),

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.console import Console
 
-from stereogenbench_data.cli.options import FamilyOption, JsonOption, MapOption, SplitOption
+from stereogenbench_data.cli.options import (
+    EngineOption,
+    FamilyOption,
+    JsonOption,
+    MapOption,
+    SplitOption,
+)
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.cli.writing import writing
@@ -34,6 +40,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that read scenes [one a core].")
     ] = None,
+    engine: EngineOption = "local",
     valid_depth: Annotated[
         bool,
         typer.Option(
@@ -53,6 +60,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     are listed and left out. Broken ones too, and then the exit status is 1. With --split,
     --family or --map only such scenes are read.
     """
+    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.index.build import SceneJournal, walk
     from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
@@ -84,6 +92,7 @@ def index(  # noqa: PLR0913 - one parameter an option
             report = walk(
                 root,
                 workers=workers,
+                engine=engine_of(engine),
                 progress=progress,
                 journal=journal,
                 valid_depth=mode,

@@ -95,6 +95,15 @@ DepthUnitOption = Annotated[
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")]
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes [one a core].")]
+EngineOption = Annotated[
+    str,
+    typer.Option(
+        "--engine",
+        help="local: processes here; ray: the Ray cluster of RAY_ADDRESS or of this machine "
+        "(extra 'ray'); ray://HOST:PORT or HOST:PORT: the one there.",
+        autocompletion=complete_from(("local", "ray")),
+    ),
+]
 OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
 
 

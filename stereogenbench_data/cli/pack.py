@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from stereogenbench_data.cli.options import JsonOption, RootOption
+from stereogenbench_data.cli.options import EngineOption, JsonOption, RootOption
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.stopping import STOPPED
 
@@ -33,10 +33,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that pack [one a core].")
     ] = None,
-    engine: Annotated[
-        Literal["local", "ray"],
-        typer.Option(help="local: processes here; ray: tasks of a Ray cluster (extra 'ray')."),
-    ] = "local",
+    engine: EngineOption = "local",
     depth_codec: Annotated[
         Literal["released", "blosc2"],
         typer.Option(
@@ -53,13 +50,13 @@ def pack(  # noqa: PLR0913 - one parameter an option
     sizes and times of change and reads metadata again; `stereogenbench verify` reads every byte.
     With --part, run the same command once for each I; whichever is finished last writes the index.
     """
+    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.index.open import IncompleteSceneWarning
     from stereogenbench_data.index.stale import StaleIndexWarning
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.schema.problems import counted, plain_line
-    from stereogenbench_data.shards.pack import pack as pack_locally
+    from stereogenbench_data.shards.pack import pack as packed_by
     from stereogenbench_data.shards.plan import parse_size
-    from stereogenbench_data.shards.ray_pack import pack_on_ray
 
     target_bytes, wanted = parse_size(shard_size), _part(part)
     try:
@@ -74,25 +71,16 @@ def pack(  # noqa: PLR0913 - one parameter an option
             def progress(done: int, total: int) -> None:
                 bar(-(-done // _MEGABYTE), -(-total // _MEGABYTE))
 
-            if engine == "ray":
-                report = pack_on_ray(
-                    index,
-                    out,
-                    target_bytes=target_bytes,
-                    depth_codec=depth_codec,
-                    part=wanted,
-                    progress=progress,
-                )
-            else:
-                report = pack_locally(
-                    index,
-                    out,
-                    target_bytes=target_bytes,
-                    depth_codec=depth_codec,
-                    part=wanted,
-                    workers=workers,
-                    progress=progress,
-                )
+            report = packed_by(
+                index,
+                out,
+                target_bytes=target_bytes,
+                depth_codec=depth_codec,
+                part=wanted,
+                workers=workers,
+                engine=engine_of(engine),
+                progress=progress,
+            )
     except KeyboardInterrupt:
         typer.echo("stopped; run the same command again to go on from here", err=True)
         raise typer.Exit(STOPPED) from None

@@ -1,13 +1,12 @@
 """``stereogenbench synth``: scenes in the released layout, drawn without Unreal."""
 
 import json
-import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
-from stereogenbench_data.cli.options import JsonOption, complete_from
+from stereogenbench_data.cli.options import EngineOption, JsonOption, complete_from
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.schema.problems import counted
@@ -18,9 +17,6 @@ from stereogenbench_data.schema.release import (
     Split,
     Subset,
 )
-
-if TYPE_CHECKING:
-    from stereogenbench_data.synthesis.request import SynthRequest
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
 """As in `synthesis.request`, which is imported when scenes are drawn, not for the help."""
@@ -56,6 +52,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that draw (default: one a core).")
     ] = None,
+    engine: EngineOption = "local",
     as_json: JsonOption = False,
 ) -> None:
     """Draw scenes with exact depth, poses and intrinsics, in the released layout.
@@ -63,6 +60,8 @@ def synth(  # noqa: PLR0913 - one parameter an option
     Scenes that the same request wrote before are kept, so a run that was stopped goes on if it
     is run again. Scene i is the same for any number of scenes and workers.
     """
+    from stereogenbench_data.engine import engine_of
+    from stereogenbench_data.synthesis.produce import synthesise
     from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
     request = SynthRequest(
@@ -80,7 +79,10 @@ def synth(  # noqa: PLR0913 - one parameter an option
         ),
     )
     try:
-        keys = _drawn(out, request, workers=workers or os.cpu_count() or 1)
+        with progress_bar("drawing", unit="frames") as progress:
+            keys = synthesise(
+                out, request, workers=workers, engine=engine_of(engine), progress=progress
+            )
     except KeyboardInterrupt:
         typer.echo("stopped; run the same command again to go on from here", err=True)
         raise typer.Exit(STOPPED) from None
@@ -88,10 +90,3 @@ def synth(  # noqa: PLR0913 - one parameter an option
         typer.echo(json.dumps({"root": str(out), "scenes": keys}, indent=2))
     else:
         typer.echo(f"{out}: {counted(len(keys), 'scene')} in {request.folder}")
-
-
-def _drawn(out: Path, request: "SynthRequest", *, workers: int) -> list[str]:
-    from stereogenbench_data.synthesis.produce import synthesise
-
-    with progress_bar("drawing", unit="frames") as report:
-        return synthesise(out, request, workers=workers, progress=report)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from stereogenbench_data.cli.options import RootOption
+from stereogenbench_data.cli.options import EngineOption, RootOption
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.stopping import STOPPED
 
@@ -24,11 +24,13 @@ def verify(
     workers: Annotated[
         int | None, typer.Option(min=1, help="Processes that read [one a core].")
     ] = None,
+    engine: EngineOption = "local",
 ) -> None:
     """Read shards through, and list all that is wrong with them.
 
     The exit status is 0 if nothing is wrong, 1 if something is, 2 if they cannot be verified.
     """
+    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.schema.problems import counted, plain_line
     from stereogenbench_data.shards.verify import verify as verified
 
@@ -39,7 +41,14 @@ def verify(
             def progress(done: int, total: int) -> None:
                 bar(-(-done // _MEGABYTE), -(-total // _MEGABYTE))
 
-            report = verified(shards, root=data_root, mode=mode, workers=workers, progress=progress)
+            report = verified(
+                shards,
+                root=data_root,
+                mode=mode,
+                workers=workers,
+                engine=engine_of(engine),
+                progress=progress,
+            )
     except KeyboardInterrupt:
         typer.echo("stopped", err=True)
         raise typer.Exit(STOPPED) from None

@@ -13,6 +13,7 @@ from typing import Any, Final, Unpack
 import numpy as np
 
 from stereogenbench_data.datasets.mapped import Data
+from stereogenbench_data.engine import LOCAL
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.aggregate import CONTROL, Scores, cell
 from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
@@ -191,6 +192,7 @@ def score_controls(
             OtherView(RANDOM_RIGHT, protocol.size, donors=donors),
         ),
         workers=options.get("workers"),
+        engine=options.get("engine", LOCAL),
         beside=donors,
     )
     return scored(extent, run, options=options, tier=CONTROL, about={"seed": seed})

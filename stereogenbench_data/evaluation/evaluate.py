@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final, TypedDict, Unpack
 
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.engine import LOCAL, Engine
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, grouped, tally
 from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
@@ -41,6 +42,8 @@ class RunOptions(TypedDict, total=False):
             it they are lost.
         workers: How many processes score scenes, None for one a core. A callable is called, and
             its right views scored, in this process.
+        engine: Where scenes are scored, `engine.LOCAL` or an `engine.RayCluster`; a callable
+            stays in this process.
         allow_missing: How many right views of pairs may be missing or unusable; they are counted
             in the tables. 0 makes the first an error.
         progress: Called with (frames done, frames in all).
@@ -48,6 +51,7 @@ class RunOptions(TypedDict, total=False):
 
     out: str | Path | None
     workers: int | None
+    engine: Engine
     allow_missing: int
     progress: Progress
 
@@ -89,11 +93,11 @@ def evaluate(
     protocol = protocol or EvaluationProtocol()
     known = require_tier(tier)
     candidate: Candidate
-    workers = options.get("workers")
+    workers, engine = options.get("workers"), options.get("engine", LOCAL)
     if callable(predictions):
         called = name or str(getattr(predictions, "__name__", type(predictions).__name__))
         candidate = CalledMethod(called, predictions, known)
-        workers = 1
+        workers, engine = 1, LOCAL
     else:
         root = Path(predictions)
         if not root.is_dir():
@@ -105,6 +109,7 @@ def evaluate(
         candidates=(candidate,),
         allow_missing=options.get("allow_missing", 0),
         workers=workers,
+        engine=engine,
     )
     (scores,) = scored(extent, run, options=options, tier=known.name)
     return scores

@@ -24,7 +24,7 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
+from stereogenbench_data.engine import LOCAL, Advance
 from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
 from stereogenbench_data.evaluation.evaluate import selected
 from stereogenbench_data.evaluation.predictions import Wanted, frame_name, item_name
@@ -131,7 +131,13 @@ def export_inputs(
 
     after_frames(0)
     with closing(
-        run_tasks(_write_item, works, workers=options.get("workers"), after_bytes=after_frames)
+        LOCAL.map(
+            _write_item,
+            works,
+            name=lambda work: f"{work.wanted.scene}, pair {work.wanted.pair}",
+            workers=options.get("workers"),
+            advance=after_frames,
+        )
     ) as written:
         for _ in written:
             after_frames(0)
@@ -165,7 +171,7 @@ def _begin(root: Path, told: Mapping[str, Any]) -> None:
         )
 
 
-def _write_item(work: _ItemWork, after_frames: AfterBytes) -> None:
+def _write_item(work: _ItemWork, after_frames: Advance) -> None:
     """Write one item, whole or not at all."""
     unfinished = work.folder.with_name(f".{work.folder.name}")
     request = Request(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from stereogenbench_data.datasets.mapped import StereoPairs
-from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
+from stereogenbench_data.engine import LOCAL, Advance, Engine
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.partial import PartialResults
 from stereogenbench_data.evaluation.predictions import Candidate, Pair, PredictionFault, Wanted
@@ -100,6 +100,7 @@ class Run:
         candidates: Whose right views are scored.
         allow_missing: How many right views of pairs may be missing or unusable, and are counted.
         workers: How many processes, None for one a core.
+        engine: Where they are.
         beside: For each scene, by key, the one that candidates read beside it, if any.
     """
 
@@ -107,6 +108,7 @@ class Run:
     candidates: tuple[Candidate, ...]
     allow_missing: int = 0
     workers: int | None = None
+    engine: Engine = LOCAL
     beside: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -155,7 +157,7 @@ def score_all(extent: Extent, run: Run, *, partial: PartialResults, progress: Pr
 
     after_frames(0)
     _require_few(faults, allowed=run.allow_missing)
-    for scene, scores in _scored(works, workers=run.workers, after_frames=after_frames):
+    for scene, scores in _scored(works, run, after_frames=after_frames):
         partial.write(scene, scores, stamps=stamps[scene])
         faults.extend(found.fault for found in scores.values() if found.fault)
         _require_few(faults, allowed=run.allow_missing)
@@ -163,14 +165,16 @@ def score_all(extent: Extent, run: Run, *, partial: PartialResults, progress: Pr
 
 
 def _scored(
-    works: Sequence[SceneWork], *, workers: int | None, after_frames: AfterBytes
+    works: Sequence[SceneWork], run: Run, *, after_frames: Advance
 ) -> Iterator[tuple[str, SceneScores]]:
-    results = run_tasks(_score, works, workers=workers, after_bytes=after_frames)
+    results = run.engine.map(
+        _score, works, name=lambda work: work.scene, workers=run.workers, advance=after_frames
+    )
     with closing(results):
         yield from results
 
 
-def _score(work: SceneWork, after_frames: AfterBytes) -> tuple[str, SceneScores]:
+def _score(work: SceneWork, after_frames: Advance) -> tuple[str, SceneScores]:
     return work.scene, score_scene(work, after_frames)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from av.video.reformatter import VideoReformatter
 
-from stereogenbench_data.engine.process_pool import AfterBytes
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.metrics.frechet import Spread
 from stereogenbench_data.evaluation.metrics.matching import (
@@ -326,7 +326,7 @@ SceneScores = dict[tuple[str, Pair], PairScores]
 
 
 def score_scene(
-    work: SceneWork, after_frames: AfterBytes, *, tools: Tools | None = None
+    work: SceneWork, after_frames: Advance, *, tools: Tools | None = None
 ) -> SceneScores:
     """Return the scores of each candidate and pair of a scene.
 

@@ -9,11 +9,12 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Literal, TextIO
 
-from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
+from stereogenbench_data.engine import LOCAL, Advance, Engine
 from stereogenbench_data.errors import (
     MediaError,
     StereoGenBenchError,
@@ -195,10 +196,11 @@ def _parse_lines(lines: list[str]) -> dict[str, tuple[str, Any]]:
     return known
 
 
-def walk(
+def walk(  # noqa: PLR0913 - each is an option of the command
     root: str | Path,
     *,
     workers: int | None = None,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
     journal: SceneJournal | None = None,
     valid_depth: ValidDepth = "skip",
@@ -211,6 +213,7 @@ def walk(
             listed (``hf://datasets/...``, ``s3://...``).
         workers: Processes that read at the same time; None is one a core. With few scenes this
             process reads them all.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with the number of scenes done and that of all, after each.
         journal: Where described scenes are kept, and found again by a later walk.
         valid_depth: "sample" decodes some depth pictures of each scene, to tell the share of
@@ -231,7 +234,7 @@ def walk(
         progress(len(outcomes), total)
     pending = [key for key in folders.keys if key not in outcomes]
     task = _DescribeTask(str(root), valid_depth)
-    for outcome in _described(task, pending, workers):
+    for outcome in _described(task, pending, workers, engine):
         outcomes[outcome.key] = outcome
         if journal is not None and outcome.scene is not None:
             journal.add(outcome.scene, stamp=outcome.stamp)
@@ -288,20 +291,19 @@ def _reused(
     return outcomes
 
 
-def _described(task: _DescribeTask, keys: list[str], workers: int | None) -> Iterator[_Outcome]:
+def _described(
+    task: _DescribeTask, keys: list[str], workers: int | None, engine: Engine
+) -> Iterator[_Outcome]:
     items = [(task, key) for key in keys]
-    few = len(keys) < POOL_FROM
-    return run_tasks(_describe, items, workers=1 if few else workers, after_bytes=_ignore)
+    if engine is LOCAL and len(keys) < POOL_FROM:
+        workers = 1
+    return engine.map(_describe, items, name=itemgetter(1), workers=workers)
 
 
-def _describe(item: tuple[_DescribeTask, str], after_bytes: AfterBytes) -> _Outcome:
+def _describe(item: tuple[_DescribeTask, str], after_bytes: Advance) -> _Outcome:
     task, key = item
     after_bytes(0)
     return task(key)
-
-
-def _ignore(count: int) -> None:
-    """Take no note of bytes: scenes are counted."""
 
 
 def _report(root: str | Path, folders: FoundScenes, outcomes: list[_Outcome]) -> TreeReport:

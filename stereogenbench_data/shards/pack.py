@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from stereogenbench_data.engine.process_pool import run_tasks
+from stereogenbench_data.engine import LOCAL, Engine
 from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.parquet import INDEX_NAME
@@ -94,6 +94,7 @@ def pack(  # noqa: PLR0913 - each is an option of the command
     depth_codec: DepthCodec = "released",
     part: tuple[int, int] = (1, 1),
     workers: int | None = None,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
 ) -> PackReport:
     """Pack a release into tar shards, or one part of it.
@@ -110,6 +111,8 @@ def pack(  # noqa: PLR0913 - each is an option of the command
             alone and decodes faster, bit for bit (extra ``blosc2``).
         part: (I, N): pack every N-th shard, from the I-th on; I is 1 to N.
         workers: Processes that pack at the same time; None is one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`, of which all nodes find
+            release and folder at the same paths.
         progress: Called now and then with the bytes packed of this part, and all there are.
 
     Returns:
@@ -123,7 +126,13 @@ def pack(  # noqa: PLR0913 - each is an option of the command
     job = prepare(data, out, target_bytes=target_bytes, depth_codec=depth_codec, part=part)
     tasks = job.unfinished()
     after_bytes = packed_counter(job, tasks, progress)
-    outcomes = run_tasks(pack_task, tasks, workers=workers, after_bytes=after_bytes)
+    outcomes = engine.map(
+        pack_task,
+        tasks,
+        name=lambda task: str(task.target),
+        workers=workers,
+        advance=after_bytes,
+    )
     return finish(job, packed=[each.shard.name for each in outcomes if each.work == "packed"])
 
 

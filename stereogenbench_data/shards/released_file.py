@@ -9,7 +9,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.engine.process_pool import AfterBytes
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
 from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.shards.manifest import SeenFile
@@ -18,7 +18,7 @@ _CHUNK_BYTES: Final = 4 * 1024 * 1024
 
 
 def read_released(
-    source: Path, size: int, *, take: Callable[[bytes], object], after_bytes: AfterBytes
+    source: Path, size: int, *, take: Callable[[bytes], object], after_bytes: Advance
 ) -> SeenFile:
     """Hand over all bytes of a file, in pieces of a few megabytes.
 
@@ -55,7 +55,7 @@ def read_released(
 
 
 def read_packed_depth(
-    source: Path, size: int, *, frames: int, after_bytes: AfterBytes
+    source: Path, size: int, *, frames: int, after_bytes: Advance
 ) -> tuple[bytes, SeenFile]:
     """Return a released depth video as blosc2's frames, and the file as it was.
 

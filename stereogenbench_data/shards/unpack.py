@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
+from stereogenbench_data.engine import LOCAL, Advance
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.table import SceneIndex
@@ -122,7 +122,13 @@ def unpack(
                     f"unpack into another."
                 )
             try:
-                outcomes = run_tasks(unpack_scene, tasks, workers=workers, after_bytes=after_bytes)
+                outcomes = LOCAL.map(
+                    unpack_scene,
+                    tasks,
+                    name=lambda task: task.scene.id.key,
+                    workers=workers,
+                    advance=after_bytes,
+                )
                 found.update(outcomes)
             finally:
                 (out / _LOCK).unlink(missing_ok=True)
@@ -154,7 +160,7 @@ def _why_not_written(out: Path, error: OSError) -> str:
     return f"{error.filename or out}: cannot be written ({error.strerror or error}). {cure}"
 
 
-def unpack_scene(task: _Task, after_bytes: AfterBytes) -> tuple[str, Literal["unpacked", "kept"]]:
+def unpack_scene(task: _Task, after_bytes: Advance) -> tuple[str, Literal["unpacked", "kept"]]:
     """Unpack one scene, unless it is there; a worker process calls this.
 
     Raises:
@@ -191,7 +197,7 @@ def _member_of(task: _Task, member: Member) -> MemberFile:
 
 
 def _copy(
-    file: MemberFile, member: Member, target: Path, *, where: str, after_bytes: AfterBytes
+    file: MemberFile, member: Member, target: Path, *, where: str, after_bytes: Advance
 ) -> None:
     crc32 = 0
     with target.open("xb") as output:

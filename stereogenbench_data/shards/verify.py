@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.engine.process_pool import run_tasks
+from stereogenbench_data.engine import LOCAL, Engine
 from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.stale import StaleIndexWarning
@@ -56,6 +56,7 @@ def verify(
     root: str | Path | None = None,
     mode: Literal["bytes", "decode"] = "bytes",
     workers: int | None = None,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
 ) -> VerifyReport:
     """Compare shards, and what was packed beside them, with their index.
@@ -67,6 +68,7 @@ def verify(
         root: The folder of the shards, by your word, where an index file does not lie in it.
         mode: "bytes" reads all bytes; "decode" then decodes all frames of all videos, too.
         workers: Processes that work at the same time; None is one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called now and then with the bytes done, and all there are; with "decode" those
             of videos count twice.
 
@@ -88,11 +90,19 @@ def verify(
             progress(min(done, total), total)
 
     sound: set[str] = set()
-    for checked in run_tasks(check_shard, checks, workers=workers, after_bytes=after_bytes):
+    for checked in engine.map(
+        check_shard, checks, name=lambda each: each.shard, workers=workers, advance=after_bytes
+    ):
         problems += checked.problems
         sound |= checked.sound
     tasks = decode_tasks(scenes, index.root, sound)
-    for found in run_tasks(decode_scene, tasks, workers=workers, after_bytes=after_bytes):
+    for found in engine.map(
+        decode_scene,
+        tasks,
+        name=lambda task: task.scene.id.key,
+        workers=workers,
+        advance=after_bytes,
+    ):
         problems += found
     return VerifyReport(
         root=index.where,

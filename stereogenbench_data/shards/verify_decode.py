@@ -4,7 +4,7 @@ import io
 from dataclasses import dataclass
 from pathlib import Path
 
-from stereogenbench_data.engine.process_pool import AfterBytes
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, cure_of
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import require_depth_stream, resolve_encoding
@@ -54,7 +54,7 @@ def decode_tasks(scenes: list[Scene], root: str, sound: set[str]) -> list[Decode
     return tasks
 
 
-def decode_scene(task: DecodeTask, after_bytes: AfterBytes) -> list[Problem]:
+def decode_scene(task: DecodeTask, after_bytes: Advance) -> list[Problem]:
     """Decode all frames of a scene's videos; return what is wrong with any."""
     problems = []
     for name in task.names:

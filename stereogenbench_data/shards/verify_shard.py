@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.engine.process_pool import AfterBytes
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.schema.problems import counted
@@ -46,7 +46,7 @@ class CheckedShard:
     sound: set[str] = field(default_factory=set)
 
 
-def check_shard(expected: ExpectedShard, after_bytes: AfterBytes) -> CheckedShard:
+def check_shard(expected: ExpectedShard, after_bytes: Advance) -> CheckedShard:
     """Read a shard through and return what is wrong with it; a worker process calls this."""
     path = Path(expected.root, expected.shard)
     try:
@@ -58,7 +58,7 @@ def check_shard(expected: ExpectedShard, after_bytes: AfterBytes) -> CheckedShar
 
 
 def _checked(
-    expected: ExpectedShard, file: io.FileIO, size: int, after_bytes: AfterBytes
+    expected: ExpectedShard, file: io.FileIO, size: int, after_bytes: Advance
 ) -> CheckedShard:
     checked = CheckedShard()
     try:

@@ -12,7 +12,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.engine.process_pool import AfterBytes
+from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import METADATA_FILES
@@ -65,7 +65,7 @@ def pack_shard(plan: ShardPlan, number: int, out: str | Path) -> PackedShard:
     return pack_task(task, lambda count: None).shard
 
 
-def pack_task(task: ShardTask, after_bytes: AfterBytes) -> ShardOutcome:
+def pack_task(task: ShardTask, after_bytes: Advance) -> ShardOutcome:
     """Pack one shard, as `pack_shard` does; a worker process calls this."""
     done = find_packed(task)
     if done is not None:
@@ -82,7 +82,7 @@ def pack_task(task: ShardTask, after_bytes: AfterBytes) -> ShardOutcome:
         raise ShardError(_why_not_written(task, error)) from error
 
 
-def found_whole(task: ShardTask, after_bytes: AfterBytes) -> PackedShard | None:
+def found_whole(task: ShardTask, after_bytes: Advance) -> PackedShard | None:
     """Return a finished shard that was touched and holds the bytes that were noted all the same.
 
     Raises:
@@ -157,7 +157,7 @@ class _Output:
         self.sources.append(source)
 
 
-def _pack(task: ShardTask, file: FileIO, after_bytes: AfterBytes) -> ShardOutcome:
+def _pack(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardOutcome:
     # A shard without a note is kept if it is what packing gives: its notes were removed.
     is_unknown = read_note(task) is None and task.target.exists()
     note = _written(task, file, after_bytes)
@@ -195,7 +195,7 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def _written(task: ShardTask, file: FileIO, after_bytes: AfterBytes) -> ShardNote:
+def _written(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardNote:
     """Write a shard's bytes; return what is to be noted of it."""
     output = _Output(file)
     scenes = {scene.id.key: scene for scene in task.shard.scenes}
@@ -218,7 +218,7 @@ def _write_scene(
     output: _Output,
     *,
     scene: Scene | None,
-    after_bytes: AfterBytes,
+    after_bytes: Advance,
 ) -> None:
     """Write a scene's files, its metadata first; these must be what the index was made from."""
     texts: dict[str, bytes] = {}

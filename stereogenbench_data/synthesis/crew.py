@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from stereogenbench_data.engine.process_pool import run_tasks
+from stereogenbench_data.engine import LOCAL, Engine
 from stereogenbench_data.errors import StorageError, SynthesisError, cure_of
 from stereogenbench_data.synthesis.filming import film_camera
 from stereogenbench_data.synthesis.plan import plan_scene
@@ -41,20 +41,31 @@ class Job:
 
 
 def run_jobs(
-    jobs: Sequence[Job], *, workers: int, after_frames: Callable[[int], None]
+    jobs: Sequence[Job],
+    *,
+    workers: int | None,
+    engine: Engine = LOCAL,
+    after_frames: Callable[[int], None],
 ) -> Generator[Job, None, None]:
     """Do jobs in any order and yield each when it is done; close it to stop the rest.
 
     Args:
         jobs: The work.
-        workers: How many processes; 1 works in this one.
+        workers: How many processes, None for one a core; 1 works in this one.
+        engine: Where they are.
         after_frames: Called now and then with how many frames were drawn since it was called.
 
     Raises:
         SynthesisError: If a job fails or a worker dies; the others are stopped first.
     """
     try:
-        yield from run_tasks(_film, jobs, workers=workers, after_bytes=after_frames)
+        yield from engine.map(
+            _film,
+            jobs,
+            name=lambda job: f"{job.request.key(job.index)}, camera {job.camera}",
+            workers=workers,
+            advance=after_frames,
+        )
     except StorageError as error:
         raise SynthesisError(str(error)) from error
 

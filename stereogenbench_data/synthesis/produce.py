@@ -11,6 +11,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Final
 
+from stereogenbench_data.engine import LOCAL, Engine
 from stereogenbench_data.errors import SynthesisError, cure_of
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
@@ -26,7 +27,12 @@ _LOOK: Final = "See that the disk has room and may be written to."
 
 
 def synthesise(
-    out: str | Path, request: SynthRequest, *, workers: int = 1, progress: Progress | None = None
+    out: str | Path,
+    request: SynthRequest,
+    *,
+    workers: int | None = 1,
+    engine: Engine = LOCAL,
+    progress: Progress | None = None,
 ) -> list[str]:
     """Write scenes in the released layout, and keep those that the same request wrote before.
 
@@ -34,7 +40,9 @@ def synthesise(
         out: Root of the tree, made if need be.
         request: Which scenes; scene i does not depend on their number or on ``workers``.
         workers: Processes to draw with, one camera of one scene each. 1 draws in this process;
-            more are spawned, so a script must start them below ``if __name__ == "__main__"``.
+            more are spawned, so a script must start them below ``if __name__ == "__main__"``;
+            None is one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called now and then with the camera frames drawn so far, and all there are.
 
     Returns:
@@ -44,7 +52,7 @@ def synthesise(
         SynthesisError: If ``workers`` is below 1, a scene's folder holds something else, a file
             cannot be written, or a worker process dies.
     """
-    if workers < 1:
+    if workers is not None and workers < 1:
         raise SynthesisError(f"workers must be at least 1, got {workers}.")
     root = Path(out)
     missing = [index for index in range(request.scenes) if _is_missing(root, request, index=index)]
@@ -59,10 +67,11 @@ def synthesise(
 
     left = dict.fromkeys(missing, CAMERA_COUNT)
     jobs = list(_jobs(root, request, missing=missing))
-    needed = min(workers, max(1, len(missing) * CAMERA_COUNT))
     after_frames(0)
     try:
-        with closing(run_jobs(jobs, workers=needed, after_frames=after_frames)) as done:
+        with closing(
+            run_jobs(jobs, workers=workers, engine=engine, after_frames=after_frames)
+        ) as done:
             for job in done:
                 left[job.index] -= 1
                 if not left[job.index]:

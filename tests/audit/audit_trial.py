@@ -22,7 +22,8 @@ import typer
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.audit import audit
-from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import (
     as_inverse,
     as_ray,

@@ -21,8 +21,8 @@ import numpy as np
 
 from stereogenbench_data.audit.contract.doctor import diagnose
 from stereogenbench_data.audit.contract.verdict import Verdict, encoding_line
-from stereogenbench_data.synthesis import SynthRequest, synthesise
-from stereogenbench_data.synthesis.request import ExportContract
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.audit.corruption import (
     as_inverse,
     as_ray,

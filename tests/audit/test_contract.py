@@ -26,8 +26,8 @@ from stereogenbench_data.audit.contract.verdict import (
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.synthesis import SynthRequest, synthesise
-from stereogenbench_data.synthesis.request import ExportContract
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.audit.corruption import (
     as_inverse,
     as_ray,

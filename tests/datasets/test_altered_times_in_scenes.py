@@ -10,7 +10,8 @@ from stereogenbench_data import SceneIndex, StereoGenBenchError, StereoPairs
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.shards.pack import pack
-from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 from tests.media.test_altered_times import flipped, matroska_times
 
 FRAMES = 17

@@ -13,7 +13,8 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.selection.plan import Address
-from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 
 FRAMES = 4
 SIZE = (48, 64)

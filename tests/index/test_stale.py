@@ -21,7 +21,8 @@ from stereogenbench_data.selection.filters import filter_scenes
 from stereogenbench_data.selection.lookup import find_scene
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.unpack import unpack
-from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 
 MAP = "train/Uniform/SynthStage"
 OLD = r"index\.parquet: is older than the folder "

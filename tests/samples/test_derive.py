@@ -19,8 +19,8 @@ from stereogenbench_data.schema.records import (
     Trajectory,
 )
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.synthesis import SynthRequest, synthesise
-from stereogenbench_data.synthesis.request import ExportContract
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
 GAP_CM = 20.0
 INTRINSICS = Intrinsics(100.0, 100.0, 20.0, 10.0, 40, 20)

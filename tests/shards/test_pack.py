@@ -19,7 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.commands import app
-from stereogenbench_data.engine.process_pool import run_tasks
+from stereogenbench_data.engine import LOCAL
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
@@ -456,23 +456,9 @@ def test_workers_stop_in_the_middle_of_their_shards(large_tasks, tmp_path):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        list(run_tasks(pack_task, large_tasks, workers=2, after_bytes=interrupted))
+        list(LOCAL.map(pack_task, large_tasks, name=str, workers=2, advance=interrupted))
 
     assert tars(tmp_path / "out") == []
-
-
-class Deadly:
-    """Ends the process that unpickles it."""
-
-    def __reduce__(self):
-        return os._exit, (9,)
-
-
-def test_a_dead_worker_is_an_error_and_not_a_wait():
-    tasks = [Deadly(), Deadly()]
-
-    with pytest.raises(StorageError, match="a worker process died: it was killed"):
-        list(run_tasks(print, tasks, workers=2, after_bytes=lambda count: None))
 
 
 def test_no_workers_are_refused(release, tmp_path):

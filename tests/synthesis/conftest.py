@@ -6,8 +6,8 @@ import av
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis import SynthRequest, synthesise
-from stereogenbench_data.synthesis.request import ExportContract
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
 UNIT_M = 0.001
 SENSOR_MM = 23.76

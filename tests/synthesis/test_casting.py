@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis import SynthRequest
 from stereogenbench_data.synthesis.casting import GROUND, SKY, View, first_met, pixel_rays
 from stereogenbench_data.synthesis.plan import plan_scene
 from stereogenbench_data.synthesis.render import Scenery, draw_depth, draw_frame, still_light
+from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.shapes import Material, Shape
 
 LEVEL = np.zeros(2)

@@ -15,8 +15,7 @@ from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.schema.parse import parse_rig
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.schema.trajectory import parse_trajectory
-from stereogenbench_data.synthesis import SynthRequest
-from stereogenbench_data.synthesis.request import ExportContract
+from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
 OPENCV_FROM_UNREAL = np.array([[0, 1, 0], [0, 0, -1], [1, 0, 0]])
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis import SynthRequest
 from stereogenbench_data.synthesis.plan import plan_scene
+from stereogenbench_data.synthesis.request import SynthRequest
 
 
 def warped(right, disparity_px):

@@ -7,7 +7,8 @@ import os
 import pytest
 
 from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.videos import VideoFile
 
 SMALL = {"size_px": 32, "frames": 2, "seed": 9}

@@ -20,7 +20,7 @@ import numpy as np
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnose_scene
 from stereogenbench_data.audit.contract.matching import SceneFrames
 from stereogenbench_data.audit.contract.verdict import Verdict, grouped, judge
-from stereogenbench_data.engine.process_pool import AfterBytes, run_tasks
+from stereogenbench_data.engine import LOCAL, Advance
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
@@ -148,12 +148,12 @@ def _task(index: SceneIndex, row: int, *, frames: int, encoding: DepthEncoding) 
 
 def _diagnoses(tasks: list[DiagnosisTask], *, workers: int | None) -> Iterator[SceneDiagnosis]:
     with closing(
-        run_tasks(_diagnose, tasks, workers=workers, after_bytes=lambda _: None)
+        LOCAL.map(_diagnose, tasks, name=lambda task: task.scene.id.key, workers=workers)
     ) as results:
         yield from results
 
 
-def _diagnose(task: DiagnosisTask, after_bytes: AfterBytes) -> SceneDiagnosis:
+def _diagnose(task: DiagnosisTask, after_bytes: Advance) -> SceneDiagnosis:
     after_bytes(0)
     with closing(task.streams()) as streams:
         views = SceneFrames(task.scene, streams, encoding=task.encoding)

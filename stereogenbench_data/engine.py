@@ -1,0 +1,440 @@
+"""Batch work on one interface with two engines: processes of this machine, or a Ray cluster.
+
+`Engine.map` works on items in parallel and yields each result as it comes. A task is a function
+of a module that takes an item and a function to call now and then with how much of the item is
+done; there the task is interrupted when the work is stopped. Results depend neither on the engine
+nor on the number of workers.
+"""
+
+import importlib
+import multiprocessing
+import os
+import platform
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from multiprocessing.process import BaseProcess
+from multiprocessing.sharedctypes import Synchronized
+from multiprocessing.synchronize import Event
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Protocol, TypeVar, runtime_checkable
+
+from stereogenbench_data.errors import ExtraError, StorageError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Advance = Callable[[int], None]
+"""Called with how many bytes, frames or scenes were done since the last call."""
+
+_POLL_S: Final = 0.2
+_SHOWN: Final = 3
+
+
+def no_advance(count: int) -> None:
+    """Take no note of what is done."""
+
+
+@runtime_checkable
+class Engine(Protocol):
+    """Where the items of a batch are worked on."""
+
+    def map(
+        self,
+        task: Callable[[Item, Advance], Result],
+        items: Sequence[Item],
+        *,
+        name: Callable[[Item], str],
+        workers: int | None = None,
+        advance: Advance = no_advance,
+    ) -> Generator[Result, None, None]:
+        """Do a task for each item, in any order, and yield the results; close it to stop the rest.
+
+        Args:
+            task: A function of a module, which other processes can import.
+            items: What it is called with, one at a time; each can be pickled.
+            name: Returns what messages call an item.
+            workers: How many items are worked on at the same time; None for one a core.
+            advance: Called now and then in this process with how much was done since.
+
+        Raises:
+            StorageError: If ``workers`` is below 1, or a worker died; the message names its item.
+                The error of a task is raised as it is, with a note that names the item, once the
+                other tasks are stopped.
+        """
+
+
+def engine_of(text: str, *, device: str = "cpu") -> Engine:
+    """Return the engine that an option names.
+
+    Args:
+        text: "local"; "ray" for the cluster that Ray finds by itself (``RAY_ADDRESS``, or one on
+            this machine); "ray://HOST:PORT" or "HOST:PORT" for the one at an address.
+        device: Where tasks compute; on Ray each has a GPU of its own unless it is "cpu".
+
+    Raises:
+        StorageError: If it is none of these.
+    """
+    if text == "local":
+        return LOCAL
+    if text == "ray":
+        text = "auto"
+    elif not (text.startswith("ray://") or text.rpartition(":")[2].isdecimal()):
+        raise StorageError(
+            f"engine {text!r}: there is none of that name. Choose local, ray, ray://HOST:PORT or "
+            f"HOST:PORT."
+        )
+    return RayCluster(text, gpus=int(device != "cpu"))
+
+
+def _require_workers(workers: int | None) -> None:
+    if workers is not None and workers < 1:
+        raise StorageError(f"workers must be at least 1, got {workers}.")
+
+
+class _Naming:
+    """A context that adds a note to whatever error a task raises: the name of its item."""
+
+    def __init__(self, name: Callable[[Item], str], item: Item) -> None:
+        self._name: Callable[[], str] = lambda: name(item)
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: object, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None and not isinstance(error, BrokenProcessPool):
+            error.add_note(f"This happened while {self._name()} was worked on.")
+
+
+# Processes of this machine.
+
+
+class _Stopped(Exception):
+    """The work was called off."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Shared:
+    """What processes tell each other: units done, whether to stop, who works on which item."""
+
+    done: "Synchronized[int]"
+    stop: Event
+    worked_on_by: Any
+    """An array of the process id that works on each item; 0 before and after."""
+
+
+_shared: list[_Shared] = []
+"""What a worker process was given when it started; empty elsewhere."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessPool:
+    """The engine of this machine: processes, or this one alone for one worker or one item."""
+
+    def map(
+        self,
+        task: Callable[[Item, Advance], Result],
+        items: Sequence[Item],
+        *,
+        name: Callable[[Item], str],
+        workers: int | None = None,
+        advance: Advance = no_advance,
+    ) -> Generator[Result, None, None]:
+        """Work as `Engine.map` says; items of a dead worker are not tried again."""
+        _require_workers(workers)
+        needed = min(workers or os.cpu_count() or 1, len(items))
+        if needed <= 1:
+            for item in items:
+                with _Naming(name, item):
+                    result = task(item, advance)
+                yield result
+            return
+        context = multiprocessing.get_context("spawn")
+        shared = _Shared(context.Value("q", 0), context.Event(), context.RawArray("q", len(items)))
+        others = set(multiprocessing.active_children())
+        workers_here: set[BaseProcess] = set()
+        pool = ProcessPoolExecutor(
+            needed, mp_context=context, initializer=_start_worker, initargs=(shared,)
+        )
+        try:
+            with _interrupts_held():
+                futures = {
+                    pool.submit(_run_in_process, task, item, number): item
+                    for number, item in enumerate(items)
+                }
+            workers_here = set(multiprocessing.active_children()) - others
+            yield from _results(futures, name=name, shared=shared, advance=advance)
+        except BrokenProcessPool as error:
+            pool.shutdown()
+            named = [name(items[number]) for number in _items_of_dead(workers_here, shared)]
+            where = f"{', '.join(named[:_SHOWN])}: " if named else ""
+            raise StorageError(
+                f"{where}a worker process died: it was killed (is memory short?), or the calling "
+                f"script starts work without `if __name__ == '__main__':`. Run it again, with "
+                f"fewer workers; what is finished is kept."
+            ) from error
+        finally:
+            shared.stop.set()
+            pool.shutdown(cancel_futures=True)
+
+
+LOCAL: Final = ProcessPool()
+
+
+def _results(
+    futures: dict[Future[Result], Item],
+    *,
+    name: Callable[[Item], str],
+    shared: _Shared,
+    advance: Advance,
+) -> Iterator[Result]:
+    reported = 0
+    waiting = set(futures)
+    while waiting:
+        finished, waiting = wait(waiting, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+        done = shared.done.value
+        advance(done - reported)
+        reported = done
+        for future in finished:
+            with _Naming(name, futures[future]):
+                result = future.result()
+            yield result
+
+
+def _items_of_dead(workers: set[BaseProcess], shared: _Shared) -> list[int]:
+    """Return the numbers of the items whose workers died, not those that the pool then ended."""
+    ended = {each.pid for each in workers if each.exitcode in (0, -signal.SIGTERM)}
+    return [
+        number for number, pid in enumerate(shared.worked_on_by) if pid != 0 and pid not in ended
+    ]
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Start processes so that Ctrl-C never reaches them; here it counts as soon as they started."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker(shared: _Shared) -> None:
+    """Prepare a worker: Ctrl-C is left to the main process, and there is no life without it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    _shared.append(shared)
+
+
+def _die_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
+
+
+def _run_in_process(task: Callable[[Item, Advance], Result], item: Item, number: int) -> Result:
+    (shared,) = _shared
+
+    def advance(count: int) -> None:
+        with shared.done.get_lock():
+            shared.done.value += count
+        if shared.stop.is_set():
+            raise _Stopped
+
+    shared.worked_on_by[number] = os.getpid()
+    try:
+        advance(0)
+        return task(item, advance)
+    finally:
+        shared.worked_on_by[number] = 0
+
+
+# A Ray cluster.
+
+_TRIES: Final = 3
+"""How often an item is begun whose workers die."""
+_CANCEL_S: Final = 30.0
+"""How long to wait for tasks that are called off to remove what they began."""
+_RAY_POLL_S: Final = 1.0
+_AHEAD: Final = 2
+"""How many items are handed to Ray for each core of the cluster, one of them waiting."""
+
+
+@dataclass(frozen=True, slots=True)
+class RayCluster:
+    """A Ray cluster that runs already, one task an item; none is started. Needs the extra ``ray``.
+
+    This package must be installed on all nodes. Files must be at the same paths on all of them, and
+    so must the working folder, which relative paths begin at. An item whose worker or node dies
+    is begun again, twice at most. What is done is reported when an item is finished.
+
+    Attributes:
+        address: Where it is: "ray://HOST:PORT" (needs ``ray[client]``) or "HOST:PORT"; "auto" for
+            the one of ``RAY_ADDRESS`` or of this machine. A connection that this process has
+            already is used instead, and stays.
+        gpus: How many GPUs each task has to itself.
+    """
+
+    address: str = "auto"
+    gpus: int = 0
+
+    def map(
+        self,
+        task: Callable[[Item, Advance], Result],
+        items: Sequence[Item],
+        *,
+        name: Callable[[Item], str],
+        workers: int | None = None,
+        advance: Advance = no_advance,
+    ) -> Generator[Result, None, None]:
+        """Work as `Engine.map` says.
+
+        Raises:
+            ExtraError: If Ray is not installed.
+            StorageError: If no cluster is there, it has too few GPUs, or workers died of one item
+                again and again.
+        """
+        _require_workers(workers)
+        if not items:
+            return
+        ray = _ray()
+        with _connected(ray, self.address):
+            remote = ray.remote(max_retries=0, num_cpus=1, num_gpus=self.gpus)(_run_on_ray)
+            there = ray.cluster_resources()
+            if there.get("GPU", 0) < self.gpus:
+                raise StorageError(
+                    f"{self.address}: this Ray cluster has {there.get('GPU', 0):g} GPUs, and each "
+                    f"task needs {self.gpus}. Compute on the device cpu, or add a node with GPUs."
+                )
+            limit = workers or _AHEAD * max(1, int(there.get("CPU", 1)))
+            work = _RayWork(ray, lambda item: remote.remote(task, item, str(Path.cwd())), name)
+            with closing(work.results(list(items), limit=limit, advance=advance)) as results:
+                yield from results
+
+
+@dataclass(frozen=True, slots=True)
+class _RayWork:
+    """Items that are handed to Ray, a bounded number at a time."""
+
+    ray: Any
+    submit: Callable[[Any], Any]
+    name: Callable[[Any], str]
+
+    def results(
+        self, items: list[Any], *, limit: int, advance: Advance
+    ) -> Generator[Any, None, None]:
+        """Yield the result of each item."""
+        waiting = [(item, 1) for item in reversed(items)]
+        running: dict[Any, tuple[Any, int]] = {}
+        try:
+            while waiting or running:
+                while waiting and len(running) < limit:
+                    item, attempt = waiting.pop()
+                    running[self.submit(item)] = (item, attempt)
+                finished, _ = self.ray.wait(list(running), num_returns=1, timeout=_RAY_POLL_S)
+                advance(0)
+                for reference in finished:
+                    item, attempt = running.pop(reference)
+                    try:
+                        result, done = self.ray.get(reference)
+                    except self.ray.exceptions.RayTaskError as error:
+                        self._raise(item, error)
+                    except self.ray.exceptions.RayError as error:
+                        self._require_another_try(item, attempt, error)
+                        waiting.append((item, attempt + 1))
+                        continue
+                    advance(done)
+                    yield result
+        finally:
+            for reference in running:
+                self.ray.cancel(reference)
+            if running:
+                self.ray.wait(list(running), num_returns=len(running), timeout=_CANCEL_S)
+
+    def _raise(self, item: Any, error: Any) -> None:
+        """Raise what a task raised, without Ray's wrapping."""
+        cause = error.cause
+        if isinstance(cause, RuntimeError) and "failed to import" in _first_line(cause):
+            raise StorageError(
+                f"{self.name(item)}: a node of the Ray cluster cannot import this package, or has "
+                f"another version of it. Install the same stereogenbench-data on all nodes."
+            ) from error
+        with _Naming(self.name, item):
+            raise cause if isinstance(cause, Exception) else error
+
+    def _require_another_try(self, item: Any, attempt: int, error: Any) -> None:
+        if attempt == _TRIES:
+            raise StorageError(
+                f"{self.name(item)}: Ray did not finish it in {_TRIES} tries "
+                f"({_first_line(error)}). Look whether its worker was killed for want of memory, "
+                f"and run it again, with fewer workers; what is finished is kept."
+            ) from error
+
+
+def _run_on_ray(
+    task: Callable[[Item, Advance], Result], item: Item, working_folder: str
+) -> tuple[Result, int]:
+    """Return the result of a task, and how much it reported as done; a worker of Ray calls this."""
+    try:
+        os.chdir(working_folder)
+    except OSError as error:
+        raise StorageError(
+            f"{working_folder}: the working folder cannot be entered on the node {platform.node()} "
+            f"({error.strerror}). Start the command in a folder that all nodes have."
+        ) from error
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+
+    result = task(item, advance)
+    return result, done
+
+
+def _ray() -> Any:
+    try:
+        return importlib.import_module("ray")
+    except ImportError as error:
+        raise ExtraError(
+            f"Ray cannot be imported ({error}): install `stereogenbench-data[ray]`, or choose the "
+            f"engine `local`."
+        ) from error
+
+
+@contextmanager
+def _connected(ray: Any, address: str) -> Iterator[None]:
+    if ray.is_initialized():
+        yield
+        return
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    on_end = signal.getsignal(signal.SIGTERM)
+    try:
+        ray.init(address=address, log_to_driver=False)
+    except (ConnectionError, ImportError, RuntimeError, ValueError) as error:
+        raise StorageError(
+            f"{address}: no Ray cluster could be connected to ({_first_line(error)}). Start one "
+            f"with `ray start --head` and give its address as the engine or by RAY_ADDRESS, or "
+            f"choose the engine `local`."
+        ) from error
+    try:
+        if in_main_thread and on_end is not None:
+            signal.signal(signal.SIGTERM, on_end)  # Ray put its own in place.
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _first_line(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
