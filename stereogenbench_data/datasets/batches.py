@@ -13,10 +13,10 @@ from stereogenbench_data.datasets.frameworks import require_shared_once
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.order import (
-    LANES,
-    LANES_OF_LARGE,
+    GROUPS_OF_LARGE,
     OPEN_SCENES,
     ORDER_VERSION,
+    SHUFFLE_GROUPS,
     EpochOrder,
     OrderKind,
     OrderRule,
@@ -28,6 +28,9 @@ from stereogenbench_data.selection.plan import Plan
 
 State = dict[str, Any]
 """A position: a flat dict of numbers and texts, which JSON and `torch.save` take."""
+
+_RENAMED: Final = {"lanes": "shuffle_groups"}
+"""What a position that was saved before calls otherwise."""
 
 _STATES: Final = (
     "Pass what state_dict() of a loader, of EpochBatches or of a stream returned, unchanged."
@@ -48,15 +51,16 @@ class EpochOptions(TypedDict, total=False):
             left out; samples from the epoch's start fill up, marked in the field ``is_padding``
             (batch,) bool. "uneven": every sample exactly once; the last batch may be short, and
             ranks may differ by one batch. Validate with "uneven" (or "wrap", less its padding).
-        lanes: Into how many lanes the scenes are parted; batch n belongs to lane n mod lanes. If
-            left out 4, but 2 where scenes are so large that a lane has fewer than 16 open. Each
-            video is decoded by one process, once an epoch, if world_size * num_workers divides
-            ``lanes``; make it a multiple of (or equal to) that product. Selections too small for so
-            many lanes have fewer.
-        open_scenes: How many scenes each lane interleaves; if left out 16, or the batch size where
-            that is more, but of large pictures no more than about 0.9 GB of decoders hold: of
-            1280x1280 pixels 16 with one pair a scene, and 4 with all pairs. Fewer take less memory
-            and shuffle less well. A process has so many of each lane that it reads.
+        shuffle_groups: How many groups of scenes are shuffled apart; batch n belongs to group n mod
+            shuffle_groups. If left out 4, but 2 where scenes are so large that a group has fewer
+            than 16 open. Each video is decoded by one process, once an epoch, if world_size *
+            num_workers divides ``shuffle_groups``; make it a multiple of (or equal to) that
+            product. Selections too small for so many groups have fewer.
+        open_scenes: The shuffle buffer, counted in scenes: how many each group interleaves. If left
+            out 16, or the batch size where that is more, but of large pictures no more than about
+            0.9 GB of decoders hold: of 1280x1280 pixels 16 with one pair a scene, and 4 with all
+            pairs. Fewer take less memory and shuffle less well. A process has so many of each group
+            that it reads.
         order: "shuffled" (the default) or "sequential".
     """
 
@@ -64,7 +68,7 @@ class EpochOptions(TypedDict, total=False):
     rank: int
     world_size: int
     tail: Tail
-    lanes: int
+    shuffle_groups: int
     open_scenes: int
     order: OrderKind
 
@@ -96,7 +100,7 @@ class Numbered(Protocol):
 
     @property
     def scenes_at_once(self) -> int:
-        """How many scenes a lane may interleave before their open videos take too much memory."""
+        """How many scenes a group may interleave before their open videos take too much memory."""
         ...
 
 
@@ -131,8 +135,8 @@ class EpochBatches(Sampler[list[int]]):
 
     Its passes are of the same epoch until `set_epoch` is called, as with torch's samplers; a
     ``loader(...)`` goes to the next epoch by itself. The order depends on the selection, the seed,
-    the epoch, the batch size, the lanes and the open scenes, and on nothing else: global batch n
-    goes to rank n mod world_size, whoever asks. It offers its position as torchdata's
+    the epoch, the batch size, the shuffle groups and the open scenes, and on nothing else: global
+    batch n goes to rank n mod world_size, whoever asks. It offers its position as torchdata's
     ``StatefulDataLoader`` asks for it; with torch's own `DataLoader`, which reads ahead, use the
     dataset's ``loader(...)``, which counts what the training loop has taken.
 
@@ -168,7 +172,9 @@ class EpochBatches(Sampler[list[int]]):
         rule = OrderRule(
             batch_size=batch_size,
             seed=options.get("seed", dataset.plan.seed),
-            lanes=options.get("lanes", LANES if at_once >= OPEN_SCENES else LANES_OF_LARGE),
+            shuffle_groups=options.get(
+                "shuffle_groups", SHUFFLE_GROUPS if at_once >= OPEN_SCENES else GROUPS_OF_LARGE
+            ),
             kind=options.get("order", "shuffled"),
         )
         most_open = min(max(OPEN_SCENES, rule.batch_size), at_once)
@@ -344,6 +350,8 @@ class EpochBatches(Sampler[list[int]]):
             raise StateError(
                 f"a state is a dict as state_dict() returns it, got {state!r:.60}: {_STATES}"
             )
+        if "lanes" in state:
+            state = {_RENAMED.get(name, name): value for name, value in state.items()}
         own = {"version": ORDER_VERSION, **self._identity}
         missing = sorted({*own, "epoch", "batches_consumed"} - state.keys())
         if missing:
@@ -376,7 +384,7 @@ class EpochBatches(Sampler[list[int]]):
         return {
             "seed": rule.seed,
             "batch_size": rule.batch_size,
-            "lanes": rule.lanes,
+            "shuffle_groups": rule.shuffle_groups,
             "open_scenes": rule.open_scenes,
             "order": rule.kind,
             "tail": self.tail,

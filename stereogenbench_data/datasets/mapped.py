@@ -193,7 +193,7 @@ class _MappedScenes(Dataset[Sample]):
             batch_size: Samples in a batch of one rank.
             num_workers: How many processes load; 0 loads in this one.
             **options: How the epoch is ordered and shared out (`EpochOptions`: seed, rank,
-                world_size, tail, lanes, open_scenes, order); and what `DataLoader` takes.
+                world_size, tail, shuffle_groups, open_scenes, order); and what `DataLoader` takes.
 
         Returns:
             A loader with an epoch and open videos of its own: any number of them can be used side
@@ -219,7 +219,7 @@ class _MappedScenes(Dataset[Sample]):
 
     @property
     def scenes_at_once(self) -> int:
-        """How many scenes a lane interleaves at the most, unless ``open_scenes`` says otherwise."""
+        """How many scenes a shuffle group interleaves, unless ``open_scenes`` says otherwise."""
         return scenes_at_once(self.index, self.plan)
 
     def keep_open(self, batches: EpochBatches, *, processes: int) -> None:

@@ -61,8 +61,8 @@ class StereoPairStream(IterableDataset[Sample]):
         Args:
             data: As for `StereoPairs`.
             batch_size: Samples in a batch of one rank; give `DataLoader` the same.
-            **options: What `StereoPairs` takes; and `EpochOptions` (rank, world_size, tail, lanes,
-                open_scenes, order).
+            **options: What `StereoPairs` takes; and `EpochOptions` (rank, world_size, tail,
+                shuffle_groups, open_scenes, order).
 
         Raises:
             SelectionError: If nothing matches, or an option is out of its range.

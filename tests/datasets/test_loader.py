@@ -20,7 +20,7 @@ from stereogenbench_data import (
 )
 from stereogenbench_data.datasets.open_videos import (
     OpenVideosWarning,
-    SharedLanesWarning,
+    RepeatedDecodingWarning,
     videos_per_scene,
 )
 from stereogenbench_data.samples import streams
@@ -365,13 +365,17 @@ def opened(monkeypatch):
     return counts, frames
 
 
-@pytest.mark.parametrize(("world", "lanes"), [(1, 1), (1, 2), (2, 2), (2, 4)])
-def test_each_video_is_opened_once_and_each_frame_decoded_once(small_index, opened, world, lanes):
+@pytest.mark.parametrize(("world", "shuffle_groups"), [(1, 1), (1, 2), (2, 2), (2, 4)])
+def test_each_video_is_opened_once_and_each_frame_decoded_once(
+    small_index, opened, world, shuffle_groups
+):
     counts, frames = opened
     for rank in range(world):
         pairs = StereoPairs(small_index, pairs="all", frames="all")
-        loader = pairs.loader(2, lanes=lanes, rank=rank, world_size=world, tail="uneven")
-        assert loader.batches.order(0).lanes == min(lanes, 2)
+        loader = pairs.loader(
+            2, shuffle_groups=shuffle_groups, rank=rank, world_size=world, tail="uneven"
+        )
+        assert loader.batches.order(0).groups == min(shuffle_groups, 2)
         for _ in loader:
             pass
         pairs.close()
@@ -381,9 +385,9 @@ def test_each_video_is_opened_once_and_each_frame_decoded_once(small_index, open
     assert set(map(tuple, frames.values())) == {tuple(range(7))}
 
 
-@pytest.mark.parametrize(("workers", "lanes"), [(1, 2), (2, 2), (2, 4)])
-def test_workers_among_which_lanes_are_dealt_open_each_video_once(
-    small_index, monkeypatch, tmp_path, workers, lanes
+@pytest.mark.parametrize(("workers", "shuffle_groups"), [(1, 2), (2, 2), (2, 4)])
+def test_workers_among_which_groups_are_dealt_open_each_video_once(
+    small_index, monkeypatch, tmp_path, workers, shuffle_groups
 ):
     log = tmp_path / "opened"
 
@@ -396,9 +400,13 @@ def test_workers_among_which_lanes_are_dealt_open_each_video_once(
     monkeypatch.setattr(streams, "VideoReader", Logging)
     pairs = StereoPairs(small_index, pairs="adjacent", frames="all")
     loader = pairs.loader(
-        2, lanes=lanes, num_workers=workers, multiprocessing_context="fork", tail="uneven"
+        2,
+        shuffle_groups=shuffle_groups,
+        num_workers=workers,
+        multiprocessing_context="fork",
+        tail="uneven",
     )
-    assert loader.batches.order(0).lanes == 2
+    assert loader.batches.order(0).groups == 2
     batches = list(loader)
 
     assert len(batches) == 70
@@ -407,7 +415,7 @@ def test_workers_among_which_lanes_are_dealt_open_each_video_once(
 
 def test_videos_are_closed_after_their_scenes_last_sample(small_index):
     pairs = StereoPairs(small_index, pairs="all", frames="all")
-    loader = pairs.loader(2, lanes=1, open_scenes=1, tail="uneven")
+    loader = pairs.loader(2, shuffle_groups=1, open_scenes=1, tail="uneven")
     most = 0
     for _ in loader:
         most = max(most, len(loader.dataset._loader._streams._open))
@@ -450,15 +458,23 @@ def _of_many_scenes(index):
 @pytest.mark.parametrize(
     ("workers", "options", "said"),
     [
-        (8, {}, r"decoded by 2 processes, as 8 \(ranks times workers\) read 4 lanes: .*lanes=8"),
-        (3, {}, r"decoded by 3 processes, as 3 .* read 4 lanes: .*lanes=3"),
-        (2, {"world_size": 2, "rank": 1, "lanes": 2}, "by 2 processes, as 4 .*lanes=4"),
+        (
+            8,
+            {},
+            r"decoded by 2 processes, as 8 \(ranks times workers\) read 4 .*: .*shuffle_groups=8",
+        ),
+        (3, {}, r"decoded by 3 processes, as 3 .* read 4 shuffle groups: .*shuffle_groups=3"),
+        (
+            2,
+            {"world_size": 2, "rank": 1, "shuffle_groups": 2},
+            "by 2 processes, as 4 .*shuffle_groups=4",
+        ),
     ],
 )
 def test_workers_that_decode_the_same_videos_are_warned_of(small_index, workers, options, said):
     pairs = StereoPairs(_of_many_scenes(small_index), frames=range(2), fields=("left",))
 
-    with pytest.warns(SharedLanesWarning, match=said):
+    with pytest.warns(RepeatedDecodingWarning, match=said):
         pairs.loader(1, num_workers=workers, **options)
 
 
@@ -466,14 +482,14 @@ def test_workers_that_decode_the_same_videos_are_warned_of(small_index, workers,
     ("frames", "workers", "options"),
     [
         (range(2), 4, {}),
-        (range(2), 8, {"lanes": 8}),
+        (range(2), 8, {"shuffle_groups": 8}),
         (range(2), 32, {}),
         ("first", 8, {}),
         (range(2), 8, {"order": "sequential"}),
     ],
-    ids=["a lane each", "lanes asked for", "too few scenes", "one sample a scene", "sequential"],
+    ids=["a group each", "groups asked for", "too few scenes", "one sample a scene", "sequential"],
 )
-def test_workers_are_not_warned_of_where_more_lanes_would_not_help(
+def test_workers_are_not_warned_of_where_more_groups_would_not_help(
     small_index, frames, workers, options
 ):
     pairs = StereoPairs(_of_many_scenes(small_index), frames=frames, fields=("left",))
@@ -482,7 +498,7 @@ def test_workers_are_not_warned_of_where_more_lanes_would_not_help(
 
 
 @pytest.mark.parametrize(
-    ("side_px", "selection", "expected", "lanes"),
+    ("side_px", "selection", "expected", "shuffle_groups"),
     [
         (1280, {}, 16, 4),
         (1280, {"pairs": "all"}, 4, 2),
@@ -493,7 +509,7 @@ def test_workers_are_not_warned_of_where_more_lanes_would_not_help(
     ids=str,
 )
 def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
-    small_index, side_px, selection, expected, lanes
+    small_index, side_px, selection, expected, shuffle_groups
 ):
     scenes = [
         replace(scene, rig=replace(scene.rig, image_width_px=side_px, image_height_px=side_px))
@@ -504,11 +520,11 @@ def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
     pairs = StereoPairs(index, **options)
 
     assert pairs.loader(4).batches.rule.open_scenes == expected
-    assert pairs.loader(4).batches.rule.lanes == lanes
+    assert pairs.loader(4).batches.rule.shuffle_groups == shuffle_groups
     assert pairs.loader(4, num_workers=3).batches.rule == pairs.loader(4).batches.rule
     assert StereoPairs(index, **(options | {"fields": ("depth",)})).scenes_at_once == (
         pairs.scenes_at_once
     )
-    assert pairs.loader(4, open_scenes=7, lanes=6).batches.rule == OrderRule(
-        4, lanes=6, open_scenes=7
+    assert pairs.loader(4, open_scenes=7, shuffle_groups=6).batches.rule == OrderRule(
+        4, shuffle_groups=6, open_scenes=7
     )

@@ -15,8 +15,7 @@ from stereogenbench_data.errors import SelectionError, ShardError
 from stereogenbench_data.index.stale import StaleIndexWarning
 from stereogenbench_data.index.table import INDEX_NAME, IncompleteSceneWarning, SceneIndex
 from stereogenbench_data.schema.release import COMPLETE_JSON
-from stereogenbench_data.selection.filters import filter_scenes
-from stereogenbench_data.selection.lookup import find_scene
+from stereogenbench_data.selection.filters import filter_scenes, find_scene
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.unpack import unpack
 from stereogenbench_data.synthesis import SynthRequest, synthesise

@@ -3,7 +3,7 @@
 import pytest
 
 from stereogenbench_data import SceneIndex, SelectionError
-from stereogenbench_data.selection.lookup import find_scene
+from stereogenbench_data.selection.filters import find_scene
 
 
 @pytest.fixture(scope="module")
