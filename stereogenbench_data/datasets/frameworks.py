@@ -51,7 +51,7 @@ class RankBatches(Protocol):
         """Go to another epoch."""
         ...
 
-    def require_group(self, rank: int, world_size: int) -> None:
+    def _require_group(self, rank: int, world_size: int) -> None:
         """Require that these are the batches of a rank of so many."""
         ...
 
@@ -118,7 +118,7 @@ class AcceleratedLoader:
         if states is None:
             return False
         state = states.PartialState()
-        self.batches.require_group(state.process_index, state.num_processes)
+        self.batches._require_group(state.process_index, state.num_processes)
         self._device = state.device
         self._gradient_state = states.GradientState()
         return True

@@ -7,12 +7,11 @@ from typing import Final
 
 import numpy as np
 
-from stereogenbench_data.datasets.batches import EpochBatches
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Stream
 from stereogenbench_data.samples.streams import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.selection.order import Numbers
+from stereogenbench_data.selection.order import Numbers, OrderRule
 from stereogenbench_data.selection.plan import Plan
 
 SPARE_FILES = 128
@@ -39,7 +38,7 @@ class RepeatedDecodingWarning(UserWarning):
 
 
 def videos_to_keep(
-    plan: Plan, batches: EpochBatches, *, streams: frozenset[Stream], processes: int
+    plan: Plan, rule: OrderRule, *, streams: frozenset[Stream], processes: int
 ) -> int:
     """Return how many videos one of so many processes keeps open for its share of an epoch.
 
@@ -48,9 +47,9 @@ def videos_to_keep(
     videos though more groups would spare that, a warning says what to do.
     """
     lengths = np.diff(plan.first_sample)
-    groups = batches.rule.groups_of(lengths)
-    _warn_of_repeated_decoding(batches, lengths=lengths, processes=processes)
-    scenes = groups // math.gcd(groups, processes) * batches.rule.most_open(lengths)
+    groups = rule.groups_of(lengths)
+    _warn_of_repeated_decoding(rule, lengths=lengths, processes=processes)
+    scenes = groups // math.gcd(groups, processes) * rule.most_open(lengths)
     wanted = max(OPEN_STREAMS, scenes * videos_per_scene(plan, streams))
     allowed = max(OPEN_STREAMS, _most_files() - SPARE_FILES)
     if wanted > allowed:
@@ -58,15 +57,14 @@ def videos_to_keep(
             f"up to {wanted} videos would be open at a time, and this process may open {allowed}: "
             "they will be closed and opened again, which is slow. Raise the limit (`ulimit -n "
             f"{wanted + SPARE_FILES}`), use more workers, or fewer open_scenes than "
-            f"{batches.rule.open_scenes}.",
+            f"{rule.open_scenes}.",
             OpenVideosWarning,
             stacklevel=5,
         )
     return min(wanted, allowed)
 
 
-def _warn_of_repeated_decoding(batches: EpochBatches, *, lengths: Numbers, processes: int) -> None:
-    rule = batches.rule
+def _warn_of_repeated_decoding(rule: OrderRule, *, lengths: Numbers, processes: int) -> None:
     together = processes // math.gcd(rule.shuffle_groups, processes)
     spared = replace(rule, shuffle_groups=math.lcm(rule.shuffle_groups, processes)).groups_of(
         lengths

@@ -40,12 +40,12 @@ class StreamStats(NamedTuple):
     """What a pool has open.
 
     Attributes:
-        open: How many videos.
-        limit: How many at the most.
+        videos_open: How many videos.
+        videos_limit: How many at the most.
     """
 
-    open: int
-    limit: int
+    videos_open: int
+    videos_limit: int
 
 
 @dataclass(slots=True)
@@ -145,7 +145,7 @@ class Streams:
     def stats(self) -> "StreamStats":
         """What this process has open."""
         is_own = os.getpid() == self._process
-        return StreamStats(open=len(self._open) if is_own else 0, limit=self._limit)
+        return StreamStats(len(self._open) if is_own else 0, self._limit)
 
     def keep(self, limit: int) -> None:
         """Keep at most so many videos open from now on."""

@@ -57,6 +57,17 @@ def test_the_seed_is_the_datasets_unless_another_is_given(small_index):
     assert list(EpochBatches(pairs, 4)) != list(EpochBatches(others, 4))
 
 
+def test_torchs_words_for_tail_and_order_are_taken(keyed):
+    assert list(EpochBatches(keyed, 9, drop_last=True)) == list(EpochBatches(keyed, 9))
+    assert list(EpochBatches(keyed, 9, drop_last=False)) == list(
+        EpochBatches(keyed, 9, tail="uneven")
+    )
+    assert list(EpochBatches(keyed, 9, shuffle=True)) == list(EpochBatches(keyed, 9))
+    assert list(EpochBatches(keyed, 9, shuffle=False)) == list(
+        EpochBatches(keyed, 9, order="sequential")
+    )
+
+
 def test_the_epoch_is_the_datasets(keyed):
     batches = EpochBatches(keyed, 4)
     first = list(batches)
@@ -214,7 +225,15 @@ def test_something_else_than_a_position_is_refused(keyed):
         ({"rank": 2, "world_size": 2}, "got rank=2, world_size=2"),
         ({"rank": 1}, "got rank=1, world_size=None"),
         ({"tail": "keep"}, "tail must be"),
-        ({"drop_last": True}, "there is no option 'drop_last'; there are seed, rank"),
+        ({"drop": True}, "there is no option 'drop'; there are seed, rank"),
+        ({"drop_last": 1}, "drop_last must be True or False, got 1"),
+        ({"shuffle": "yes"}, "shuffle must be True or False, got 'yes'"),
+        ({"shuffle": True, "order": "shuffled"}, "shuffle=True and order= say the same"),
+        ({"drop_last": True, "tail": "wrap"}, "drop_last=True and tail= say the same"),
+        (
+            {"drop_last": False, "rank": 0, "world_size": 2},
+            "drop_last=False of 2 ranks .* tail='wrap' .* tail='uneven'",
+        ),
     ],
     ids=str,
 )

@@ -21,10 +21,11 @@ from stereogenbench_data import (
 from stereogenbench_data.datasets.open_videos import (
     OpenVideosWarning,
     RepeatedDecodingWarning,
+    scenes_at_once,
     videos_per_scene,
 )
 from stereogenbench_data.samples import streams
-from stereogenbench_data.samples.fields import streams_of
+from stereogenbench_data.samples.fields import PAIR_FIELDS, streams_of
 from stereogenbench_data.selection.order import OrderRule
 from tests.datasets.conftest import flat, in_turn, keys_of
 
@@ -111,13 +112,13 @@ def test_loaders_of_one_dataset_have_their_own_videos(small_index):
     next(samples)
     for _ in other:
         pass
-    opened = len(one.dataset._loader._streams._open)
+    opened = one.stats().videos_open
     other.close()
 
-    assert opened == len(one.dataset._loader._streams._open) > 0
-    assert len(pairs._loader._streams._open) == 0
+    assert opened == one.stats().videos_open > 0
+    assert pairs.stats().videos_open == 0
     one.close()
-    assert len(one.dataset._loader._streams._open) == 0
+    assert one.stats().videos_open == 0
     assert len(list(samples)) == 6
     one.close()
 
@@ -326,10 +327,40 @@ def test_an_option_that_does_not_exist_is_refused(keyed):
         keyed.loader(9, batchsize=3)
 
 
-@pytest.mark.parametrize("name", ["shuffle", "drop_last", "sampler", "batch_sampler"])
+@pytest.mark.parametrize("name", ["sampler", "batch_sampler"])
 def test_what_would_undo_the_order_is_refused_with_what_to_use_instead(keyed, name):
-    with pytest.raises(SelectionError, match=rf"takes no {name}: use (order|tail|seed)="):
+    with pytest.raises(SelectionError, match=rf"takes no {name}: use seed= and order="):
         keyed.loader(9, **{name: True})
+
+
+def test_a_loader_says_what_it_holds(small_index):
+    pairs = StereoPairs(small_index, fields=("left",), frames="all")
+    loader = pairs.loader(2, num_workers=2, persistent_workers=True)
+    before = loader.stats()
+    held = list(itertools.islice(loader, 4))[-2:]
+    while_held = loader.stats()
+    del held
+    after = loader.stats()
+    loader.close()
+
+    assert (before.epoch, before.batches_taken, before.workers, before.batches_held) == (0, 0, 0, 0)
+    assert (while_held.batches_taken, while_held.workers, while_held.videos_open) == (4, 2, 0)
+    # The first batch of a worker lies in memory of its own: it says how large the slots must be.
+    assert 1 <= while_held.batches_held <= 2
+    assert after.batches_held == 0
+    assert loader.stats().workers == 0
+
+
+def test_public_objects_say_what_they_are(keyed):
+    loader = keyed.loader(9, num_workers=2)
+    batches = iter(keyed.loader(9))
+
+    assert "140 samples of 4 scenes" in repr(keyed)
+    for part in ("epoch 0", "2 workers", "9 of 140 samples a batch", "rank 0 of 1", "tail='drop'"):
+        assert part in repr(loader)
+    assert "not begun" in repr(batches)
+    next(batches)
+    assert "1 of 15 batches of epoch 0" in repr(batches)
 
 
 def test_a_killed_worker_ends_the_loop_with_an_error_that_says_so(keyed):
@@ -418,17 +449,16 @@ def test_videos_are_closed_after_their_scenes_last_sample(small_index):
     loader = pairs.loader(2, shuffle_groups=1, open_scenes=1, tail="uneven")
     most = 0
     for _ in loader:
-        most = max(most, len(loader.dataset._loader._streams._open))
+        most = max(most, loader.stats().videos_open)
 
     assert most == 11
-    assert len(loader.dataset._loader._streams._open) == 0
+    assert loader.stats().videos_open == 0
 
 
 def test_a_scene_needs_the_videos_that_its_fields_are_made_from(small_index):
     def videos(fields, **selection):
         pairs = StereoPairs(small_index, fields=fields, **selection)
-        known = pairs._loader._request.known
-        return videos_per_scene(pairs.plan, streams_of(fields, known=known))
+        return videos_per_scene(pairs.plan, streams_of(fields, known=PAIR_FIELDS))
 
     assert videos(("left", "right", "disparity")) == 3
     assert videos(("left", "right", "disparity"), pairs="all") == 11
@@ -444,7 +474,7 @@ def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):
 
     with pytest.warns(OpenVideosWarning, match=r"up to 88 videos .* may open 32.*ulimit -n 216"):
         loader = pairs.loader(4)
-    assert loader.dataset._loader._streams._limit == 32
+    assert loader.stats().videos_limit == 32
 
 
 def _of_many_scenes(index):
@@ -522,9 +552,8 @@ def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
     assert pairs.loader(4).batches.rule.open_scenes == expected
     assert pairs.loader(4).batches.rule.shuffle_groups == shuffle_groups
     assert pairs.loader(4, num_workers=3).batches.rule == pairs.loader(4).batches.rule
-    assert StereoPairs(index, **(options | {"fields": ("depth",)})).scenes_at_once == (
-        pairs.scenes_at_once
-    )
+    others = StereoPairs(index, **(options | {"fields": ("depth",)}))
+    assert scenes_at_once(index, others.plan) == scenes_at_once(index, pairs.plan)
     assert pairs.loader(4, open_scenes=7, shuffle_groups=6).batches.rule == OrderRule(
         4, shuffle_groups=6, open_scenes=7
     )
