@@ -1,4 +1,4 @@
-"""The batches of an epoch as one rank gets them, and positions in them that can be saved."""
+"""The batches of an epoch for one rank, and positions in them that can be saved."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -40,13 +40,13 @@ _STATES: Final = (
 
 
 class EpochOptions(TypedDict, total=False):
-    """How an epoch is ordered and shared out.
+    """How an epoch is ordered and divided among ranks.
 
     Attributes:
         seed: The seed of the order; that of the dataset if left out.
-        rank: Which share of the batches this process gets; as torch.distributed says if left out
-            (0 where it is not initialised).
-        world_size: How many shares there are; as torch.distributed says, or 1, if left out.
+        rank: Whose batches these are, from 0. By default torch.distributed's rank, or 0 where it is
+            not initialised.
+        world_size: How many ranks there are. By default torch.distributed's world size, or 1.
         drop_last: As in torch: True is ``tail="drop"``, the default; False is ``tail="uneven"``,
             and refused for several ranks, which must choose between "uneven" and "wrap".
         shuffle: As in torch: True is ``order="shuffled"``, the default; False is "sequential".
@@ -56,11 +56,11 @@ class EpochOptions(TypedDict, total=False):
             left out; samples from the epoch's start fill up, marked in the field ``is_padding``
             (batch,) bool. "uneven": every sample exactly once; the last batch may be short, and
             ranks may differ by one batch. Validate with "uneven" (or "wrap", less its padding).
-        shuffle_groups: How many groups of scenes are shuffled apart; batch n belongs to group n mod
-            shuffle_groups. If left out 4, but 2 where scenes are so large that a group has fewer
-            than 16 open. Each video is decoded by one process, once an epoch, if world_size *
-            num_workers divides ``shuffle_groups``; make it a multiple of (or equal to) that
-            product. Selections too small for so many groups have fewer.
+        shuffle_groups: How many groups of scenes are shuffled separately; batch n belongs to group
+            n mod shuffle_groups. By default 4, but 2 where scenes are so large that a group has
+            fewer than 16 open; selections too small for so many groups have fewer. Each video is
+            decoded by one process, once an epoch, if world_size * num_workers divides
+            ``shuffle_groups``: make it that product or a multiple of it.
         open_scenes: The shuffle buffer, counted in scenes: how many each group interleaves. If left
             out 16, or the batch size where that is more, but of large pictures no more than about
             0.9 GB of decoders hold: of 1280x1280 pixels 16 with one pair a scene, and 4 with all
@@ -244,19 +244,19 @@ class EpochBatches(Sampler[list[int]]):
         return (epoch, start) if epoch == self._epoch.value else (self._epoch.value, 0)
 
     def _begin(self, latest: "BatchPass | None" = None) -> None:
-        """Take note that a pass has begun: the next one starts its epoch from the beginning."""
+        """Record that a pass has begun: the next one starts its epoch from the beginning."""
         self._resumed = (0, 0)
         self._latest = latest
 
     def _complete(self, epoch: int) -> None:
-        """Take note that a pass over an epoch gave its last batch."""
+        """Record that a pass over an epoch gave its last batch."""
         self._completed = (epoch, self._epoch.version)
 
     def _require_no_other_reader(self) -> None:
-        """Require that no `DataLoader` of another's making is in the middle of these batches.
+        """Require that no other `DataLoader` is in the middle of these batches.
 
         Raises:
-            StateError: If one is: workers read ahead, so what its loop has taken is not known.
+            StateError: If one is: its workers read ahead, so nobody knows what its loop has taken.
         """
         if self._latest is not None and not self._latest.is_complete:
             raise StateError(
@@ -318,7 +318,7 @@ class EpochBatches(Sampler[list[int]]):
         return np.arange(number * size, (number + 1) * size) >= len(self.dataset.plan)
 
     def order(self, epoch: int) -> EpochOrder:
-        """Return the order of an epoch; the last one asked for is kept."""
+        """Return the order of an epoch; the last one is kept."""
         if self._order is None or self._order.epoch != epoch:
             self._order = EpochOrder(self.dataset.plan.first_sample, self.rule, epoch=epoch)
         return self._order
@@ -371,7 +371,7 @@ class EpochBatches(Sampler[list[int]]):
 
     @cached_property
     def _identity(self) -> State:
-        """What must be equal where a state is saved and where it is loaded."""
+        """What must be the same when a state is saved and when it is loaded."""
         rule = self.rule.in_effect(np.diff(self.dataset.plan.first_sample))
         return {
             "seed": rule.seed,
@@ -385,7 +385,7 @@ class EpochBatches(Sampler[list[int]]):
         }
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy in another process needs, which orders the epoch by itself."""
+        """Return what a copy in another process needs; it computes the order itself."""
         return self.__dict__ | {"_order": None, "_latest": None}
 
 

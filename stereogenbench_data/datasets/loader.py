@@ -1,4 +1,4 @@
-"""A torch `DataLoader` over the batches of an epoch that knows what its loop has consumed."""
+"""A torch `DataLoader` over the batches of an epoch, which counts what its loop has consumed."""
 
 import os
 import sys
@@ -178,8 +178,8 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
     def __iter__(self) -> "LoaderPass":  # type: ignore[override]  # torch names a private class
         """Return a pass over the current epoch, or over what a loaded state left of it.
 
-        After a whole pass it is the next epoch, unless an epoch was set since. It begins when its
-        first batch is asked for: trainers set the epoch in between.
+        After a whole pass it is the next epoch, unless an epoch was set since. The pass begins with
+        its first batch, because trainers set the epoch in between.
         """
         return LoaderPass(self)
 
@@ -194,7 +194,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         return self.batches.state_at(self.epoch, consumed if epoch == self.epoch else 0)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go to a saved position; nothing is replayed, and later epochs are whole again.
+        """Go to a saved position. Nothing is replayed; later epochs are whole again.
 
         A position behind the last batch of an epoch is the beginning of the next one.
 
@@ -260,7 +260,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         return epoch, start
 
     def _begun(self, begun: "LoaderPass") -> None:
-        """Take note that a pass begins."""
+        """Record that a pass begins."""
         if begun.epoch != self.epoch:
             self._loadable._epoch.advance(begun.epoch)
         self.batches._begin()
@@ -271,7 +271,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         self.end_of_dataloader = False
 
     def _taken(self, by: "LoaderPass") -> None:
-        """Take note that a pass gives a batch."""
+        """Record that a pass gives a batch."""
         self.end_of_dataloader = by.is_complete
         if by not in self._unfinished:
             return
@@ -283,7 +283,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             self._unfinished.discard(by)
 
     def _ended(self, ended: "LoaderPass") -> None:
-        """Take note that a pass is over: if it was left within another one, that one counts."""
+        """Record that a pass is over. If it ran within another pass, the position is that one's."""
         self._running -= 1
         if self._running == 0:
             self._leave_loop()
@@ -306,7 +306,7 @@ class LoaderPass(Iterator[Any]):
     """
 
     def __init__(self, loader: PairsLoader) -> None:
-        """Stand for the next pass of a loader; workers start when the first batch is asked for."""
+        """Represent the next pass of a loader; workers start with the first batch."""
         self._workers: _Workers | None = None
         self._loader = loader
         self.epoch = loader.epoch
@@ -421,7 +421,7 @@ class LoaderPass(Iterator[Any]):
             workers.end()
 
     def __del__(self) -> None:
-        """End the pass when nobody can go on with it."""
+        """End the pass when nobody refers to it."""
         self.close()
 
     def _require_own_process(self) -> None:
@@ -494,11 +494,11 @@ class _Workers:
         return None if self._context is None else self._context.error(noticed)
 
     def __del__(self) -> None:
-        """End the workers when nobody can use them."""
+        """End the workers when nobody refers to them."""
         self.end()
 
     def end(self) -> None:
-        """End the workers, and let go of the memory that came from them."""
+        """End the workers, and release the memory that came from them."""
         batches, self._batches = self._batches, iter(())
         loader, self._torch = self._torch, None
         if loader is None or self._context is None or sys.is_finalizing():
@@ -531,8 +531,8 @@ _running: Final[WeakSet[_Workers]] = WeakSet()
 """The workers of the passes of this process."""
 
 _inherited: Final[list[object]] = []
-"""What came over a fork. These workers are the parent's: if the last reference to torch's iterator
-went here, torch would end them. The operating system takes it all back when this process ends."""
+"""Workers that a fork copied. They are the parent's: if the last reference to torch's iterator were
+dropped here, torch would end them. The operating system frees all of it when this process ends."""
 
 
 def _keep_inherited() -> None:
@@ -545,7 +545,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def require_options(options: Mapping[str, Any]) -> None:
-    """Refuse what a loader does not take, naming what to use instead.
+    """Refuse options that a loader does not take, naming what to use instead.
 
     Raises:
         SelectionError: If there is such an option.

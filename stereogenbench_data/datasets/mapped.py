@@ -184,16 +184,16 @@ class _MappedScenes(Dataset[Sample]):
         """
         require_options(options)
         ordering, others = split_options(options)
-        own = self._apart()
+        own = self._copy()
         batches = EpochBatches(own, batch_size, **ordering)
         return PairsLoader(own, batches, num_workers=num_workers, **others)
 
-    def _apart(self) -> Self:
-        """Return the same samples, to be loaded side by side with these."""
-        apart = copy.copy(self)
-        apart._loader, apart._buffers = self._loader.apart(), BatchBuffers(self._buffers.kind)
-        apart._epoch = SharedEpoch(self._epoch)
-        return apart
+    def _copy(self) -> Self:
+        """Return the same samples with an epoch, videos and buffers of their own."""
+        twin = copy.copy(self)
+        twin._loader, twin._buffers = self._loader.copy(), BatchBuffers(self._buffers.kind)
+        twin._epoch = SharedEpoch(self._epoch)
+        return twin
 
     def _keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Read by these batches, in one of so many processes: each video is opened once.

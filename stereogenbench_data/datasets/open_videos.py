@@ -30,7 +30,7 @@ _KEPT_BYTES: Final = 4
 
 
 class OpenVideosWarning(UserWarning):
-    """More videos would be open at a time than the process may have: some are opened again."""
+    """More videos are needed at a time than this process may open: some are opened repeatedly."""
 
 
 class RepeatedDecodingWarning(UserWarning):
@@ -42,9 +42,9 @@ def videos_to_keep(
 ) -> int:
     """Return how many videos one of so many processes keeps open for its share of an epoch.
 
-    It reads every shuffle group of which it gets batches, each with its open scenes. As many files
-    are asked for as the process may open; if that is too few, or if other processes decode the same
-    videos though more groups would spare that, a warning says what to do.
+    A process reads every shuffle group of which it gets batches, each with its open scenes. A
+    warning says what to do if the process may not open so many files, or if several processes
+    decode the same videos and more groups would avoid it.
     """
     lengths = np.diff(plan.first_sample)
     groups = rule.groups_of(lengths)
@@ -95,7 +95,7 @@ def scenes_at_once(index: SceneIndex, plan: Plan) -> int:
 
 
 def _most_files() -> int:
-    """Return how many files this process may open: where a system does not tell, 512."""
+    """Return how many files this process may open; 512 where the system does not say."""
     try:
         import resource
     except ImportError:

@@ -1,8 +1,8 @@
 """The open videos of one process: opened when first needed, decoded forwards, closed in turn.
 
 Samples that share a frame (pairs of one moment, fields of one pair) share its decoding: each
-stream keeps the last picture that it gave. A stream that failed is closed, so that it is opened
-anew if it is asked for again.
+stream keeps the last picture that it returned. A stream that fails is closed, and opened again when
+it is next needed.
 """
 
 import os
@@ -99,7 +99,7 @@ class Streams:
     ) -> None:
         """Write one frame of a scene's video as RGB, scaled to the array's height and width.
 
-        The picture is not kept: for who asks for it once.
+        The picture is not kept: use this for pictures that are needed once.
 
         Raises:
             StorageError: If the video cannot be read.
@@ -232,9 +232,9 @@ def _read_only(picture: Any) -> Any:
 
 
 def _unused(last: dict[Any, Any], *, height_width: tuple[int, int] | None) -> Any:
-    """Return the array of the last picture to be written again, where nobody else has it.
+    """Return the array of the last picture for reuse, if nobody else refers to it.
 
-    Memory that is new costs more than what is written into it: the system clears it first.
+    New memory costs more than writing into it: the system clears it first.
     """
     for key in last:
         picture = last[key]
@@ -265,7 +265,7 @@ _REFERENCES_HERE: Final = _references_here()
 
 @contextmanager
 def _cause_raised(file: Path | MemberFile) -> Iterator[None]:
-    """Where a video failed because its bytes could not be fetched, raise that; close the file."""
+    """Raise the failed fetch that made a video fail, if one did, and close the file."""
     try:
         yield
     except (MediaError, StorageError) as error:

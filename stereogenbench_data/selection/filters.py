@@ -65,7 +65,7 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
 
     Raises:
         SelectionError: If no scene passes, naming the filter that left nothing, what it was
-            asked for and what exists there; or if a filter cannot be understood.
+            given and what exists there; or if a filter cannot be understood.
     """
     rows = np.arange(len(index), dtype=np.int64)
     applied: list[str] = []
@@ -205,7 +205,7 @@ def find_scene(index: SceneIndex, text: str) -> int:
             )
     near = _near_keys(wanted, keys)
     raise SelectionError(
-        f"{text!r} is no key of {counted(len(keys), 'scene')}, nor a part of one. "
+        f"{text!r} is not a key of {counted(len(keys), 'scene')}, nor a part of one. "
         + (f"Did you mean {_first_keys(near)}?" if near else f"There is {_first_keys(keys)}.")
         + stale_note(index)
     )

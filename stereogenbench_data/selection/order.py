@@ -42,7 +42,7 @@ Numbers = Int64[np.ndarray, " n"]
 
 @dataclass(frozen=True, slots=True)
 class OrderRule:
-    """What an order depends on beside the selection and the epoch.
+    """What an order depends on, apart from the selection and the epoch.
 
     Attributes:
         batch_size: Samples in a batch.
@@ -62,7 +62,7 @@ class OrderRule:
     kind: OrderKind = "shuffled"
 
     def __post_init__(self) -> None:
-        """Refuse what orders nothing."""
+        """Require numbers in their ranges and a known kind."""
         options = {"batch_size": 1, "seed": 0, "shuffle_groups": 1, "open_scenes": 1}
         for name, least in options.items():
             value = getattr(self, name)
@@ -89,7 +89,7 @@ class OrderRule:
     def in_effect(self, lengths: Numbers) -> "OrderRule":
         """Return what the order of scenes of so many samples depends on: equal for equal orders.
 
-        With few scenes other groups and open scenes are used than were asked for; a sequential
+        Few scenes have fewer groups and open scenes than requested; a sequential
         order depends on the batch size alone.
         """
         if self.kind == "sequential":
@@ -185,7 +185,7 @@ class EpochOrder:
         if len(lengths) == 0:
             return np.empty(0, dtype=np.int64)
         count = self.rule.streams_of(len(lengths))
-        stream = _dealt(lengths, streams=count)
+        stream = _assign(lengths, streams=count)
         draws = _uniform(self._raw(2 * count, part=group + 1))
         numbers, times = [], []
         for number, (phase, pace) in enumerate(zip(draws[:count], draws[count:], strict=True)):
@@ -259,8 +259,8 @@ def rank_share(start: int, end: int, *, rank: int, world_size: int) -> range:
     return range(start + (rank - start) % world_size, end, world_size)
 
 
-def _dealt(lengths: Numbers, *, streams: int) -> Numbers:
-    """Return each piece's stream: the longest first, each to the stream that has least."""
+def _assign(lengths: Numbers, *, streams: int) -> Numbers:
+    """Return each piece's stream: the longest piece first, each to the shortest stream."""
     stream = np.empty(len(lengths), dtype=np.int64)
     loads = [(0, number) for number in range(streams)]
     for piece in np.argsort(-lengths, kind="stable").tolist():

@@ -469,7 +469,7 @@ def test_a_scene_needs_the_videos_that_its_fields_are_made_from(small_index):
 
 
 def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):
-    monkeypatch.setattr("stereogenbench_data.datasets.open_videos._most_files", lambda: 160)
+    monkeypatch.setattr("resource.getrlimit", lambda which: (160, 160))
     pairs = StereoPairs(small_index, pairs="all", frames="all")
 
     with pytest.warns(OpenVideosWarning, match=r"up to 88 videos .* may open 32.*ulimit -n 216"):
