@@ -253,7 +253,8 @@ def _watch(material: Material, *, batches: int, say: Say) -> dict[str, Any]:
     growth_mb = float(np.mean(last) - np.mean(third)) / quarter * 1000
     return {
         "workers": workers, "batch": size, "batches": len(megabytes),
-        "open_scenes": loader.batches.rule.open_scenes, "lanes": loader.batches.rule.lanes,
+        "open_scenes": loader.batches.rule.open_scenes,
+        "lanes": loader.batches.rule.shuffle_groups,
         "scenes": len(pairs.plan.scene_rows), "epoch_batches": len(loader),
         "peak_mb": max(megabytes), "peak_private_mb": max(private),
         "growth_mb_per_1000": growth_mb,

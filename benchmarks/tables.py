@@ -116,7 +116,7 @@ def _memory(memory: dict[str, Any]) -> str:
     ]  # fmt: skip
     text = (
         "## Memory\n\nAll pairs, all frames, default fields and settings "
-        f"({memory['lanes']} lanes, {memory['open_scenes']} open scenes each), "
+        f"({memory['lanes']} shuffle groups, {memory['open_scenes']} open scenes each), "
         f"{memory['scenes']} scenes, {memory['workers']} workers, batches of {memory['batch']}, "
         f"{memory['batches']} batches.\n\n"
     )

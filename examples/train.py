@@ -42,7 +42,7 @@ def main() -> None:
     )  # fmt: skip
     network = SmallStereo()
     optimiser = torch.optim.Adam(network.parameters(), lr=3e-3)
-    loader = pairs.loader(batch_size=16, num_workers=2, seed=0, lanes=2)
+    loader = pairs.loader(batch_size=16, num_workers=2, seed=0, shuffle_groups=2)
     for step, batch in zip(range(24), loader, strict=False):
         error = (network(batch["left"], batch["right"]) - batch["disparity"]).abs()
         loss = error[batch["valid"] & (batch["disparity"] < 64)].mean()

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
         Resize,
     )
     from stereogenbench_data.schema.records import DepthEncoding
-    from stereogenbench_data.selection.quality import order_quality
+    from stereogenbench_data.selection.order import order_quality
     from stereogenbench_data.sources.cache import ShardCache
     from stereogenbench_data.sources.retry import RetryPolicy
 
@@ -101,7 +101,7 @@ _HOMES = {
         "Resize",
     ),
     "schema.records": ("DepthEncoding",),
-    "selection.quality": ("order_quality",),
+    "selection.order": ("order_quality",),
     "sources.cache": ("ShardCache",),
     "index.table": ("SceneIndex",),
     "sources.retry": ("RetryPolicy",),

@@ -74,7 +74,7 @@ class _ScenesOfEpoch(ExamplesIterable):  # type: ignore[misc]  # datasets ships 
 
 
 def _samples(pairs: StereoPairs, scenes: list[int], epoch: int | None = None) -> Iterator[Sample]:
-    drawn = pairs if epoch is None else pairs._apart()
+    drawn = pairs if epoch is None else pairs._copy()
     if epoch is not None:
         drawn.set_epoch(epoch)
     first: Any = pairs.plan.first_sample

@@ -58,7 +58,7 @@ def show(  # noqa: PLR0913 - one parameter an option
     """
     from stereogenbench_data.audit.scene_reader import SceneReader
     from stereogenbench_data.schema.records import DepthEncoding
-    from stereogenbench_data.selection.lookup import find_scene
+    from stereogenbench_data.selection.filters import find_scene
 
     cameras = None if pair is None else _cameras(pair)
     clip = clip or (out is not None and out.suffix.lower() in _CLIPS)

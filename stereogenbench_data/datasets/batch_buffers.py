@@ -380,6 +380,16 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(before=_retire_held)
 
 
+def held_batches(pids: set[int]) -> int:
+    """Return how many batches of these worker processes this process holds any part of."""
+    statuses = [slots.status for owner, slots in tuple(_opened.items()) if owner.pid in pids]
+    return sum(
+        any(held.status is status for status in statuses)
+        for held in tuple(_held.values())
+        if held.pid == os.getpid()
+    )
+
+
 def forget_slots(pids: set[int]) -> None:
     """Let go of the slots of worker processes that have ended; open batches keep their memory."""
     for owner in tuple(_opened):

@@ -1,22 +1,24 @@
-"""The batches of an epoch as one rank gets them, and positions in them that can be saved."""
+"""The batches of an epoch for one rank, and positions in them that can be saved."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
-from typing import Any, Final, Protocol, TypedDict, Unpack, runtime_checkable
+from typing import Any, Final, Protocol, TypedDict, Unpack
 
 import numpy as np
 import torch.distributed
 from torch.utils.data import Sampler
 
 from stereogenbench_data.datasets.frameworks import require_shared_once
+from stereogenbench_data.datasets.open_videos import scenes_at_once
+from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.order import (
-    LANES,
-    LANES_OF_LARGE,
+    GROUPS_OF_LARGE,
     OPEN_SCENES,
     ORDER_VERSION,
+    SHUFFLE_GROUPS,
     EpochOrder,
     OrderKind,
     OrderRule,
@@ -29,75 +31,61 @@ from stereogenbench_data.selection.plan import Plan
 State = dict[str, Any]
 """A position: a flat dict of numbers and texts, which JSON and `torch.save` take."""
 
+_RENAMED: Final = {"lanes": "shuffle_groups"}
+"""What a position that was saved before calls otherwise."""
+
 _STATES: Final = (
     "Pass what state_dict() of a loader, of EpochBatches or of a stream returned, unchanged."
 )
 
 
 class EpochOptions(TypedDict, total=False):
-    """How an epoch is ordered and shared out.
+    """How an epoch is ordered and divided among ranks.
 
     Attributes:
         seed: The seed of the order; that of the dataset if left out.
-        rank: Which share of the batches this process gets; as torch.distributed says if left out
-            (0 where it is not initialised).
-        world_size: How many shares there are; as torch.distributed says, or 1, if left out.
+        rank: Whose batches these are, from 0. By default torch.distributed's rank, or 0 where it is
+            not initialised.
+        world_size: How many ranks there are. By default torch.distributed's world size, or 1.
+        drop_last: As in torch: True is ``tail="drop"``, the default; False is ``tail="uneven"``,
+            and refused for several ranks, which must choose between "uneven" and "wrap".
+        shuffle: As in torch: True is ``order="shuffled"``, the default; False is "sequential".
         tail: What becomes of the epoch's last batches. "drop" (the default): each rank gets as
             many batches, all of them full; what is left over is dropped (see
             `EpochBatches.left_out`). "wrap": each rank gets as many full batches and no sample is
             left out; samples from the epoch's start fill up, marked in the field ``is_padding``
             (batch,) bool. "uneven": every sample exactly once; the last batch may be short, and
             ranks may differ by one batch. Validate with "uneven" (or "wrap", less its padding).
-        lanes: Into how many lanes the scenes are parted; batch n belongs to lane n mod lanes. If
-            left out 4, but 2 where scenes are so large that a lane has fewer than 16 open. Each
-            video is decoded by one process, once an epoch, if world_size * num_workers divides
-            ``lanes``; make it a multiple of (or equal to) that product. Selections too small for so
-            many lanes have fewer.
-        open_scenes: How many scenes each lane interleaves; if left out 16, or the batch size where
-            that is more, but of large pictures no more than about 0.9 GB of decoders hold: of
-            1280x1280 pixels 16 with one pair a scene, and 4 with all pairs. Fewer take less memory
-            and shuffle less well. A process has so many of each lane that it reads.
+        shuffle_groups: How many groups of scenes are shuffled separately; batch n belongs to group
+            n mod shuffle_groups. By default 4, but 2 where scenes are so large that a group has
+            fewer than 16 open; selections too small for so many groups have fewer. Each video is
+            decoded by one process, once an epoch, if world_size * num_workers divides
+            ``shuffle_groups``: make it that product or a multiple of it.
+        open_scenes: The shuffle buffer, counted in scenes: how many each group interleaves. If left
+            out 16, or the batch size where that is more, but of large pictures no more than about
+            0.9 GB of decoders hold: of 1280x1280 pixels 16 with one pair a scene, and 4 with all
+            pairs. Fewer take less memory and shuffle less well. A process has so many of each group
+            that it reads.
         order: "shuffled" (the default) or "sequential".
     """
 
     seed: int
     rank: int
     world_size: int
+    drop_last: bool
+    shuffle: bool
     tail: Tail
-    lanes: int
+    shuffle_groups: int
     open_scenes: int
     order: OrderKind
 
 
-@runtime_checkable
 class Numbered(Protocol):
     """A dataset whose samples a plan numbers."""
 
     index: SceneIndex
     plan: Plan
-
-    @property
-    def epoch(self) -> int:
-        """The current epoch."""
-        ...
-
-    @property
-    def epoch_version(self) -> tuple[int, ...]:
-        """What differs after each `set_epoch`, whatever epoch it sets."""
-        ...
-
-    def set_epoch(self, epoch: int) -> None:
-        """Go to another epoch."""
-        ...
-
-    def advance_epoch(self, epoch: int) -> None:
-        """Go to another epoch because a pass is over, not because the user says so."""
-        ...
-
-    @property
-    def scenes_at_once(self) -> int:
-        """How many scenes a lane may interleave before their open videos take too much memory."""
-        ...
+    _epoch: SharedEpoch
 
 
 class EpochBatch(list[int]):
@@ -131,8 +119,8 @@ class EpochBatches(Sampler[list[int]]):
 
     Its passes are of the same epoch until `set_epoch` is called, as with torch's samplers; a
     ``loader(...)`` goes to the next epoch by itself. The order depends on the selection, the seed,
-    the epoch, the batch size, the lanes and the open scenes, and on nothing else: global batch n
-    goes to rank n mod world_size, whoever asks. It offers its position as torchdata's
+    the epoch, the batch size, the shuffle groups and the open scenes, and on nothing else: global
+    batch n goes to rank n mod world_size, whoever asks. It offers its position as torchdata's
     ``StatefulDataLoader`` asks for it; with torch's own `DataLoader`, which reads ahead, use the
     dataset's ``loader(...)``, which counts what the training loop has taken.
 
@@ -164,23 +152,26 @@ class EpochBatches(Sampler[list[int]]):
                 f"{', '.join(EpochOptions.__annotations__)}."
             )
         self.dataset = dataset
-        at_once = dataset.scenes_at_once
+        self._epoch = dataset._epoch
+        at_once = scenes_at_once(dataset.index, dataset.plan)
         rule = OrderRule(
             batch_size=batch_size,
             seed=options.get("seed", dataset.plan.seed),
-            lanes=options.get("lanes", LANES if at_once >= OPEN_SCENES else LANES_OF_LARGE),
-            kind=options.get("order", "shuffled"),
+            shuffle_groups=options.get(
+                "shuffle_groups", SHUFFLE_GROUPS if at_once >= OPEN_SCENES else GROUPS_OF_LARGE
+            ),
+            kind=_order_kind(options),
         )
         most_open = min(max(OPEN_SCENES, rule.batch_size), at_once)
         self.rule = replace(rule, open_scenes=options.get("open_scenes", most_open))
-        self.tail = options.get("tail", "drop")
         self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
+        self.tail = _tail(options, world_size=self.world_size)
         self._follows_the_group = "rank" not in options
         self._resumed = (0, 0)
-        self.completed: tuple[int, tuple[int, ...]] | None = None
+        self._completed: tuple[int, tuple[int, ...]] | None = None
         self._order: EpochOrder | None = None
         self._latest: BatchPass | None = None
-        if self.end() == 0:
+        if self._end() == 0:
             raise SelectionError(
                 f"tail='drop' drops all of {len(dataset.plan)} samples: they fill no batch of "
                 f"{batch_size} for each of {self.world_size} ranks. Take a smaller batch_size, "
@@ -200,11 +191,19 @@ class EpochBatches(Sampler[list[int]]):
     @property
     def left_out(self) -> int:
         """How many samples of an epoch no rank gets: of ``tail="drop"`` only."""
-        return max(0, len(self.dataset.plan) - self.end() * self.rule.batch_size)
+        return max(0, len(self.dataset.plan) - self._end() * self.rule.batch_size)
 
     def __len__(self) -> int:
         """The number of this rank's batches in a whole epoch."""
-        return len(self.share(0))
+        return len(self._share(0))
+
+    def __repr__(self) -> str:
+        """Say what batches they are."""
+        kind = "sequential" if self.rule.kind == "sequential" else f"seed {self.rule.seed}"
+        return (
+            f"<{type(self).__name__}: {self.rule.batch_size} of {self.samples_of_epoch} samples a "
+            f"batch, rank {self.rank} of {self.world_size}, {kind}, tail={self.tail!r}>"
+        )
 
     def __iter__(self) -> "BatchPass":
         """Return this rank's batches of the current epoch, or what a loaded state left of it.
@@ -213,18 +212,17 @@ class EpochBatches(Sampler[list[int]]):
             SelectionError: If Accelerate would share these batches among ranks a second time.
         """
         require_shared_once(self, type(self).__name__, rank=self.rank, world_size=self.world_size)
-        epoch, start = self.next_position()
+        epoch, start = self._next_position()
         return BatchPass(self, epoch=epoch, start=start)
 
     def set_epoch(self, epoch: int) -> None:
         """Go to another epoch, which begins at its beginning; the dataset goes with it."""
-        self.dataset.set_epoch(epoch)
+        self._epoch.set(epoch)
 
     def state_dict(self) -> State:
         """Return the position after the last batch that was given out."""
-        if self._latest is None:
-            return self.state_at(*self.next_position())
-        return self._latest.state_dict()
+        latest = self._latest
+        return self.state_at(*(self._next_position() if latest is None else latest.position))
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go to a saved position: the next pass begins there, all later ones at the beginning.
@@ -232,33 +230,33 @@ class EpochBatches(Sampler[list[int]]):
         Raises:
             StateError: If it belongs to other samples or another order, naming what differs.
         """
-        self.go_to(*self.position_in(state))
+        self._go_to(*self._position_in(state))
 
-    def go_to(self, epoch: int, start: int) -> None:
+    def _go_to(self, epoch: int, start: int) -> None:
         """Begin the next pass at a global batch of an epoch."""
-        self.dataset.set_epoch(epoch)
+        self._epoch.set(epoch)
         self._resumed = (epoch, start)
         self._latest = None
 
-    def next_position(self) -> tuple[int, int]:
+    def _next_position(self) -> tuple[int, int]:
         """Return the epoch and the global batch at which the next pass begins."""
         epoch, start = self._resumed
-        return (epoch, start) if epoch == self.dataset.epoch else (self.dataset.epoch, 0)
+        return (epoch, start) if epoch == self._epoch.value else (self._epoch.value, 0)
 
-    def begin(self, latest: "BatchPass | None" = None) -> None:
-        """Take note that a pass has begun: the next one starts its epoch from the beginning."""
+    def _begin(self, latest: "BatchPass | None" = None) -> None:
+        """Record that a pass has begun: the next one starts its epoch from the beginning."""
         self._resumed = (0, 0)
         self._latest = latest
 
-    def complete(self, epoch: int) -> None:
-        """Take note that a pass over an epoch gave its last batch."""
-        self.completed = (epoch, self.dataset.epoch_version)
+    def _complete(self, epoch: int) -> None:
+        """Record that a pass over an epoch gave its last batch."""
+        self._completed = (epoch, self._epoch.version)
 
-    def require_no_other_reader(self) -> None:
-        """Require that no `DataLoader` of another's making is in the middle of these batches.
+    def _require_no_other_reader(self) -> None:
+        """Require that no other `DataLoader` is in the middle of these batches.
 
         Raises:
-            StateError: If one is: workers read ahead, so what its loop has taken is not known.
+            StateError: If one is: its workers read ahead, so nobody knows what its loop has taken.
         """
         if self._latest is not None and not self._latest.is_complete:
             raise StateError(
@@ -268,7 +266,7 @@ class EpochBatches(Sampler[list[int]]):
                 "load_state), without skip_first_batches."
             )
 
-    def end(self, start: int = 0) -> int:
+    def _end(self, start: int = 0) -> int:
         """Return the global number at which an epoch ends for ranks that go on from ``start``."""
         return last_batch(
             len(self.dataset.plan),
@@ -278,7 +276,7 @@ class EpochBatches(Sampler[list[int]]):
             start=start,
         )
 
-    def share(self, start: int) -> range:
+    def _share(self, start: int) -> range:
         """Return the global numbers of this rank's batches from ``start`` on.
 
         Raises:
@@ -286,10 +284,10 @@ class EpochBatches(Sampler[list[int]]):
         """
         group = _group()
         if group is not None:
-            self.require_group(*group)
-        return rank_share(start, self.end(start), rank=self.rank, world_size=self.world_size)
+            self._require_group(*group)
+        return rank_share(start, self._end(start), rank=self.rank, world_size=self.world_size)
 
-    def require_group(self, rank: int, world_size: int) -> None:
+    def _require_group(self, rank: int, world_size: int) -> None:
         """Require that the batches were made for a rank of so many, unless the user chose another.
 
         Raises:
@@ -320,7 +318,7 @@ class EpochBatches(Sampler[list[int]]):
         return np.arange(number * size, (number + 1) * size) >= len(self.dataset.plan)
 
     def order(self, epoch: int) -> EpochOrder:
-        """Return the order of an epoch; the last one asked for is kept."""
+        """Return the order of an epoch; the last one is kept."""
         if self._order is None or self._order.epoch != epoch:
             self._order = EpochOrder(self.dataset.plan.first_sample, self.rule, epoch=epoch)
         return self._order
@@ -330,11 +328,11 @@ class EpochBatches(Sampler[list[int]]):
         return {
             "version": ORDER_VERSION,
             "epoch": epoch,
-            "batches_consumed": min(batches, self.batches_of_all),
+            "batches_consumed": min(batches, self._batches_of_all),
             **self._identity,
         }
 
-    def position_in(self, state: Mapping[str, Any]) -> tuple[int, int]:
+    def _position_in(self, state: Mapping[str, Any]) -> tuple[int, int]:
         """Return the epoch and the number of global batches that a state says are consumed.
 
         Raises:
@@ -344,6 +342,8 @@ class EpochBatches(Sampler[list[int]]):
             raise StateError(
                 f"a state is a dict as state_dict() returns it, got {state!r:.60}: {_STATES}"
             )
+        if "lanes" in state:
+            state = {_RENAMED.get(name, name): value for name, value in state.items()}
         own = {"version": ORDER_VERSION, **self._identity}
         missing = sorted({*own, "epoch", "batches_consumed"} - state.keys())
         if missing:
@@ -362,21 +362,21 @@ class EpochBatches(Sampler[list[int]]):
                 "data with the same selection and options, or begin the epoch anew without it."
             )
         epoch = require_count(state, "epoch")
-        return epoch, require_count(state, "batches_consumed", most=self.batches_of_all)
+        return epoch, require_count(state, "batches_consumed", most=self._batches_of_all)
 
     @property
-    def batches_of_all(self) -> int:
+    def _batches_of_all(self) -> int:
         """How many batches hold all samples of an epoch, whatever ranks and tail there are."""
         return -(-len(self.dataset.plan) // self.rule.batch_size)
 
     @cached_property
     def _identity(self) -> State:
-        """What must be equal where a state is saved and where it is loaded."""
+        """What must be the same when a state is saved and when it is loaded."""
         rule = self.rule.in_effect(np.diff(self.dataset.plan.first_sample))
         return {
             "seed": rule.seed,
             "batch_size": rule.batch_size,
-            "lanes": rule.lanes,
+            "shuffle_groups": rule.shuffle_groups,
             "open_scenes": rule.open_scenes,
             "order": rule.kind,
             "tail": self.tail,
@@ -385,7 +385,7 @@ class EpochBatches(Sampler[list[int]]):
         }
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy in another process needs, which orders the epoch by itself."""
+        """Return what a copy in another process needs; it computes the order itself."""
         return self.__dict__ | {"_order": None, "_latest": None}
 
 
@@ -395,39 +395,65 @@ class BatchPass(Iterator[list[int]]):
     def __init__(self, batches: EpochBatches, *, epoch: int, start: int) -> None:
         """Begin an epoch at a global batch."""
         self._batches = batches
-        self._go_to(epoch, start)
+        self._epoch, self._start, self._given = epoch, start, 0
+        self._end = batches._end(start)
+        share = batches._share(start)
+        self._left, self._count = iter(share), len(share)
+        if not share:
+            # torchdata's loader asks for no batch of a pass that it saved at its end.
+            batches._begin(self)
 
     def __next__(self) -> EpochBatch:
         """Return the next batch: the numbers of its samples."""
-        self._batches.begin(self)
+        self._batches._begin(self)
         number = next(self._left)
         self._given += 1
         if self.is_complete:
-            self._batches.complete(self._epoch)
+            self._batches._complete(self._epoch)
         return self._batches.batch(number, epoch=self._epoch)
+
+    def __repr__(self) -> str:
+        """Say how far it is."""
+        return f"<BatchPass: {self._given} of {self._count} batches of epoch {self._epoch}>"
 
     @property
     def is_complete(self) -> bool:
         """Whether the last batch was given out."""
         return self._given >= self._count
 
-    def state_dict(self) -> State:
-        """Return the position after the last batch that this pass gave out."""
-        given = min(self._start + self._given * self._batches.world_size, self._end)
-        return self._batches.state_at(self._epoch, given)
+    @property
+    def position(self) -> tuple[int, int]:
+        """The epoch, and how many global batches are consumed after the last one given out."""
+        given = self._start + self._given * self._batches.world_size
+        return self._epoch, min(given, self._end)
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go to a saved position."""
-        epoch, start = self._batches.position_in(state)
-        self._batches.dataset.set_epoch(epoch)
-        self._batches.begin(self)
-        self._go_to(epoch, start)
 
-    def _go_to(self, epoch: int, start: int) -> None:
-        self._epoch, self._start, self._given = epoch, start, 0
-        self._end = self._batches.end(start)
-        share = self._batches.share(start)
-        self._left, self._count = iter(share), len(share)
+def _order_kind(options: EpochOptions) -> OrderKind:
+    if "shuffle" not in options:
+        return options.get("order", "shuffled")
+    _require_one_of_two(options, "shuffle", "order")
+    return "shuffled" if options["shuffle"] else "sequential"
+
+
+def _tail(options: EpochOptions, *, world_size: int) -> Tail:
+    if "drop_last" not in options:
+        return options.get("tail", "drop")
+    _require_one_of_two(options, "drop_last", "tail")
+    if not options["drop_last"] and world_size > 1:
+        raise SelectionError(
+            f"drop_last=False of {world_size} ranks may mean two things: give tail='wrap' (samples "
+            "from the epoch's start fill up, as in DistributedSampler, and are marked) or "
+            "tail='uneven' (every sample exactly once; ranks may differ by one batch)."
+        )
+    return "drop" if options["drop_last"] else "uneven"
+
+
+def _require_one_of_two(options: EpochOptions, name: str, other: str) -> None:
+    value = dict(options)[name]
+    if not isinstance(value, bool):
+        raise SelectionError(f"{name} must be True or False, got {value!r}.")
+    if other in options:
+        raise SelectionError(f"{name}={value} and {other}= say the same thing: give one of them.")
 
 
 def require_count(state: Mapping[str, Any], name: str, *, most: int | None = None) -> int:

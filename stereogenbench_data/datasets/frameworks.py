@@ -1,9 +1,9 @@
-"""What training frameworks ask of a loader that shares its batches among ranks by itself.
+"""What training frameworks need of a loader that divides its batches among ranks itself.
 
-Accelerate and Lightning give each rank its share of a torch `DataLoader`. Our loaders have done
-that, so that sharing once more would lose samples without a word. Lightning leaves a loader alone
-whose sampler is torch's `DistributedSampler`; Accelerate one that says that it was prepared.
-Batches and streams that are shared twice all the same are refused.
+Accelerate and Lightning give each rank its share of a torch `DataLoader`. Our loaders have already
+done that; dividing them again would silently lose samples. Lightning leaves loaders alone whose
+sampler is torch's `DistributedSampler`, Accelerate those that say they are prepared. Batches and
+streams that are divided twice all the same are refused.
 """
 
 import sys
@@ -51,13 +51,13 @@ class RankBatches(Protocol):
         """Go to another epoch."""
         ...
 
-    def require_group(self, rank: int, world_size: int) -> None:
+    def _require_group(self, rank: int, world_size: int) -> None:
         """Require that these are the batches of a rank of so many."""
         ...
 
 
 class ShareSampler(DistributedSampler[Any]):
-    """The samples of one rank, as the sampler that tells frameworks that they are shared out."""
+    """The samples of one rank, as a sampler that tells frameworks that they are divided already."""
 
     def __init__(self, batches: RankBatches) -> None:
         """Stand for the samples of these batches."""
@@ -86,8 +86,8 @@ class AcceleratedLoader:
     Attributes:
         use_stateful_dataloader: That Accelerate's ``save_state`` keeps the loader's ``state_dict``.
         end_of_dataloader: Whether the batch given last is the last of its pass.
-        remainder: How many samples that are no padding all ranks' last batches hold together; 0
-            where all are none.
+        remainder: How many samples of all ranks' last batches are not padding; 0 where none is
+            padding.
     """
 
     batches: RankBatches
@@ -109,7 +109,7 @@ class AcceleratedLoader:
 
     @property
     def _is_accelerate_prepared(self) -> bool:
-        """That Accelerate need not share the batches, which is asked by ``accelerator.prepare``.
+        """Whether Accelerate need not divide the batches; ``accelerator.prepare`` reads it.
 
         Raises:
             SelectionError: If the batches are shared out otherwise than Accelerate's processes are.
@@ -118,14 +118,14 @@ class AcceleratedLoader:
         if states is None:
             return False
         state = states.PartialState()
-        self.batches.require_group(state.process_index, state.num_processes)
+        self.batches._require_group(state.process_index, state.num_processes)
         self._device = state.device
         self._gradient_state = states.GradientState()
         return True
 
     @_is_accelerate_prepared.setter
     def _is_accelerate_prepared(self, value: bool) -> None:
-        """Take note of nothing: Accelerate sets what it has asked for before."""
+        """Do nothing: Accelerate sets what it has just read."""
 
     def _enter_loop(self) -> None:
         """Tell Accelerate that a loop over this loader begins."""
@@ -166,7 +166,7 @@ def accelerates_epoch(dataset: object) -> int | None:
 
 
 def require_shared_once(data: Sized | object, name: str, *, rank: int, world_size: int) -> None:
-    """Refuse what Accelerate is about to share among processes though it is a share already.
+    """Refuse data that Accelerate is about to divide among processes a second time.
 
     Args:
         data: A batch sampler or an iterable dataset.

@@ -1,17 +1,17 @@
-"""A torch `DataLoader` over the batches of an epoch that knows what its loop has consumed."""
+"""A torch `DataLoader` over the batches of an epoch, which counts what its loop has consumed."""
 
 import os
 import sys
 import threading
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any, Final, Protocol, cast, runtime_checkable
+from typing import Any, Final, NamedTuple, Protocol, cast
 from weakref import WeakSet
 
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from stereogenbench_data.datasets.batch_buffers import BatchBuffers, forget_slots
+from stereogenbench_data.datasets.batch_buffers import BatchBuffers, forget_slots, held_batches
 from stereogenbench_data.datasets.batches import (
     EpochBatch,
     EpochBatches,
@@ -27,11 +27,10 @@ from stereogenbench_data.errors import (
     StereoGenBenchError,
     WorkerError,
 )
+from stereogenbench_data.samples.streams import StreamStats
 
 _ORDERED: Final = "or torch's own DataLoader over the dataset"
 _INSTEAD: Final = {
-    "shuffle": "use order='shuffled' or order='sequential'",
-    "drop_last": "use tail='drop', tail='wrap' or tail='uneven'",
     "sampler": f"use seed= and order=, {_ORDERED}",
     "batch_sampler": f"use seed= and order=, {_ORDERED} with EpochBatches",
 }
@@ -51,19 +50,43 @@ class LoaderOptions(EpochOptions, total=False):
     collate_fn: Any
 
 
-@runtime_checkable
-class Keeping(Numbered, Protocol):
-    """A numbered dataset that is told how many scenes are read at a time."""
+class Loadable(Numbered, Protocol):
+    """A numbered dataset that a loader loads."""
 
-    buffers: BatchBuffers
+    _buffers: BatchBuffers
 
-    def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
+    def _keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Keep videos open for the scenes that one of so many processes reads at a time."""
+        ...
+
+    def stats(self) -> StreamStats:
+        """Return how many videos this process has open."""
         ...
 
     def close(self) -> None:
         """Close the videos that are open in this process."""
         ...
+
+
+class LoaderStats(NamedTuple):
+    """What a loader has and holds, in the process that asks.
+
+    Attributes:
+        epoch: The current epoch.
+        batches_taken: How many global batches of it the loop has taken, of all ranks.
+        workers: How many worker processes run for it.
+        videos_open: How many videos this process has open for it; each worker has its own.
+        videos_limit: How many videos a process opens for it at the most.
+        batches_held: How many batches of its workers lie in shared slots that the loop still holds
+            any part of.
+    """
+
+    epoch: int
+    batches_taken: int
+    workers: int
+    videos_open: int
+    videos_limit: int
+    batches_held: int
 
 
 class PairsLoader(AcceleratedLoader, DataLoader[Any]):
@@ -97,7 +120,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     def __init__(
         self,
-        dataset: Keeping,
+        dataset: Loadable,
         batches: EpochBatches,
         *,
         num_workers: int = 0,
@@ -115,7 +138,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             **options: Those of `DataLoader`.
         """
         if options.get("collate_fn") is None:
-            options["collate_fn"] = dataset.buffers.collate
+            options["collate_fn"] = dataset._buffers.collate
         super().__init__(
             # A protocol: torch asks for len and [] alone.
             cast("Dataset[Any]", dataset),
@@ -124,20 +147,21 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             **options,
         )
         self.batches = batches
-        self._keeping = dataset
-        self._position = batches.next_position()
+        self._loadable = dataset
+        self._position = batches._next_position()
         self._unfinished: WeakSet[LoaderPass] = WeakSet()
+        self._workers: WeakSet[_Workers] = WeakSet()
         self._running = 0
         self._clock = 0
         self._persistent: _Workers | None = None
         # Past torch's guard against another sampler: it says that the batches are a rank's share.
         object.__setattr__(self, "sampler", ShareSampler(batches))
-        dataset.keep_open(batches, processes=batches.world_size * max(1, num_workers))
+        dataset._keep_open(batches, processes=batches.world_size * max(1, num_workers))
 
     @property
     def epoch(self) -> int:
         """The current epoch, from 0: until the next pass begins, that of the last one."""
-        return self.batches.dataset.epoch
+        return self._loadable._epoch.value
 
     def set_epoch(self, epoch: int) -> None:
         """Go to an epoch: another order, other random frames and transforms.
@@ -154,8 +178,8 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
     def __iter__(self) -> "LoaderPass":  # type: ignore[override]  # torch names a private class
         """Return a pass over the current epoch, or over what a loaded state left of it.
 
-        After a whole pass it is the next epoch, unless an epoch was set since. It begins when its
-        first batch is asked for: trainers set the epoch in between.
+        After a whole pass it is the next epoch, unless an epoch was set since. The pass begins with
+        its first batch, because trainers set the epoch in between.
         """
         return LoaderPass(self)
 
@@ -165,39 +189,62 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         Raises:
             StateError: If the loop runs over another DataLoader, made of this one's parts.
         """
-        self.batches.require_no_other_reader()
+        self.batches._require_no_other_reader()
         epoch, consumed = self._position
         return self.batches.state_at(self.epoch, consumed if epoch == self.epoch else 0)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go to a saved position; nothing is replayed, and later epochs are whole again.
+        """Go to a saved position. Nothing is replayed; later epochs are whole again.
 
         A position behind the last batch of an epoch is the beginning of the next one.
 
         Raises:
             StateError: If it belongs to other samples or another order, naming what differs.
         """
-        epoch, start = self.batches.position_in(state)
-        if start > 0 and start >= self.batches.end(start):
+        epoch, start = self.batches._position_in(state)
+        if start > 0 and start >= self.batches._end(start):
             epoch, start = epoch + 1, 0
-        self.batches.go_to(epoch, start)
+        self.batches._go_to(epoch, start)
         self._position = epoch, start
         self._unfinished.clear()
+
+    def stats(self) -> LoaderStats:
+        """Return what the loader has and holds now: open videos, workers, batches."""
+        pids = {pid for each in self._workers for pid in each.pids}
+        videos = self._loadable.stats()
+        epoch, taken = self._position
+        return LoaderStats(
+            epoch=self.epoch,
+            batches_taken=taken if epoch == self.epoch else 0,
+            workers=len(pids),
+            videos_open=videos.videos_open,
+            videos_limit=videos.videos_limit,
+            batches_held=held_batches(pids),
+        )
+
+    def __repr__(self) -> str:
+        """Say what it loads, and how."""
+        return (
+            f"<{type(self).__name__}: epoch {self.epoch} of {self.dataset!r} by "
+            f"{self.num_workers} workers, {self.batches!r}>"
+        )
 
     def close(self) -> None:
         """End workers that persist, and close this process's videos; it can be used again."""
         if self._persistent is not None:
             self._forget(self._persistent)
-        self._keeping.close()
+        self._loadable.close()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: it has passes and workers of its own."""
-        return self.__dict__ | {"_unfinished": None, "_persistent": None, "_running": 0}
+        return self.__dict__ | {
+            "_unfinished": None, "_workers": None, "_persistent": None, "_running": 0,
+        }  # fmt: skip
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy."""
         self.__dict__.update(state)
-        self._unfinished = WeakSet()
+        self._unfinished, self._workers = WeakSet(), WeakSet()
 
     def _forget(self, workers: "_Workers") -> None:
         """End workers; the next pass starts others."""
@@ -207,16 +254,16 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     def _next_position(self) -> tuple[int, int]:
         """Return the epoch and the global batch at which a pass begins now."""
-        epoch, start = self.batches.next_position()
-        if start == 0 and self.batches.completed == (epoch, self._keeping.epoch_version):
+        epoch, start = self.batches._next_position()
+        if start == 0 and self.batches._completed == (epoch, self._loadable._epoch.version):
             epoch += 1
         return epoch, start
 
     def _begun(self, begun: "LoaderPass") -> None:
-        """Take note that a pass begins."""
+        """Record that a pass begins."""
         if begun.epoch != self.epoch:
-            self._keeping.advance_epoch(begun.epoch)
-        self.batches.begin()
+            self._loadable._epoch.advance(begun.epoch)
+        self.batches._begin()
         self._unfinished.add(begun)
         self._running += 1
         if self._running == 1:
@@ -224,27 +271,27 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         self.end_of_dataloader = False
 
     def _taken(self, by: "LoaderPass") -> None:
-        """Take note that a pass gives a batch."""
+        """Record that a pass gives a batch."""
         self.end_of_dataloader = by.is_complete
         if by not in self._unfinished:
             return
-        self._position = by.position
+        self._position = by._position
         self._clock += 1
-        by.last_taken = self._clock
+        by._last_taken = self._clock
         if by.is_complete:
-            self.batches.complete(by.epoch)
+            self.batches._complete(by.epoch)
             self._unfinished.discard(by)
 
     def _ended(self, ended: "LoaderPass") -> None:
-        """Take note that a pass is over: if it was left within another one, that one counts."""
+        """Record that a pass is over. If it ran within another pass, the position is that one's."""
         self._running -= 1
         if self._running == 0:
             self._leave_loop()
         if ended in self._unfinished:
             self._unfinished.discard(ended)
-            if self._unfinished and self._position == ended.position:
-                latest = max(self._unfinished, key=lambda each: each.last_taken)
-                self._position = latest.position
+            if self._unfinished and self._position == ended._position:
+                latest = max(self._unfinished, key=lambda each: each._last_taken)
+                self._position = latest._position
 
 
 _NOTHING: Final = object()
@@ -255,18 +302,17 @@ class LoaderPass(Iterator[Any]):
 
     Attributes:
         epoch: The epoch of its batches.
-        position: The epoch, and the number of global batches that are consumed.
         taken: How many batches it has given.
     """
 
     def __init__(self, loader: PairsLoader) -> None:
-        """Stand for the next pass of a loader; workers start when the first batch is asked for."""
+        """Represent the next pass of a loader; workers start with the first batch."""
         self._workers: _Workers | None = None
         self._loader = loader
         self.epoch = loader.epoch
-        self.position = self.epoch, 0
+        self._position = self.epoch, 0
         self.taken = 0
-        self.last_taken = 0
+        self._last_taken = 0
         self._share: range | None = None
         self._pid = os.getpid()
         self._over: str | None = None
@@ -277,9 +323,9 @@ class LoaderPass(Iterator[Any]):
     def _begin(self) -> None:
         """Begin at the position that the loader is at now."""
         loader, batches = self._loader, self._loader.batches
-        self.epoch, start = self.position = loader._next_position()
-        self._end = batches.end(start)
-        share = batches.share(start)
+        self.epoch, start = self._position = loader._next_position()
+        self._end = batches._end(start)
+        share = batches._share(start)
         # No reference to this pass in it: without a cycle, a pass that is left ends at once.
         numbers: Iterator[Any] = map(partial(batches.batch, epoch=self.epoch), share)
         if loader.batch_sampler is not batches:
@@ -307,8 +353,14 @@ class LoaderPass(Iterator[Any]):
     def __len__(self) -> int:
         """Return how many batches it has in all."""
         if self._share is None:
-            return len(self._loader.batches.share(self._loader._next_position()[1]))
+            return len(self._loader.batches._share(self._loader._next_position()[1]))
         return len(self._share)
+
+    def __repr__(self) -> str:
+        """Say how far it is."""
+        if self._share is None:
+            return "<LoaderPass: not begun>"
+        return f"<LoaderPass: {self.taken} of {len(self._share)} batches of epoch {self.epoch}>"
 
     def __next__(self) -> Any:
         """Return the next batch.
@@ -352,8 +404,8 @@ class LoaderPass(Iterator[Any]):
                 self.close()
         self._over = None
         self.taken += 1
-        consumed = self.position[1] + self._loader.batches.world_size
-        self.position = self.epoch, min(consumed, self._end)
+        consumed = self._position[1] + self._loader.batches.world_size
+        self._position = self.epoch, min(consumed, self._end)
         self._loader._taken(self)
         return self._loader._on_device(batch)
 
@@ -369,7 +421,7 @@ class LoaderPass(Iterator[Any]):
             workers.end()
 
     def __del__(self) -> None:
-        """End the pass when nobody can go on with it."""
+        """End the pass when nobody refers to it."""
         self.close()
 
     def _require_own_process(self) -> None:
@@ -396,6 +448,7 @@ class _Workers:
         self._torch: DataLoader[Any] | None = None
         self._batches: Iterator[Any] = iter(())
         _running.add(self)
+        loader._workers.add(self)
         self.passes = 0
         self._numbers = _Numbers()
         self._context = None
@@ -420,6 +473,11 @@ class _Workers:
         """Whether this process started them, and not one that it was forked from."""
         return self._context is None or self._context.is_of_this_process
 
+    @property
+    def pids(self) -> set[int]:
+        """The numbers of the processes that run."""
+        return set() if self._context is None or self._torch is None else self._context.pids
+
     def begin(self, numbers: Iterator[Any]) -> Iterator[Any]:
         """Return the batches of a pass; the pass that these workers served before has ended."""
         if self._torch is None:
@@ -436,11 +494,11 @@ class _Workers:
         return None if self._context is None else self._context.error(noticed)
 
     def __del__(self) -> None:
-        """End the workers when nobody can use them."""
+        """End the workers when nobody refers to them."""
         self.end()
 
     def end(self) -> None:
-        """End the workers, and let go of the memory that came from them."""
+        """End the workers, and release the memory that came from them."""
         batches, self._batches = self._batches, iter(())
         loader, self._torch = self._torch, None
         if loader is None or self._context is None or sys.is_finalizing():
@@ -473,8 +531,8 @@ _running: Final[WeakSet[_Workers]] = WeakSet()
 """The workers of the passes of this process."""
 
 _inherited: Final[list[object]] = []
-"""What came over a fork. These workers are the parent's: if the last reference to torch's iterator
-went here, torch would end them. The operating system takes it all back when this process ends."""
+"""Workers that a fork copied. They are the parent's: if the last reference to torch's iterator were
+dropped here, torch would end them. The operating system frees all of it when this process ends."""
 
 
 def _keep_inherited() -> None:
@@ -487,7 +545,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def require_options(options: Mapping[str, Any]) -> None:
-    """Refuse what a loader does not take, naming what to use instead.
+    """Refuse options that a loader does not take, naming what to use instead.
 
     Raises:
         SelectionError: If there is such an option.

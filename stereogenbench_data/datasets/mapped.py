@@ -4,7 +4,7 @@ import copy
 import operator
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Final, Literal, Self, Unpack, get_args
+from typing import Literal, Self, Unpack, get_args
 
 import numpy as np
 import torch
@@ -19,8 +19,8 @@ from stereogenbench_data.datasets.loader import (
     require_options,
     split_options,
 )
-from stereogenbench_data.datasets.open_videos import scenes_at_once, videos_to_keep
-from stereogenbench_data.datasets.shared import shared_full
+from stereogenbench_data.datasets.open_videos import videos_to_keep
+from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
@@ -32,6 +32,7 @@ from stereogenbench_data.samples.fields import (
 )
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request, Transform, parse_request
+from stereogenbench_data.samples.streams import StreamStats
 from stereogenbench_data.samples.writer import Allocate, new_array
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
@@ -43,9 +44,6 @@ Data = str | Path | SceneIndex
 
 Check = Literal["read", "opened", "metadata"]
 """Which videos are compared with their checksums: see `StereoPairs`."""
-
-_FOLLOWS: Final = -1
-"""Stands for the epoch of the dataset that a loader was made from."""
 
 
 class _MappedScenes(Dataset[Sample]):
@@ -72,26 +70,15 @@ class _MappedScenes(Dataset[Sample]):
             check="opened" if opened else "metadata",
             frames="shared" if (np.diff(plan.first_pair) > 1).any() else "used once",
         )
-        self.buffers = BatchBuffers(buffers)
+        self._buffers = BatchBuffers(buffers)
         self._streams = request.streams
         self._access: Literal["random", "in order"] = "random"
-        # The epoch, and how often it was set. Shared memory, because workers that persist over
-        # epochs hold copies of the dataset.
-        self._epoch = self._followed = shared_full((2,), 0)
-        self._advanced_from: int | None = None
+        self._epoch = SharedEpoch()
 
     @property
     def epoch(self) -> int:
         """The epoch that random frames and transforms are drawn for."""
-        own, followed = int(self._epoch[0]), int(self._followed[0])
-        if own == _FOLLOWS or self._advanced_from not in (None, int(self._followed[1])):
-            return followed
-        return own
-
-    @property
-    def epoch_version(self) -> tuple[int, int]:
-        """What differs after each `set_epoch`, whatever epoch it sets."""
-        return int(self._epoch[1]), int(self._followed[1])
+        return self._epoch.value
 
     def set_epoch(self, epoch: int) -> None:
         """Draw random frames and transforms anew, in this process and in running workers.
@@ -104,16 +91,7 @@ class _MappedScenes(Dataset[Sample]):
         Raises:
             SelectionError: If it is negative.
         """
-        if not isinstance(epoch, int | np.integer) or not 0 <= epoch < 2**63:
-            raise SelectionError(f"an epoch is a whole number from 0, got {epoch!r}.")
-        self._epoch[0] = int(epoch)
-        self._epoch[1] += 1
-        self._advanced_from = None
-
-    def advance_epoch(self, epoch: int) -> None:
-        """Go to another epoch until `set_epoch` is called, here or on the dataset followed."""
-        self._epoch[0] = epoch
-        self._advanced_from = int(self._followed[1])
+        self._epoch.set(epoch)
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -140,16 +118,16 @@ class _MappedScenes(Dataset[Sample]):
         `EpochBatches` gives is drawn for its own epoch, and has the field ``is_padding`` where its
         tail is "wrap".
         """
-        arrays = self.buffers.allocate(len(numbers))
+        arrays = self._buffers.allocate(len(numbers))
         batch = (
             numbers if isinstance(numbers, EpochBatch) else EpochBatch(numbers, epoch=self.epoch)
         )
         loaded: dict[int, Sample] = {}
         for place, number in sorted(enumerate(numbers), key=operator.itemgetter(1)):
-            loaded[place] = self.load_into(arrays, place, number, batch=batch)
+            loaded[place] = self._load_into(arrays, place, number, batch=batch)
         return [loaded[place] for place in range(len(numbers))]
 
-    def load_into(
+    def _load_into(
         self, arrays: BatchArrays | None, place: int, number: int, *, batch: EpochBatch
     ) -> Sample:
         """Return a sample of a batch, as slices of the batch's arrays if they are given."""
@@ -193,7 +171,8 @@ class _MappedScenes(Dataset[Sample]):
             batch_size: Samples in a batch of one rank.
             num_workers: How many processes load; 0 loads in this one.
             **options: How the epoch is ordered and shared out (`EpochOptions`: seed, rank,
-                world_size, tail, lanes, open_scenes, order); and what `DataLoader` takes.
+                world_size, drop_last or tail, shuffle or order, shuffle_groups, open_scenes); and
+                what `DataLoader` takes.
 
         Returns:
             A loader with an epoch and open videos of its own: any number of them can be used side
@@ -205,33 +184,36 @@ class _MappedScenes(Dataset[Sample]):
         """
         require_options(options)
         ordering, others = split_options(options)
-        own = self._apart()
+        own = self._copy()
         batches = EpochBatches(own, batch_size, **ordering)
         return PairsLoader(own, batches, num_workers=num_workers, **others)
 
-    def _apart(self) -> Self:
-        """Return the same samples, to be loaded side by side with these."""
-        apart = copy.copy(self)
-        apart._loader, apart.buffers = self._loader.apart(), BatchBuffers(self.buffers.kind)
-        apart._epoch, apart._followed = shared_full((2,), 0), self._epoch
-        apart._epoch[0], apart._advanced_from = _FOLLOWS, None
-        return apart
+    def _copy(self) -> Self:
+        """Return the same samples with an epoch, videos and buffers of their own."""
+        twin = copy.copy(self)
+        twin._loader, twin._buffers = self._loader.copy(), BatchBuffers(self._buffers.kind)
+        twin._epoch = SharedEpoch(self._epoch)
+        return twin
 
-    @property
-    def scenes_at_once(self) -> int:
-        """How many scenes a lane interleaves at the most, unless ``open_scenes`` says otherwise."""
-        return scenes_at_once(self.index, self.plan)
-
-    def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
+    def _keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Read by these batches, in one of so many processes: each video is opened once.
 
         Videos are kept open for as many scenes as the batches interleave, and closed after a
-        scene's last sample. ``loader`` does this.
+        scene's last sample.
         """
         if batches.rule.kind == "shuffled":
-            videos = videos_to_keep(self.plan, batches, streams=self._streams, processes=processes)
+            videos = videos_to_keep(
+                self.plan, batches.rule, streams=self._streams, processes=processes
+            )
             self._loader.keep_open(videos)
         self._access = "in order"
+
+    def stats(self) -> StreamStats:
+        """Return how many videos this process has open for this dataset, and may have.
+
+        A loader has its own, which its ``stats()`` tells.
+        """
+        return self._loader.stats
 
     def close(self) -> None:
         """Close the videos that this process holds open; the dataset can be used again.

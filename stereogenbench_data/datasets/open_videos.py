@@ -7,20 +7,19 @@ from typing import Final
 
 import numpy as np
 
-from stereogenbench_data.datasets.batches import EpochBatches
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Stream
 from stereogenbench_data.samples.streams import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.selection.order import Numbers
+from stereogenbench_data.selection.order import Numbers, OrderRule
 from stereogenbench_data.selection.plan import Plan
 
 SPARE_FILES = 128
 """Open files that are left to everything else."""
 
 
-LANE_BYTES: Final = 900_000_000
-"""Memory for the open scenes of a lane, where nobody asks for a number of them."""
+GROUP_BYTES: Final = 900_000_000
+"""Memory for the open scenes of a shuffle group, where nobody asks for a number of them."""
 
 _DECODER_BYTES: Final = 17
 """Of a camera's decoders for each pixel: 12.6 of H.264 with its reference pictures, 4.3 of FFV1,
@@ -31,26 +30,26 @@ _KEPT_BYTES: Final = 4
 
 
 class OpenVideosWarning(UserWarning):
-    """More videos would be open at a time than the process may have: some are opened again."""
+    """More videos are needed at a time than this process may open: some are opened repeatedly."""
 
 
-class SharedLanesWarning(UserWarning):
-    """Several processes read the same lane, so each of them decodes its videos."""
+class RepeatedDecodingWarning(UserWarning):
+    """Several processes read the same shuffle group, so each of them decodes its videos."""
 
 
 def videos_to_keep(
-    plan: Plan, batches: EpochBatches, *, streams: frozenset[Stream], processes: int
+    plan: Plan, rule: OrderRule, *, streams: frozenset[Stream], processes: int
 ) -> int:
     """Return how many videos one of so many processes keeps open for its share of an epoch.
 
-    It reads every lane of which it gets batches, each with its open scenes. As many files are
-    asked for as the process may open; if that is too few, or if other processes decode the same
-    videos though more lanes would spare that, a warning says what to do.
+    A process reads every shuffle group of which it gets batches, each with its open scenes. A
+    warning says what to do if the process may not open so many files, or if several processes
+    decode the same videos and more groups would avoid it.
     """
     lengths = np.diff(plan.first_sample)
-    lanes = batches.rule.lanes_of(lengths)
-    _warn_of_shared_lanes(batches, lengths=lengths, processes=processes)
-    scenes = lanes // math.gcd(lanes, processes) * batches.rule.most_open(lengths)
+    groups = rule.groups_of(lengths)
+    _warn_of_repeated_decoding(rule, lengths=lengths, processes=processes)
+    scenes = groups // math.gcd(groups, processes) * rule.most_open(lengths)
     wanted = max(OPEN_STREAMS, scenes * videos_per_scene(plan, streams))
     allowed = max(OPEN_STREAMS, _most_files() - SPARE_FILES)
     if wanted > allowed:
@@ -58,29 +57,31 @@ def videos_to_keep(
             f"up to {wanted} videos would be open at a time, and this process may open {allowed}: "
             "they will be closed and opened again, which is slow. Raise the limit (`ulimit -n "
             f"{wanted + SPARE_FILES}`), use more workers, or fewer open_scenes than "
-            f"{batches.rule.open_scenes}.",
+            f"{rule.open_scenes}.",
             OpenVideosWarning,
             stacklevel=5,
         )
     return min(wanted, allowed)
 
 
-def _warn_of_shared_lanes(batches: EpochBatches, *, lengths: Numbers, processes: int) -> None:
-    rule = batches.rule
-    together = processes // math.gcd(rule.lanes, processes)
-    spared = replace(rule, lanes=math.lcm(rule.lanes, processes)).lanes_of(lengths)
+def _warn_of_repeated_decoding(rule: OrderRule, *, lengths: Numbers, processes: int) -> None:
+    together = processes // math.gcd(rule.shuffle_groups, processes)
+    spared = replace(rule, shuffle_groups=math.lcm(rule.shuffle_groups, processes)).groups_of(
+        lengths
+    )
     if together > 1 and lengths.max() > 1 and spared % processes == 0:
         warnings.warn(
             f"every video is decoded by {together} processes, as {processes} (ranks times workers) "
-            f"read {rule.lanes} lanes: give lanes={processes}, or a multiple of it. This is "
-            "another order of the epoch; each lane has its own open scenes.",
-            SharedLanesWarning,
+            f"read {rule.shuffle_groups} shuffle groups: give shuffle_groups={processes}, or a "
+            "multiple of it. This is another order of the epoch; each group has its own open "
+            "scenes.",
+            RepeatedDecodingWarning,
             stacklevel=6,
         )
 
 
 def scenes_at_once(index: SceneIndex, plan: Plan) -> int:
-    """Return how many scenes with all their videos fit into the memory meant for a lane.
+    """Return how many scenes with all their videos fit into the memory meant for a shuffle group.
 
     It depends on the selected pairs and the stored size of their pictures alone, not on fields,
     ranks or workers: so does the order.
@@ -90,11 +91,11 @@ def scenes_at_once(index: SceneIndex, plan: Plan) -> int:
     cameras = videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
     is_shared = (np.diff(plan.first_pair) > 1).any()
     scene_bytes = int(pixels) * cameras * (_DECODER_BYTES + (_KEPT_BYTES if is_shared else 0))
-    return max(2, LANE_BYTES // max(1, scene_bytes))
+    return max(2, GROUP_BYTES // max(1, scene_bytes))
 
 
 def _most_files() -> int:
-    """Return how many files this process may open: where a system does not tell, 512."""
+    """Return how many files this process may open; 512 where the system does not say."""
     try:
         import resource
     except ImportError:

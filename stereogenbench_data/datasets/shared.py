@@ -8,10 +8,15 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any, Final
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import pyarrow as pa
 import torch
 
+from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
+
+_FOLLOWS: Final = -1
+"""Stands for the epoch that is followed."""
 
 _rows: Final[WeakKeyDictionary[SceneIndex, torch.Tensor]] = WeakKeyDictionary()
 """The rows of each index that was sent to other processes, laid out once."""
@@ -22,6 +27,52 @@ def shared_full(size: tuple[int, ...], value: int) -> torch.Tensor:
     numbers = torch.full(size, value, dtype=torch.int64)
     numbers.share_memory_()
     return numbers
+
+
+class SharedEpoch:
+    """The current epoch of a dataset, in memory that all its workers see.
+
+    Whatever has an epoch (dataset, batches, loader, stream) asks here. That of a loader follows
+    that of the dataset that it was made from, until it is set itself.
+    """
+
+    def __init__(self, followed: "SharedEpoch | None" = None) -> None:
+        """Begin at epoch 0, or follow another one."""
+        # The epoch, and how often it was set.
+        self._own = shared_full((2,), 0 if followed is None else _FOLLOWS)
+        self._own[1] = 0
+        self._followed = self._own if followed is None else followed._own
+        self._advanced_from: int | None = None
+
+    @property
+    def value(self) -> int:
+        """The epoch, from 0."""
+        own, followed = int(self._own[0]), int(self._followed[0])
+        if own == _FOLLOWS or self._advanced_from not in (None, int(self._followed[1])):
+            return followed
+        return own
+
+    @property
+    def version(self) -> tuple[int, int]:
+        """What differs after each `set`, whatever epoch it sets."""
+        return int(self._own[1]), int(self._followed[1])
+
+    def set(self, epoch: int) -> None:
+        """Go to an epoch because the user says so.
+
+        Raises:
+            SelectionError: If it is not a whole number from 0.
+        """
+        if not isinstance(epoch, int | np.integer) or not 0 <= epoch < 2**63:
+            raise SelectionError(f"an epoch is a whole number from 0, got {epoch!r}.")
+        self._own[0] = int(epoch)
+        self._own[1] += 1
+        self._advanced_from = None
+
+    def advance(self, epoch: int) -> None:
+        """Go to an epoch because a pass is over: until `set` is called, here or on the followed."""
+        self._own[0] = epoch
+        self._advanced_from = int(self._followed[1])
 
 
 def _shared_rows(index: SceneIndex, table: pa.Table) -> torch.Tensor:

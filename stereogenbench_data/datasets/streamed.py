@@ -61,8 +61,8 @@ class StereoPairStream(IterableDataset[Sample]):
         Args:
             data: As for `StereoPairs`.
             batch_size: Samples in a batch of one rank; give `DataLoader` the same.
-            **options: What `StereoPairs` takes; and `EpochOptions` (rank, world_size, tail, lanes,
-                open_scenes, order).
+            **options: What `StereoPairs` takes; and `EpochOptions` (rank, world_size, tail,
+                shuffle_groups, open_scenes, order).
 
         Raises:
             SelectionError: If nothing matches, or an option is out of its range.
@@ -89,7 +89,7 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             FieldError: If a field has another shape in one sample than in the first.
         """
-        return self.pairs.buffers.collate(samples)
+        return self.pairs._buffers.collate(samples)
 
     @property
     def epoch(self) -> int:
@@ -107,10 +107,14 @@ class StereoPairStream(IterableDataset[Sample]):
     def __len__(self) -> int:
         """Return how many samples this rank has in a whole epoch."""
         batches = self.batches
-        share, size = batches.share(0), batches.rule.batch_size
+        share, size = batches._share(0), batches.rule.batch_size
         short = len(self.pairs) % size
         has_short = batches.tail == "uneven" and short > 0 and len(self.pairs) // size in share
         return len(share) * size - (size - short if has_short else 0)
+
+    def __repr__(self) -> str:
+        """Say what it streams, and how."""
+        return f"<{type(self).__name__}: epoch {self.epoch} of {self.pairs!r}, {self.batches!r}>"
 
     def __iter__(self) -> "SamplePass":
         """Return this rank's and this worker's samples of the current epoch.
@@ -121,11 +125,11 @@ class StereoPairStream(IterableDataset[Sample]):
         self._require_shared_once()
         info = get_worker_info()
         worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
-        epoch, start = self.batches.next_position()
+        epoch, start = self.batches._next_position()
         if self._begun[worker % MOST_WORKERS]:
             start = 0
         self._begun[worker % MOST_WORKERS] = 1
-        self.pairs.keep_open(self.batches, processes=self.batches.world_size * workers)
+        self.pairs._keep_open(self.batches, processes=self.batches.world_size * workers)
         self._latest = SamplePass(self, epoch=epoch, start=start, worker=worker, workers=workers)
         return self._latest
 
@@ -140,7 +144,7 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             StateError: If the number is needed and not given.
         """
-        epoch, start = self.batches.next_position()
+        epoch, start = self.batches._next_position()
         if self._latest is not None and batches is None:
             return self._latest.state_dict()
         if batches is None:
@@ -151,7 +155,7 @@ class StereoPairStream(IterableDataset[Sample]):
                     "StereoPairs or torchdata's StatefulDataLoader, which count them."
                 )
             batches = 0
-        consumed = min(start + batches * self.batches.world_size, self.batches.end(start))
+        consumed = min(start + batches * self.batches.world_size, self.batches._end(start))
         return self.batches.state_at(epoch, consumed)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -199,7 +203,7 @@ class SamplePass(Iterator[Sample]):
         """Return the next sample."""
         if self._at == len(self._batch):
             self._next_batch()
-        sample = self._stream.pairs.load_into(
+        sample = self._stream.pairs._load_into(
             self._arrays, self._at, self._batch[self._at], batch=self._batch
         )
         self._at += 1
@@ -211,7 +215,7 @@ class SamplePass(Iterator[Sample]):
         batches = self._stream.batches
         taken = self._given // batches.rule.batch_size * batches.world_size
         return {
-            **batches.state_at(self._epoch, min(self._start + taken, batches.end(self._start))),
+            **batches.state_at(self._epoch, min(self._start + taken, batches._end(self._start))),
             "start": self._start,
             "samples_given": self._given,
             **self._own_place,
@@ -224,7 +228,7 @@ class SamplePass(Iterator[Sample]):
             StateError: If it belongs to other samples, another order, or another worker.
         """
         batches = self._stream.batches
-        epoch, _ = batches.position_in(state)
+        epoch, _ = batches._position_in(state)
         differing = [
             f"{name} is {value} here and {state.get(name)} there"
             for name, value in self._own_place.items()
@@ -235,8 +239,8 @@ class SamplePass(Iterator[Sample]):
                 f"the position is that of another worker: {'; '.join(differing)}. Load it under "
                 "the same ranks and workers; the state of a stream itself goes with any."
             )
-        start = require_count(state, "start", most=batches.batches_of_all)
-        share = len(batches.share(start)[self._place["worker"] :: self._place["workers"]])
+        start = require_count(state, "start", most=batches._batches_of_all)
+        share = len(batches._share(start)[self._place["worker"] :: self._place["workers"]])
         given = require_count(state, "samples_given", most=share * batches.rule.batch_size)
         self._stream.set_epoch(epoch)
         self._go_to(epoch, start, given=given)
@@ -249,7 +253,7 @@ class SamplePass(Iterator[Sample]):
     def _go_to(self, epoch: int, start: int, *, given: int) -> None:
         batches = self._stream.batches
         self._epoch, self._start, self._given = epoch, start, given
-        share = batches.share(start)[self._place["worker"] :: self._place["workers"]]
+        share = batches._share(start)[self._place["worker"] :: self._place["workers"]]
         whole, part = divmod(given, batches.rule.batch_size)
         self._left = iter(share[whole:])
         self._batch, self._at = EpochBatch((), epoch=epoch), 0
@@ -260,5 +264,5 @@ class SamplePass(Iterator[Sample]):
     def _next_batch(self) -> None:
         self._batch = self._stream.batches.batch(next(self._left), epoch=self._epoch)
         self._at = 0
-        buffers = self._stream.pairs.buffers
+        buffers = self._stream.pairs._buffers
         self._arrays = buffers.allocate(len(self._batch)) if buffers.makes_batches else None

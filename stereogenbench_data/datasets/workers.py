@@ -1,4 +1,4 @@
-"""The worker processes of one pass: torch's own, whose death always ends the pass with an error.
+"""The worker processes of one pass: torch's own, but a worker that dies always ends the pass.
 
 torch shares an event and a queue with its workers, each guarded by a lock between processes. A
 worker that is killed while it holds such a lock, as by a system short of memory, would leave the

@@ -1,4 +1,4 @@
-"""Checks before the first sample: are the videos there, is depth whole, is anything odd."""
+"""Checks before the first sample: missing videos, lossy depth, unusual rigs and units."""
 
 import warnings
 from collections.abc import Iterator

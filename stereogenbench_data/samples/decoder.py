@@ -1,8 +1,8 @@
 """The decoder: from a sample's address to its `Views`, reading no more than the fields need."""
 
+import copy
 from collections import OrderedDict
 from collections.abc import Mapping
-from copy import copy
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -87,12 +87,12 @@ class SampleDecoder:
         """
         return self._frames == "used once" and not self._is_changed
 
-    def apart(self) -> "SampleDecoder":
+    def copy(self) -> "SampleDecoder":
         """Return a decoder of the same samples with open videos of its own."""
-        apart = copy(self)
-        apart._streams = Streams(self._source)
-        apart._scenes, apart._depths, apart._poses = OrderedDict(), OrderedDict(), OrderedDict()
-        return apart
+        twin = copy.copy(self)
+        twin._streams = Streams(self._source)
+        twin._scenes, twin._depths, twin._poses = OrderedDict(), OrderedDict(), OrderedDict()
+        return twin
 
     def keep_open(self, videos: int) -> None:
         """Keep up to so many videos open, in this process and in copies of this decoder."""

@@ -1,4 +1,4 @@
-"""From decoded views to the fields of a sample: each is worked out once, and only if asked for."""
+"""Geometry of a pair from its decoded views: each map is computed once, when first needed."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,7 +40,7 @@ Motions = Float64[np.ndarray, "t 4 4"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneFacts:
-    """What is known of a sample beside its pictures.
+    """What is known of a sample apart from its pictures.
 
     Attributes:
         scene: The row of the index.
@@ -99,7 +99,7 @@ class PairGeometry:
 
     @property
     def depth_m(self) -> MapF32:
-        """Depth along the optical axis, 0 where not measured; worked out once for all pairs."""
+        """Depth along the optical axis, 0 where not measured; computed once for all pairs."""
         derived, key = self.stored.derived, ("depth_m", self._views.intrinsics)
         if key not in derived:
             derived[key] = depth_m_from_units(

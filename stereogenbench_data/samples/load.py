@@ -1,7 +1,7 @@
 """One sample: decoded, transformed, written; read and decoded only as far as the fields need."""
 
+import copy
 from collections.abc import Iterator
-from copy import copy
 from typing import Literal
 
 import numpy as np
@@ -98,11 +98,11 @@ class SampleLoader:
         """What this process has open."""
         return self._decoder.stats
 
-    def apart(self) -> "SampleLoader":
+    def copy(self) -> "SampleLoader":
         """Return a loader of the same samples with open videos of its own."""
-        apart = copy(self)
-        apart._decoder = self._decoder.apart()
-        return apart
+        twin = copy.copy(self)
+        twin._decoder = self._decoder.copy()
+        return twin
 
     def keep_open(self, videos: int) -> None:
         """Keep up to so many videos open, in this process and in copies of this loader."""

@@ -1,4 +1,4 @@
-"""What is asked of every sample, and what may change one on its way."""
+"""What a dataset requests of every sample, and the interface of transforms."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ Layout = Literal["single", "stacked"]
 
 @runtime_checkable
 class Transform(Protocol):
-    """What changes pictures and cameras together.
+    """A function that changes pictures and cameras together.
 
     ``swaps_views`` says whether source and target may change places, so that what one view needs
     must be read of both.
@@ -99,8 +99,8 @@ def parse_request(
 
     Raises:
         FieldError: If a field does not exist; if the size is not two whole numbers of 1 to 16384;
-            if the depth contract is none; or if the transform cannot be called, does not say
-            whether it swaps the views, or swaps those of a sample that is no pair.
+            if depth is not a `DepthEncoding`; or if the transform cannot be called, lacks
+            ``swaps_views``, or swaps the views of samples that are not pairs.
     """
     return Request(
         kind=kind,

@@ -1,8 +1,8 @@
 """The open videos of one process: opened when first needed, decoded forwards, closed in turn.
 
 Samples that share a frame (pairs of one moment, fields of one pair) share its decoding: each
-stream keeps the last picture that it gave. A stream that failed is closed, so that it is opened
-anew if it is asked for again.
+stream keeps the last picture that it returned. A stream that fails is closed, and opened again when
+it is next needed.
 """
 
 import os
@@ -40,12 +40,12 @@ class StreamStats(NamedTuple):
     """What a pool has open.
 
     Attributes:
-        open: How many videos.
-        limit: How many at the most.
+        videos_open: How many videos.
+        videos_limit: How many at the most.
     """
 
-    open: int
-    limit: int
+    videos_open: int
+    videos_limit: int
 
 
 class _PictureMemory:
@@ -123,7 +123,7 @@ class Streams:
     ) -> None:
         """Write one frame of a scene's video as RGB, scaled to the array's height and width.
 
-        The picture is not kept: for who asks for it once.
+        The picture is not kept: use this for pictures that are needed once.
 
         Raises:
             StorageError: If the video cannot be read.
@@ -169,7 +169,7 @@ class Streams:
     def stats(self) -> "StreamStats":
         """What this process has open."""
         is_own = os.getpid() == self._process
-        return StreamStats(open=len(self._open) if is_own else 0, limit=self._limit)
+        return StreamStats(len(self._open) if is_own else 0, self._limit)
 
     def keep(self, limit: int) -> None:
         """Keep at most so many videos open from now on."""
@@ -255,9 +255,44 @@ def _read_only(picture: Any) -> Any:
     return picture
 
 
+<<<<<<< HEAD
+=======
+def _unused(last: dict[Any, Any], *, height_width: tuple[int, int] | None) -> Any:
+    """Return the array of the last picture for reuse, if nobody else refers to it.
+
+    New memory costs more than writing into it: the system clears it first.
+    """
+    for key in last:
+        picture = last[key]
+        if (
+            key[1] == height_width
+            and picture.base is None
+            and sys.getrefcount(picture) == _REFERENCES_HERE
+        ):
+            picture.flags.writeable = True
+            return picture
+    return None
+
+
+def _references_here() -> int:
+    """Return how many references `_unused` sees to a picture that nobody else has.
+
+    Interpreters differ: some count the one that a function borrows, some do not.
+    """
+    last = {(0, None): np.empty(1)}
+    for key in last:
+        picture = last[key]
+        return sys.getrefcount(picture)
+    return 0
+
+
+_REFERENCES_HERE: Final = _references_here()
+
+
+>>>>>>> h-samples
 @contextmanager
 def _cause_raised(file: Path | MemberFile) -> Iterator[None]:
-    """Where a video failed because its bytes could not be fetched, raise that; close the file."""
+    """Raise the failed fetch that made a video fail, if one did, and close the file."""
     try:
         yield
     except (MediaError, StorageError) as error:

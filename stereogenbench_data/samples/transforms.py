@@ -3,7 +3,7 @@
 Each maps `Views` to `Views` with the random numbers of one sample, so the same seed gives the same
 sample in whatever process it is made. Pictures are averaged when they shrink; stored depth takes
 the nearest pixel centre, never a mixture of two depths. A pixel that was averaged with padding is
-no more measured than the padding. Every frame and camera of a sample is treated alike, but where a
+no more measured than the padding. Every frame and camera of a sample is treated alike, unless a
 docstring says otherwise.
 """
 
@@ -28,13 +28,13 @@ class Compose:
 
     Raises:
         FieldError: If an `Eraser` stands before a `HorizontalFlip`: the erased patch would land in
-            the first view, whose disparity is taken for good.
+            the first view, whose disparity would still count as valid.
     """
 
     transforms: Sequence[Transform]
 
     def __post_init__(self) -> None:
-        """Refuse what is no transform, and an order that would give wrong samples."""
+        """Refuse non-transforms, and an order that would give wrong samples."""
         odd = [step for step in self.transforms if not isinstance(step, Transform)]
         if odd or any(isinstance(step, type) for step in self.transforms):
             raise FieldError(f"Compose takes transforms, got {(odd or self.transforms)[0]!r}.")
@@ -76,7 +76,7 @@ class _Sized:
     swaps_views: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Refuse a size of nothing."""
+        """Require at least one pixel."""
         _require_size(self.height, self.width)
 
 
@@ -112,7 +112,7 @@ class Letterbox(_Sized):
 
 @dataclass(frozen=True, slots=True)
 class Crop:
-    """Cut a window, the same in every view; where it reaches beyond the picture, refuse."""
+    """Cut the same window from every view; it must lie inside the picture."""
 
     top: int
     left: int
@@ -121,7 +121,7 @@ class Crop:
     swaps_views: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Refuse a size of nothing."""
+        """Require at least one pixel."""
         _require_size(self.height, self.width)
         _require_size(self.top + 1, self.left + 1)
 
@@ -151,7 +151,7 @@ class RandomCrop(_Sized):
                 f"{self} is larger than a picture of {views.intrinsics.width_px} x "
                 f"{views.intrinsics.height_px} pixels; scale it up first."
             )
-        top, left = (int(generator.integers(room + 1)) for room in spare)
+        top, left = (int(generator.integers(free + 1)) for free in spare)
         return _windowed(views, top=top, left=left, size=(self.height, self.width))
 
 
@@ -171,7 +171,7 @@ class RandomScale:
     swaps_views: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Refuse a range that is none."""
+        """Require ascending ranges, a probability and at least one pixel."""
         _require_range(self, -8.0, "low", "high")
         _require_range(self, 0.0, "stretch")
         _require_probability(self, "stretch_probability")
@@ -202,7 +202,7 @@ class HorizontalFlip:
     swaps_views: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Refuse what is no probability."""
+        """Require a probability."""
         _require_probability(self, "probability")
 
     def __call__(self, views: Views, generator: Generator) -> Views:
@@ -252,7 +252,7 @@ class ColorJitter:
     swaps_views: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Refuse factors below 0 and what is no probability."""
+        """Require factors and a probability of 0 to 1."""
         for name in ("brightness", "contrast", "saturation", "hue"):
             _require_probability(self, name)
         _require_probability(self, "asymmetric_probability")
@@ -291,7 +291,7 @@ class Eraser:
     swaps_views: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Refuse boxes of nothing and what is no probability."""
+        """Require a probability, and boxes of at least one pixel."""
         _require_probability(self, "probability")
         _require_range(self, 1, "low", "high")
         _require_size(self.most_boxes, 1)

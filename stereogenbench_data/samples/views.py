@@ -1,4 +1,4 @@
-"""What was decoded for one sample, before anything is derived from it.
+"""What is decoded for one sample, before anything is derived from it.
 
 Transforms map one `Views` to another: they move pictures, stored depth and cameras together and
 never see a disparity, so that all that is derived afterwards fits by construction.
@@ -23,7 +23,7 @@ class StoredDepth:
     Attributes:
         units: (t, h, w) or (h, w) uint16, stored numbers.
         measured: (t, h, w) or (h, w) bool, where they mean a depth.
-        derived: What was worked out of these numbers and will be wanted again, by what it is.
+        derived: Maps computed from these numbers, kept for other pairs, by what they are.
     """
 
     units: UInt16[np.ndarray, "*t h w"]
@@ -63,7 +63,7 @@ class Views:
     erased: dict[int, Bool[np.ndarray, "h w"]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Refuse maps that a transform forgot to move together with the pictures."""
+        """Require that `padded` and `erased` have the size of the pictures."""
         height_px, width_px = self.intrinsics.height_px, self.intrinsics.width_px
         for name, maps in (("padded", [self.padded]), ("erased", self.erased.values())):
             for pixels in maps:
@@ -75,7 +75,7 @@ class Views:
                     )
 
     def unseen(self, camera: int) -> Bool[np.ndarray, "h w"] | None:
-        """Return where a camera's picture does not show what the camera saw; None is nowhere."""
+        """Return where a picture does not show what its camera saw, None for nowhere."""
         maps = [pixels for pixels in (self.padded, self.erased.get(camera)) if pixels is not None]
         return np.logical_or.reduce(maps) if maps else None
 

@@ -40,7 +40,8 @@ class SampleWriter:
             allocate: Returns the array of a field; called once for each.
         """
         self.sample: Sample = {}
-        self._fields = [request.known[name] for name in request.fields]
+        known = request.known
+        self._fields = [known[name] for name in request.fields]
         self._kind = request.kind
         self._address = address
         self._is_clip = clip == "clip"

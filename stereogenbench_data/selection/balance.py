@@ -44,8 +44,9 @@ def balanced(
     for name, places, share in zip(names, members, shares, strict=True):
         if share > len(places):
             raise SelectionError(
-                f"balance={by!r}, limit={limit}: {share} pairs are wanted of {_said(name, by=by)}, "
-                f"which has {len(places)}; the most that balances is {poorest * len(members)}."
+                f"balance={by!r}, limit={limit}: {share} pairs are wanted of "
+                f"{_stratum_name(name, by=by)}, which has {len(places)}; the most that balances is "
+                f"{poorest * len(members)}."
             )
         drawn.append(generator.choice(places, size=share, replace=False))
     return np.sort(np.concatenate(drawn))
@@ -70,7 +71,7 @@ def _shares(limit: int, strata: int) -> list[int]:
     return [limit // strata + (number < limit % strata) for number in range(strata)]
 
 
-def _said(stratum: int, *, by: Balance) -> str:
+def _stratum_name(stratum: int, *, by: Balance) -> str:
     if by == "bins":
         return f"the bin {list(BASELINE_BINS)[stratum]} cm"
     return f"stratum {stratum + 1} of {LOG_STRATA} of log-baseline"

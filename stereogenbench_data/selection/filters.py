@@ -1,4 +1,4 @@
-"""Which scenes: filters on the index, each of which names itself where it leaves nothing."""
+"""Which scenes: by filters, each of which names itself where it leaves nothing, or by a key."""
 
 import difflib
 from collections.abc import Callable, Iterable, Sequence
@@ -57,6 +57,7 @@ _TEXT_COLUMNS = {
 }
 _RANGE_COLUMNS = {"focal_mm": "focal_mm", "valid_depth_ratio": "valid_depth_ratio"}
 _MOST_VALUES = 12
+_MOST_KEYS = 6
 
 
 def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray, " n"]:
@@ -64,7 +65,7 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
 
     Raises:
         SelectionError: If no scene passes, naming the filter that left nothing, what it was
-            asked for and what exists there; or if a filter cannot be understood.
+            given and what exists there; or if a filter cannot be understood.
     """
     rows = np.arange(len(index), dtype=np.int64)
     applied: list[str] = []
@@ -76,7 +77,7 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
             before = f" of those left by {', '.join(applied)}" if applied else ""
             raise SelectionError(
                 f"{name}={wanted!r} matches none of {counted(len(rows), 'scene')}{before}; "
-                f"{name} there is {there()}.{told_stale(index)}"
+                f"{name} there is {there()}.{stale_note(index)}"
             )
         rows = rows[keep]
         applied.append(f"{name}={wanted!r}")
@@ -85,7 +86,7 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
     return rows
 
 
-def told_stale(index: SceneIndex) -> str:
+def stale_note(index: SceneIndex) -> str:
     """Return what to add to a message about scenes that an index does not have."""
     return f" {index.stale}" if index.stale else ""
 
@@ -103,7 +104,7 @@ def _apply(
             raise SelectionError(
                 f"{name}={nowhere[0]!r} matches none of {counted(len(column), 'scene')} of the "
                 f"index; {name} "
-                f"there is {_listed(column, near=nowhere)}.{told_stale(index)}"
+                f"there is {_listed(column, near=nowhere)}.{stale_note(index)}"
             )
         return np.isin(values.astype(str), names), lambda: _listed(values, near=names)
     if name in _RANGE_COLUMNS:
@@ -172,3 +173,54 @@ def _listed(values: Any, *, near: list[str]) -> str:
 
 def _spanned(numbers: Any) -> str:
     return f"{np.nanmin(numbers):g} to {np.nanmax(numbers):g}"
+
+
+def find_scene(index: SceneIndex, text: str) -> int:
+    """Return the row of the one scene whose key is a text, or ends in it, or holds it.
+
+    A text that is whole folders of one key is that scene's, whatever other keys it is a part of.
+
+    Args:
+        index: Where to look.
+        text: A key, or a part of one, in any case.
+
+    Raises:
+        SelectionError: If no key or several keys hold the text, naming those that are close.
+    """
+    keys = [str(key) for key in index.column("key")]
+    lowered = [key.lower() for key in keys]
+    wanted = text.strip("/").lower()
+    for matches in (
+        [row for row, key in enumerate(keys) if key == text],
+        [row for row, key in enumerate(lowered) if f"/{key}".endswith(f"/{wanted}")],
+        [row for row, key in enumerate(lowered) if f"/{wanted}/" in f"/{key}/"],
+        [row for row, key in enumerate(lowered) if wanted in key],
+    ):
+        if len(matches) == 1:
+            return matches[0]
+        if matches:
+            raise SelectionError(
+                f"{text!r} is a part of {len(matches)} keys: "
+                f"{_first_keys([keys[row] for row in matches])}. Give more of the key."
+            )
+    near = _near_keys(wanted, keys)
+    raise SelectionError(
+        f"{text!r} is not a key of {counted(len(keys), 'scene')}, nor a part of one. "
+        + (f"Did you mean {_first_keys(near)}?" if near else f"There is {_first_keys(keys)}.")
+        + stale_note(index)
+    )
+
+
+def _near_keys(wanted: str, keys: list[str]) -> list[str]:
+    """Return the keys whose end, as long as what is wanted, is most like it."""
+    levels = wanted.count("/") + 1
+    ends: dict[str, list[str]] = {}
+    for key in keys:
+        ends.setdefault("/".join(key.lower().split("/")[-levels:]), []).append(key)
+    close = difflib.get_close_matches(wanted, ends, n=_MOST_KEYS)
+    return [key for end in close for key in ends[end]]
+
+
+def _first_keys(keys: list[str]) -> str:
+    more = f" and {len(keys) - _MOST_KEYS} more" if len(keys) > _MOST_KEYS else ""
+    return ", ".join(keys[:_MOST_KEYS]) + more

@@ -87,7 +87,7 @@ def test_a_tree_with_a_broken_scene_shows_the_others(small_release, tmp_path):
     good = run("show", tmp_path / "data", "IPD_Gaussian", "-o", tmp_path / "sheet.png")
     bad = run("show", tmp_path / "data", SCENE, "-o", tmp_path / "sheet.png")
     assert (good.exit_code, bad.exit_code) == (0, 2)
-    assert f"'{SCENE}' is no key of 3 scenes" in bad.stderr
+    assert f"'{SCENE}' is not a key of 3 scenes" in bad.stderr
     assert f"1 broken of 4 scenes left out: {SCENE}/baseline.json: " in good.stderr
     assert f"`stereogenbench index {tmp_path / 'data'}` lists them all." in good.stderr
 

@@ -57,6 +57,17 @@ def test_the_seed_is_the_datasets_unless_another_is_given(small_index):
     assert list(EpochBatches(pairs, 4)) != list(EpochBatches(others, 4))
 
 
+def test_torchs_words_for_tail_and_order_are_taken(keyed):
+    assert list(EpochBatches(keyed, 9, drop_last=True)) == list(EpochBatches(keyed, 9))
+    assert list(EpochBatches(keyed, 9, drop_last=False)) == list(
+        EpochBatches(keyed, 9, tail="uneven")
+    )
+    assert list(EpochBatches(keyed, 9, shuffle=True)) == list(EpochBatches(keyed, 9))
+    assert list(EpochBatches(keyed, 9, shuffle=False)) == list(
+        EpochBatches(keyed, 9, order="sequential")
+    )
+
+
 def test_the_epoch_is_the_datasets(keyed):
     batches = EpochBatches(keyed, 4)
     first = list(batches)
@@ -84,7 +95,7 @@ def test_a_position_is_flat_json_and_says_what_it_belongs_to(keyed):
         "batches_consumed": 4,
         "seed": 3,
         "batch_size": 4,
-        "lanes": 2,
+        "shuffle_groups": 2,
         "open_scenes": 4,
         "order": "shuffled",
         "tail": "drop",
@@ -107,7 +118,7 @@ def test_what_is_loaded_goes_on_once_and_then_epochs_are_whole(keyed):
     [
         ({"batch_size": 5}, "batch_size is 5 here and 4 there"),
         ({"seed": 1}, "seed is 1 here and 0 there"),
-        ({"batch_size": 1, "lanes": 2}, "lanes is 2 here and 4 there"),
+        ({"batch_size": 1, "shuffle_groups": 2}, "shuffle_groups is 2 here and 4 there"),
         ({"batch_size": 1, "open_scenes": 1}, "open_scenes is 1 here and 4 there"),
         ({"order": "sequential"}, "order is 'sequential' here and 'shuffled' there"),
         ({"tail": "wrap"}, "tail is 'wrap' here and 'drop' there"),
@@ -123,8 +134,26 @@ def test_a_position_in_another_order_is_refused_by_name(keyed, options, message)
         EpochBatches(keyed, **({"batch_size": size} | options)).load_state_dict(state)
 
 
+def test_a_position_saved_when_shuffle_groups_were_called_lanes_is_resumed(keyed):
+    """As `state_dict` wrote it before; and in another order it is refused by name."""
+    saved = {
+        "version": 2, "epoch": 0, "batches_consumed": 30, "seed": 0, "batch_size": 4, "lanes": 2,
+        "open_scenes": 4, "order": "shuffled", "tail": "drop", "selection": keyed.plan.digest,
+        "index": keyed.index.digest,
+    }  # fmt: skip
+    batches = EpochBatches(keyed, 4)
+    whole = list(batches)
+    batches.load_state_dict(saved)
+
+    assert list(batches) == whole[30:]
+    with pytest.raises(StateError, match="shuffle_groups is 2 here and 4 there"):
+        batches.load_state_dict(saved | {"lanes": 4})
+
+
 @pytest.mark.parametrize(
-    "options", [{"lanes": 2}, {"lanes": 12, "open_scenes": 40}, {"open_scenes": 4}], ids=str
+    "options",
+    [{"shuffle_groups": 2}, {"shuffle_groups": 12, "open_scenes": 40}, {"open_scenes": 4}],
+    ids=str,
 )
 def test_options_that_few_scenes_leave_without_effect_are_the_same_order(keyed, options):
     asked, plain = EpochBatches(keyed, 4, **options), EpochBatches(keyed, 4)
@@ -134,7 +163,7 @@ def test_options_that_few_scenes_leave_without_effect_are_the_same_order(keyed, 
 
 
 def test_a_sequential_position_goes_with_any_seed(keyed):
-    batches = EpochBatches(keyed, 4, order="sequential", seed=3, lanes=2)
+    batches = EpochBatches(keyed, 4, order="sequential", seed=3, shuffle_groups=2)
     batches.load_state_dict(EpochBatches(keyed, 4, order="sequential").state_at(0, 34))
 
     assert list(batches) == [[136, 137, 138, 139]]
@@ -196,7 +225,15 @@ def test_something_else_than_a_position_is_refused(keyed):
         ({"rank": 2, "world_size": 2}, "got rank=2, world_size=2"),
         ({"rank": 1}, "got rank=1, world_size=None"),
         ({"tail": "keep"}, "tail must be"),
-        ({"drop_last": True}, "there is no option 'drop_last'; there are seed, rank"),
+        ({"drop": True}, "there is no option 'drop'; there are seed, rank"),
+        ({"drop_last": 1}, "drop_last must be True or False, got 1"),
+        ({"shuffle": "yes"}, "shuffle must be True or False, got 'yes'"),
+        ({"shuffle": True, "order": "shuffled"}, "shuffle=True and order= say the same"),
+        ({"drop_last": True, "tail": "wrap"}, "drop_last=True and tail= say the same"),
+        (
+            {"drop_last": False, "rank": 0, "world_size": 2},
+            "drop_last=False of 2 ranks .* tail='wrap' .* tail='uneven'",
+        ),
     ],
     ids=str,
 )

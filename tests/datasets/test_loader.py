@@ -20,11 +20,12 @@ from stereogenbench_data import (
 )
 from stereogenbench_data.datasets.open_videos import (
     OpenVideosWarning,
-    SharedLanesWarning,
+    RepeatedDecodingWarning,
+    scenes_at_once,
     videos_per_scene,
 )
 from stereogenbench_data.samples import streams
-from stereogenbench_data.samples.fields import streams_of
+from stereogenbench_data.samples.fields import PAIR_FIELDS, streams_of
 from stereogenbench_data.selection.order import OrderRule
 from tests.datasets.conftest import flat, in_turn, keys_of
 
@@ -111,13 +112,13 @@ def test_loaders_of_one_dataset_have_their_own_videos(small_index):
     next(samples)
     for _ in other:
         pass
-    opened = len(one.dataset._loader._streams._open)
+    opened = one.stats().videos_open
     other.close()
 
-    assert opened == len(one.dataset._loader._streams._open) > 0
-    assert len(pairs._loader._streams._open) == 0
+    assert opened == one.stats().videos_open > 0
+    assert pairs.stats().videos_open == 0
     one.close()
-    assert len(one.dataset._loader._streams._open) == 0
+    assert one.stats().videos_open == 0
     assert len(list(samples)) == 6
     one.close()
 
@@ -326,10 +327,40 @@ def test_an_option_that_does_not_exist_is_refused(keyed):
         keyed.loader(9, batchsize=3)
 
 
-@pytest.mark.parametrize("name", ["shuffle", "drop_last", "sampler", "batch_sampler"])
+@pytest.mark.parametrize("name", ["sampler", "batch_sampler"])
 def test_what_would_undo_the_order_is_refused_with_what_to_use_instead(keyed, name):
-    with pytest.raises(SelectionError, match=rf"takes no {name}: use (order|tail|seed)="):
+    with pytest.raises(SelectionError, match=rf"takes no {name}: use seed= and order="):
         keyed.loader(9, **{name: True})
+
+
+def test_a_loader_says_what_it_holds(small_index):
+    pairs = StereoPairs(small_index, fields=("left",), frames="all")
+    loader = pairs.loader(2, num_workers=2, persistent_workers=True)
+    before = loader.stats()
+    held = list(itertools.islice(loader, 4))[-2:]
+    while_held = loader.stats()
+    del held
+    after = loader.stats()
+    loader.close()
+
+    assert (before.epoch, before.batches_taken, before.workers, before.batches_held) == (0, 0, 0, 0)
+    assert (while_held.batches_taken, while_held.workers, while_held.videos_open) == (4, 2, 0)
+    # The first batch of a worker lies in memory of its own: it says how large the slots must be.
+    assert 1 <= while_held.batches_held <= 2
+    assert after.batches_held == 0
+    assert loader.stats().workers == 0
+
+
+def test_public_objects_say_what_they_are(keyed):
+    loader = keyed.loader(9, num_workers=2)
+    batches = iter(keyed.loader(9))
+
+    assert "140 samples of 4 scenes" in repr(keyed)
+    for part in ("epoch 0", "2 workers", "9 of 140 samples a batch", "rank 0 of 1", "tail='drop'"):
+        assert part in repr(loader)
+    assert "not begun" in repr(batches)
+    next(batches)
+    assert "1 of 15 batches of epoch 0" in repr(batches)
 
 
 def test_a_killed_worker_ends_the_loop_with_an_error_that_says_so(keyed):
@@ -365,13 +396,17 @@ def opened(monkeypatch):
     return counts, frames
 
 
-@pytest.mark.parametrize(("world", "lanes"), [(1, 1), (1, 2), (2, 2), (2, 4)])
-def test_each_video_is_opened_once_and_each_frame_decoded_once(small_index, opened, world, lanes):
+@pytest.mark.parametrize(("world", "shuffle_groups"), [(1, 1), (1, 2), (2, 2), (2, 4)])
+def test_each_video_is_opened_once_and_each_frame_decoded_once(
+    small_index, opened, world, shuffle_groups
+):
     counts, frames = opened
     for rank in range(world):
         pairs = StereoPairs(small_index, pairs="all", frames="all")
-        loader = pairs.loader(2, lanes=lanes, rank=rank, world_size=world, tail="uneven")
-        assert loader.batches.order(0).lanes == min(lanes, 2)
+        loader = pairs.loader(
+            2, shuffle_groups=shuffle_groups, rank=rank, world_size=world, tail="uneven"
+        )
+        assert loader.batches.order(0).groups == min(shuffle_groups, 2)
         for _ in loader:
             pass
         pairs.close()
@@ -381,9 +416,9 @@ def test_each_video_is_opened_once_and_each_frame_decoded_once(small_index, open
     assert set(map(tuple, frames.values())) == {tuple(range(7))}
 
 
-@pytest.mark.parametrize(("workers", "lanes"), [(1, 2), (2, 2), (2, 4)])
-def test_workers_among_which_lanes_are_dealt_open_each_video_once(
-    small_index, monkeypatch, tmp_path, workers, lanes
+@pytest.mark.parametrize(("workers", "shuffle_groups"), [(1, 2), (2, 2), (2, 4)])
+def test_workers_among_which_groups_are_dealt_open_each_video_once(
+    small_index, monkeypatch, tmp_path, workers, shuffle_groups
 ):
     log = tmp_path / "opened"
 
@@ -396,9 +431,13 @@ def test_workers_among_which_lanes_are_dealt_open_each_video_once(
     monkeypatch.setattr(streams, "VideoReader", Logging)
     pairs = StereoPairs(small_index, pairs="adjacent", frames="all")
     loader = pairs.loader(
-        2, lanes=lanes, num_workers=workers, multiprocessing_context="fork", tail="uneven"
+        2,
+        shuffle_groups=shuffle_groups,
+        num_workers=workers,
+        multiprocessing_context="fork",
+        tail="uneven",
     )
-    assert loader.batches.order(0).lanes == 2
+    assert loader.batches.order(0).groups == 2
     batches = list(loader)
 
     assert len(batches) == 70
@@ -407,20 +446,19 @@ def test_workers_among_which_lanes_are_dealt_open_each_video_once(
 
 def test_videos_are_closed_after_their_scenes_last_sample(small_index):
     pairs = StereoPairs(small_index, pairs="all", frames="all")
-    loader = pairs.loader(2, lanes=1, open_scenes=1, tail="uneven")
+    loader = pairs.loader(2, shuffle_groups=1, open_scenes=1, tail="uneven")
     most = 0
     for _ in loader:
-        most = max(most, len(loader.dataset._loader._streams._open))
+        most = max(most, loader.stats().videos_open)
 
     assert most == 11
-    assert len(loader.dataset._loader._streams._open) == 0
+    assert loader.stats().videos_open == 0
 
 
 def test_a_scene_needs_the_videos_that_its_fields_are_made_from(small_index):
     def videos(fields, **selection):
         pairs = StereoPairs(small_index, fields=fields, **selection)
-        known = pairs._loader._request.known
-        return videos_per_scene(pairs.plan, streams_of(fields, known=known))
+        return videos_per_scene(pairs.plan, streams_of(fields, known=PAIR_FIELDS))
 
     assert videos(("left", "right", "disparity")) == 3
     assert videos(("left", "right", "disparity"), pairs="all") == 11
@@ -431,12 +469,12 @@ def test_a_scene_needs_the_videos_that_its_fields_are_made_from(small_index):
 
 
 def test_too_many_open_videos_are_warned_of(small_index, monkeypatch):
-    monkeypatch.setattr("stereogenbench_data.datasets.open_videos._most_files", lambda: 160)
+    monkeypatch.setattr("resource.getrlimit", lambda which: (160, 160))
     pairs = StereoPairs(small_index, pairs="all", frames="all")
 
     with pytest.warns(OpenVideosWarning, match=r"up to 88 videos .* may open 32.*ulimit -n 216"):
         loader = pairs.loader(4)
-    assert loader.dataset._loader._streams._limit == 32
+    assert loader.stats().videos_limit == 32
 
 
 def _of_many_scenes(index):
@@ -450,15 +488,23 @@ def _of_many_scenes(index):
 @pytest.mark.parametrize(
     ("workers", "options", "said"),
     [
-        (8, {}, r"decoded by 2 processes, as 8 \(ranks times workers\) read 4 lanes: .*lanes=8"),
-        (3, {}, r"decoded by 3 processes, as 3 .* read 4 lanes: .*lanes=3"),
-        (2, {"world_size": 2, "rank": 1, "lanes": 2}, "by 2 processes, as 4 .*lanes=4"),
+        (
+            8,
+            {},
+            r"decoded by 2 processes, as 8 \(ranks times workers\) read 4 .*: .*shuffle_groups=8",
+        ),
+        (3, {}, r"decoded by 3 processes, as 3 .* read 4 shuffle groups: .*shuffle_groups=3"),
+        (
+            2,
+            {"world_size": 2, "rank": 1, "shuffle_groups": 2},
+            "by 2 processes, as 4 .*shuffle_groups=4",
+        ),
     ],
 )
 def test_workers_that_decode_the_same_videos_are_warned_of(small_index, workers, options, said):
     pairs = StereoPairs(_of_many_scenes(small_index), frames=range(2), fields=("left",))
 
-    with pytest.warns(SharedLanesWarning, match=said):
+    with pytest.warns(RepeatedDecodingWarning, match=said):
         pairs.loader(1, num_workers=workers, **options)
 
 
@@ -466,14 +512,14 @@ def test_workers_that_decode_the_same_videos_are_warned_of(small_index, workers,
     ("frames", "workers", "options"),
     [
         (range(2), 4, {}),
-        (range(2), 8, {"lanes": 8}),
+        (range(2), 8, {"shuffle_groups": 8}),
         (range(2), 32, {}),
         ("first", 8, {}),
         (range(2), 8, {"order": "sequential"}),
     ],
-    ids=["a lane each", "lanes asked for", "too few scenes", "one sample a scene", "sequential"],
+    ids=["a group each", "groups asked for", "too few scenes", "one sample a scene", "sequential"],
 )
-def test_workers_are_not_warned_of_where_more_lanes_would_not_help(
+def test_workers_are_not_warned_of_where_more_groups_would_not_help(
     small_index, frames, workers, options
 ):
     pairs = StereoPairs(_of_many_scenes(small_index), frames=frames, fields=("left",))
@@ -482,7 +528,7 @@ def test_workers_are_not_warned_of_where_more_lanes_would_not_help(
 
 
 @pytest.mark.parametrize(
-    ("side_px", "selection", "expected", "lanes"),
+    ("side_px", "selection", "expected", "shuffle_groups"),
     [
         (1280, {}, 16, 4),
         (1280, {"pairs": "all"}, 4, 2),
@@ -493,7 +539,7 @@ def test_workers_are_not_warned_of_where_more_lanes_would_not_help(
     ids=str,
 )
 def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
-    small_index, side_px, selection, expected, lanes
+    small_index, side_px, selection, expected, shuffle_groups
 ):
     scenes = [
         replace(scene, rig=replace(scene.rig, image_width_px=side_px, image_height_px=side_px))
@@ -504,11 +550,10 @@ def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
     pairs = StereoPairs(index, **options)
 
     assert pairs.loader(4).batches.rule.open_scenes == expected
-    assert pairs.loader(4).batches.rule.lanes == lanes
+    assert pairs.loader(4).batches.rule.shuffle_groups == shuffle_groups
     assert pairs.loader(4, num_workers=3).batches.rule == pairs.loader(4).batches.rule
-    assert StereoPairs(index, **(options | {"fields": ("depth",)})).scenes_at_once == (
-        pairs.scenes_at_once
-    )
-    assert pairs.loader(4, open_scenes=7, lanes=6).batches.rule == OrderRule(
-        4, lanes=6, open_scenes=7
+    others = StereoPairs(index, **(options | {"fields": ("depth",)}))
+    assert scenes_at_once(index, others.plan) == scenes_at_once(index, pairs.plan)
+    assert pairs.loader(4, open_scenes=7, shuffle_groups=6).batches.rule == OrderRule(
+        4, shuffle_groups=6, open_scenes=7
     )

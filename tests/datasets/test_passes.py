@@ -339,7 +339,8 @@ class DieAt:
 def test_a_worker_that_dies_ends_the_pass_whatever_it_held(
     small_index, how, persistent, pin_memory
 ):
-    pairs = StereoPairs(small_index, fields=FIELDS, frames="all", transform=DieAt(how))
+    dying = DieAt(how)
+    pairs = StereoPairs(small_index, fields=FIELDS, frames="all", transform=dying)
     loader = pairs.loader(
         2,
         num_workers=2,
@@ -351,7 +352,7 @@ def test_a_worker_that_dies_ends_the_pass_whatever_it_held(
     with pytest.raises(WorkerError, match=r"worker \(pid \d+\) was killed by SIGKILL in"):
         list(loader)
     loader.close()
-    loader.dataset._loader._request.transform.how = None
+    dying.how = None
 
     assert len(list(loader)) == 14
     loader.close()

@@ -17,8 +17,7 @@ from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.stale import StaleIndexWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import COMPLETE_JSON
-from stereogenbench_data.selection.filters import filter_scenes
-from stereogenbench_data.selection.lookup import find_scene
+from stereogenbench_data.selection.filters import filter_scenes, find_scene
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.unpack import unpack
 from stereogenbench_data.synthesis import synthesise
@@ -110,7 +109,7 @@ def test_a_filter_that_matches_nothing_says_that_the_index_is_old(tree):
     told = rf"matches none of 4 scenes; .*'Uniform'\. /.*{OLD}.*New_Family.*{CURE}"
     with pytest.raises(SelectionError, match=told):
         filter_scenes(index, {"family": "New_Family"})
-    with pytest.raises(SelectionError, match=rf"is no key of 4 scenes.*{OLD}"):
+    with pytest.raises(SelectionError, match=rf"is not a key of 4 scenes.*{OLD}"):
         find_scene(index, "New_Family")
 
 

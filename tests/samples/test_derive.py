@@ -1,7 +1,5 @@
 """What is derived from decoded views, against hand-worked numbers and the long way round."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -57,12 +55,13 @@ def facts(encoding, *, residual_px=0.0, order=1.0, yaw_deg=(0.0,) * 6):
     return SceneFacts(scene, dict.fromkeys(range(6), encoding), poses, "url", (0,))
 
 
-def geometry(units, encoding, *, source=0, target=1, world="as filmed", **scene):
+def geometry(units, encoding, *, source=0, target=1, world="as filmed", padded=None, **scene):
     units = np.asarray(units, dtype=np.uint16)[None]
     stored = StoredDepth(units, units > 0)
     views = Views(
         source=source, targets=(target,), frames=(0,), pictures={},
         depths={source: stored, target: stored}, intrinsics=INTRINSICS, world=world,
+        padded=padded,
     )  # fmt: skip
     return PairGeometry(views, facts(encoding, **scene), source=source, target=target)
 
@@ -179,7 +178,7 @@ def test_nothing_is_visible_in_a_padded_target_nor_warped_into_it(residual_px):
     plain = geometry(some_units(), DepthEncoding(0.1), residual_px=residual_px)
     padded = np.zeros((20, 40), dtype=bool)
     padded[:, 10:15], padded[4:6] = True, True
-    boxed = PairGeometry(replace(plain._views, padded=padded), plain._facts, source=0, target=1)
+    boxed = geometry(some_units(), DepthEncoding(0.1), residual_px=residual_px, padded=padded)
 
     columns = np.nan_to_num(np.floor(plain.projection.u_px)).clip(0, 39).astype(int)
     on_padding = padded[np.arange(20)[:, None], columns]

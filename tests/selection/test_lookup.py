@@ -3,7 +3,7 @@
 import pytest
 
 from stereogenbench_data import SceneIndex, SelectionError
-from stereogenbench_data.selection.lookup import find_scene
+from stereogenbench_data.selection.filters import find_scene
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +36,14 @@ def test_a_part_of_several_keys_names_them(index):
 
 
 def test_what_is_no_part_names_the_keys_that_are_close(index):
-    with pytest.raises(SelectionError, match=r"'scene_00001' is no key .* Did you mean .*_000001"):
+    with pytest.raises(
+        SelectionError, match=r"'scene_00001' is not a key .* Did you mean .*_000001"
+    ):
         find_scene(index, "scene_00001")
 
 
 def test_what_is_like_nothing_lists_what_there_is(index):
-    with pytest.raises(SelectionError, match=r"'kitchen' is no key of 4 scenes.* There is eval/"):
+    with pytest.raises(
+        SelectionError, match=r"'kitchen' is not a key of 4 scenes.* There is eval/"
+    ):
         find_scene(index, "kitchen")

@@ -10,8 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.selection.order import EpochOrder, OrderRule, last_batch, rank_share
-from stereogenbench_data.selection.quality import order_quality
+from stereogenbench_data.selection.order import (
+    EpochOrder,
+    OrderRule,
+    last_batch,
+    order_quality,
+    rank_share,
+)
 
 WORLDS, WORKERS = range(1, 6), range(5)
 KINDS = ("shuffled", "sequential")
@@ -47,7 +52,7 @@ lengths_of_scenes = st.lists(st.integers(1, 30), min_size=1, max_size=40)
 rules = st.fixed_dictionaries(
     {
         "batch_size": st.integers(1, 20),
-        "lanes": st.integers(1, 6),
+        "shuffle_groups": st.integers(1, 6),
         "open_scenes": st.integers(1, 20),
         "seed": st.integers(0, 2**70),
         "epoch": st.integers(0, 9),
@@ -69,29 +74,29 @@ def test_every_sample_is_in_one_batch_and_only_the_last_batch_is_short(lengths, 
 
 @given(lengths=lengths_of_scenes, rule=rules)
 @settings(deadline=None, max_examples=100)
-def test_a_lane_reads_each_of_its_scenes_forwards_and_few_are_in_two_lanes(lengths, rule):
+def test_a_group_reads_each_of_its_scenes_forwards_and_few_are_in_two_groups(lengths, rule):
     order = order_of(lengths, **(rule | {"kind": "shuffled"}))
-    lanes_of_scene = {}
-    for lane in range(order.lanes):
-        numbers = order.lane(lane)
+    groups_of_scene = {}
+    for group in range(order.groups):
+        numbers = order.group(group)
         scenes = order.scenes_of(numbers)
         for scene in set(scenes.tolist()):
             own = numbers[scenes == scene]
             assert (np.diff(own) == 1).all()
-            lanes_of_scene.setdefault(scene, []).append(lane)
+            groups_of_scene.setdefault(scene, []).append(group)
 
-    parts = sum(map(len, lanes_of_scene.values()))
-    assert len(lanes_of_scene) == len(lengths)
-    assert parts - len(lengths) <= order.lanes - 1
+    parts = sum(map(len, groups_of_scene.values()))
+    assert len(groups_of_scene) == len(lengths)
+    assert parts - len(lengths) <= order.groups - 1
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
 @settings(deadline=None, max_examples=100)
-def test_no_more_scenes_are_open_in_a_lane_than_announced(lengths, rule):
+def test_no_more_scenes_are_open_in_a_group_than_announced(lengths, rule):
     order = order_of([7] * len(lengths), **(rule | {"kind": "shuffled"}))
     most = order.rule.most_open(np.full(len(lengths), 7))
-    for lane in range(order.lanes):
-        scenes = order.scenes_of(order.lane(lane)).tolist()
+    for group in range(order.groups):
+        scenes = order.scenes_of(order.group(group)).tolist()
         first = {scene: scenes.index(scene) for scene in set(scenes)}
         last = {scene: len(scenes) - scenes[::-1].index(scene) for scene in first}
         for place in range(len(scenes)):
@@ -101,8 +106,8 @@ def test_no_more_scenes_are_open_in_a_lane_than_announced(lengths, rule):
 @pytest.mark.parametrize("scenes", [3, 10, 13, 64, 2123])
 @pytest.mark.parametrize("open_scenes", [1, 2, 4, 5, 15])
 def test_a_small_number_of_open_scenes_is_reached_and_never_exceeded(scenes, open_scenes):
-    order = order_of([7] * scenes, batch_size=1, lanes=1, open_scenes=open_scenes)
-    found = order.scenes_of(order.lane(0))
+    order = order_of([7] * scenes, batch_size=1, shuffle_groups=1, open_scenes=open_scenes)
+    found = order.scenes_of(order.group(0))
     first = np.array([np.flatnonzero(found == scene)[0] for scene in range(scenes)])
     last = np.array([np.flatnonzero(found == scene)[-1] for scene in range(scenes)])
     opened = np.searchsorted(np.sort(first), np.arange(len(found)), side="right")
@@ -201,7 +206,7 @@ def test_two_seeds_and_two_epochs_differ_from_the_first_epoch_on():
 def test_the_order_of_version_2_never_changes():
     """If this fails, orders that users have saved positions in have changed: see ORDER_VERSION."""
     order = order_of(
-        [3, 4, 5, 4, 3, 4, 5, 4], batch_size=4, lanes=2, open_scenes=2, seed=7, epoch=3
+        [3, 4, 5, 4, 3, 4, 5, 4], batch_size=4, shuffle_groups=2, open_scenes=2, seed=7, epoch=3
     )
 
     assert all_batches(order) == PINNED
@@ -262,16 +267,16 @@ def test_frames_of_a_batch_come_from_all_over_their_scenes():
 
 
 @pytest.mark.parametrize(
-    ("scenes", "lanes"), [(1, 1), (3, 1), (4, 2), (15, 2), (63, 2), (64, 4), (9000, 4)]
+    ("scenes", "groups"), [(1, 1), (3, 1), (4, 2), (15, 2), (63, 2), (64, 4), (9000, 4)]
 )
-def test_small_selections_have_fewer_lanes(scenes, lanes):
-    assert order_of([5] * scenes).lanes == lanes
+def test_small_selections_have_fewer_groups(scenes, groups):
+    assert order_of([5] * scenes).groups == groups
 
 
 def test_the_whole_release_is_ordered_within_seconds():
     order = order_of([81 * 15] * 8493, batch_size=16)
     began = time.perf_counter()
-    sizes = [len(order.lane(lane)) for lane in range(order.lanes)]
+    sizes = [len(order.group(group)) for group in range(order.groups)]
 
     assert sum(sizes) == 10_318_995
     assert time.perf_counter() - began < 10
@@ -282,7 +287,7 @@ def test_the_whole_release_is_ordered_within_seconds():
     [
         ({"batch_size": 0}, "batch_size must be a whole number from 1, got 0"),
         ({"batch_size": 2.0}, r"batch_size must be a whole number from 1, got 2\.0"),
-        ({"lanes": True}, "lanes must be a whole number from 1, got True"),
+        ({"shuffle_groups": True}, "shuffle_groups must be a whole number from 1, got True"),
         ({"open_scenes": 0}, "open_scenes must be a whole number from 1, got 0"),
         ({"seed": -1}, "seed must be a whole number from 0, got -1"),
         ({"kind": "random"}, "order must be 'shuffled' or 'sequential', got 'random'"),
@@ -303,8 +308,10 @@ def test_a_rule_that_orders_nothing_is_refused(rule, message):
 @settings(deadline=None, max_examples=60)
 def test_rules_that_are_the_same_in_effect_give_the_same_order(lengths, size, asked, kind):
     found = {}
-    for lanes, open_scenes in asked:
-        rule = OrderRule(batch_size=size, lanes=lanes, open_scenes=open_scenes, kind=kind)
+    for shuffle_groups, open_scenes in asked:
+        rule = OrderRule(
+            batch_size=size, shuffle_groups=shuffle_groups, open_scenes=open_scenes, kind=kind
+        )
         batches = all_batches(EpochOrder(np.concatenate([[0], np.cumsum(lengths)]), rule, epoch=0))
 
         assert found.setdefault(rule.in_effect(np.array(lengths)), batches) == batches
