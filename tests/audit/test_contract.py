@@ -39,6 +39,7 @@ from tests.audit.corruption import (
     rewrite_depth,
     rewrite_one_depth,
     rewrite_rgb,
+    scale_camera,
     scaled,
 )
 
@@ -123,13 +124,7 @@ def test_a_wrong_quotient_is_measured_and_no_unit_is_pasted(verdict_on, factor):
 
 
 def test_a_wrong_focal_length_is_not_called_a_wrong_unit(verdict_on):
-    def corrupt(folder):
-        def change(document):
-            document["camera_intrinsics"]["focal_length_mm"] *= 0.95
-
-        edit_baseline(folder, change)
-
-    verdict = verdict_on(corrupt)
+    verdict = verdict_on(lambda folder: scale_camera(folder, focal_length_mm=0.95))
 
     assert wrong_topics(verdict) == {QUOTIENT}
     assert answer(verdict, "metres a unit").status == "not seen alone"

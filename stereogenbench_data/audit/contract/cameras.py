@@ -590,9 +590,9 @@ def row_terms(
     numerator, denominator = np.zeros(len(place)), np.zeros(len(place))
     for beside in range(-_ROWS_BESIDE, _ROWS_BESIDE + 1):
         rows = np.clip(frame_match.rows + beside, 1, len(left) - 2)
-        there, _, inside = sample_along_rows(right, rows, place)
-        above, _, _ = sample_along_rows(right, rows - 1, place)
-        below, _, _ = sample_along_rows(right, rows + 1, place)
+        there, inside = sample_along_rows(right, rows, place)
+        above, _ = sample_along_rows(right, rows - 1, place)
+        below, _ = sample_along_rows(right, rows + 1, place)
         own = (left[rows + 1, frame_match.columns] - left[rows - 1, frame_match.columns]) / 2
         slope = ((below - above) / 2 + own) / 2
         numerator += np.where(inside, slope * (there - left[rows, frame_match.columns]), 0)

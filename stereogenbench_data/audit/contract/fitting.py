@@ -12,12 +12,12 @@ power is fitted beside the scale, so no unit can stand in for it: 0 is depth alo
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32, Float64
 
 from stereogenbench_data.audit.contract.hypotheses import Hypothesis
 from stereogenbench_data.audit.contract.matching import FrameMatch, Points, SceneFrames
@@ -25,7 +25,7 @@ from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
     Pair,
     ScoredContract,
-    differences,
+    sample_with_slope,
     score_hypothesis,
 )
 from stereogenbench_data.schema.records import DepthKind
@@ -39,22 +39,25 @@ _STEPS: Final = 10
 _LARGEST_STEP_PX: Final = 1.0
 _DRAWS: Final = 300
 _FEWEST_USABLE: Final = 10
-NEAR_PX: Final = 3 * _TOLERANCE_PX
+_NEAR_PX: Final = 3 * _TOLERANCE_PX
 """RowMatches that a prediction misses by more take no part in refining it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
-    """A frame match with the disparity that a hypothesis predicts where depth is known.
+    """A frame match, its pixels with known depth alone, and the disparity that is predicted there.
 
     ``large_px`` is the 90th percentile of the predicted sizes.
     """
 
     frame_match: FrameMatch
-    known: np.ndarray
     predicted_px: Points
-    matched_px: Points
     large_px: float
+
+    @property
+    def matched_px(self) -> Points:
+        """The disparity that was found."""
+        return self.frame_match.matched_px
 
     @property
     def pair(self) -> Pair:
@@ -90,9 +93,9 @@ def fit_terms(
         predicted = views.predicted(frame_match, hypothesis)
         if predicted is not None and predicted[1].any():
             disparity_px, known = predicted
-            told_px = disparity_px[known]
-            large_px = float(np.percentile(np.abs(told_px), 90))
-            terms.append(Term(frame_match, known, told_px, frame_match.matched_px[known], large_px))
+            predicted_px = disparity_px[known]
+            large_px = float(np.percentile(np.abs(predicted_px), 90))
+            terms.append(Term(frame_match.at(known), predicted_px, large_px))
     return terms
 
 
@@ -198,7 +201,7 @@ def _refined(
     error = math.inf
     for _ in range(_STEPS):
         normals, rights = _equations(views, terms, scale, offsets_px, unknowns=unknowns)
-        step, spread = solve_normal_equations(normals, rights)
+        step, spread = _solved(normals, rights)
         limit = max(np.abs(_moved(term, scale, step, unknowns)).max() for term in terms)
         step *= min(1.0, _LARGEST_STEP_PX / max(limit, 1e-12))
         for name, change in zip(unknowns, step, strict=True):
@@ -236,14 +239,8 @@ def _equations(
     normals = np.zeros((len(terms), len(unknowns), len(unknowns)))
     rights = np.zeros((len(terms), len(unknowns)))
     for number, term in enumerate(terms):
-        full = np.zeros(len(term.frame_match.rows))
-        full[term.known] = scale * term.predicted_px
-        shift_px = term.frame_match.shift_px(offsets_px)
-        difference, slope, inside = (
-            part[term.known] for part in differences(views, term.frame_match, full + shift_px)
-        )
-        near = np.abs(full[term.known] + shift_px - term.matched_px) < NEAR_PX
-        weight = robust_weights(difference, inside & near)
+        disparity_px = scale * term.predicted_px + term.frame_match.shift_px(offsets_px)
+        difference, slope, weight = _compared(views, term, disparity_px)
         if weight is None:
             continue
         # Of all unknowns a frame match depends on its own pair's, and on the scale.
@@ -252,27 +249,50 @@ def _equations(
             for place, name in enumerate(unknowns)
             if name in ("scale", term.pair)
         }
-        for place, column in columns.items():
-            rights[number, place] = (column * weight * difference).sum()
-            for other, beside in columns.items():
-                normals[number, place, other] = (column * weight * beside).sum()
+        _add_columns(normals[number], rights[number], columns, weight=weight, difference=difference)
     return normals, rights
 
 
-def robust_weights(
-    difference: Float32[np.ndarray, " n"], usable: Bool[np.ndarray, " n"]
-) -> Float64[np.ndarray, " n"] | None:
-    """Return how much each pixel counts, 0 for those not usable; None where these are too few."""
+def _compared(
+    views: SceneFrames, term: Term, disparity_px: Points
+) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float64[np.ndarray, " n"] | None]:
+    """Return right less left at a disparity, the mean slope of both, and each pixel's weight.
+
+    The weight is robust, and 0 for pixels that leave the picture or were matched elsewhere. It is
+    None where too few are left.
+    """
+    match = term.frame_match
+    there, slope, inside = sample_with_slope(
+        views.band(match.frame, match.right), match.rows, match.columns - disparity_px
+    )
+    difference = there - match.brightness
+    slope = (slope + match.slope) / 2
+    usable = inside & (np.abs(disparity_px - match.matched_px) < _NEAR_PX)
     if usable.sum() < _FEWEST_USABLE:
-        return None
+        return difference, slope, None
     spread = 1.4826 * float(np.median(np.abs(difference[usable]))) + 1e-3
     weight: Float64[np.ndarray, " n"] = (
         usable / (1 + (difference.astype(np.float64) / (2 * spread)) ** 2) ** 2 / spread**2
     )
-    return weight
+    return difference, slope, weight
 
 
-def solve_normal_equations(
+def _add_columns(
+    normals: Float64[np.ndarray, "k k"],
+    rights: Float64[np.ndarray, " k"],
+    columns: Mapping[int, Points],
+    *,
+    weight: Points,
+    difference: Float32[np.ndarray, " n"],
+) -> None:
+    """Write one frame match's weighted normal equations, from derivatives by unknown."""
+    for place, column in columns.items():
+        rights[place] = (column * weight * difference).sum()
+        for other, beside in columns.items():
+            normals[place, other] = (column * weight * beside).sum()
+
+
+def _solved(
     normals: Float64[np.ndarray, "terms k k"], rights: Float64[np.ndarray, "terms k"]
 ) -> tuple[Points, Points]:
     """Return the step and its standard errors, from how much frame matches disagree."""
@@ -332,27 +352,20 @@ def ray_power(
         rights = np.zeros((len(terms), 2 + len(pairs)))
         for number, term in enumerate(terms):
             frame_match = term.frame_match
-            log_ray = np.log(views.ray_per_planar[frame_match.rows, frame_match.columns])[
-                term.known
-            ]
+            log_ray = np.log(views.ray_per_planar[frame_match.rows, frame_match.columns])
             grown_px = term.predicted_px * np.exp(log_scale + bend * log_ray)
-            full = np.zeros(len(frame_match.rows))
-            full[term.known] = grown_px + frame_match.shift_px(offsets_px)
-            difference, slope, inside = (
-                part[term.known] for part in differences(views, frame_match, full)
+            difference, slope, weight = _compared(
+                views, term, grown_px + frame_match.shift_px(offsets_px)
             )
-            usable = inside & (np.abs(full[term.known] - term.matched_px) < NEAR_PX)
-            weight = robust_weights(difference, usable)
             if weight is None:
                 continue
             columns = {0: slope * grown_px, 1: slope * grown_px * log_ray}
             if term.pair in offsets_px:
                 columns[2 + pairs.index(term.pair)] = term.sign * slope
-            for place, column in columns.items():
-                rights[number, place] = (column * weight * difference).sum()
-                for other, beside in columns.items():
-                    normals[number, place, other] = (column * weight * beside).sum()
-        step, spread = solve_normal_equations(normals, rights)
+            _add_columns(
+                normals[number], rights[number], columns, weight=weight, difference=difference
+            )
+        step, spread = _solved(normals, rights)
         log_scale += float(np.clip(step[0], -0.1, 0.1))
         bend += float(np.clip(step[1], -_LARGEST_RAY_STEP, _LARGEST_RAY_STEP))
         for pair, change in zip(pairs, step[2:], strict=True):

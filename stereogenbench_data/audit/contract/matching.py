@@ -247,6 +247,14 @@ class FrameMatch:
         """The two files, the lower number first."""
         return min(self.left, self.right), max(self.left, self.right)
 
+    def at(self, pixels: Bool[np.ndarray, " n"]) -> "FrameMatch":
+        """Return the frame match of some of its pixels alone."""
+        return replace(
+            self, rows=self.rows[pixels], columns=self.columns[pixels],
+            matched_px=self.matched_px[pixels], brightness=self.brightness[pixels],
+            slope=self.slope[pixels], cells=self.cells[pixels],
+        )  # fmt: skip
+
     def shift_px(self, offsets_px: dict[tuple[int, int], float]) -> float:
         """Return the constant disparity here, of those of pairs seen from their lower number."""
         offset_px = offsets_px.get(self.pair, 0.0)

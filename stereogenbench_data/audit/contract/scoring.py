@@ -7,7 +7,7 @@ in one scene (`evidence`), and pooled over several (`pooled`).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -163,11 +163,29 @@ class ScoredContract:
 
 def sample_along_rows(
     band: Luma, rows: np.ndarray, columns: Points
+) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
+    """Return a picture's values between its pixels along rows, and which places are inside it."""
+    here, (linear, square, cube), t, inside = _cubic(band, rows, columns)
+    return here + t * (linear + t * (square + t * cube)), inside
+
+
+def sample_with_slope(
+    band: Luma, rows: np.ndarray, columns: Points
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], np.ndarray]:
     """Return a picture between its pixels along rows, its slope there, and what is inside it."""
+    here, (linear, square, cube), t, inside = _cubic(band, rows, columns)
+    value = here + t * (linear + t * (square + t * cube))
+    return value, linear + t * (2 * square + 3 * t * cube), inside
+
+
+def _cubic(band: Luma, rows: np.ndarray, columns: Points) -> tuple[Any, tuple[Any, ...], Any, Any]:
+    """Return the pixel before each place, the cubic's coefficients, the part to go, and inside.
+
+    Catmull and Rom's cubic: between pixels a straight line is a blur, which favours some places.
+    """
     width = band.shape[1]
     inside = (columns >= 0) & (columns <= width - 1)
-    place = np.clip(np.where(inside, columns, 0.0), 0, width - 2)
+    place = np.minimum(np.where(inside, columns, 0.0), width - 2)
     low = place.astype(np.int64)
     t = (place - low).astype(np.float32)
     first = rows * width + low
@@ -175,23 +193,10 @@ def sample_along_rows(
     here, there = flat[first], flat[first + 1]
     before = flat[first - (low > 0)]
     after = flat[first + 1 + (low < width - 2)]
-    # Catmull and Rom's cubic: between pixels a straight line is a blur, which favours some places.
     linear = (there - before) / 2
     square = before - 2.5 * here + 2 * there - after / 2
     cube = (after - before) / 2 + 1.5 * (here - there)
-    value = here + t * (linear + t * (square + t * cube))
-    return value, linear + t * (2 * square + 3 * t * cube), inside
-
-
-def differences(
-    views: SceneFrames, frame_match: FrameMatch, disparity_px: Points
-) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], np.ndarray]:
-    """Return right less left at a disparity, the mean slope of both, and what lands inside."""
-    band = views.band(frame_match.frame, frame_match.right)
-    there, slope, inside = sample_along_rows(
-        band, frame_match.rows, frame_match.columns - disparity_px
-    )
-    return there - frame_match.brightness, (slope + frame_match.slope) / 2, inside
+    return here, (linear, square, cube), t, inside
 
 
 def score_hypothesis(
@@ -215,8 +220,13 @@ def score_hypothesis(
         if predicted is not None:
             disparity_px, known = predicted
             shift_px = frame_match.shift_px(offsets_px)
-            difference, _, inside = differences(views, frame_match, scale * disparity_px + shift_px)
-            capped = np.where(inside, np.minimum(difference**2, frame_match.cap), frame_match.cap)
+            there, inside = sample_along_rows(
+                views.band(frame_match.frame, frame_match.right),
+                frame_match.rows,
+                frame_match.columns - (scale * disparity_px + shift_px),
+            )
+            square = (there - frame_match.brightness) ** 2
+            capped = np.where(inside, np.minimum(square, frame_match.cap), frame_match.cap)
             squares[known] = capped[known]
         errors.append(squares)
     return ScoredContract(hypothesis, scale, offsets_px, scale_error, errors)
