@@ -255,41 +255,6 @@ def _read_only(picture: Any) -> Any:
     return picture
 
 
-<<<<<<< HEAD
-=======
-def _unused(last: dict[Any, Any], *, height_width: tuple[int, int] | None) -> Any:
-    """Return the array of the last picture for reuse, if nobody else refers to it.
-
-    New memory costs more than writing into it: the system clears it first.
-    """
-    for key in last:
-        picture = last[key]
-        if (
-            key[1] == height_width
-            and picture.base is None
-            and sys.getrefcount(picture) == _REFERENCES_HERE
-        ):
-            picture.flags.writeable = True
-            return picture
-    return None
-
-
-def _references_here() -> int:
-    """Return how many references `_unused` sees to a picture that nobody else has.
-
-    Interpreters differ: some count the one that a function borrows, some do not.
-    """
-    last = {(0, None): np.empty(1)}
-    for key in last:
-        picture = last[key]
-        return sys.getrefcount(picture)
-    return 0
-
-
-_REFERENCES_HERE: Final = _references_here()
-
-
->>>>>>> h-samples
 @contextmanager
 def _cause_raised(file: Path | MemberFile) -> Iterator[None]:
     """Raise the failed fetch that made a video fail, if one did, and close the file."""

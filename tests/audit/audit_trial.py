@@ -7,12 +7,8 @@ a time, runs ``stereogenbench audit`` on each, and prints a table of verdicts. E
 FOLDER/verdicts.jsonl.
 """
 
-import argparse
 import json
 import re
-import shutil
-import sys
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,21 +18,23 @@ import typer
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.audit import audit
-from stereogenbench_data.synthesis import synthesise
-from stereogenbench_data.synthesis.request import SynthRequest
+from stereogenbench_data.synthesis import SynthRequest
 from tests.audit.corruption import (
     as_inverse,
     as_ray,
-    copied,
-    edit_baseline,
     exchange,
+    late,
+    lengthen_label,
     read_depth,
     rewrite_depth,
+    rewrite_one_depth,
     rewrite_rgb,
+    scale_camera,
+    scaled,
     write_depth,
 )
+from tests.audit.trial import FAMILIES, drawn_scenes, main, run_cases
 
-FAMILIES = ("IPD_Gaussian", "Uniform", "Pairwise_Uniform")
 OUTCOMES = ("found", "found elsewhere", "not testable", "missed", "passed", "false alarm")
 
 
@@ -80,20 +78,20 @@ def cases(rng: np.random.Generator) -> Iterator[Case]:
         ("1 px higher", lambda p: np.roll(p, -1, 1)),
         ("1 px aside", lambda p: np.roll(p, 1, 2)),
         ("0.5 px lower", lambda p: ((p.astype(int) + np.roll(p, 1, 1) + 1) // 2).astype(np.uint8)),
-        ("1 frame late", lambda p: _late(p, 1)),
-        ("2 frames late", lambda p: _late(p, 2)),
-        ("5 frames late", lambda p: _late(p, 5)),
-        ("15 frames late", lambda p: _late(p, 15)),
+        ("1 frame late", late(1)),
+        ("2 frames late", late(2)),
+        ("5 frames late", late(5)),
+        ("15 frames late", late(15)),
         ("reversed in time", lambda p: p[::-1]),
         ("mirrored", lambda p: p[:, :, ::-1]),
     ):
         yield _of_pictures(sort, one(), change)
     for sort, change in (
         ("1 px aside", lambda u: np.roll(u, 1, 2)),
-        ("scaled by 2 %", lambda u: _times(u, 1.02)),
-        ("halved", lambda u: _times(u, 0.5)),
-        ("1 frame late", lambda u: _late(u, 1)),
-        ("5 frames late", lambda u: _late(u, 5)),
+        ("scaled by 2 %", scaled(1.02)),
+        ("halved", scaled(0.5)),
+        ("1 frame late", late(1)),
+        ("5 frames late", late(5)),
     ):
         yield _of_depth(sort, one(), change)
     yield _ray_of_one(one())
@@ -109,12 +107,22 @@ def cases(rng: np.random.Generator) -> Iterator[Case]:
         yield _exchanged(sort, kinds, tuple(int(c) for c in rng.choice(6, 2, replace=False)))
     for percent in (2, 5):
         factor = 1 + percent / 100 * float(rng.choice([-1, 1]))
-        focal = _changed("focal_length_mm", factor)
         told_by = ("depth fit", "motion fit", "pictures fit")
-        yield Case(f"focal length off by {percent} %", focal, checks=told_by)
-    height = _changed("sensor_height_mm", 3 / 4)
-    yield Case("sensor height of 4:3", height, checks=("motion fit",))
-    yield Case("a baseline's label 0.5 mm off", _longer, checks=("pose/baseline",))
+        yield Case(
+            f"focal length off by {percent} %",
+            lambda f, x=factor: scale_camera(f, focal_length_mm=x),
+            checks=told_by,
+        )
+    yield Case(
+        "sensor height of 4:3",
+        lambda f: scale_camera(f, sensor_height_mm=3 / 4),
+        checks=("motion fit",),
+    )
+    yield Case(
+        "a baseline's label 0.5 mm off",
+        lambda f: lengthen_label(f, (1, 2), by_cm=0.05),
+        checks=("pose/baseline",),
+    )
     yield _tagged(one())
 
 
@@ -128,7 +136,7 @@ def _of_pictures(sort: str, camera: int, change: Callable) -> Case:
 def _of_depth(sort: str, camera: int, change: Callable) -> Case:
     return Case(
         f"depth of one camera {sort}",
-        lambda f: _depth(f, camera, change),
+        lambda f: rewrite_one_depth(f, camera, change),
         (camera,),
         ("depth fit",),
     )
@@ -136,7 +144,9 @@ def _of_depth(sort: str, camera: int, change: Callable) -> Case:
 
 def _ray_of_one(camera: int) -> Case:
     return Case(
-        "depth of one camera along the ray", lambda f: _depth(f, camera, as_ray(f)), (camera,)
+        "depth of one camera along the ray",
+        lambda f: rewrite_one_depth(f, camera, as_ray(f)),
+        (camera,),
     )
 
 
@@ -158,39 +168,6 @@ def _tagged(camera: int) -> Case:
 
 def _pictures(folder: Path, camera: int, change: Callable) -> None:
     rewrite_rgb(folder, camera, change, crf=0)
-
-
-def _depth(folder: Path, camera: int, change: Callable) -> None:
-    units, tags = read_depth(folder, camera)
-    write_depth(
-        folder, camera, change(units), {k: v for k, v in tags.items() if "scale" in k.lower()}
-    )
-
-
-def _late(frames: np.ndarray, lag: int) -> np.ndarray:
-    return frames[np.maximum(np.arange(len(frames)) - lag, 0)]
-
-
-def _times(units: np.ndarray, factor: float) -> np.ndarray:
-    known = (units > 0) & (units < 65535)
-    return np.where(known, np.clip(np.rint(units * factor), 1, 65534), units)
-
-
-def _changed(name: str, factor: float) -> Callable[[Path], None]:
-    def change(document: dict) -> None:
-        document["camera_intrinsics"][name] *= factor
-
-    return lambda folder: edit_baseline(folder, change)
-
-
-def _longer(folder: Path) -> None:
-    def change(document: dict) -> None:
-        for pairs in ("adjacent_pairs", "pairwise_pairs"):
-            for pair in document[pairs]:
-                if (pair["camera_index_a"], pair["camera_index_b"]) == (1, 2):
-                    pair["baseline_cm"] += 0.05
-
-    edit_baseline(folder, change)
 
 
 def audited(folder: Path) -> tuple[int, dict]:
@@ -226,60 +203,29 @@ def outcome(case: Case, status: int, document: dict) -> str:
 def run(root: Path, *, seed: int, count: int, also: Path | None) -> list[dict]:
     """Draw, make wrong and audit; return one record a case."""
     rng = np.random.default_rng([seed, 3])
-    scenes = []
-    for number, request in enumerate(drawn_requests(seed, count)):
-        place = root / f"drawn_{number}"
-        (key,) = synthesise(place, request, workers=1)
-        scenes.append(place / key)
-    if also is not None:
-        scenes += sorted(path.parent for path in also.rglob("baseline.json"))
-    records = []
-    with (root / "verdicts.jsonl").open("w") as log:
-        for scene in scenes:
-            for case in cases(rng):
-                spoilt = root / "spoilt"
-                shutil.rmtree(spoilt, ignore_errors=True)
-                case.corrupt(copied(scene, spoilt))
-                status, document = audited(spoilt)
-                (audited_scene,) = document["scenes"] or ({},)
-                record = {
-                    "sort": case.sort,
-                    "cameras": case.cameras,
-                    "scene": str(scene),
-                    "frames": audited_scene.get("frames"),
-                    "outcome": outcome(case, status, document),
-                    "checks": [f"{each['member']} {each['check']}: {each['found']}"
-                               for each in document["findings"]],
-                    "alignment": audited_scene.get("alignment"),
-                }  # fmt: skip
-                records.append(record)
-                log.write(json.dumps(record) + "\n")
-                log.flush()
-    return records
+    rendered = sorted(path.parent for path in also.rglob("baseline.json")) if also else []
+    return run_cases(
+        root,
+        [*drawn_scenes(root, drawn_requests(seed, count)), *rendered],
+        cases_of=lambda scene: cases(rng),
+        examine=examine,
+    )
 
 
-def table(records: list[dict]) -> str:
-    """Return a row a sort of mistake: how many were found, not testable, missed."""
-    others = {record["outcome"] for record in records} - set(OUTCOMES)
-    words = (*OUTCOMES, *sorted(others))
-    lines = ["| made wrong | " + " | ".join(words) + " |", "|---" * (len(words) + 1) + "|"]
-    for sort in dict.fromkeys(record["sort"] for record in records):
-        told = Counter(record["outcome"] for record in records if record["sort"] == sort)
-        lines.append(f"| {sort} | " + " | ".join(str(told[word] or "") for word in words) + " |")
-    return "\n".join(lines)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--scenes", type=int, default=6)
-    parser.add_argument("--also", type=Path)
-    options = parser.parse_args()
-    options.folder.mkdir(parents=True)
-    records = run(options.folder, seed=options.seed, count=options.scenes, also=options.also)
-    sys.stdout.write(table(records) + "\n")
+def examine(case: Case, spoilt: Path) -> dict:
+    """Return what is kept of the audit of one spoilt scene."""
+    status, document = audited(spoilt)
+    (scene,) = document["scenes"] or ({},)
+    findings = document["findings"]
+    return {
+        "sort": case.sort,
+        "cameras": case.cameras,
+        "frames": scene.get("frames"),
+        "outcome": outcome(case, status, document),
+        "checks": [f"{each['member']} {each['check']}: {each['found']}" for each in findings],
+        "alignment": scene.get("alignment"),
+    }
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__, run, OUTCOMES, scenes=6)

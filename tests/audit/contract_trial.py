@@ -4,15 +4,10 @@
 
 draws as many scenes, rewrites their files in ways that the doctor is not told, asks it about each
 alone by four frames, and prints a table of verdicts. Each is kept in FOLDER/verdicts.jsonl.
-``--rendered ROOT`` spoils copies of scenes in the released layout beside those that are drawn.
+``--also ROOT`` spoils copies of scenes in the released layout beside those that are drawn.
 """
 
-import argparse
-import json
 import re
-import shutil
-import sys
-from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,13 +16,10 @@ import numpy as np
 
 from stereogenbench_data.audit.contract.doctor import diagnose
 from stereogenbench_data.audit.contract.verdict import Verdict, encoding_line
-from stereogenbench_data.synthesis import synthesise
-from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
+from stereogenbench_data.synthesis import ExportContract, SynthRequest
 from tests.audit.corruption import (
     as_inverse,
     as_ray,
-    copied,
-    edit_baseline,
     exchange,
     lagged,
     late,
@@ -36,10 +28,11 @@ from tests.audit.corruption import (
     rewrite_depth,
     rewrite_one_depth,
     rewrite_rgb,
+    scale_camera,
     scaled,
 )
+from tests.audit.trial import FAMILIES, drawn_scenes, main, run_cases
 
-FAMILIES = ("IPD_Gaussian", "Uniform", "Pairwise_Uniform")
 SENSORS_MM = ((23.76, 23.76), (36.0, 24.0), (22.3, 14.9), (13.2, 8.8))
 SIZES_PX = (96, 128, 160, 192, 256)
 QUOTIENT, KIND, FORM = "unit / (focal length x baseline)", "depth along", "stored is"
@@ -118,11 +111,11 @@ def _contract_cases(rng: np.random.Generator, *, frames: int) -> Iterator[Case]:
         )  # fmt: skip
     focal = float(rng.choice([0.95, 1.05]))
     yield Case(
-        "focal length wrong by 5 %", lambda f: _camera(f, focal_length_mm=focal),
+        "focal length wrong by 5 %", lambda f: scale_camera(f, focal_length_mm=focal),
         named=r"if unit and baselines are right", details=f"x {focal}", **quotient,
     )  # fmt: skip
     yield Case(
-        "sensor's height of 4:3", lambda f: _camera(f, sensor_height_mm=0.75),
+        "sensor's height of 4:3", lambda f: scale_camera(f, sensor_height_mm=0.75),
         hidden=True,
     )  # fmt: skip
     yield Case(
@@ -295,14 +288,6 @@ def _combined_cases(rng: np.random.Generator) -> Iterator[Case]:
         )  # fmt: skip
 
 
-def _camera(folder: Path, **factors: float) -> None:
-    def change(document: dict) -> None:
-        for name, factor in factors.items():
-            document["camera_intrinsics"][name] *= factor
-
-    edit_baseline(folder, change)
-
-
 def outcome(case: Case, verdict: Verdict) -> tuple[str, str]:
     """Return how good a verdict is, in a word, and why where it is wrong."""
     untouched = case.sort == "nothing"
@@ -327,27 +312,20 @@ def outcome(case: Case, verdict: Verdict) -> tuple[str, str]:
     return ("named" if any(re.search(case.named, w) for w in words) else "seen"), ""
 
 
-def run(root: Path, *, seed: int, count: int, rendered: Path | None) -> list[dict]:
+def run(root: Path, *, seed: int, count: int, also: Path | None) -> list[dict]:
     """Draw, spoil and ask; return one record a case."""
     rng = np.random.default_rng([seed, 1])
-    sources = list(rendered.glob("*/*/*/scene_*")) if rendered else []
-    for number, request in enumerate(drawn_requests(seed, count)):
-        place = root / f"drawn_{number}"
-        (key,) = synthesise(place, request, workers=1)
-        sources.append(place / key)
-    records = []
-    with (root / "verdicts.jsonl").open("w") as log:
-        for source in sources:
-            for case in cases(rng, frames=len(read_depth(source, 0)[0])):
-                spoilt = root / "spoilt"
-                shutil.rmtree(spoilt, ignore_errors=True)
-                case.corrupt(copied(source, spoilt))
-                report = diagnose(spoilt, frames=4, workers=1)
-                record = recorded(case, report.verdicts[0]) | {"scene": f"{source}"}
-                records.append(record)
-                log.write(json.dumps(record) + "\n")
-                log.flush()
-    return records
+    rendered = list(also.glob("*/*/*/scene_*")) if also else []
+
+    def examine(case: Case, spoilt: Path) -> dict:
+        return recorded(case, diagnose(spoilt, frames=4, workers=1).verdicts[0])
+
+    return run_cases(
+        root,
+        [*rendered, *drawn_scenes(root, drawn_requests(seed, count))],
+        cases_of=lambda scene: cases(rng, frames=len(read_depth(scene, 0)[0])),
+        examine=examine,
+    )
 
 
 def recorded(case: Case, verdict: Verdict) -> dict:
@@ -369,28 +347,5 @@ def recorded(case: Case, verdict: Verdict) -> dict:
     }
 
 
-def table(records: list[dict]) -> str:
-    """Return a row a sort of mistake: how many were named, seen, left open, or wrong."""
-    lines = ["| made wrong | " + " | ".join(OUTCOMES) + " |", "|---" * (len(OUTCOMES) + 1) + "|"]
-    for sort in dict.fromkeys(record["sort"] for record in records):
-        told = Counter(record["outcome"] for record in records if record["sort"] == sort)
-        lines.append(f"| {sort} | " + " | ".join(str(told[word] or "") for word in OUTCOMES) + " |")
-    return "\n".join(lines)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--scenes", type=int, default=12)
-    parser.add_argument("--rendered", type=Path)
-    options = parser.parse_args()
-    options.folder.mkdir(parents=True)
-    records = run(
-        options.folder, seed=options.seed, count=options.scenes, rendered=options.rendered
-    )
-    sys.stdout.write(table(records) + "\n")
-
-
 if __name__ == "__main__":
-    main()
+    main(__doc__, run, OUTCOMES, scenes=12)

@@ -70,6 +70,28 @@ def edit_baseline(folder: Path, change) -> None:
     path.write_text(json.dumps(document))
 
 
+def scale_camera(folder: Path, **factors: float) -> None:
+    """Multiply lengths of the camera that baseline.json records, by their names there."""
+
+    def change(document):
+        for name, factor in factors.items():
+            document["camera_intrinsics"][name] *= factor
+
+    edit_baseline(folder, change)
+
+
+def lengthen_label(folder: Path, cameras: tuple[int, int], *, by_cm: float) -> None:
+    """Make the recorded baseline of two cameras longer; the poses stay."""
+
+    def change(document):
+        for name in ("adjacent_pairs", "pairwise_pairs"):
+            for pair in document[name]:
+                if (pair["camera_index_a"], pair["camera_index_b"]) == cameras:
+                    pair["baseline_cm"] += by_cm
+
+    edit_baseline(folder, change)
+
+
 def place_cameras(folder: Path, factors: dict[int, float]) -> None:
     """Record cameras so many times as far from camera 0, in the poses and the baselines alike."""
     path = folder / "trajectory.json"

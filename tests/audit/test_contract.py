@@ -11,7 +11,7 @@ from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraFigure
 from stereogenbench_data.audit.contract.diagnosis import Rival, SceneDiagnosis
 from stereogenbench_data.audit.contract.doctor import diagnose
 from stereogenbench_data.audit.contract.fitting import RayPower
-from stereogenbench_data.audit.contract.hypotheses import LAGS, Structure
+from stereogenbench_data.audit.contract.hypotheses import LAGS, Hypothesis
 from stereogenbench_data.audit.contract.matching import match_rows, relative_step
 from stereogenbench_data.audit.contract.scoring import Evidence, interval, pooled
 from stereogenbench_data.audit.contract.verdict import (
@@ -19,7 +19,7 @@ from stereogenbench_data.audit.contract.verdict import (
     TOPICS,
     Unit,
     encoding_line,
-    grouped,
+    group_by_contract,
     judge,
     offset_words,
 )
@@ -40,6 +40,7 @@ from tests.audit.corruption import (
     rewrite_depth,
     rewrite_one_depth,
     rewrite_rgb,
+    scale_camera,
     scaled,
 )
 
@@ -124,13 +125,7 @@ def test_a_wrong_quotient_is_measured_and_no_unit_is_pasted(verdict_on, factor):
 
 
 def test_a_wrong_focal_length_is_not_called_a_wrong_unit(verdict_on):
-    def corrupt(folder):
-        def change(document):
-            document["camera_intrinsics"]["focal_length_mm"] *= 0.95
-
-        edit_baseline(folder, change)
-
-    verdict = verdict_on(corrupt)
+    verdict = verdict_on(lambda folder: scale_camera(folder, focal_length_mm=0.95))
 
     assert wrong_topics(verdict) == {QUOTIENT}
     assert answer(verdict, "metres a unit").status == "not seen alone"
@@ -168,7 +163,7 @@ FITTING = CameraCheck(tuple(CameraFigures(camera, 999, 0.9, 1.0, 0.0, 0.0) for c
 
 def diagnosed(**said):
     """A scene's diagnosis: the declared contract holds, and no other answer was tested."""
-    planar = Structure()
+    planar = Hypothesis()
     basics = {
         "key": "scene", "views": 1, "pairs": ((0, 1),), "matches": 999, "textured": 999,
         "unit_m": UNIT_M, "unit_source": "tag", "focal_ratios": {}, "recorded_pair": None,
@@ -204,7 +199,7 @@ def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
 @pytest.mark.parametrize("question", TOPICS)
 @pytest.mark.parametrize("behind_db", [math.nan, 0.01, 9.0])
 def test_an_answer_is_confirmed_only_where_all_others_were_tested_and_lost(question, behind_db):
-    others = [getattr(each, question) for each in Structure().alternatives(question)]
+    others = [getattr(each, question) for each in Hypothesis().alternatives(question)]
     lost, last = Evidence(9.0, 0.1), Evidence(behind_db, 0.1)
     # Of lags, the next one.
     different = others.index(1) if question == "frame_lag" else len(others) - 1
@@ -236,7 +231,7 @@ def test_a_lag_whose_neighbours_no_frame_could_test_is_left_open(best, tested, s
         if lag != best
     )
 
-    lag = answer(judged(best=Structure(frame_lag=best), rivals=rivals), "frame lag")
+    lag = answer(judged(best=Hypothesis(frame_lag=best), rivals=rivals), "frame lag")
 
     assert (lag.status, lag.found) == (status, found)
     assert ("not tested" in lag.note) == (len(tested) < len(LAGS) - 1)
@@ -334,9 +329,9 @@ def test_confirmed_never_stands_beside_an_interval_that_reaches_the_margin(scene
 def test_nothing_is_pasted_and_nothing_fits_while_a_camera_does_not(check, words):
     rivals = (Rival("kind", "planar", Evidence(9.0, 0.1)),)
     verdict = judged(
-        best=Structure(kind="ray"), gain=Evidence(9.0, 0.1), rivals=rivals, check=check
+        best=Hypothesis(kind="ray"), gain=Evidence(9.0, 0.1), rivals=rivals, check=check
     )
-    sound = judged(best=Structure(kind="ray"), gain=Evidence(9.0, 0.1), rivals=rivals)
+    sound = judged(best=Hypothesis(kind="ray"), gain=Evidence(9.0, 0.1), rivals=rivals)
 
     assert sound.encoding == DepthEncoding(kind="ray")
     assert verdict.encoding is None
@@ -349,7 +344,7 @@ def test_a_scene_with_a_faulty_camera_gets_a_verdict_of_its_own():
     faulty = replace(FITTING, faults=("depth of camera 2 is 0.5 x that of the others",))
     scenes = [diagnosed(key="a"), diagnosed(key="b", check=faulty), diagnosed(key="c")]
 
-    groups = grouped(scenes)
+    groups = group_by_contract(scenes)
 
     assert sorted([scene.key for scene in group] for group in groups) == [["a", "c"], ["b"]]
 
@@ -376,9 +371,9 @@ def test_a_shifted_picture_is_not_told_from_depth_of_the_other_camera():
     swapped = "depth of cameras 0 and 1 exchanged"
     rivals = tuple(
         Rival("order", each.order, Evidence(9.0, 0.1))
-        for each in Structure(order=swapped).alternatives("order")
+        for each in Hypothesis(order=swapped).alternatives("order")
     )
-    said = {"best": Structure(order=swapped), "rivals": rivals, "gain": Evidence(9.0, 0.1)}
+    said = {"best": Hypothesis(order=swapped), "rivals": rivals, "gain": Evidence(9.0, 0.1)}
 
     alone = judged(**said)
     shifted = judged(**said, changed="offset", offsets_px={(0, 1): -3.0, (1, 2): 0.0})
@@ -757,7 +752,7 @@ def test_matching_finds_a_shift_of_either_sign_to_a_part_of_a_pixel():
         np.testing.assert_allclose(matches.disparity_px, shift_px, atol=0.2)
 
 
-@pytest.mark.parametrize("order", Structure().alternatives("order"), ids=lambda s: s.order)
+@pytest.mark.parametrize("order", Hypothesis().alternatives("order"), ids=lambda s: s.order)
 def test_an_exchange_of_files_pairs_each_picture_with_the_depth_of_its_camera(order):
     for file in range(6):
         camera = order.camera_of(file, content="rgb")
@@ -768,7 +763,7 @@ def test_an_exchange_of_files_pairs_each_picture_with_the_depth_of_its_camera(or
 
 
 def test_every_exchange_of_two_cameras_is_asked_about():
-    orders = {order.order for order in Structure().alternatives("order")}
+    orders = {order.order for order in Hypothesis().alternatives("order")}
 
     for a, b in CAMERA_PAIRS:
         for words in ("cameras", "pictures of cameras", "depth of cameras"):

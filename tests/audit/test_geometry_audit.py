@@ -26,9 +26,13 @@ from tests.audit.corruption import (
     copied,
     edit_baseline,
     exchange,
+    lengthen_label,
     read_depth,
     rewrite_depth,
+    rewrite_one_depth,
     rewrite_rgb,
+    scale_camera,
+    scaled,
     write_depth,
 )
 
@@ -172,11 +176,7 @@ def one_view_twice(folder):
 
 
 def changed_depth(camera, change):
-    def rewrite(folder):
-        units, tags = read_depth(folder, camera)
-        write_depth(folder, camera, change(units), tags)
-
-    return rewrite
+    return lambda folder: rewrite_one_depth(folder, camera, change)
 
 
 def higher_pictures(folder):
@@ -191,19 +191,12 @@ def reversed_pictures(folder):
     rewrite_rgb(folder, 4, lambda pictures: pictures[::-1])
 
 
-def scaled(units):
-    return np.where(units < 65535, np.minimum(np.rint(units * 1.02), 65534), units)
-
-
 def along_the_ray(folder):
     rewrite_depth(folder, as_ray(folder))
 
 
 def lower_sensor(folder):
-    def change(document):
-        document["camera_intrinsics"]["sensor_height_mm"] *= 3 / 4
-
-    edit_baseline(folder, change)
+    scale_camera(folder, sensor_height_mm=3 / 4)
 
 
 def without_depth(units):
@@ -226,13 +219,7 @@ def rounded(folder):
 
 
 def longer_baseline(folder):
-    def change(document):
-        for pairs in ("adjacent_pairs", "pairwise_pairs"):
-            for pair in document[pairs]:
-                if (pair["camera_index_a"], pair["camera_index_b"]) == (2, 3):
-                    pair["baseline_cm"] += 0.05
-
-    edit_baseline(folder, change)
+    lengthen_label(folder, (2, 3), by_cm=0.05)
 
 
 def focal_in_pixels(folder):
@@ -272,7 +259,7 @@ def contradicting(folder):
          "pictures of camera 4, taken to "),
         (changed_depth(0, lambda units: np.roll(units, 1, 2)), "cam_00_depth.mkv", "depth fit",
          "depth of camera 0 is +"),
-        (changed_depth(4, scaled), "cam_04_depth.mkv", "depth fit",
+        (changed_depth(4, scaled(1.02)), "cam_04_depth.mkv", "depth fit",
          "camera 4 differs from that of the others by +1.9"),
         (along_the_ray, "", "depth fit", "depth of all cameras is 99% of the way"),
         (lower_sensor, "", "motion fit", "the vertical focal length (sensor height)"),

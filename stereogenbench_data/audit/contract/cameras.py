@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from stereogenbench_data.audit.contract.fitting import voted_scale
-from stereogenbench_data.audit.contract.hypotheses import Question, Structure
-from stereogenbench_data.audit.contract.matching import Luma, SceneFrames, Shot, match_rows
-from stereogenbench_data.audit.contract.scoring import Pair, Scored, sampled
+from stereogenbench_data.audit.contract.hypotheses import Hypothesis, Question
+from stereogenbench_data.audit.contract.matching import FrameMatch, Luma, SceneFrames, match_rows
+from stereogenbench_data.audit.contract.scoring import Pair, ScoredContract, sample_along_rows
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 LEAST_SHARE: Final = 0.5
@@ -87,8 +87,8 @@ class CameraCheck:
         """Share of the matches of neighbouring cameras that is explained; nan where untested."""
         tested = [figures for figures in self.cameras if figures.is_tested]
         count = sum(figures.matches for figures in tested)
-        told = sum(figures.matches * figures.agreement for figures in tested)
-        return told / count if count else math.nan
+        explained = sum(figures.matches * figures.agreement for figures in tested)
+        return explained / count if count else math.nan
 
     @property
     def untested(self) -> tuple[int, ...]:
@@ -131,16 +131,21 @@ class CameraComparison:
     """A scene's cameras at one contract."""
 
     def __init__(
-        self, views: SceneFrames, shots: Sequence[Shot], contract: Scored, *, depth_step: float
+        self,
+        views: SceneFrames,
+        frame_matches: Sequence[FrameMatch],
+        contract: ScoredContract,
+        *,
+        depth_step: float,
     ) -> None:
-        """Take shots from both sides by turns, and a contract with its scale fitted."""
+        """Take frame matches from both sides by turns, and a contract with its scale fitted."""
         self._views = views
-        self._shots = shots
+        self._frame_matches = frame_matches
         self._contract = contract
         self._depth_step = depth_step
         self._most_log_scale = max(MOST_LOG_SCALE, depth_step / 4)
-        self._partner: dict[int, Shot] = {}
-        for here, there in zip(shots[::2], shots[1::2], strict=True):
+        self._partner: dict[int, FrameMatch] = {}
+        for here, there in zip(frame_matches[::2], frame_matches[1::2], strict=True):
             self._partner |= {id(here): there, id(there): here}
         self._pairs = {beside.pair: beside for beside in self._besides()}
 
@@ -161,10 +166,10 @@ class CameraComparison:
         for camera in range(CAMERA_COUNT):
             nearest = self._of(camera)[:_NARROWEST]
             count = sum(beside.count for beside in nearest)
-            told = sum(beside.count * beside.near[camera] for beside in nearest)
+            explained = sum(beside.count * beside.near[camera] for beside in nearest)
             figures.append(
                 CameraFigures(
-                    camera, count, told / count if count else math.nan,
+                    camera, count, explained / count if count else math.nan,
                     scales[camera], rows_px[camera], columns_px[camera],
                 )
             )  # fmt: skip
@@ -178,20 +183,20 @@ class CameraComparison:
         return CameraCheck(tuple(figures), tuple(found))
 
     def _besides(self) -> Iterator[_Beside]:
-        grouped: dict[Pair, list[tuple[Shot, Shot]]] = {}
-        for here, there in zip(self._shots[::2], self._shots[1::2], strict=True):
-            grouped.setdefault(here.pair, []).append((here, there))
-        for pair, both in grouped.items():
+        by_pair: dict[Pair, list[tuple[FrameMatch, FrameMatch]]] = {}
+        for here, there in zip(self._frame_matches[::2], self._frame_matches[1::2], strict=True):
+            by_pair.setdefault(here.pair, []).append((here, there))
+        for pair, both in by_pair.items():
             found = self._beside(pair, both)
             if found is not None:
                 yield found
 
-    def _beside(self, pair: Pair, both: Sequence[tuple[Shot, Shot]]) -> _Beside | None:
+    def _beside(self, pair: Pair, both: Sequence[tuple[FrameMatch, FrameMatch]]) -> _Beside | None:
         parts = []
-        structure, scale = self._contract.structure, self._contract.scale
+        hypothesis, scale = self._contract.hypothesis, self._contract.scale
         for here, there in both:
-            mine = self._views.predicted(here, structure)
-            theirs = self._views.predicted(there, structure)
+            mine = self._views.predicted(here, hypothesis)
+            theirs = self._views.predicted(there, hypothesis)
             if mine is None or theirs is None:
                 continue
             known = mine[1] & theirs[1]
@@ -221,7 +226,7 @@ class CameraComparison:
         log_scale, _ = _median(np.log(np.maximum(found[agreed][wide] / predicted[wide], 1e-3)))
         return _Beside(
             pair=pair,
-            width_m=abs(self._views.baseline_m(both[0][0], structure)),
+            width_m=abs(self._views.baseline_m(both[0][0], hypothesis)),
             count=len(found),
             near={pair[0]: float(near[0].mean()), pair[1]: float(near[1].mean())},
             log_ratio=log_ratio,
@@ -289,8 +294,12 @@ class CameraComparison:
         own = self._of(camera)
         neighbour = next((beside for beside in own if not set(beside.pair) & behind), own[0])
         (other,) = set(neighbour.pair) - {camera}
-        shots = [shot for shot in self._shots if (shot.left, shot.right) == (other, camera)]
-        middle = shots[len(shots) // 2]
+        frame_matches = [
+            frame_match
+            for frame_match in self._frame_matches
+            if (frame_match.left, frame_match.right) == (other, camera)
+        ]
+        middle = frame_matches[len(frame_matches) // 2]
         frames = self._views.scene.frames
         now = self._share([(middle, self._band(middle.frame, camera))])
         readings = [
@@ -302,14 +311,20 @@ class CameraComparison:
             band = np.roll(self._band(middle.frame, camera), -rows, axis=0)
             readings.append((self._share([(middle, band)]), ""))
         for lag in range(-_FARTHEST_FRAMES, _FARTHEST_FRAMES + 1):
-            usable = [shot for shot in shots if 0 <= shot.frame + lag < frames]
+            usable = [
+                frame_match
+                for frame_match in frame_matches
+                if 0 <= frame_match.frame + lag < frames
+            ]
             if lag and usable:
-                shot = min(usable, key=lambda each: abs(each.frame - middle.frame))
-                share = self._share([(shot, self._band(shot.frame + lag, camera))])
+                frame_match = min(usable, key=lambda each: abs(each.frame - middle.frame))
+                share = self._share([(frame_match, self._band(frame_match.frame + lag, camera))])
                 many = "s" if abs(lag) > 1 else ""
                 word = "late" if lag > 0 else "early"
                 readings.append((share, f"{abs(lag)} frame{many} {word}"))
-        everywhere = [each for each in self._shots if (each.left, each.right) == (other, camera)]
+        everywhere = [
+            each for each in self._frame_matches if (each.left, each.right) == (other, camera)
+        ]
         share, words = max(readings, default=(0.0, ""))
         elsewhere = self._share_elsewhere(everywhere)
         # Where disparities are small another place explains what is wrong with rows as well.
@@ -329,14 +344,14 @@ class CameraComparison:
             return f"camera {camera} {words}"
         return f"pictures of camera {camera} are {words}" if words else row_fault or ""
 
-    def _share_elsewhere(self, shots: Sequence[Shot]) -> float:
+    def _share_elsewhere(self, frame_matches: Sequence[FrameMatch]) -> float:
         """Return the share of matches that depth explains if the two stand otherwise apart."""
         found, predicted = [], []
-        for shot in shots:
-            told = self._views.predicted(shot, self._contract.structure)
-            if told is not None:
-                found.append(shot.matched_px[told[1]])
-                predicted.append(told[0][told[1]])
+        for frame_match in frame_matches:
+            prediction = self._views.predicted(frame_match, self._contract.hypothesis)
+            if prediction is not None:
+                found.append(frame_match.matched_px[prediction[1]])
+                predicted.append(prediction[0][prediction[1]])
         if not sum(map(len, found)):
             return 0.0
         found_px, predicted_px = np.concatenate(found), np.concatenate(predicted)
@@ -345,27 +360,29 @@ class CameraComparison:
             voted_scale(found_px, sign * predicted_px) * sign * predicted_px - found_px
             for sign in (1, -1)
         ]
-        return max(float((np.abs(away) < shots[0].grain_px).mean()) for away in aways)
+        return max(float((np.abs(away) < frame_matches[0].grain_px).mean()) for away in aways)
 
     def _band(self, frame: int, camera: int) -> Luma:
         return self._views.band(frame, camera)
 
-    def _share(self, shots: Sequence[tuple[Shot, Luma]]) -> float:
+    def _share(self, frame_matches: Sequence[tuple[FrameMatch, Luma]]) -> float:
         """Return the share of matches with other right pictures that depth explains."""
         near, count = 0, 0
-        structure = self._contract.structure
-        for shot, right in shots:
-            matches = match_rows(self._views.band(shot.frame, shot.left), right)
-            file = structure.depth_file(shot.left)
-            frame = min(max(shot.frame + structure.frame_lag, 0), self._views.scene.frames - 1)
+        hypothesis = self._contract.hypothesis
+        for frame_match, right in frame_matches:
+            found = match_rows(self._views.band(frame_match.frame, frame_match.left), right)
+            file = hypothesis.depth_file(frame_match.left)
+            frame = min(
+                max(frame_match.frame + hypothesis.frame_lag, 0), self._views.scene.frames - 1
+            )
             units, known = self._views.depth(frame, file)
-            place = matches.rows, matches.columns
+            place = found.rows, found.columns
             number = np.where(known[place], units[place], 1).astype(np.float64)
             predicted = self._contract.scale * self._views.disparity_of(
-                number, shot, structure, place=place, file=file
+                number, frame_match, hypothesis, place=place, file=file
             )
-            near += int((np.abs(predicted - matches.disparity_px) < matches.grain_px).sum())
-            count += len(matches.rows)
+            near += int((np.abs(predicted - found.disparity_px) < found.grain_px).sum())
+            count += len(found.rows)
         return near / count if count else 0.0
 
     def _depth_faults(
@@ -411,31 +428,33 @@ class CameraComparison:
 
     def _better_depth(self, camera: int, *, scale: float) -> str:
         """Return another reading of one camera's depth that explains clearly more, in words."""
-        structure = self._contract.structure
-        shots = [shot for shot in self._shots if shot.left == camera]
-        now = self._shares(shots, structure)
+        hypothesis = self._contract.hypothesis
+        frame_matches = [
+            frame_match for frame_match in self._frame_matches if frame_match.left == camera
+        ]
+        now = self._shares(frame_matches, hypothesis)
         subject = f"depth of camera {camera}"
-        lagged: dict[str, Structure] = {}
-        readings: list[tuple[str, Float64[np.ndarray, " shots"]]] = [
+        lagged: dict[str, Hypothesis] = {}
+        readings: list[tuple[str, Float64[np.ndarray, " matches"]]] = [
             (
                 f"{subject} is {scale:.4g} x that of the others",
-                self._shares(shots, structure, factor=scale),
+                self._shares(frame_matches, hypothesis, factor=scale),
             )
         ]
         for question in _READINGS:
-            for other in structure.alternatives(question):
+            for other in hypothesis.alternatives(question):
                 words = _READINGS[question].format(getattr(other, question))
-                factor = self._own_factor(shots, other) if question == "form" else 1.0
+                factor = self._own_factor(frame_matches, other) if question == "form" else 1.0
                 words = f"{subject} fits better {words}"
                 if question == "frame_lag":
                     lagged[words] = other
-                readings.append((words, self._shares(shots, other, factor=factor)))
+                readings.append((words, self._shares(frame_matches, other, factor=factor)))
         for file in range(CAMERA_COUNT):
-            if file != structure.depth_file(camera):
+            if file != hypothesis.depth_file(camera):
                 readings.append(
                     (
                         f"{subject} fits worse than that of file {file} does in its place",
-                        self._shares(shots, structure, file=file),
+                        self._shares(frame_matches, hypothesis, file=file),
                     )
                 )
         best, most = "", 0.0
@@ -448,64 +467,71 @@ class CameraComparison:
             return f"pictures of camera {camera} are {self._lateness(lagged[best])}"
         return best
 
-    def _lateness(self, lagged: Structure) -> str:
-        lag = self._contract.structure.frame_lag - lagged.frame_lag
+    def _lateness(self, lagged: Hypothesis) -> str:
+        lag = self._contract.hypothesis.frame_lag - lagged.frame_lag
         return f"{abs(lag)} frame{'s' if abs(lag) > 1 else ''} {'late' if lag > 0 else 'early'}"
 
-    def _is_late(self, camera: int, lagged: Structure) -> bool:
+    def _is_late(self, camera: int, lagged: Hypothesis) -> bool:
         """Tell whether it is a camera's pictures that lag rather than its depth.
 
         Depth before its time fits pictures that are late. If they are, then a later picture fits
         the depth of the neighbours better.
         """
-        lag = self._contract.structure.frame_lag - lagged.frame_lag
+        lag = self._contract.hypothesis.frame_lag - lagged.frame_lag
         (neighbour,) = set(self._of(camera)[0].pair) - {camera}
-        shots = [
-            shot
-            for shot in self._shots
-            if (shot.left, shot.right) == (neighbour, camera)
-            and 0 <= shot.frame + lag < self._views.scene.frames
+        frame_matches = [
+            frame_match
+            for frame_match in self._frame_matches
+            if (frame_match.left, frame_match.right) == (neighbour, camera)
+            and 0 <= frame_match.frame + lag < self._views.scene.frames
         ]
         now, then = (
-            self._share([(shot, self._band(shot.frame + by, camera)) for shot in shots])
+            self._share(
+                [
+                    (frame_match, self._band(frame_match.frame + by, camera))
+                    for frame_match in frame_matches
+                ]
+            )
             for by in (0, lag)
         )
         return then > now + _LEAST_LATER
 
-    def _own_factor(self, shots: Sequence[Shot], structure: Structure) -> float:
+    def _own_factor(self, frame_matches: Sequence[FrameMatch], hypothesis: Hypothesis) -> float:
         """Return the factor that most of a camera's matches agree on."""
         ratios = []
-        for shot in shots:
-            predicted = self._views.predicted(shot, structure)
+        for frame_match in frame_matches:
+            predicted = self._views.predicted(frame_match, hypothesis)
             if predicted is not None:
                 disparity_px, known = predicted
-                ratio = shot.matched_px[known] / (self._contract.scale * disparity_px[known])
+                ratio = frame_match.matched_px[known] / (self._contract.scale * disparity_px[known])
                 ratios.append(ratio[ratio > 0])
-        told = np.concatenate(ratios) if ratios else np.ones(1)
-        return math.exp(float(np.median(np.log(told)))) if len(told) else 1.0
+        positive = np.concatenate(ratios) if ratios else np.ones(1)
+        return math.exp(float(np.median(np.log(positive)))) if len(positive) else 1.0
 
     def _shares(
         self,
-        shots: Sequence[Shot],
-        structure: Structure,
+        frame_matches: Sequence[FrameMatch],
+        hypothesis: Hypothesis,
         *,
         file: int | None = None,
         factor: float = 1.0,
-    ) -> Float64[np.ndarray, " shots"]:
-        """Return at what share of each shot's matches a reading agrees with the other's depth.
+    ) -> Float64[np.ndarray, " matches"]:
+        """Return the share of each frame match at which a reading agrees with the other's depth.
 
         Depth agrees more sharply with depth than with matches, some of which are wrong. ``factor``
         is what depth is divided by, in that disparity is multiplied.
         """
-        shares = np.full(len(shots), np.nan)
-        for place, shot in enumerate(shots):
-            predicted = self._views.predicted(shot, structure, depth_file=file)
-            other = self._views.predicted(self._partner[id(shot)], self._contract.structure)
+        shares = np.full(len(frame_matches), np.nan)
+        for place, frame_match in enumerate(frame_matches):
+            predicted = self._views.predicted(frame_match, hypothesis, depth_file=file)
+            other = self._views.predicted(self._partner[id(frame_match)], self._contract.hypothesis)
             if predicted is not None and other is not None:
                 known = predicted[1] & other[1]
                 expected_px = -self._contract.scale * other[0][known]
                 away = self._contract.scale * factor * predicted[0][known] - expected_px
-                allowed = _LEAST_AWAY * shot.grain_px + 2 * self._depth_step * np.abs(expected_px)
+                allowed = _LEAST_AWAY * frame_match.grain_px + 2 * self._depth_step * np.abs(
+                    expected_px
+                )
                 shares[place] = float((np.abs(away) < allowed).mean()) if known.any() else np.nan
         return shares
 
@@ -514,16 +540,16 @@ class CameraComparison:
 
         The others' distances are taken for right.
         """
-        told = {
+        wide = {
             pair: beside for pair, beside in self._pairs.items()
             if beside.rms_px > 2.0 and beside.share >= LEAST_SHARE
         }  # fmt: skip
-        if len(told) < _MAJORITY or self._contract.offsets_px:
+        if len(wide) < _MAJORITY or self._contract.offsets_px:
             return []
-        middle = float(np.median([beside.log_scale for beside in told.values()]))
+        middle = float(np.median([beside.log_scale for beside in wide.values()]))
         off = {
             pair: beside.log_scale - middle
-            for pair, beside in told.items()
+            for pair, beside in wide.items()
             if abs(beside.log_scale - middle) > max(0.01, 0.25 / beside.rms_px)
         }
         if not off:
@@ -550,23 +576,26 @@ _READINGS: Final[dict[Question, str]] = {
 
 
 def row_terms(
-    views: SceneFrames, shot: Shot
+    views: SceneFrames, frame_match: FrameMatch
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Return how far lower the left picture lies at each match: numerator and denominator.
 
     One step of Lucas and Kanade along the column, over five rows, at the disparity that was found.
     """
-    left, right = views.band(shot.frame, shot.left), views.band(shot.frame, shot.right)
-    place = shot.columns - shot.matched_px
+    left, right = (
+        views.band(frame_match.frame, frame_match.left),
+        views.band(frame_match.frame, frame_match.right),
+    )
+    place = frame_match.columns - frame_match.matched_px
     numerator, denominator = np.zeros(len(place)), np.zeros(len(place))
     for beside in range(-_ROWS_BESIDE, _ROWS_BESIDE + 1):
-        rows = np.clip(shot.rows + beside, 1, len(left) - 2)
-        there, _, inside = sampled(right, rows, place)
-        above, _, _ = sampled(right, rows - 1, place)
-        below, _, _ = sampled(right, rows + 1, place)
-        own = (left[rows + 1, shot.columns] - left[rows - 1, shot.columns]) / 2
+        rows = np.clip(frame_match.rows + beside, 1, len(left) - 2)
+        there, inside = sample_along_rows(right, rows, place)
+        above, _ = sample_along_rows(right, rows - 1, place)
+        below, _ = sample_along_rows(right, rows + 1, place)
+        own = (left[rows + 1, frame_match.columns] - left[rows - 1, frame_match.columns]) / 2
         slope = ((below - above) / 2 + own) / 2
-        numerator += np.where(inside, slope * (there - left[rows, shot.columns]), 0)
+        numerator += np.where(inside, slope * (there - left[rows, frame_match.columns]), 0)
         denominator += np.where(inside, slope * slope, 0)
     return numerator, denominator
 

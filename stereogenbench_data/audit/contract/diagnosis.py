@@ -1,7 +1,8 @@
 """One scene's diagnosis: the declared contract, changed as little as the pictures ask.
 
 `Search` fits each hypothesis once and takes the contract with the fewest changes that no further
-change clearly improves; `diagnose_scene` says what that one explains and what it leaves open.
+change clearly improves. `diagnose_scene` reports what that contract explains and what it leaves
+open.
 """
 
 import math
@@ -13,20 +14,25 @@ from stereogenbench_data.audit.contract.cameras import CameraCheck, CameraCompar
 from stereogenbench_data.audit.contract.fitting import (
     Free,
     RayPower,
-    fitted,
+    fit_hypothesis,
     ray_power,
     voted_agreement,
 )
-from stereogenbench_data.audit.contract.hypotheses import QUESTIONS, Question, Structure
-from stereogenbench_data.audit.contract.matching import SceneFrames, Shot, disparity_px, spread_px
+from stereogenbench_data.audit.contract.hypotheses import QUESTIONS, Hypothesis, Question
+from stereogenbench_data.audit.contract.matching import (
+    FrameMatch,
+    SceneFrames,
+    disparity_px,
+    spread_px,
+)
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
     Evidence,
     Pair,
-    Scored,
+    ScoredContract,
     agreement,
     evidence,
-    scored,
+    score_hypothesis,
 )
 from stereogenbench_data.schema.records import Rig, Scene
 
@@ -82,7 +88,7 @@ class SceneDiagnosis:
         spread_px: Root mean square of the same, less the mean of each view.
         depth_step: How far apart neighbouring stored depths lie, as a share.
         check: What the best contract leaves to explain, camera by camera.
-        problem: Why nothing could be told; empty where something could.
+        problem: Why the scene could not be judged; empty where it could.
     """
 
     key: str
@@ -94,8 +100,8 @@ class SceneDiagnosis:
     unit_source: str
     focal_ratios: dict[str, float]
     recorded_pair: Pair | None
-    declared: Structure
-    best: Structure
+    declared: Hypothesis
+    best: Hypothesis
     changed: Free = "nothing"
     scale: float = 1.0
     scale_error: float = math.inf
@@ -105,7 +111,7 @@ class SceneDiagnosis:
     parallax: Evidence = _NOTHING
     agreement: float = math.nan
     rivals: tuple[Rival, ...] = ()
-    equals: tuple[tuple[Structure, Free, float], ...] = ()
+    equals: tuple[tuple[Hypothesis, Free, float], ...] = ()
     disparity_px: float = math.inf
     spread_px: float = math.inf
     depth_step: float = 0.0
@@ -131,11 +137,12 @@ def focal_ratios(rig: Rig) -> dict[str, float]:
         "f / sensor height * picture width": by_sensor,
         "f / sensor width * picture height": by_pixels,
     }
-    told: dict[str, float] = {}
+    distinct: dict[str, float] = {}
     for words, ratio in readings.items():
-        if all(abs(math.log(ratio / other)) > LEAST_LOG_SCALE for other in (1.0, *told.values())):
-            told[words] = ratio
-    return told
+        known = (1.0, *distinct.values())
+        if all(abs(math.log(ratio / other)) > LEAST_LOG_SCALE for other in known):
+            distinct[words] = ratio
+    return distinct
 
 
 def crossed_pair(scene: Scene) -> Pair | None:
@@ -145,10 +152,10 @@ def crossed_pair(scene: Scene) -> Pair | None:
 
 
 _COARSEST_STEP: Final = 0.5
-"""With depths further apart, as a share, nothing is told."""
+"""A scene whose stored depths are further apart, as a share, is not judged."""
 _LEAST_SCALE_DB: Final = 0.02
 _SCALE_ERRORS: Final = 1.5
-"""Less is asked of the score of a scale, which has an error of its own to be judged by."""
+"""A scale has an error of its own to be judged by, so its score has to prove less."""
 _MOST_CHANGES: Final = 4
 _PROMISING: Final = 4
 """Of the exchanges of cameras so many are tried with a scale of their own."""
@@ -166,47 +173,57 @@ class _Candidate:
     """A contract in the search: how much of it is fitted, and its score."""
 
     free: Free
-    score: Scored
+    score: ScoredContract
 
     @property
-    def structure(self) -> Structure:
-        return self.score.structure
+    def hypothesis(self) -> Hypothesis:
+        return self.score.hypothesis
 
 
 class Search:
     """Contracts of one scene, each fitted once."""
 
     def __init__(
-        self, views: SceneFrames, shots: Sequence[Shot], *, least_log_scale: float = LEAST_LOG_SCALE
+        self,
+        views: SceneFrames,
+        frame_matches: Sequence[FrameMatch],
+        *,
+        least_log_scale: float = LEAST_LOG_SCALE,
     ) -> None:
         """Take what the contracts are judged by, and how far off a unit may be."""
         self._views = views
         self._least_log_scale = least_log_scale
-        self._every = shots
-        near = views.neighbours(Structure())
+        self._every = frame_matches
+        near = views.neighbours(Hypothesis())
         # Those next but one are for the comparison of cameras.
-        self._shots = [shot for shot in shots if shot.pair in near] or list(shots)
-        self._bias = BIAS_PX / max(disparity_px(shots), 1e-6)
-        self._bias_beside_offset = BIAS_PX / max(spread_px(shots), 1e-6)
-        self._fitted: dict[tuple[Structure, Free], _Candidate] = {}
-        self._likely: dict[Structure, tuple[Structure, ...]] = {}
-        self._powers: dict[tuple[Structure, Free], RayPower] = {}
-        self.declared = self.candidate(Structure.declared(views.encoding), free="nothing")
+        self._frame_matches = [
+            frame_match for frame_match in frame_matches if frame_match.pair in near
+        ] or list(frame_matches)
+        self._bias = BIAS_PX / max(disparity_px(frame_matches), 1e-6)
+        self._bias_beside_offset = BIAS_PX / max(spread_px(frame_matches), 1e-6)
+        self._fitted: dict[tuple[Hypothesis, Free], _Candidate] = {}
+        self._likely: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
+        self._powers: dict[tuple[Hypothesis, Free], RayPower] = {}
+        self.declared = self.candidate(Hypothesis.declared(views.encoding), free="nothing")
 
-    def candidate(self, structure: Structure, *, free: Free) -> _Candidate:
+    def candidate(self, hypothesis: Hypothesis, *, free: Free) -> _Candidate:
         """Return a contract, fitted."""
-        if (structure, free) not in self._fitted:
-            score = fitted(self._views, self._shots, structure, free=free)
-            self._fitted[structure, free] = _Candidate(free, score)
-        return self._fitted[structure, free]
+        if (hypothesis, free) not in self._fitted:
+            score = fit_hypothesis(self._views, self._frame_matches, hypothesis, free=free)
+            self._fitted[hypothesis, free] = _Candidate(free, score)
+        return self._fitted[hypothesis, free]
 
-    def _at(self, structure: Structure, other: _Candidate) -> _Candidate:
-        """Return a structure with the scale and the offsets of another contract."""
+    def _at(self, hypothesis: Hypothesis, other: _Candidate) -> _Candidate:
+        """Return a hypothesis with the scale and the offsets of another contract."""
         score = other.score
         return _Candidate(
             other.free,
-            scored(
-                self._views, self._shots, structure, scale=score.scale, offsets_px=score.offsets_px
+            score_hypothesis(
+                self._views,
+                self._frame_matches,
+                hypothesis,
+                scale=score.scale,
+                offsets_px=score.offsets_px,
             ),
         )
 
@@ -229,9 +246,9 @@ class Search:
 
         A scale makes up for most of the difference, so that the search may have taken one instead.
         """
-        (other,) = current.structure.alternatives("kind")
+        (other,) = current.hypothesis.alternatives("kind")
         free = _freed(current.free, "scale")
-        mine, theirs = (self.candidate(each, free=free) for each in (current.structure, other))
+        mine, theirs = (self.candidate(each, free=free) for each in (current.hypothesis, other))
         # What is further off than a ray is longer than its depth has another scale altogether.
         most = math.log(float(self._views.ray_per_planar.max())) + self._least_log_scale
         if abs(math.log(mine.score.scale / current.score.scale)) > most:
@@ -241,16 +258,16 @@ class Search:
     def _one_change(self, current: _Candidate) -> Iterator[_Candidate]:
         """Yield contracts that change one answer, or let one length be fitted."""
         for question in QUESTIONS:
-            others = current.structure.alternatives(question)
+            others = current.hypothesis.alternatives(question)
             if question == "order" and current.free != "nothing":
-                others = self._promising(current.structure)
-            for structure in others:
+                others = self._promising(current.hypothesis)
+            for hypothesis in others:
                 free = _freed(current.free, "scale") if question == "form" else current.free
-                yield self.candidate(structure, free=free)
+                yield self.candidate(hypothesis, free=free)
         for length in ("scale", "offset"):
             free = _freed(current.free, length)
             if free != current.free:
-                yield self.candidate(current.structure, free=free)
+                yield self.candidate(current.hypothesis, free=free)
 
     def _two_changes(self, current: _Candidate) -> Iterator[_Candidate]:
         """Yield contracts that change one answer and the scale, or scale and offset."""
@@ -258,19 +275,23 @@ class Search:
         if free != current.free:
             for question in QUESTIONS:
                 others = (
-                    self._promising(current.structure)
+                    self._promising(current.hypothesis)
                     if question == "order"
-                    else current.structure.alternatives(question)
+                    else current.hypothesis.alternatives(question)
                 )
-                for structure in others:
-                    yield self.candidate(structure, free=free)
-            yield self.candidate(current.structure, free="both")
+                for hypothesis in others:
+                    yield self.candidate(hypothesis, free=free)
+            yield self.candidate(current.hypothesis, free="both")
 
-    def _promising(self, current: Structure) -> tuple[Structure, ...]:
+    def _promising(self, current: Hypothesis) -> tuple[Hypothesis, ...]:
         """Return the orders that explain most matches, whatever the scale."""
         if current not in self._likely:
             orders = current.alternatives("order")
-            few = [shot for shot in self._shots if shot.frame == self._shots[0].frame]
+            few = [
+                frame_match
+                for frame_match in self._frame_matches
+                if frame_match.frame == self._frame_matches[0].frame
+            ]
             shares = {order: voted_agreement(self._views, few, order) for order in orders}
             best = sorted(orders, key=lambda order: -shares[order])[:_PROMISING]
             self._likely[current] = tuple(best)
@@ -295,113 +316,115 @@ class Search:
         return current
 
     def _simpler(self, current: _Candidate) -> Iterator[_Candidate]:
-        declared = self.declared.structure
+        declared = self.declared.hypothesis
         fixed: dict[Free, tuple[Free, ...]] = {
             "scale": ("nothing",), "offset": ("nothing",), "both": ("scale", "offset"),
             "nothing": (),
         }  # fmt: skip
-        for question in current.structure.changes_from(declared):
-            back = current.structure.changed(question, getattr(declared, question))
+        for question in current.hypothesis.changes_from(declared):
+            back = current.hypothesis.changed(question, getattr(declared, question))
             yield self.candidate(back, free=current.free)
         for free in fixed[current.free]:
-            if current.structure.form == declared.form or free in ("scale", "both"):
-                yield self.candidate(current.structure, free=free)
+            if current.hypothesis.form == declared.form or free in ("scale", "both"):
+                yield self.candidate(current.hypothesis, free=free)
 
     def simplest(self) -> _Candidate:
         """Return the declared contract, with another scale only if that is clearly better."""
-        scaled = self.candidate(self.declared.structure, free="scale")
+        scaled = self.candidate(self.declared.hypothesis, free="scale")
         return scaled if self._is_better(scaled, self.declared) else self.declared
 
     def cameras(self, contract: _Candidate, *, depth_step: float) -> CameraCheck:
         """Return what a contract leaves to explain, its scale fitted."""
-        fitted_too = self.candidate(contract.structure, free=_freed(contract.free, "scale"))
-        structure = contract.structure
-        shots = self._every
-        if structure.order != self.declared.structure.order:
+        fitted_too = self.candidate(contract.hypothesis, free=_freed(contract.free, "scale"))
+        hypothesis = contract.hypothesis
+        frame_matches = self._every
+        if hypothesis.order != self.declared.hypothesis.order:
             # Other files stand beside each other.
-            frames = len({shot.frame for shot in shots})
-            shots = self._views.shots(frames=frames, structure=structure)
-        return CameraComparison(self._views, shots, fitted_too.score, depth_step=depth_step).check()
+            frames = len({frame_match.frame for frame_match in frame_matches})
+            frame_matches = self._views.frame_matches(frames=frames, hypothesis=hypothesis)
+        return CameraComparison(
+            self._views, frame_matches, fitted_too.score, depth_step=depth_step
+        ).check()
 
     def rivals(self, best: _Candidate) -> tuple[Rival, ...]:
         """Return the other answers to every question, each with its own scale."""
         free = _freed(best.free, "scale")
-        likely = self._promising(best.structure)
+        likely = self._promising(best.hypothesis)
         found = []
         for question in QUESTIONS:
-            for structure in best.structure.alternatives(question):
-                if question == "order" and structure not in likely:
+            for hypothesis in best.hypothesis.alternatives(question):
+                if question == "order" and hypothesis not in likely:
                     # Two cameras exchanged leave the others, and with them the scale, as they are.
-                    other = self._at(structure, best)
+                    other = self._at(hypothesis, best)
                 else:
-                    other = self.candidate(structure, free=free)
-                answer = getattr(structure, question)
+                    other = self.candidate(hypothesis, free=free)
+                answer = getattr(hypothesis, question)
                 found.append(Rival(question, answer, self.gain(best, other)))
         return tuple(found)
 
-    def equals(self, best: _Candidate) -> tuple[tuple[Structure, Free, float], ...]:
+    def equals(self, best: _Candidate) -> tuple[tuple[Hypothesis, Free, float], ...]:
         """Return the contracts with one change that are not clearly worse than the best one."""
         if best is self.declared:
             return ()
         return tuple(
-            (other.structure, other.free, other.score.scale)
+            (other.hypothesis, other.free, other.score.scale)
             for other in self._one_change(self.declared)
             if other is not best
             and self._is_better(other, self.declared)
             and not self.gain(best, other).is_clear()
         )
 
-    def told(self, best: _Candidate) -> Evidence:
+    def gain_where_they_differ(self, best: _Candidate) -> Evidence:
         """Return by how much a contract is better than the declared one, where the two differ.
 
         An offset of one camera leaves the pairs of the others as they are.
         """
-        if best.structure != self.declared.structure or best.free != "offset":
+        if best.hypothesis != self.declared.hypothesis or best.free != "offset":
             return self.gain(best, self.declared)
         moved = [
             place
-            for place, shot in enumerate(self._shots)
-            if abs(shot.shift_px(best.score.offsets_px)) >= LEAST_OFFSET_PX
+            for place, frame_match in enumerate(self._frame_matches)
+            if abs(frame_match.shift_px(best.score.offsets_px)) >= LEAST_OFFSET_PX
         ]
         ours, theirs = (
             replace(score, errors=[score.errors[place] for place in moved])
             for score in (best.score, self.declared.score)
         )
-        return evidence([self._shots[place] for place in moved], ours, theirs)
+        return evidence([self._frame_matches[place] for place in moved], ours, theirs)
 
     def without_parallax(self, best: _Candidate) -> Evidence:
         """Return by how much a contract is better than if all were infinitely far."""
-        flat = scored(self._views, self._shots, best.structure, scale=1e-12)
-        return evidence(self._shots, best.score, flat)
+        flat = score_hypothesis(self._views, self._frame_matches, best.hypothesis, scale=1e-12)
+        return evidence(self._frame_matches, best.score, flat)
 
     def gain(self, better: _Candidate, worse: _Candidate) -> Evidence:
         """Return by how much one contract is better than another."""
-        found = evidence(self._shots, better.score, worse.score)
-        kind = better.structure.kind
-        only_kind = better.structure.changes_from(worse.structure) == ("kind",)
+        found = evidence(self._frame_matches, better.score, worse.score)
+        kind = better.hypothesis.kind
+        only_kind = better.hypothesis.changes_from(worse.hypothesis) == ("kind",)
         # Coarse depth has a shape of its own.
         is_fine = self._least_log_scale <= LEAST_LOG_SCALE
         if is_fine and only_kind and worse.free in (better.free, _freed(better.free, "scale")):
             power = self._power(better)
-            told = power.kind
-            if told is not None and (told != kind or found.mean_db > 0):
-                return replace(found, by_shape=told == kind, shape=power.interval)
+            shape_kind = power.kind
+            if shape_kind is not None and (shape_kind != kind or found.mean_db > 0):
+                return replace(found, by_shape=shape_kind == kind, shape=power.interval)
         return found
 
     def _power(self, candidate: _Candidate) -> RayPower:
         """Return the power of the ray's length at a contract, whichever its kind and scale."""
-        planar = candidate.structure.changed("kind", "planar")
+        planar = candidate.hypothesis.changed("kind", "planar")
         free = _freed(candidate.free, "scale")
         if (planar, free) not in self._powers:
             start = self.candidate(planar, free=free).score
-            self._powers[planar, free] = ray_power(self._views, self._shots, start)
+            self._powers[planar, free] = ray_power(self._views, self._frame_matches, start)
         return self._powers[planar, free]
 
     def _is_better(self, other: _Candidate, current: _Candidate) -> bool:
         """Tell whether a contract is clearly better, and what it fits worth mentioning."""
         gain = self.gain(other, current)
         freed = (current.free, other.free)
-        if other.structure == current.structure and freed in (
+        if other.hypothesis == current.hypothesis and freed in (
             ("nothing", "scale"), ("offset", "both"),
         ):  # fmt: skip
             off = abs(math.log(other.score.scale))
@@ -419,7 +442,7 @@ class Search:
 
 def _new(other: _Candidate, current: _Candidate) -> set[str]:
     """Return which of "scale" and "offset" alone a contract fits beside another."""
-    if other.structure != current.structure:
+    if other.hypothesis != current.hypothesis:
         return set()
     return set(_LENGTHS[other.free]) - set(_LENGTHS[current.free])
 
@@ -454,15 +477,15 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
     Raises:
         MediaError: If a video does not decode, or has another size than the scene's metadata say.
     """
-    shots = views.shots(frames=frames)
+    frame_matches = views.frame_matches(frames=frames)
     file = views.primary[0]
-    declared = Structure.declared(views.encoding)
+    declared = Hypothesis.declared(views.encoding)
     basics: dict[str, Any] = {
         "key": views.scene.id.key,
-        "views": len(shots) // 2,
-        "pairs": tuple(views.chosen_pairs(Structure())),
-        "matches": sum(len(shot.rows) for shot in shots[::2]),
-        "textured": sum(shot.textured for shot in shots[::2]),
+        "views": len(frame_matches) // 2,
+        "pairs": tuple(views.chosen_pairs(Hypothesis())),
+        "matches": sum(len(frame_match.rows) for frame_match in frame_matches[::2]),
+        "textured": sum(frame_match.textured for frame_match in frame_matches[::2]),
         "unit_m": views.unit_m(file),
         "unit_source": "user" if views.encoding.unit_m else views.scene.depth_unit_source[file],
         "focal_ratios": focal_ratios(views.scene.rig),
@@ -475,23 +498,23 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
             problem=f"no texture: {basics['textured']:,} pixels have any, and "
             f"{basics['matches']:,} were found in both pictures",
         )  # fmt: skip
-    basics["depth_step"] = views.depth_step(shots[0].frame)
+    basics["depth_step"] = views.depth_step(frame_matches[0].frame)
     if basics["depth_step"] > _COARSEST_STEP:
         return SceneDiagnosis(
             **basics, best=declared,
             problem=f"stored depth is too coarse: its steps are {basics['depth_step']:.0%} of it",
         )  # fmt: skip
-    basics["spread_px"] = spread_px(shots)
+    basics["spread_px"] = spread_px(frame_matches)
     least_log_scale = allowed_log_scale(basics["depth_step"])
-    basics["disparity_px"] = disparity_px(shots)
+    basics["disparity_px"] = disparity_px(frame_matches)
     if basics["disparity_px"] < _LEAST_PARALLAX_PX:
         return SceneDiagnosis(
             **basics, best=declared,
             problem=f"too little parallax: disparities are of {basics['disparity_px']:.2f} px",
         )  # fmt: skip
-    search = Search(views, shots, least_log_scale=least_log_scale)
+    search = Search(views, frame_matches, least_log_scale=least_log_scale)
     best, check = _checked(search, search.best(), depth_step=basics["depth_step"])
-    share_told = agreement(views, shots, best.score)
+    share_told = agreement(views, frame_matches, best.score)
     parallax = search.without_parallax(best)
     if math.isnan(share_told) or not parallax.is_clear():
         problem = (
@@ -501,21 +524,21 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
             f"contract explains {share_told:.0%} to a pixel, and pictures no better than none does"
         )
         return SceneDiagnosis(**basics, best=declared, parallax=parallax, problem=problem)
-    (other_kind,) = best.structure.alternatives("kind")
+    (other_kind,) = best.hypothesis.alternatives("kind")
     with_scale, of_other_kind = (
-        search.candidate(structure, free=_freed(best.free, "scale")).score
-        for structure in (best.structure, other_kind)
+        search.candidate(hypothesis, free=_freed(best.free, "scale")).score
+        for hypothesis in (best.hypothesis, other_kind)
     )
     shifted: Free = "offset" if best.free in ("nothing", "offset") else "both"
     return SceneDiagnosis(
         **basics,
-        best=best.structure,
+        best=best.hypothesis,
         changed=best.free,
         scale=with_scale.scale,
         scale_error=with_scale.scale_error,
         other_kind_scale=of_other_kind.scale,
-        offsets_px=search.candidate(best.structure, free=shifted).score.offsets_px,
-        gain=search.told(best),
+        offsets_px=search.candidate(best.hypothesis, free=shifted).score.offsets_px,
+        gain=search.gain_where_they_differ(best),
         parallax=parallax,
         agreement=check.agreement,
         check=check,

@@ -19,7 +19,7 @@ import numpy as np
 
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnose_scene
 from stereogenbench_data.audit.contract.matching import SceneFrames
-from stereogenbench_data.audit.contract.verdict import Verdict, grouped, judge
+from stereogenbench_data.audit.contract.verdict import Verdict, group_by_contract, judge
 from stereogenbench_data.engine import LOCAL, Advance
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
@@ -41,7 +41,7 @@ class DoctorReport:
 
     Attributes:
         data: The root of the data.
-        declared: The contract that was asked about.
+        declared: The contract under test.
         scenes: Each scene's own diagnosis, sorted by key.
         verdicts: One for each group of scenes with one contract, the largest group first.
         left_out: Key to the reason, for scenes that could not be judged.
@@ -129,7 +129,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         if progress is not None:
             progress(len(found), len(tasks))
     found.sort(key=lambda diagnosis: diagnosis.key)
-    verdicts = tuple(judge(group, declared=encoding) for group in grouped(found))
+    verdicts = tuple(judge(group, declared=encoding) for group in group_by_contract(found))
     return DoctorReport(index.where, encoding, tuple(found), verdicts, left_out)
 
 

@@ -12,21 +12,21 @@ power is fitted beside the scale, so no unit can stand in for it: 0 is depth alo
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32, Float64
 
-from stereogenbench_data.audit.contract.hypotheses import Structure
-from stereogenbench_data.audit.contract.matching import Points, SceneFrames, Shot
+from stereogenbench_data.audit.contract.hypotheses import Hypothesis
+from stereogenbench_data.audit.contract.matching import FrameMatch, Points, SceneFrames
 from stereogenbench_data.audit.contract.scoring import (
     LEAST_ERRORS,
     Pair,
-    Scored,
-    differences,
-    scored,
+    ScoredContract,
+    sample_with_slope,
+    score_hypothesis,
 )
 from stereogenbench_data.schema.records import DepthKind
 
@@ -39,62 +39,71 @@ _STEPS: Final = 10
 _LARGEST_STEP_PX: Final = 1.0
 _DRAWS: Final = 300
 _FEWEST_USABLE: Final = 10
-NEAR_PX: Final = 3 * _TOLERANCE_PX
-"""Matches that a prediction misses by more take no part in refining it."""
+_NEAR_PX: Final = 3 * _TOLERANCE_PX
+"""RowMatches that a prediction misses by more take no part in refining it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
-    """A shot with the disparity that a structure predicts for the pixels of which it tells.
+    """A frame match, its pixels with known depth alone, and the disparity that is predicted there.
 
     ``large_px`` is the 90th percentile of the predicted sizes.
     """
 
-    shot: Shot
-    known: np.ndarray
+    frame_match: FrameMatch
     predicted_px: Points
-    matched_px: Points
     large_px: float
+
+    @property
+    def matched_px(self) -> Points:
+        """The disparity that was found."""
+        return self.frame_match.matched_px
 
     @property
     def pair(self) -> Pair:
         """The two files, the lower number first."""
-        return self.shot.pair
+        return self.frame_match.pair
 
     @property
     def sign(self) -> int:
         """1 if the pixels are those of the lower number, whose way offsets are counted, else -1."""
-        return 1 if self.shot.left < self.shot.right else -1
+        return 1 if self.frame_match.left < self.frame_match.right else -1
 
 
-def fitted(
-    views: SceneFrames, shots: Sequence[Shot], structure: Structure, *, free: Free
-) -> Scored:
-    """Return a structure with the scale and offsets that explain the pictures best."""
-    terms = [] if free == "nothing" else fit_terms(views, shots, structure)
+def fit_hypothesis(
+    views: SceneFrames, frame_matches: Sequence[FrameMatch], hypothesis: Hypothesis, *, free: Free
+) -> ScoredContract:
+    """Return a hypothesis with the scale and offsets that explain the pictures best."""
+    terms = [] if free == "nothing" else fit_terms(views, frame_matches, hypothesis)
     if not terms:
-        return scored(views, shots, structure)
+        return score_hypothesis(views, frame_matches, hypothesis)
     scale, offsets_px = _start(terms, free=free)
     scale, offsets_px, error = _refined(views, terms, scale, offsets_px, free=free)
-    return scored(views, shots, structure, scale=scale, offsets_px=offsets_px, scale_error=error)
+    return score_hypothesis(
+        views, frame_matches, hypothesis, scale=scale, offsets_px=offsets_px, scale_error=error
+    )
 
 
-def fit_terms(views: SceneFrames, shots: Sequence[Shot], structure: Structure) -> list[Term]:
-    """Return the shots of which a structure tells anything, with what it predicts."""
+def fit_terms(
+    views: SceneFrames, frame_matches: Sequence[FrameMatch], hypothesis: Hypothesis
+) -> list[Term]:
+    """Return the frame matches for which a hypothesis predicts anything, with its predictions."""
     terms = []
-    for shot in shots:
-        predicted = views.predicted(shot, structure)
+    for frame_match in frame_matches:
+        predicted = views.predicted(frame_match, hypothesis)
         if predicted is not None and predicted[1].any():
             disparity_px, known = predicted
-            told_px = disparity_px[known]
-            large_px = float(np.percentile(np.abs(told_px), 90))
-            terms.append(Term(shot, known, told_px, shot.matched_px[known], large_px))
+            predicted_px = disparity_px[known]
+            large_px = float(np.percentile(np.abs(predicted_px), 90))
+            terms.append(Term(frame_match.at(known), predicted_px, large_px))
     return terms
 
 
-def voted_agreement(views: SceneFrames, shots: Sequence[Shot], structure: Structure) -> float:
-    """Return how many matches a structure explains at the scale that most of them agree on."""
-    terms = fit_terms(views, shots, structure)
+def voted_agreement(
+    views: SceneFrames, frame_matches: Sequence[FrameMatch], hypothesis: Hypothesis
+) -> float:
+    """Return how many matches a hypothesis explains at the scale that most of them agree on."""
+    terms = fit_terms(views, frame_matches, hypothesis)
     if not terms:
         return 0.0
     found = np.concatenate([term.matched_px for term in terms])
@@ -192,7 +201,7 @@ def _refined(
     error = math.inf
     for _ in range(_STEPS):
         normals, rights = _equations(views, terms, scale, offsets_px, unknowns=unknowns)
-        step, spread = solved(normals, rights)
+        step, spread = _solved(normals, rights)
         limit = max(np.abs(_moved(term, scale, step, unknowns)).max() for term in terms)
         step *= min(1.0, _LARGEST_STEP_PX / max(limit, 1e-12))
         for name, change in zip(unknowns, step, strict=True):
@@ -226,50 +235,67 @@ def _equations(
     *,
     unknowns: Sequence[object],
 ) -> tuple[Float64[np.ndarray, "terms k k"], Float64[np.ndarray, "terms k"]]:
-    """Return each shot's normal equations for log(scale) and the pairs' offsets."""
+    """Return each frame match's normal equations for log(scale) and the pairs' offsets."""
     normals = np.zeros((len(terms), len(unknowns), len(unknowns)))
     rights = np.zeros((len(terms), len(unknowns)))
     for number, term in enumerate(terms):
-        full = np.zeros(len(term.shot.rows))
-        full[term.known] = scale * term.predicted_px
-        shift_px = term.shot.shift_px(offsets_px)
-        difference, slope, inside = (
-            part[term.known] for part in differences(views, term.shot, full + shift_px)
-        )
-        near = np.abs(full[term.known] + shift_px - term.matched_px) < NEAR_PX
-        weight = robust_weights(difference, inside & near)
+        disparity_px = scale * term.predicted_px + term.frame_match.shift_px(offsets_px)
+        difference, slope, weight = _compared(views, term, disparity_px)
         if weight is None:
             continue
-        # Of all unknowns a shot depends on its own pair's, and on the scale.
+        # Of all unknowns a frame match depends on its own pair's, and on the scale.
         columns = {
             place: slope * scale * term.predicted_px if name == "scale" else term.sign * slope
             for place, name in enumerate(unknowns)
             if name in ("scale", term.pair)
         }
-        for place, column in columns.items():
-            rights[number, place] = (column * weight * difference).sum()
-            for other, beside in columns.items():
-                normals[number, place, other] = (column * weight * beside).sum()
+        _add_columns(normals[number], rights[number], columns, weight=weight, difference=difference)
     return normals, rights
 
 
-def robust_weights(
-    difference: Float32[np.ndarray, " n"], usable: Bool[np.ndarray, " n"]
-) -> Float64[np.ndarray, " n"] | None:
-    """Return how much each pixel counts, 0 for those not usable; None where these are too few."""
+def _compared(
+    views: SceneFrames, term: Term, disparity_px: Points
+) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float64[np.ndarray, " n"] | None]:
+    """Return right less left at a disparity, the mean slope of both, and each pixel's weight.
+
+    The weight is robust, and 0 for pixels that leave the picture or were matched elsewhere. It is
+    None where too few are left.
+    """
+    match = term.frame_match
+    there, slope, inside = sample_with_slope(
+        views.band(match.frame, match.right), match.rows, match.columns - disparity_px
+    )
+    difference = there - match.brightness
+    slope = (slope + match.slope) / 2
+    usable = inside & (np.abs(disparity_px - match.matched_px) < _NEAR_PX)
     if usable.sum() < _FEWEST_USABLE:
-        return None
+        return difference, slope, None
     spread = 1.4826 * float(np.median(np.abs(difference[usable]))) + 1e-3
     weight: Float64[np.ndarray, " n"] = (
         usable / (1 + (difference.astype(np.float64) / (2 * spread)) ** 2) ** 2 / spread**2
     )
-    return weight
+    return difference, slope, weight
 
 
-def solved(
+def _add_columns(
+    normals: Float64[np.ndarray, "k k"],
+    rights: Float64[np.ndarray, " k"],
+    columns: Mapping[int, Points],
+    *,
+    weight: Points,
+    difference: Float32[np.ndarray, " n"],
+) -> None:
+    """Write one frame match's weighted normal equations, from derivatives by unknown."""
+    for place, column in columns.items():
+        rights[place] = (column * weight * difference).sum()
+        for other, beside in columns.items():
+            normals[place, other] = (column * weight * beside).sum()
+
+
+def _solved(
     normals: Float64[np.ndarray, "terms k k"], rights: Float64[np.ndarray, "terms k"]
 ) -> tuple[Points, Points]:
-    """Return the step and its standard errors, from how much single shots disagree with it."""
+    """Return the step and its standard errors, from how much frame matches disagree."""
     total = normals.sum(axis=0)
     inverse = np.linalg.pinv(total, rcond=1e-12)
     step = inverse @ rights.sum(axis=0)
@@ -298,7 +324,7 @@ class RayPower:
 
     @property
     def kind(self) -> DepthKind | None:
-        """What it tells: None where it is unsure, or near neither 0 nor 1."""
+        """The kind of depth: None where the power is unsure, or near neither 0 nor 1."""
         doubt = _RAY_BIAS + LEAST_ERRORS * self.error
         if not abs(self.power - 0.5) > doubt:
             return None
@@ -312,9 +338,11 @@ class RayPower:
         return self.power, math.hypot(1.96 * self.error, _RAY_BIAS)
 
 
-def ray_power(views: SceneFrames, shots: Sequence[Shot], contract: Scored) -> RayPower:
+def ray_power(
+    views: SceneFrames, frame_matches: Sequence[FrameMatch], contract: ScoredContract
+) -> RayPower:
     """Return the power that fits a contract's pictures best, scale and its offsets fitted too."""
-    terms = fit_terms(views, shots, contract.structure)
+    terms = fit_terms(views, frame_matches, contract.hypothesis)
     pairs = list(contract.offsets_px)
     log_scale, bend = math.log(contract.scale), 0.0
     offsets_px = dict(contract.offsets_px)
@@ -323,29 +351,24 @@ def ray_power(views: SceneFrames, shots: Sequence[Shot], contract: Scored) -> Ra
         normals = np.zeros((len(terms), 2 + len(pairs), 2 + len(pairs)))
         rights = np.zeros((len(terms), 2 + len(pairs)))
         for number, term in enumerate(terms):
-            shot = term.shot
-            log_ray = np.log(views.ray_per_planar[shot.rows, shot.columns])[term.known]
+            frame_match = term.frame_match
+            log_ray = np.log(views.ray_per_planar[frame_match.rows, frame_match.columns])
             grown_px = term.predicted_px * np.exp(log_scale + bend * log_ray)
-            full = np.zeros(len(shot.rows))
-            full[term.known] = grown_px + shot.shift_px(offsets_px)
-            difference, slope, inside = (
-                part[term.known] for part in differences(views, shot, full)
+            difference, slope, weight = _compared(
+                views, term, grown_px + frame_match.shift_px(offsets_px)
             )
-            usable = inside & (np.abs(full[term.known] - term.matched_px) < NEAR_PX)
-            weight = robust_weights(difference, usable)
             if weight is None:
                 continue
             columns = {0: slope * grown_px, 1: slope * grown_px * log_ray}
             if term.pair in offsets_px:
                 columns[2 + pairs.index(term.pair)] = term.sign * slope
-            for place, column in columns.items():
-                rights[number, place] = (column * weight * difference).sum()
-                for other, beside in columns.items():
-                    normals[number, place, other] = (column * weight * beside).sum()
-        step, spread = solved(normals, rights)
+            _add_columns(
+                normals[number], rights[number], columns, weight=weight, difference=difference
+            )
+        step, spread = _solved(normals, rights)
         log_scale += float(np.clip(step[0], -0.1, 0.1))
         bend += float(np.clip(step[1], -_LARGEST_RAY_STEP, _LARGEST_RAY_STEP))
         for pair, change in zip(pairs, step[2:], strict=True):
             offsets_px[pair] += float(np.clip(change, -1.0, 1.0))
         error = float(spread[1])
-    return RayPower(bend + (contract.structure.kind == "ray"), error)
+    return RayPower(bend + (contract.hypothesis.kind == "ray"), error)

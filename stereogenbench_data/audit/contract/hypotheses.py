@@ -27,7 +27,7 @@ class _Order:
 
 
 def _orders() -> dict[str, _Order]:
-    """Return every order that is asked about, by its words."""
+    """Return every order of cameras under test, by its description."""
     orders = {"as recorded": _Order(), "mirrored": _Order(is_mirrored=True)}
     for words, contents in _KINDS_OF_FILES.items():
         orders[f"{words} reversed".strip()] = _Order(_SAME[::-1], contents)
@@ -53,7 +53,7 @@ QUESTIONS: Final = tuple(_ANSWERS)
 
 
 @dataclass(frozen=True, slots=True)
-class Structure:
+class Hypothesis:
     """All of a contract that is not a length: one answer to each question.
 
     Attributes:
@@ -73,20 +73,20 @@ class Structure:
     flip: Flip = "none"
 
     @classmethod
-    def declared(cls, encoding: DepthEncoding) -> "Structure":
+    def declared(cls, encoding: DepthEncoding) -> "Hypothesis":
         """Return what a depth contract says, pictures and cameras as they are recorded."""
         return cls(kind=encoding.kind, form=encoding.form, frame_lag=encoding.frame_lag)
 
-    def changed(self, question: Question, answer: Any) -> "Structure":
-        """Return the structure with another answer to one question."""
+    def changed(self, question: Question, answer: Any) -> "Hypothesis":
+        """Return the hypothesis with another answer to one question."""
         return replace(self, **{question: answer})
 
-    def changes_from(self, other: "Structure") -> tuple[Question, ...]:
+    def changes_from(self, other: "Hypothesis") -> tuple[Question, ...]:
         """Return the questions to which the two give different answers."""
         return tuple(name for name in QUESTIONS if getattr(self, name) != getattr(other, name))
 
-    def alternatives(self, question: Question) -> tuple["Structure", ...]:
-        """Return the structures that differ from this one in the answer to one question."""
+    def alternatives(self, question: Question) -> tuple["Hypothesis", ...]:
+        """Return the hypotheses that differ from this one in the answer to one question."""
         return tuple(
             self.changed(question, answer)
             for answer in _ANSWERS[question]
@@ -107,7 +107,7 @@ class Structure:
         """Return the number of the depth file that belongs to a numbered picture."""
         return self.camera_of(self.camera_of(rgb_file, content="rgb"), content="depth")
 
-    def reads_alike(self, other: "Structure", *, left: int, right: int) -> bool:
+    def reads_alike(self, other: "Hypothesis", *, left: int, right: int) -> bool:
         """Tell whether both take the same numbers and places for the pictures of two files."""
         return self.changed("order", other.order) == other and all(
             mine == theirs

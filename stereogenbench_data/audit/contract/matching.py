@@ -2,7 +2,7 @@
 
 Rows of two rectified pictures are correlated: every pixel of a row is compared with every pixel of
 the same row of the other picture. So no range of disparities is assumed, and no near optimum is
-locked to, whatever the depth claims. Matches that hold in both directions are kept. numpy alone
+locked to, whatever the depth claims. RowMatches that hold in both directions are kept. numpy alone
 does it: a row's comparisons are one product of matrices.
 
 `SceneFrames` holds one scene's pictures and stored depth, and predicts by a hypothesis which
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16
 from numpy.lib.stride_tricks import sliding_window_view
 
-from stereogenbench_data.audit.contract.hypotheses import LAGS, Flip, Structure
+from stereogenbench_data.audit.contract.hypotheses import LAGS, Flip, Hypothesis
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.samples.streams import Streams
@@ -48,7 +48,7 @@ Luma = Float32[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Matches:
+class RowMatches:
     """Pixels of a left picture that were found again in the right one.
 
     Attributes:
@@ -66,14 +66,14 @@ class Matches:
     grain_px: float = 1.0
 
 
-def match_rows(left: Luma, right: Luma) -> Matches:
+def match_rows(left: Luma, right: Luma) -> RowMatches:
     """Return what a left picture has in common with the right one of a rectified pair."""
     return match_pairs({0: left, 1: right}, [(0, 1)])[0, 1]
 
 
 def match_pairs(
     pictures: Mapping[int, Luma], pairs: Sequence[tuple[int, int]]
-) -> dict[tuple[int, int], Matches]:
+) -> dict[tuple[int, int], RowMatches]:
     """Return what the left and the right picture of each pair have in common.
 
     Large pictures are matched at 512 columns or fewer, and then disparity is good to half a pixel
@@ -181,13 +181,13 @@ def _match_row(
 
 def _gathered(
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], *, factor: int, textured: int
-) -> Matches:
+) -> RowMatches:
     """Put rows together and return to the full size, where a block's centre is a pixel or near."""
     empty = (np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
     rows, columns, disparity_px = (
         np.concatenate(part) for part in zip(*[empty, *found], strict=True)
     )
-    return Matches(
+    return RowMatches(
         rows=rows.astype(np.int64) * factor + factor // 2,
         columns=columns.astype(np.int64) * factor + factor // 2,
         disparity_px=(disparity_px * factor).astype(np.float32),
@@ -206,11 +206,11 @@ _MOST_POINTS: Final = 2000
 _MOST_DEPTH_BYTES: Final = 96 * 2**20
 """Decoded depth that is kept: every lag of every camera of small pictures."""
 SIDE_CELLS: Final = 4
-"""Parts of a picture along each side, by which it is told how sure a comparison is."""
+"""Parts of a picture along each side. Their spread gives the error of a comparison."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Shot:
+class FrameMatch:
     """What one frame of two cameras has in common, found in the pictures alone.
 
     Attributes:
@@ -246,6 +246,14 @@ class Shot:
         """The two files, the lower number first."""
         return min(self.left, self.right), max(self.left, self.right)
 
+    def at(self, pixels: Bool[np.ndarray, " n"]) -> "FrameMatch":
+        """Return the frame match of some of its pixels alone."""
+        return replace(
+            self, rows=self.rows[pixels], columns=self.columns[pixels],
+            matched_px=self.matched_px[pixels], brightness=self.brightness[pixels],
+            slope=self.slope[pixels], cells=self.cells[pixels],
+        )  # fmt: skip
+
     def shift_px(self, offsets_px: dict[tuple[int, int], float]) -> float:
         """Return the constant disparity here, of those of pairs seen from their lower number."""
         offset_px = offsets_px.get(self.pair, 0.0)
@@ -262,7 +270,7 @@ class SceneFrames:
         self.intrinsics: Intrinsics = rig_intrinsics(scene.rig)
         self._streams = streams
         self._bands: dict[tuple[int, int], Luma] = {}
-        self._stored: dict[tuple[int, int, int], tuple[Shot, dict[Flip, _Numbers]]] = {}
+        self._stored: dict[tuple[int, int, int], tuple[FrameMatch, dict[Flip, _Numbers]]] = {}
         self._depths: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     @property
@@ -272,7 +280,7 @@ class SceneFrames:
         return left, right
 
     def unit_m(self, file: int) -> float:
-        """Return the declared unit of a depth file; the release's default where none is told."""
+        """Return the declared unit of a depth file; the release's default where there is none."""
         unit_m = self.encoding.unit_m or self.scene.depth_unit_m[file]
         return unit_m if np.isfinite(unit_m) else DEFAULT_DEPTH_UNIT_M
 
@@ -308,23 +316,23 @@ class SceneFrames:
         self._depths[frame, file] = units, stored.measured & (units > 0)
         return self._depths[frame, file]
 
-    def _numbers(self, shot: Shot, *, frame: int, file: int) -> dict[Flip, _Numbers]:
-        """Return what a depth frame stores at a shot's pixels, as it is and turned over.
+    def _numbers(self, frame_match: FrameMatch, *, frame: int, file: int) -> dict[Flip, _Numbers]:
+        """Return what a depth frame stores at a frame match's pixels, as it is and turned over.
 
         Only these numbers are kept: whole maps of all lags and cameras would fill the memory.
         """
-        key = (id(shot), frame, file)
+        key = (id(frame_match), frame, file)
         if key not in self._stored:
             units, known = self.depth(frame, file)
             height, width = units.shape
             places: dict[Flip, tuple[np.ndarray, np.ndarray]] = {
-                "none": (shot.rows, shot.columns),
-                "vertical": (height - 1 - shot.rows, shot.columns),
-                "horizontal": (shot.rows, width - 1 - shot.columns),
+                "none": (frame_match.rows, frame_match.columns),
+                "vertical": (height - 1 - frame_match.rows, frame_match.columns),
+                "horizontal": (frame_match.rows, width - 1 - frame_match.columns),
             }
             numbers = {flip: (units[place], known[place]) for flip, place in places.items()}
-            # The shot is kept too, so that no other can get its identity.
-            self._stored[key] = (shot, numbers)
+            # The frame match is kept too, so that no other can get its identity.
+            self._stored[key] = (frame_match, numbers)
         return self._stored[key][1]
 
     def depth_step(self, frame: int) -> float:
@@ -340,105 +348,115 @@ class SceneFrames:
         y = (np.arange(camera.height_px) + 0.5 - camera.cy_px) / camera.fy_px
         return np.sqrt(1 + x**2 + y[:, None] ** 2)
 
-    def shots(self, *, frames: int, structure: Structure | None = None) -> list[Shot]:
+    def frame_matches(
+        self, *, frames: int, hypothesis: Hypothesis | None = None
+    ) -> list[FrameMatch]:
         """Return what pairs of several frames have in common, seen from either side.
 
-        The pairs are those that stand beside each other by a structure's order of cameras.
+        The pairs are those that stand beside each other by a hypothesis's order of cameras.
         """
-        pairs = self.chosen_pairs(structure or Structure())
+        pairs = self.chosen_pairs(hypothesis or Hypothesis())
         files = dict.fromkeys(itertools.chain.from_iterable(pairs))
-        shots: list[Shot] = []
+        frame_matches: list[FrameMatch] = []
         for frame in chosen_frames(self.scene.frames, count=frames):
             found = match_pairs({file: self.band(frame, file) for file in files}, pairs)
-            for (left, right), matches in found.items():
-                shots += self._both_ways(frame, left, right, matches)
-        return shots
+            for (left, right), row_matches in found.items():
+                frame_matches += self._both_ways(frame, left, right, row_matches)
+        return frame_matches
 
-    def chosen_pairs(self, structure: Structure) -> list[tuple[int, int]]:
+    def chosen_pairs(self, hypothesis: Hypothesis) -> list[tuple[int, int]]:
         """Return pairs in which every camera stands beside others: next to it, and next but one.
 
         The primary and the widest pair are among them. The lower number comes first.
         """
-        across = self._across(structure)
+        across = self._across(hypothesis)
         beside = ((min(pair), max(pair)) for pair in zip(across, across[2:], strict=False))
-        return list(dict.fromkeys([*self.neighbours(structure), *beside]))
+        return list(dict.fromkeys([*self.neighbours(hypothesis), *beside]))
 
-    def neighbours(self, structure: Structure) -> list[tuple[int, int]]:
+    def neighbours(self, hypothesis: Hypothesis) -> list[tuple[int, int]]:
         """Return the primary pair, those that stand next to each other, and the widest."""
-        across = self._across(structure)
+        across = self._across(hypothesis)
         pairs = [self.primary, *itertools.pairwise(across), (across[0], across[-1])]
         return list(dict.fromkeys((min(pair), max(pair)) for pair in pairs))
 
-    def _across(self, structure: Structure) -> list[int]:
+    def _across(self, hypothesis: Hypothesis) -> list[int]:
         """Return the numbers of the pictures' files from left to right."""
         return sorted(
             range(CAMERA_COUNT),
-            key=lambda file: self.scene.lateral_m[structure.camera_of(file, content="rgb")],
+            key=lambda file: self.scene.lateral_m[hypothesis.camera_of(file, content="rgb")],
         )
 
-    def _both_ways(self, frame: int, left: int, right: int, matches: Matches) -> tuple[Shot, Shot]:
+    def _both_ways(
+        self, frame: int, left: int, right: int, row_matches: RowMatches
+    ) -> tuple[FrameMatch, FrameMatch]:
         """Return one set of matches from both sides, so that either camera's depth is tested."""
         here, there = self.band(frame, left), self.band(frame, right)
-        keep = np.arange(len(matches.rows))
+        keep = np.arange(len(row_matches.rows))
         if len(keep) > _MOST_POINTS:
             chosen = np.random.default_rng(0).choice(keep, _MOST_POINTS, replace=False)
             keep = np.sort(chosen)
-        rows, columns = matches.rows[keep], matches.columns[keep]
-        matched_px = matches.disparity_px[keep].astype(np.float64)
+        rows, columns = row_matches.rows[keep], row_matches.columns[keep]
+        matched_px = row_matches.disparity_px[keep].astype(np.float64)
         width = here.shape[1]
         found = np.clip(np.rint(columns - matched_px), 0, width - 1).astype(np.int64)
-        shots = (
-            _shot_of(here, rows, columns, matched_px, frame=frame, files=(left, right)),
-            _shot_of(there, rows, found, -matched_px, frame=frame, files=(right, left)),
+        frame_matches = (
+            _frame_match(here, rows, columns, matched_px, frame=frame, files=(left, right)),
+            _frame_match(there, rows, found, -matched_px, frame=frame, files=(right, left)),
         )
         here_seen, there_seen = (
-            replace(shot, textured=matches.textured, grain_px=matches.grain_px) for shot in shots
+            replace(frame_match, textured=row_matches.textured, grain_px=row_matches.grain_px)
+            for frame_match in frame_matches
         )
         return here_seen, there_seen
 
     def predicted(
-        self, shot: Shot, structure: Structure, *, depth_file: int | None = None
+        self, frame_match: FrameMatch, hypothesis: Hypothesis, *, depth_file: int | None = None
     ) -> tuple[Points, Bool[np.ndarray, " n"]] | None:
-        """Return the disparity of a shot's pixels at the declared unit, and where it is known.
+        """Return the disparity of matched pixels at the declared unit, and where it is known.
 
         None where the frame of depth does not exist. ``depth_file`` is read in place of the one
-        that the structure names.
+        that the hypothesis names.
         """
-        file = structure.depth_file(shot.left) if depth_file is None else depth_file
-        frame = shot.frame + structure.frame_lag
+        file = hypothesis.depth_file(frame_match.left) if depth_file is None else depth_file
+        frame = frame_match.frame + hypothesis.frame_lag
         if not 0 <= frame < self.scene.frames:
             return None
-        units, known = self._numbers(shot, frame=frame, file=file)[structure.flip]
+        units, known = self._numbers(frame_match, frame=frame, file=file)[hypothesis.flip]
         number = np.where(known, units, 1).astype(np.float64)
-        place = shot.rows, shot.columns
-        return self.disparity_of(number, shot, structure, place=place, file=file), known
+        place = frame_match.rows, frame_match.columns
+        return self.disparity_of(number, frame_match, hypothesis, place=place, file=file), known
 
     def disparity_of(
         self,
         number: Points,
-        shot: Shot,
-        structure: Structure,
+        frame_match: FrameMatch,
+        hypothesis: Hypothesis,
         *,
         place: tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]],
         file: int,
     ) -> Points:
-        """Return the disparity in a shot's pair that a depth file's numbers mean at some pixels."""
+        """Return the disparity, between a frame match's files, that stored depths mean."""
         unit_m = self.unit_m(file)
-        per_m = 1 / (unit_m * number) if structure.form == "depth" else number / unit_m
-        if structure.kind == "ray":
+        per_m = 1 / (unit_m * number) if hypothesis.form == "depth" else number / unit_m
+        if hypothesis.kind == "ray":
             per_m *= self.ray_per_planar[place]
-        disparity_px: Points = self.intrinsics.fx_px * self.baseline_m(shot, structure) * per_m
+        disparity_px: Points = (
+            self.intrinsics.fx_px * self.baseline_m(frame_match, hypothesis) * per_m
+        )
         return disparity_px
 
-    def baseline_m(self, shot: Shot, structure: Structure) -> float:
-        """Return the signed baseline of a shot's two files."""
-        left, right = (structure.camera_of(file, content="rgb") for file in (shot.left, shot.right))
+    def baseline_m(self, frame_match: FrameMatch, hypothesis: Hypothesis) -> float:
+        """Return the signed baseline of a frame match's two files."""
+        left, right = (
+            hypothesis.camera_of(file, content="rgb")
+            for file in (frame_match.left, frame_match.right)
+        )
         lateral_m = self.scene.lateral_m
         baseline_m = lateral_m[right] - lateral_m[left]
-        return -baseline_m if structure.is_mirrored else baseline_m
+        return -baseline_m if hypothesis.is_mirrored else baseline_m
 
 
-def _shot_of(
+def _frame_match(
     here: Luma,
     rows: Int64[np.ndarray, " n"],
     columns: Int64[np.ndarray, " n"],
@@ -446,11 +464,11 @@ def _shot_of(
     *,
     frame: int,
     files: tuple[int, int],
-) -> Shot:
+) -> FrameMatch:
     brightness = here[rows, columns]
     height, width = here.shape
     after, before = np.minimum(columns + 1, width - 1), np.maximum(columns - 1, 0)
-    return Shot(
+    return FrameMatch(
         frame=frame,
         left=files[0],
         right=files[1],
@@ -465,14 +483,22 @@ def _shot_of(
     )
 
 
-def disparity_px(shots: Sequence[Shot]) -> float:
+def disparity_px(frame_matches: Sequence[FrameMatch]) -> float:
     """Return the root mean square of found disparities."""
-    return float(np.sqrt((np.concatenate([shot.matched_px for shot in shots]) ** 2).mean()))
+    return float(
+        np.sqrt(
+            (np.concatenate([frame_match.matched_px for frame_match in frame_matches]) ** 2).mean()
+        )
+    )
 
 
-def spread_px(shots: Sequence[Shot]) -> float:
-    """Return the root mean square of found disparities about the mean of each shot."""
-    spreads = [shot.matched_px - shot.matched_px.mean() for shot in shots if len(shot.rows)]
+def spread_px(frame_matches: Sequence[FrameMatch]) -> float:
+    """Return the root mean square of found disparities about the mean of each frame match."""
+    spreads = [
+        frame_match.matched_px - frame_match.matched_px.mean()
+        for frame_match in frame_matches
+        if len(frame_match.rows)
+    ]
     return float(np.sqrt((np.concatenate(spreads) ** 2).mean())) if spreads else 0.0
 
 

@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis
 from stereogenbench_data.audit.contract.doctor import DoctorReport, scene_task
-from stereogenbench_data.audit.contract.hypotheses import Structure
-from stereogenbench_data.audit.contract.matching import SceneFrames, Shot
-from stereogenbench_data.audit.contract.scoring import scored
+from stereogenbench_data.audit.contract.hypotheses import Hypothesis
+from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
+from stereogenbench_data.audit.contract.scoring import score_hypothesis
 from stereogenbench_data.errors import ExtraError, SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.files import open_output
@@ -39,7 +39,7 @@ def require_picture_file(path: Path) -> None:
 
 
 def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
-    """Write the picture of the scene that tells most.
+    """Write the picture of the scene with the most to report.
 
     Left, right, the right one warped to the left by the declared and by the best contract, what
     differs; the score over metres a unit; and by how much every other answer is worse.
@@ -50,26 +50,28 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     """
     if not report.scenes:
         raise SelectionError(f"{report.data}: no scene was judged, so there is nothing to draw.")
-    diagnosis = max(report.scenes, key=_tells)
+    diagnosis = max(report.scenes, key=_report_rank)
     task = scene_task(index, diagnosis.key, encoding=report.declared)
     figure = _figure_class()(figsize=(14, 13.5), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(2, 1))
     with closing(task.streams()) as streams:
         views = SceneFrames(task.scene, streams, encoding=report.declared)
-        shots = views.shots(frames=task.frames)
+        frame_matches = views.frame_matches(frames=task.frames)
         figure.suptitle(f"{diagnosis.key}: {_title(diagnosis)}", fontsize=12)
-        _draw_views(above.subplots(2, 3).ravel(), views, shots, diagnosis)
+        _draw_views(above.subplots(2, 3).ravel(), views, frame_matches, diagnosis)
         wide, near, others = below.subplots(1, 3)
         found_m = diagnosis.unit_m / diagnosis.scale
-        _draw_curves(wide, views, shots, diagnosis, units_m=np.sort([*_WIDE_M, *found_m * _NEAR]))
-        _draw_curves(near, views, shots, diagnosis, units_m=found_m * _NEAR)
+        _draw_curves(
+            wide, views, frame_matches, diagnosis, units_m=np.sort([*_WIDE_M, *found_m * _NEAR])
+        )
+        _draw_curves(near, views, frame_matches, diagnosis, units_m=found_m * _NEAR)
         _draw_rivals(others, diagnosis)
     with open_output(path) as file:
         figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=90)
 
 
-def _tells(scene: SceneDiagnosis) -> tuple[bool, bool, float, int]:
-    """Return by what the scene that tells most is the largest."""
+def _report_rank(scene: SceneDiagnosis) -> tuple[bool, bool, float, int]:
+    """Return the sort key of a scene: the largest has the most to report."""
     return not scene.problem, bool(scene.check.faults), scene.gain.mean_db, scene.matches
 
 
@@ -102,21 +104,30 @@ def _title(diagnosis: SceneDiagnosis) -> str:
 
 
 def _draw_views(
-    axes: Sequence[Any], views: SceneFrames, shots: Sequence[Shot], diagnosis: SceneDiagnosis
+    axes: Sequence[Any],
+    views: SceneFrames,
+    frame_matches: Sequence[FrameMatch],
+    diagnosis: SceneDiagnosis,
 ) -> None:
-    shot = max(shots, key=lambda shot: (shot.left, shot.right) == views.primary)
+    frame_match = max(
+        frame_matches,
+        key=lambda frame_match: (frame_match.left, frame_match.right) == views.primary,
+    )
     left, right = (
-        views.rgb(shot.frame, file).transpose(1, 2, 0) for file in (shot.left, shot.right)
+        views.rgb(frame_match.frame, file).transpose(1, 2, 0)
+        for file in (frame_match.left, frame_match.right)
     )
     best_scale = 1.0
     if diagnosis.changed in ("scale", "both") or diagnosis.best.form != diagnosis.declared.form:
         best_scale = diagnosis.scale
     shift_px = 0.0
     if diagnosis.changed in ("offset", "both"):
-        shift_px = shot.shift_px(diagnosis.offsets_px)
-    by_declared = _warped(views, shot, diagnosis.declared, right, scale=1.0, shift_px=0.0)
-    by_best = _warped(views, shot, diagnosis.best, right, scale=best_scale, shift_px=shift_px)
-    pair = f"frame {shot.frame}, cam {shot.left} and {shot.right}"
+        shift_px = frame_match.shift_px(diagnosis.offsets_px)
+    by_declared = _warped(views, frame_match, diagnosis.declared, right, scale=1.0, shift_px=0.0)
+    by_best = _warped(
+        views, frame_match, diagnosis.best, right, scale=best_scale, shift_px=shift_px
+    )
+    pair = f"frame {frame_match.frame}, cam {frame_match.left} and {frame_match.right}"
     pictures: list[tuple[str, Any]] = [
         (f"left ({pair})", left),
         ("right, warped by the declared contract", by_declared[0]),
@@ -134,8 +145,8 @@ def _draw_views(
 
 def _warped(
     views: SceneFrames,
-    shot: Shot,
-    structure: Structure,
+    frame_match: FrameMatch,
+    hypothesis: Hypothesis,
     right: UInt8[np.ndarray, "h w 3"],
     *,
     scale: float,
@@ -144,13 +155,14 @@ def _warped(
     """Return the right picture seen from the left one, and where depth and picture tell of it."""
     height, width = right.shape[:2]
     rows, columns = np.divmod(np.arange(height * width), width)
-    everywhere = Shot(
-        frame=shot.frame, left=shot.left, right=shot.right, rows=rows, columns=columns,
+    everywhere = FrameMatch(
+        frame=frame_match.frame, left=frame_match.left, right=frame_match.right,
+        rows=rows, columns=columns,
         matched_px=np.zeros(0), brightness=np.zeros(0, np.float32),
         slope=np.zeros(0, np.float32), cells=np.zeros(0, np.int64), cap=1.0, textured=0,
     )  # fmt: skip
     white = np.full((height * width, 3), _NOT_KNOWN, dtype=np.uint8)
-    predicted = views.predicted(everywhere, structure)
+    predicted = views.predicted(everywhere, hypothesis)
     if predicted is None:
         return white.reshape(height, width, 3), np.zeros((height, width), dtype=bool)
     disparity_px, known = predicted
@@ -167,25 +179,25 @@ def _warped(
 def _difference(
     left: UInt8[np.ndarray, "h w 3"],
     warped: UInt8[np.ndarray, "h w 3"],
-    told: Bool[np.ndarray, "h w"],
+    is_known: Bool[np.ndarray, "h w"],
 ) -> Float32[np.ndarray, "h w"]:
     """Return the mean absolute difference, nan where nothing was warped."""
     away: Float32[np.ndarray, "h w"] = np.abs(left.astype(np.float32) - warped).mean(axis=-1)
-    away[~told] = np.nan
+    away[~is_known] = np.nan
     return away
 
 
 def _draw_curves(
     axis: Any,
     views: SceneFrames,
-    shots: Sequence[Shot],
+    frame_matches: Sequence[FrameMatch],
     diagnosis: SceneDiagnosis,
     *,
     units_m: Float64[np.ndarray, " k"],
 ) -> None:
     """Draw how well the pictures agree over metres a unit, for planar, ray and inverse depth."""
     best = diagnosis.best
-    for name, structure in {
+    for name, hypothesis in {
         "along the axis": best.changed("kind", "planar").changed("form", "depth"),
         "along the ray": best.changed("kind", "ray").changed("form", "depth"),
         "inverse": best.changed("kind", "planar").changed("form", "inverse"),
@@ -193,7 +205,7 @@ def _draw_curves(
         axis.plot(
             units_m,
             [
-                _score_db(views, shots, structure, scale=diagnosis.unit_m / unit_m)
+                _score_db(views, frame_matches, hypothesis, scale=diagnosis.unit_m / unit_m)
                 for unit_m in units_m
             ],
             label=name,
@@ -211,12 +223,12 @@ def _draw_curves(
 
 
 def _score_db(
-    views: SceneFrames, shots: Sequence[Shot], structure: Structure, *, scale: float
+    views: SceneFrames, frame_matches: Sequence[FrameMatch], hypothesis: Hypothesis, *, scale: float
 ) -> float:
-    errors = scored(views, shots, structure, scale=scale).errors
+    errors = score_hypothesis(views, frame_matches, hypothesis, scale=scale).errors
     shares = [
-        max(float(np.nanmean(part)) / shot.cap, _FLOOR)
-        for part, shot in zip(errors, shots, strict=True)
+        max(float(np.nanmean(part)) / frame_match.cap, _FLOOR)
+        for part, frame_match in zip(errors, frame_matches, strict=True)
         if np.isfinite(part).any()
     ]
     return -10 * float(np.mean(np.log10(shares))) if shares else math.nan
@@ -224,14 +236,14 @@ def _score_db(
 
 def _draw_rivals(axis: Any, diagnosis: SceneDiagnosis) -> None:
     """Draw by how much each other answer is worse than the best contract."""
-    told = [rival for rival in diagnosis.rivals if math.isfinite(rival.behind.mean_db)]
-    if not told:
+    tested = [rival for rival in diagnosis.rivals if math.isfinite(rival.behind.mean_db)]
+    if not tested:
         axis.set_axis_off()
         axis.text(0.5, 0.5, diagnosis.problem or "no other answers", ha="center", wrap=True)
         return
-    names = [f"{rival.question}: {rival.answer}" for rival in told]
-    heights = [rival.behind.mean_db for rival in told]
-    errors = [min(1.96 * rival.behind.error_db, 50.0) for rival in told]
+    names = [f"{rival.question}: {rival.answer}" for rival in tested]
+    heights = [rival.behind.mean_db for rival in tested]
+    errors = [min(1.96 * rival.behind.error_db, 50.0) for rival in tested]
     axis.set_title("other answers", fontsize=10)
     axis.barh(names, heights, xerr=errors, color="tab:grey", error_kw={"linewidth": 0.8})
     axis.axvline(0, color="black", linewidth=0.8)

@@ -7,13 +7,19 @@ in one scene (`evidence`), and pooled over several (`pooled`).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from stereogenbench_data.audit.contract.hypotheses import Structure
-from stereogenbench_data.audit.contract.matching import SIDE_CELLS, Luma, Points, SceneFrames, Shot
+from stereogenbench_data.audit.contract.hypotheses import Hypothesis
+from stereogenbench_data.audit.contract.matching import (
+    SIDE_CELLS,
+    FrameMatch,
+    Luma,
+    Points,
+    SceneFrames,
+)
 
 LEAST_DB: Final = 0.15
 """A smaller mean difference is not believed, however sure: interpolation and codecs make such."""
@@ -37,7 +43,7 @@ class Evidence:
     ``by_shape`` is whether it is the better one by the shape of disparity over the picture, which
     then decides; None where that does not tell. ``shape`` is the power of the ray's length and half
     its 95 % interval. Less than ``least_db`` is not believed. ``error_db`` is the smaller of two
-    estimates, by which contracts are searched; ``wide_db`` the larger, by which intervals are told.
+    estimates, by which contracts are searched; ``wide_db`` the larger, which intervals use.
     """
 
     mean_db: float
@@ -63,11 +69,11 @@ class Gain:
         mean_db: The mean; nan where there is nothing to compare.
         low_db: Lower end.
         high_db: Upper end.
-        over: What the interval is over: scenes or, where one alone tells, parts of its pictures.
+        over: What the interval is over: scenes or, where there is one alone, parts of its pictures.
         count: How many scenes tell.
         is_clear: Whether the difference may be believed.
         by_shape: Whether that is so by the shape of disparity, however few dB it makes.
-        shape: The power of the ray's length, and half its 95 % interval; None where not told.
+        shape: The power of the ray's length, and half its 95 % interval; None where not known.
         margin_db: What the interval must keep away by, to confirm.
     """
 
@@ -107,24 +113,24 @@ def pooled(scenes: Sequence[Evidence]) -> Gain:
     its opposite in none: what one scene rules out is ruled out for all with the same contract,
     however little the others tell (of a lag where nothing moves).
     """
-    told = [scene for scene in scenes if math.isfinite(scene.mean_db)]
-    by_shape = any(scene.by_shape for scene in told)
-    if len(told) <= 1:
-        scene = told[0] if told else Evidence(math.nan, math.inf)
+    tested = [scene for scene in scenes if math.isfinite(scene.mean_db)]
+    by_shape = any(scene.by_shape for scene in tested)
+    if len(tested) <= 1:
+        scene = tested[0] if tested else Evidence(math.nan, math.inf)
         half = _NORMAL_975 * (scene.error_db if scene.wide_db is None else scene.wide_db)
         ends = (scene.mean_db - half, scene.mean_db + half)
         return Gain(
-            scene.mean_db, *ends, "parts of the pictures", len(told), scene.is_clear(),
+            scene.mean_db, *ends, "parts of the pictures", len(tested), scene.is_clear(),
             by_shape, scene.shape, scene.least_db,
         )  # fmt: skip
-    mean, low, high = interval([scene.mean_db for scene in told])
-    against = (replace(scene, mean_db=-scene.mean_db) for scene in told if scene.by_shape is None)
+    mean, low, high = interval([scene.mean_db for scene in tested])
+    against = (replace(scene, mean_db=-scene.mean_db) for scene in tested if scene.by_shape is None)
     opposed = any(scene.is_clear() for scene in against)
-    clear = (mean >= max(scene.least_db for scene in told) and low > 0) or (
-        not opposed and any(scene.is_clear() for scene in told)
+    clear = (mean >= max(scene.least_db for scene in tested) and low > 0) or (
+        not opposed and any(scene.is_clear() for scene in tested)
     )
-    least_db = max(scene.least_db for scene in told)
-    return Gain(mean, low, high, "scenes", len(told), clear, by_shape, margin_db=least_db)
+    least_db = max(scene.least_db for scene in tested)
+    return Gain(mean, low, high, "scenes", len(tested), clear, by_shape, margin_db=least_db)
 
 
 _FEWEST_POINTS = 40
@@ -135,33 +141,51 @@ Pair = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scored:
+class ScoredContract:
     """A contract and its score.
 
     Attributes:
-        structure: Its answers.
+        hypothesis: Its answers.
         scale: Measured disparity over that at the declared unit: the unit is declared / scale.
         offsets_px: Constant disparity that is added, by pair (lower number first, seen from it);
             what is missing is 0.
         scale_error: Standard error of log(scale), inf where it was not fitted.
-        errors: For each shot the squared difference at each pixel, capped; nan where the
+        errors: For each frame match the squared difference at each pixel, capped; nan where the
             contract does not tell.
     """
 
-    structure: Structure
+    hypothesis: Hypothesis
     scale: float
     offsets_px: dict[Pair, float]
     scale_error: float
     errors: list[Float32[np.ndarray, " n"]] = field(repr=False)
 
 
-def sampled(
+def sample_along_rows(
+    band: Luma, rows: np.ndarray, columns: Points
+) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
+    """Return a picture's values between its pixels along rows, and which places are inside it."""
+    here, (linear, square, cube), t, inside = _cubic(band, rows, columns)
+    return here + t * (linear + t * (square + t * cube)), inside
+
+
+def sample_with_slope(
     band: Luma, rows: np.ndarray, columns: Points
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], np.ndarray]:
     """Return a picture between its pixels along rows, its slope there, and what is inside it."""
+    here, (linear, square, cube), t, inside = _cubic(band, rows, columns)
+    value = here + t * (linear + t * (square + t * cube))
+    return value, linear + t * (2 * square + 3 * t * cube), inside
+
+
+def _cubic(band: Luma, rows: np.ndarray, columns: Points) -> tuple[Any, tuple[Any, ...], Any, Any]:
+    """Return the pixel before each place, the cubic's coefficients, the part to go, and inside.
+
+    Catmull and Rom's cubic: between pixels a straight line is a blur, which favours some places.
+    """
     width = band.shape[1]
     inside = (columns >= 0) & (columns <= width - 1)
-    place = np.clip(np.where(inside, columns, 0.0), 0, width - 2)
+    place = np.minimum(np.where(inside, columns, 0.0), width - 2)
     low = place.astype(np.int64)
     t = (place - low).astype(np.float32)
     first = rows * width + low
@@ -169,52 +193,48 @@ def sampled(
     here, there = flat[first], flat[first + 1]
     before = flat[first - (low > 0)]
     after = flat[first + 1 + (low < width - 2)]
-    # Catmull and Rom's cubic: between pixels a straight line is a blur, which favours some places.
     linear = (there - before) / 2
     square = before - 2.5 * here + 2 * there - after / 2
     cube = (after - before) / 2 + 1.5 * (here - there)
-    value = here + t * (linear + t * (square + t * cube))
-    return value, linear + t * (2 * square + 3 * t * cube), inside
+    return here, (linear, square, cube), t, inside
 
 
-def differences(
-    views: SceneFrames, shot: Shot, disparity_px: Points
-) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], np.ndarray]:
-    """Return right less left at a disparity, the mean slope of both, and what lands inside."""
-    band = views.band(shot.frame, shot.right)
-    there, slope, inside = sampled(band, shot.rows, shot.columns - disparity_px)
-    return there - shot.brightness, (slope + shot.slope) / 2, inside
-
-
-def scored(
+def score_hypothesis(
     views: SceneFrames,
-    shots: Sequence[Shot],
-    structure: Structure,
+    frame_matches: Sequence[FrameMatch],
+    hypothesis: Hypothesis,
     *,
     scale: float = 1.0,
     offsets_px: dict[Pair, float] | None = None,
     scale_error: float = math.inf,
-) -> Scored:
-    """Return a contract's score on the shots of a scene.
+) -> ScoredContract:
+    """Return a contract's score on the frame matches of a scene.
 
     A pixel counts as its capped squared difference, and as the cap where it leaves the picture.
     """
     offsets_px = offsets_px or {}
     errors = []
-    for shot in shots:
-        predicted = views.predicted(shot, structure)
-        squares = np.full(len(shot.rows), np.nan, dtype=np.float32)
+    for frame_match in frame_matches:
+        predicted = views.predicted(frame_match, hypothesis)
+        squares = np.full(len(frame_match.rows), np.nan, dtype=np.float32)
         if predicted is not None:
             disparity_px, known = predicted
-            shift_px = shot.shift_px(offsets_px)
-            difference, _, inside = differences(views, shot, scale * disparity_px + shift_px)
-            capped = np.where(inside, np.minimum(difference**2, shot.cap), shot.cap)
+            shift_px = frame_match.shift_px(offsets_px)
+            there, inside = sample_along_rows(
+                views.band(frame_match.frame, frame_match.right),
+                frame_match.rows,
+                frame_match.columns - (scale * disparity_px + shift_px),
+            )
+            square = (there - frame_match.brightness) ** 2
+            capped = np.where(inside, np.minimum(square, frame_match.cap), frame_match.cap)
             squares[known] = capped[known]
         errors.append(squares)
-    return Scored(structure, scale, offsets_px, scale_error, errors)
+    return ScoredContract(hypothesis, scale, offsets_px, scale_error, errors)
 
 
-def evidence(shots: Sequence[Shot], better: Scored, worse: Scored) -> Evidence:
+def evidence(
+    frame_matches: Sequence[FrameMatch], better: ScoredContract, worse: ScoredContract
+) -> Evidence:
     """Return by how many dB one contract explains a scene better than another.
 
     Both are judged by the pixels of which both tell, in the views that they do not read alike (an
@@ -225,24 +245,24 @@ def evidence(shots: Sequence[Shot], better: Scored, worse: Scored) -> Evidence:
 
     There are two errors, and the smaller holds: by how much views (a pair in a frame) differ, which
     is large where something is wrong with some cameras; and a jackknife over parts of the picture,
-    each left out of all views at once, which is large where only a part tells (what moves, of a
-    lag).
+    each left out of all views at once, which is large where only a part matters (of a lag, what
+    moves).
     """
-    same_places = better.structure.changed("kind", worse.structure.kind) == worse.structure
+    same_places = better.hypothesis.changed("kind", worse.hypothesis.kind) == worse.hypothesis
     share = _FINE_CAP if same_places else 1.0
     sums = np.zeros((2, 0, SIDE_CELLS**2))
-    orders_differ = better.structure.order != worse.structure.order
-    for shot, low, high in zip(shots, better.errors, worse.errors, strict=True):
-        if orders_differ and better.structure.reads_alike(
-            worse.structure, left=shot.left, right=shot.right
+    orders_differ = better.hypothesis.order != worse.hypothesis.order
+    for frame_match, low, high in zip(frame_matches, better.errors, worse.errors, strict=True):
+        if orders_differ and better.hypothesis.reads_alike(
+            worse.hypothesis, left=frame_match.left, right=frame_match.right
         ):
             continue
         both = np.isfinite(low) & np.isfinite(high)
         if both.sum() >= _FEWEST_POINTS:
             cells = [
                 np.bincount(
-                    shot.cells[both],
-                    weights=np.minimum(part[both], share * shot.cap),
+                    frame_match.cells[both],
+                    weights=np.minimum(part[both], share * frame_match.cap),
                     minlength=SIDE_CELLS**2,
                 )
                 for part in (low, high)
@@ -269,21 +289,23 @@ def evidence(shots: Sequence[Shot], better: Scored, worse: Scored) -> Evidence:
 
 
 def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:
-    """Return the mean over shots (the first axis) of the ratio of two sums in dB."""
+    """Return the mean over frame matches (the first axis) of the ratio of two sums in dB."""
     ratios = np.maximum(theirs, _SMALLEST) / np.maximum(ours, _SMALLEST)
     mean: Float64[np.ndarray, " k"] = 10 * np.log10(ratios).mean(axis=0)
     return mean
 
 
-def agreement(views: SceneFrames, shots: Sequence[Shot], contract: Scored) -> float:
-    """Return the share of matches that a contract explains to a pixel; nan if it tells of none."""
-    near, told = 0, 0
-    for shot in shots:
-        predicted = views.predicted(shot, contract.structure)
+def agreement(
+    views: SceneFrames, frame_matches: Sequence[FrameMatch], contract: ScoredContract
+) -> float:
+    """Return the share of matches that a contract explains to a pixel; nan if it predicts none."""
+    near, count = 0, 0
+    for frame_match in frame_matches:
+        predicted = views.predicted(frame_match, contract.hypothesis)
         if predicted is not None:
             disparity_px, known = predicted
-            shift_px = shot.shift_px(contract.offsets_px)
-            away = contract.scale * disparity_px + shift_px - shot.matched_px
-            near += int((np.abs(away[known]) < shot.grain_px).sum())
-            told += int(known.sum())
-    return near / told if told else math.nan
+            shift_px = frame_match.shift_px(contract.offsets_px)
+            away = contract.scale * disparity_px + shift_px - frame_match.matched_px
+            near += int((np.abs(away[known]) < frame_match.grain_px).sum())
+            count += int(known.sum())
+    return near / count if count else math.nan

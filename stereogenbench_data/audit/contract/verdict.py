@@ -21,13 +21,13 @@ from stereogenbench_data.audit.contract.diagnosis import (
     SceneDiagnosis,
     allowed_log_scale,
 )
-from stereogenbench_data.audit.contract.hypotheses import LAGS, QUESTIONS, Question, Structure
+from stereogenbench_data.audit.contract.hypotheses import LAGS, QUESTIONS, Hypothesis, Question
 from stereogenbench_data.audit.contract.scoring import LEAST_ERRORS, Gain, interval, pooled
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 Status = Literal["confirmed", "not contradicted", "wrong", "cannot tell", "not seen alone"]
-"""Confirmed: a 95 % interval keeps every rival that was asked about away by a stated margin, in
+"""Confirmed: a 95 % interval keeps every tested rival away by a stated margin, in
 every scene. Not contradicted: the declared answer fits best, and some rival is not kept away."""
 
 TOPICS: Final[dict[Question, str]] = {
@@ -53,14 +53,14 @@ class Answer:
     """The answer to one question.
 
     Attributes:
-        topic: What is asked.
+        topic: The question.
         declared: What the data declare.
         found: What the pictures say; empty where they do not tell.
         status: Whether that confirms what is declared.
-        behind: By how much the next best answer is worse, where that can be said in dB: in the
+        behind: By how much the next best answer is worse, where that is known in dB: in the
             scene in which it comes nearest.
         note: Why, in words; may be empty.
-        is_sure: Whether every rival that was asked about is kept away by the margin.
+        is_sure: Whether every tested rival is kept away by the margin.
     """
 
     topic: str
@@ -72,13 +72,13 @@ class Answer:
     is_sure: bool = False
 
 
-def has_doubts(scenes: Sequence[SceneDiagnosis]) -> bool:
-    """Tell whether some camera of some scene does not fit, so that no contract is told."""
+def has_camera_faults(scenes: Sequence[SceneDiagnosis]) -> bool:
+    """Tell whether some camera of some scene does not fit, so that no contract is reported."""
     return any(scene.check.faults or scene.check.unexplained for scene in scenes)
 
 
-def structure_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> Answer:
-    """Return the answer to one question of structure, and how far the next best is behind.
+def question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> Answer:
+    """Return the answer to one question, and how far the next best is behind.
 
     What is declared is confirmed only where the other answers were tested, and lost, in every
     scene. Of lags the two next to it are enough: how well a lag fits falls with its distance from
@@ -86,10 +86,10 @@ def structure_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     """
     first = scenes[0]
     declared, best = (getattr(part, question) for part in (first.declared, first.best))
-    blank = Answer(TOPICS[question], said(declared), "", "cannot tell", note=first.problem)
+    blank = Answer(TOPICS[question], describe(declared), "", "cannot tell", note=first.problem)
     if first.problem:
         return blank
-    if has_doubts(scenes):
+    if has_camera_faults(scenes):
         return replace(blank, note=CAMERAS_DIFFER)
     rivals = [rival for rival in first.rivals if rival.question == question]
     gains = {rival.answer: behind(scenes, rival) for rival in rivals}
@@ -110,11 +110,11 @@ def structure_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     words = _words_beside(best, close, untested, question=question)
     if best == "as recorded" and question == "order" and first.recorded_pair is not None:
         left, right = first.recorded_pair
-        named, told = f"primary: left {left}, right {right}", f"left {right}, right {left}"
+        named, seen = f"primary: left {left}, right {right}", f"left {right}, right {left}"
         note = "by poses and pictures alike"
-        return Answer(TOPICS[question], named, told, "wrong", nearest, note)
+        return Answer(TOPICS[question], named, seen, "wrong", nearest, note)
     if question == "order" and best.startswith("depth of") and changes(first, "offset"):
-        note = f"a shifted picture, which is not where its depth is, looks like {said(best)}"
+        note = f"a shifted picture, which is not where its depth is, looks like {describe(best)}"
         return replace(blank, behind=gains.get(declared), note=note)
     if best == declared:
         if close or lacking or not tested:
@@ -123,7 +123,7 @@ def structure_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
             note = f"not kept away by the margin: {_named(doubtful)}"
             note = f"{note}; {words}" if words else note
             return replace(
-                blank, found=said(best), status="not contradicted", behind=nearest, note=note
+                blank, found=describe(best), status="not contradicted", behind=nearest, note=note
             )
         shape = next(
             (g.shape for each in every.values() for g in each if g.by_shape and g.shape), None
@@ -131,14 +131,19 @@ def structure_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
         if shape is not None:
             words = f"by shape: the ray's power is {shape[0]:.2f} ± {shape[1]:.2f} (0 axis, 1 ray)"
         return replace(
-            blank, found=said(best), status="confirmed", behind=nearest, note=words, is_sure=True
+            blank,
+            found=describe(best),
+            status="confirmed",
+            behind=nearest,
+            note=words,
+            is_sure=True,
         )
     # To be called wrong the declared answer must be behind; to be pasted, by the margin too.
     if declared in close or not (declared in gains and _is_behind(gains[declared])):
-        note = f"{said(best)} fits best, but not surely better"
+        note = f"{describe(best)} fits best, but not surely better"
         return replace(blank, behind=gains[declared], note=f"{note}; {words}" if words else note)
     others = [answer for answer in [*close, *lacking, *doubtful] if answer != declared]
-    found = " or ".join(said(answer) for answer in dict.fromkeys([best, *others]))
+    found = " or ".join(describe(answer) for answer in dict.fromkeys([best, *others]))
     at_end = question == "frame_lag" and abs(best) == max(LAGS)
     return replace(
         blank, found=f"{found} or beyond" if at_end else found, status="wrong",
@@ -161,7 +166,7 @@ def _is_behind(gain: Gain) -> bool:
 
 
 def _named(answers: Sequence[Any]) -> str:
-    words = ", ".join(said(answer) for answer in answers[:_MOST_NAMED])
+    words = ", ".join(describe(answer) for answer in answers[:_MOST_NAMED])
     more = len(answers) - _MOST_NAMED
     return f"{words} and {more} more" if more > 0 else words
 
@@ -175,7 +180,7 @@ def _words_beside(
         words.append(f"fit alike: {_named([best, *close])}")
     if untested:
         want = "frames" if question == "frame_lag" else "depth where it would be"
-        words.append(f"not tested, for want of {want}: {', '.join(map(said, untested))}")
+        words.append(f"not tested, for want of {want}: {', '.join(map(describe, untested))}")
     if question == "frame_lag" and abs(best) == max(LAGS):
         words.append("lags beyond are not asked about")
     return "; ".join(words)
@@ -192,7 +197,7 @@ def behind(scenes: Sequence[SceneDiagnosis], rival: Rival) -> Gain:
     ])  # fmt: skip
 
 
-def said(answer: Any) -> str:
+def describe(answer: Any) -> str:
     """Return an answer in words."""
     return _WORDS.get(answer, f"{answer}")
 
@@ -211,7 +216,7 @@ def offset_answer(scenes: Sequence[SceneDiagnosis]) -> Answer:
     topic = "disparity offset"
     if first.problem:
         return Answer(topic, "0 px", "", "cannot tell", note=first.problem)
-    if has_doubts(scenes):
+    if has_camera_faults(scenes):
         return Answer(topic, "0 px", "", "cannot tell", note=CAMERAS_DIFFER)
     if changes(first, "offset"):
         gain = pooled([scene.gain for scene in scenes])
@@ -282,7 +287,7 @@ class Unit:
 
 def common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     """Return the unit that scenes agree on, weighted by how sure each is."""
-    told = [scene for scene in scenes if math.isfinite(scene.scale_error)]
+    fitted = [scene for scene in scenes if math.isfinite(scene.scale_error)]
     coarse = max(allowed_log_scale(scene.depth_step) for scene in scenes)
     seen_px = max(
         # An offset leaves to the scale what is no offset.
@@ -290,13 +295,13 @@ def common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
         for scene in scenes
     )
     bias = coarse if coarse > LEAST_LOG_SCALE else max(_BIAS, BIAS_PX / seen_px)
-    if not told:
+    if not fitted:
         return Unit(scenes[0].unit_m / scenes[0].scale, math.inf)
-    logs = np.array([math.log(scene.unit_m / scene.scale) for scene in told])
-    errors = np.array([max(scene.scale_error, 1e-4) for scene in told])
+    logs = np.array([math.log(scene.unit_m / scene.scale) for scene in fitted])
+    errors = np.array([max(scene.scale_error, 1e-4) for scene in fitted])
     weights = errors**-2.0 / (errors**-2.0).sum()
     half = 1.96 * float(np.sqrt((weights**2 * errors**2).sum()))
-    if len(told) > 2:
+    if len(fitted) > 2:
         _, low, high = interval([float(log) for log in logs])
         half = max(half, (high - low) / 2)
     return Unit(math.exp(float(weights @ logs)), math.hypot(half, bias))
@@ -305,7 +310,7 @@ def common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
 def length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer, ...]:
     """Return the answers on the quotient, on the unit and on the focal length.
 
-    Of the last two nothing is ever told by itself.
+    The last two are never known by themselves.
     """
     first = scenes[0]
     where = {"tag": "by the files' tag", "default": "by default", "user": "as given"}
@@ -331,16 +336,18 @@ def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
     blank = Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=first.problem)
     if first.problem:
         return blank
-    if has_doubts(scenes):
+    if has_camera_faults(scenes):
         return Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=CAMERAS_DIFFER)
     found = f"{unit.metres / first.unit_m:.5g} x declared ± {unit.uncertainty:.2%}"
     if first.best.form != first.declared.form:
-        note = f"numbers of another form: {said(first.best.form)} has a unit of its own"
+        note = f"numbers of another form: {describe(first.best.form)} has a unit of its own"
         return Answer(QUOTIENT, "1 x declared", found, "cannot tell", note=note)
     if changes(first, "scale"):
         gain = pooled([scene.gain for scene in scenes])
         if kind_explains_scale(scenes):
-            note = f"{found} if depth is along {said(first.best.kind)}, as declared if it is not"
+            note = (
+                f"{found} if depth is along {describe(first.best.kind)}, as declared if it is not"
+            )
             return Answer(QUOTIENT, "1 x declared", "", "cannot tell", gain, note)
         if unit.uncertainty > abs(math.log(unit.metres / first.unit_m)):
             note = f"{found} fits best, but is not surely another"
@@ -440,7 +447,7 @@ class Verdict:
         encoding: The contract to use in place of the declared one; None where there is none, or
             none that is sure: nothing is given for what explains less than half of the matches, for
             a unit (the quotient of lengths alone is seen), or while single cameras do not fit.
-        quotient: Unit / (focal length x baseline) over what is declared; nan where not told.
+        quotient: Unit / (focal length x baseline) over what is declared; nan where not known.
         quotient_error: Half its 95 % interval, as a share.
         choices: What would each by itself explain that quotient, in words; empty where it is right.
         faults: What is wrong with single cameras, in words.
@@ -475,14 +482,14 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     Args:
         scenes: One or more scenes with the same changes; of those without a word to say
             (``problem``) there must be no other.
-        declared: The contract that was asked about; its unit is None where files tell it.
+        declared: The contract under test; its unit is None where files state it.
     """
     first = scenes[0]
     unit = common_unit(scenes)
-    structure = [structure_answer(scenes, question) for question in QUESTIONS]
+    hypothesis = [question_answer(scenes, question) for question in QUESTIONS]
     quotient, *lengths = length_answers(scenes, unit)
     offset = offset_answer(scenes)
-    answers = (quotient, *lengths, *structure, offset)
+    answers = (quotient, *lengths, *hypothesis, offset)
     faults = tuple(
         f"{scene.key}: {fault}" if len(scenes) > 1 else fault
         for scene in scenes
@@ -526,7 +533,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
         beside=tuple(_beside(scenes, answers)),
         is_wrong=bool(wrong or faults),
         fits=explains and not (wrong or faults or untested)
-        and all(answer.status != "cannot tell" for answer in (quotient, *structure)),
+        and all(answer.status != "cannot tell" for answer in (quotient, *hypothesis)),
     )  # fmt: skip
 
 
@@ -543,16 +550,16 @@ def _pasted(
 def encoding_line(encoding: DepthEncoding) -> str:
     """Return the Python expression of a contract, defaults left out."""
     default = replace(encoding, unit_m=None, kind="planar", form="depth", frame_lag=0)
-    told = [
+    arguments = [
         f"{field.name}={getattr(encoding, field.name)!r}"
         for field in fields(encoding)
         if getattr(encoding, field.name) != getattr(default, field.name)
     ]
-    return f"DepthEncoding({', '.join(told)})"
+    return f"DepthEncoding({', '.join(arguments)})"
 
 
 def _beside(scenes: Sequence[SceneDiagnosis], answers: Sequence[Answer]) -> list[str]:
-    """Return what is to be said that no `DepthEncoding` says."""
+    """Return the advice that no `DepthEncoding` can express."""
     first = scenes[0]
     wrong = {answer.topic for answer in answers if answer.status == "wrong"}
     lines = []
@@ -574,20 +581,22 @@ def _beside(scenes: Sequence[SceneDiagnosis], answers: Sequence[Answer]) -> list
         )
     if kind_explains_scale(scenes):
         (other,) = first.best.alternatives("kind")
-        lines.append(f"Fits alike: depth along {said(other.kind)}, the unit as declared.")
-    if has_doubts(scenes):
+        lines.append(f"Fits alike: depth along {describe(other.kind)}, the unit as declared.")
+    if has_camera_faults(scenes):
         return lines
-    for structure, free, scale in dict.fromkeys(
+    for hypothesis, free, scale in dict.fromkeys(
         other for scene in scenes[:1] for other in scene.equals
     ):
-        lines.append(f"Fits alike: {_contract_words(structure, first, free=free, scale=scale)}.")
+        lines.append(f"Fits alike: {_contract_words(hypothesis, first, free=free, scale=scale)}.")
     return lines
 
 
-def _contract_words(structure: Structure, first: SceneDiagnosis, *, free: str, scale: float) -> str:
+def _contract_words(
+    hypothesis: Hypothesis, first: SceneDiagnosis, *, free: str, scale: float
+) -> str:
     words = [
-        f"{TOPICS[question]} {said(getattr(structure, question))}"
-        for question in structure.changes_from(first.declared)
+        f"{TOPICS[question]} {describe(getattr(hypothesis, question))}"
+        for question in hypothesis.changes_from(first.declared)
     ]
     if free in ("scale", "both"):
         words.append(f"{QUOTIENT} {1 / scale:.4g} x declared")
@@ -596,17 +605,17 @@ def _contract_words(structure: Structure, first: SceneDiagnosis, *, free: str, s
     return ", ".join(words)
 
 
-def grouped(scenes: Sequence[SceneDiagnosis]) -> list[list[SceneDiagnosis]]:
-    """Return scenes in groups with one contract, the largest first; what tells nothing joins.
+def group_by_contract(scenes: Sequence[SceneDiagnosis]) -> list[list[SceneDiagnosis]]:
+    """Return scenes in groups with one contract, the largest first; scenes without a finding join.
 
     Scenes for which the declared contract holds join those for which another is better where
     their own pictures do not rule that one out.
     """
-    told = [scene for scene in scenes if not scene.problem]
-    if not told:
+    judged = [scene for scene in scenes if not scene.problem]
+    if not judged:
         return [list(scenes)] if scenes else []
     groups: list[list[SceneDiagnosis]] = []
-    by_gain = sorted(told, key=lambda scene: (not _is_changed(scene), -scene.gain.mean_db))
+    by_gain = sorted(judged, key=lambda scene: (not _is_changed(scene), -scene.gain.mean_db))
     for scene in by_gain:
         home = next((group for group in groups if _fits(scene, group[0])), None)
         if home is None:
@@ -624,7 +633,7 @@ def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
     """Tell whether a scene may have the contract of another."""
     if scene.declared != leader.declared:
         return False
-    if has_doubts([scene, leader]):
+    if has_camera_faults([scene, leader]):
         # What is wrong with single cameras of a scene is its own.
         return False
     error = allowed_log_scale(max(scene.depth_step, leader.depth_step))
