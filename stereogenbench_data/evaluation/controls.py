@@ -16,10 +16,14 @@ from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.aggregate import CONTROL, Scores, cell
 from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
-from stereogenbench_data.evaluation.evaluate import EvaluationOptions, scored, selected
-from stereogenbench_data.evaluation.predictions import Wanted
+from stereogenbench_data.evaluation.predictions import PairFrames
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.evaluation.running import Run
+from stereogenbench_data.evaluation.running import (
+    EvaluationOptions,
+    Run,
+    score_workload,
+    select_workload,
+)
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Request, Sample, SampleLoader
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -51,7 +55,7 @@ class SameFrame:
         """The view."""
         return (self.view,)
 
-    def stamp(self, wanted: Wanted) -> str:
+    def stamp(self, wanted: PairFrames) -> str:
         """Return what it is."""
         return f"its {self.view} view"
 
@@ -59,7 +63,7 @@ class SameFrame:
         """Begin with a scene."""
         return self
 
-    def read(self, wanted: Wanted, samples: Sequence[Sample]) -> list[Any]:
+    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
         """Return the view of each sample."""
         return [sample[self.view] for sample in samples]
 
@@ -83,23 +87,23 @@ class OtherView:
     donors: Mapping[str, str] = field(default_factory=dict)
     inputs: tuple[str, ...] = ()
 
-    def source(self, wanted: Wanted) -> tuple[str, int]:
+    def source(self, wanted: PairFrames) -> tuple[str, int]:
         """Return the scene and the camera that the view of a pair is taken from."""
         if self.donors:
             return self.donors[wanted.scene], wanted.pair[1]
         return wanted.scene, wrong_camera(*wanted.pair)
 
-    def stamp(self, wanted: Wanted) -> str:
+    def stamp(self, wanted: PairFrames) -> str:
         """Return where its views are taken from."""
         scene, camera = self.source(wanted)
         return f"camera {camera:02d} of {scene}"
 
-    def open(self, index: SceneIndex) -> "_OtherViews":
+    def open(self, index: SceneIndex) -> "_OtherViewReader":
         """Begin with a scene."""
-        return _OtherViews(self, index)
+        return _OtherViewReader(self, index)
 
 
-class _OtherViews:
+class _OtherViewReader:
     def __init__(self, control: OtherView, index: SceneIndex) -> None:
         self._control = control
         self._index = index
@@ -107,7 +111,7 @@ class _OtherViews:
         request = Request(kind="pairs", fields=("right",), layout="single", size=control.size)
         self._loader = SampleLoader(index, request)
 
-    def read(self, wanted: Wanted, samples: Sequence[Sample]) -> list[Any]:
+    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
         scene, camera = self._control.source(wanted)
         row = self._rows[scene]
         last = int(self._index.column("frames")[row]) - 1
@@ -178,20 +182,21 @@ def score_controls(
         EvaluationError: If there are fewer than two scenes; or as `evaluate`.
     """
     protocol = protocol or EvaluationProtocol()
-    extent = selected(data, protocol, inputs=(), options=options)
-    donors = derangement([pairs[0].scene for pairs in extent.wanted], seed=seed)
+    workload = select_workload(data, protocol, inputs=(), options=options)
+    donors = derangement([pairs[0].scene for pairs in workload.pairs], seed=seed)
     run = Run(
         protocol=protocol,
-        candidates=(
+        sources=(
             SameFrame(TARGET, "right"),
             SameFrame(COPIED_LEFT, "left"),
             OtherView(WRONG_BASELINE, protocol.size),
             OtherView(RANDOM_RIGHT, protocol.size, donors=donors),
         ),
-        workers=options.get("workers"),
-        beside=donors,
+        tier=CONTROL,
+        donors=donors,
+        settings={"seed": seed},
     )
-    return scored(extent, run, options=options, tier=CONTROL, about={"seed": seed})
+    return score_workload(workload, run, options)
 
 
 _SLOPE_TOLERANCE: Final = 0.1

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
-from stereogenbench_data.evaluation.metrics.frechet import Spread
+from stereogenbench_data.evaluation.metrics.frechet import FeatureStatistics
 from stereogenbench_data.evaluation.predictions import Pair, pair_name
 from stereogenbench_data.evaluation.scene_scores import PairScores, SceneScores
 from stereogenbench_data.sources.atomic_write import write_whole
@@ -213,7 +213,7 @@ def _pair_scores(entry: Mapping[str, Any], arrays: Mapping[str, Any], place: str
             count, mean, root = (
                 arrays[f"{start}{name}/{part}"] for part in ("count", "mean", "root")
             )
-            spreads[name] = Spread(int(count), mean, root)
+            spreads[name] = FeatureStatistics(int(count), mean, root)
     return scores
 
 

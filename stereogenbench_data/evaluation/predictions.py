@@ -46,7 +46,7 @@ class PredictionFault(EvaluationError):
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class PairFrames:
     """What the prediction of one pair must hold.
 
     Attributes:
@@ -65,8 +65,13 @@ class Wanted:
     size: Size
     stored_size: Size
 
+    @property
+    def place(self) -> tuple[str, Pair]:
+        """The scene's key and the pair."""
+        return self.scene, self.pair
 
-class Frames(Protocol):
+
+class FrameReader(Protocol):
     """The opened frames of one prediction."""
 
     def read(self, frame: int) -> Any:
@@ -105,7 +110,7 @@ def frame_name(frame: int) -> str:
     return f"{frame:03d}.png"
 
 
-def find_prediction(root: Path, wanted: Wanted) -> Path:
+def find_prediction(root: Path, wanted: PairFrames) -> Path:
     """Return the folder of pictures or the video that holds a pair's prediction.
 
     Raises:
@@ -146,19 +151,19 @@ def stamp_prediction(path: Path) -> str:
     return digest.hexdigest()[:_ITEM_DIGITS]
 
 
-def open_prediction(path: Path, wanted: Wanted) -> Frames:
+def open_prediction(path: Path, wanted: PairFrames) -> FrameReader:
     """Open a prediction that `find_prediction` found.
 
     Raises:
         PredictionFault: If it has another number of frames, or is no video.
     """
     if path.is_dir():
-        return _PngFrames(path, wanted)
-    return _VideoFrames(path, wanted)
+        return _PngReader(path, wanted)
+    return _VideoFileReader(path, wanted)
 
 
-class _PngFrames:
-    def __init__(self, folder: Path, wanted: Wanted) -> None:
+class _PngReader:
+    def __init__(self, folder: Path, wanted: PairFrames) -> None:
         self._folder = folder
         self._wanted = wanted
         there = {file.name for file in folder.iterdir()}
@@ -214,8 +219,8 @@ class _PngFrames:
         """Nothing is kept open."""
 
 
-class _VideoFrames:
-    def __init__(self, path: Path, wanted: Wanted) -> None:
+class _VideoFileReader:
+    def __init__(self, path: Path, wanted: PairFrames) -> None:
         self._path = path
         self._wanted = wanted
         with self._faults():
@@ -272,7 +277,7 @@ def scaled_rgb(picture: Any, *, size: Size, scaler: VideoReformatter) -> Any:
     return np.stack([plane_numbers(frame, plane, dtype="u1") for plane in _RED_GREEN_BLUE])
 
 
-def require_picture(picture: Any, wanted: Wanted, *, where: str) -> None:
+def require_picture(picture: Any, wanted: PairFrames, *, where: str) -> None:
     """Refuse what a method returned unless it is a right view of the evaluated size.
 
     Raises:
@@ -285,7 +290,7 @@ def require_picture(picture: Any, wanted: Wanted, *, where: str) -> None:
         )
 
 
-def _require_size(found: Size, path: Path, wanted: Wanted) -> None:
+def _require_size(found: Size, path: Path, wanted: PairFrames) -> None:
     if found not in (wanted.size, wanted.stored_size):
         raise PredictionFault(
             f"{_told(wanted)}: {path} is {found[1]}x{found[0]}; expected "
@@ -294,7 +299,7 @@ def _require_size(found: Size, path: Path, wanted: Wanted) -> None:
         )
 
 
-def _told(wanted: Wanted) -> str:
+def _told(wanted: PairFrames) -> str:
     return f"{wanted.scene}, cameras {pair_name(wanted.pair)}"
 
 
@@ -303,10 +308,10 @@ Method = Callable[[dict[str, Any]], Any]
 uint8, or floats of 0 to 1, (n, 3, h, w)."""
 
 
-class Views(Protocol):
+class PredictionReader(Protocol):
     """The right views of one scene while it is scored."""
 
-    def read(self, wanted: Wanted, samples: Sequence[Sample]) -> Sequence[Any]:
+    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> Sequence[Any]:
         """Return the right view of each sample, frames of one pair in order: uint8 (3, h, w).
 
         Each is of the evaluated size, or of that of the scene's own pictures.
@@ -318,7 +323,7 @@ class Views(Protocol):
         ...
 
 
-class Candidate(Protocol):
+class PredictionSource(Protocol):
     """A source of right views."""
 
     @property
@@ -331,7 +336,7 @@ class Candidate(Protocol):
         """Fields of a sample that it needs."""
         ...
 
-    def stamp(self, wanted: Wanted) -> str:
+    def stamp(self, wanted: PairFrames) -> str:
         """Return a text that changes when the right views of a pair do.
 
         Raises:
@@ -339,7 +344,7 @@ class Candidate(Protocol):
         """
         ...
 
-    def open(self, index: SceneIndex) -> Views:
+    def open(self, index: SceneIndex) -> PredictionReader:
         """Begin with a scene; the index holds it, and scenes that are read beside it."""
         ...
 
@@ -358,7 +363,7 @@ class PredictionFolder:
     root: Path
     inputs: tuple[str, ...] = ()
 
-    def stamp(self, wanted: Wanted) -> str:
+    def stamp(self, wanted: PairFrames) -> str:
         """Return a text that changes when the files do.
 
         Raises:
@@ -366,17 +371,17 @@ class PredictionFolder:
         """
         return stamp_prediction(find_prediction(self.root, wanted))
 
-    def open(self, index: SceneIndex) -> "_FolderViews":
+    def open(self, index: SceneIndex) -> "_FolderReader":
         """Begin to read a scene's predictions."""
-        return _FolderViews(self.root)
+        return _FolderReader(self.root)
 
 
-class _FolderViews:
+class _FolderReader:
     def __init__(self, root: Path) -> None:
         self._root = root
-        self._open: dict[Pair, Frames] = {}
+        self._open: dict[Pair, FrameReader] = {}
 
-    def read(self, wanted: Wanted, samples: Sequence[Sample]) -> list[Any]:
+    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
         if wanted.pair not in self._open:
             self._open[wanted.pair] = open_prediction(find_prediction(self._root, wanted), wanted)
         frames = self._open[wanted.pair]
@@ -407,7 +412,7 @@ class CalledMethod:
         """Fields of a sample that it needs."""
         return self.tier.inputs
 
-    def stamp(self, wanted: Wanted) -> str:
+    def stamp(self, wanted: PairFrames) -> str:
         """Return the name: what a callable computes cannot be told from outside."""
         return f"called {self.name}"
 
@@ -415,7 +420,7 @@ class CalledMethod:
         """Begin with a scene."""
         return self
 
-    def read(self, wanted: Wanted, samples: Sequence[Sample]) -> Sequence[Any]:
+    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> Sequence[Any]:
         """Return what the method makes of a batch, as uint8 pictures."""
         given = self.method(batch_of([self.tier.inputs_of(sample) for sample in samples]))
         pictures = _as_pictures(given, count=len(samples), wanted=wanted, where=self.name)
@@ -437,7 +442,7 @@ def batch_of(inputs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _as_pictures(given: Any, *, count: int, wanted: Wanted, where: str) -> Sequence[Any]:
+def _as_pictures(given: Any, *, count: int, wanted: PairFrames, where: str) -> Sequence[Any]:
     """Return a method's answer as an array of uint8 where it holds floats of 0 to 1."""
     if hasattr(given, "detach"):
         tensor = given.detach().cpu()

@@ -16,7 +16,7 @@ from stereogenbench_data.evaluation.controls import Relation
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.predictions import pair_name
 from stereogenbench_data.evaluation.reference import DISCREPANCIES, PAPER
-from stereogenbench_data.evaluation.tables import Row, Table
+from stereogenbench_data.evaluation.tables import Table, TableRow
 from stereogenbench_data.evaluation.tiers import TIERS
 from stereogenbench_data.schema.problems import counted, markdown_text
 from stereogenbench_data.sources.atomic_write import write_whole
@@ -275,7 +275,7 @@ def _texts(table: Table) -> tuple[list[str], list[list[str]]]:
     return head, rows
 
 
-def _cell_text(table: Table, row: Row, column: str) -> str:
+def _cell_text(table: Table, row: TableRow, column: str) -> str:
     if row.is_papers:
         text = row.printed.get(column, ABSENT).replace("inf", "∞")
         marked = column in COLUMNS and not table.protocol.is_papers(column) and text != ABSENT
@@ -323,7 +323,7 @@ def _tex(text: str) -> str:
     return "---" if text == ABSENT else "".join(_LATEX.get(letter, letter) for letter in text)
 
 
-def _csv_lines(table: Table, row: Row) -> list[list[Any]]:
+def _csv_lines(table: Table, row: TableRow) -> list[list[Any]]:
     group = "; ".join(f"{k}={v}" for k, v in zip(table.keys, row.labels, strict=True))
     source = "paper" if row.is_papers else "scored"
     lines: list[list[Any]] = []
@@ -347,7 +347,7 @@ def _blank(number: float | None) -> float | str:
     return "" if number is None else number
 
 
-def _plain_row(table: Table, row: Row) -> dict[str, Any]:
+def _plain_row(table: Table, row: TableRow) -> dict[str, Any]:
     told: dict[str, Any] = {
         "method": row.method,
         "source": "paper" if row.is_papers else "scored",

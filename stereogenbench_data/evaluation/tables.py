@@ -34,7 +34,7 @@ _SOURCES: Mapping[str, tuple[TableName, ...]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TableRow:
     """One row: a method's scores of one group, or a row of the paper as printed.
 
     Attributes:
@@ -82,11 +82,11 @@ class Table:
     keys: tuple[str, ...]
     protocol: EvaluationProtocol
     columns: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     notes: tuple[str, ...] = ()
 
 
-def paper_row(row: Mapping[str, str], labels: Labels) -> Row:
+def paper_row(row: Mapping[str, str], labels: Labels) -> TableRow:
     """Return a row of one of the paper's tables, its numbers as printed."""
     printed = {}
     for name in (*FRAME_METRICS, "fid", "fvd"):
@@ -95,7 +95,7 @@ def paper_row(row: Mapping[str, str], labels: Labels) -> Row:
             interval = row.get(f"{name}_ci95", "")
             headline = FRAME_METRICS.get(name, (name,))[0]
             printed[headline] = f"{value} ± {interval}" if interval else value
-    return Row(
+    return TableRow(
         method=f"{row.get('method') or row['control']} (paper)",
         labels=labels,
         scenes=int(row["n_scenes"]) if "n_scenes" in row else None,
@@ -105,7 +105,7 @@ def paper_row(row: Mapping[str, str], labels: Labels) -> Row:
 
 
 def notes_of(
-    results: Sequence[Scores], rows: Sequence[Row], *, name: str, columns: Sequence[str]
+    results: Sequence[Scores], rows: Sequence[TableRow], *, name: str, columns: Sequence[str]
 ) -> list[str]:
     """Return what to know when reading a table: sources, and what is not comparable."""
     protocol = results[0].protocol
@@ -180,7 +180,7 @@ def tables_of(
 
 def branch_table(results: Sequence[Scores]) -> Table:
     """Return primary pairs by evaluation branch, beside the paper's main tables."""
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     for labels, group in _groups(results, _TEXT_OF_BRANCH, pairs="primary"):
         rows.extend(_row(one, labels, found, distances=True) for one, found in group)
         subset, family = labels
@@ -204,7 +204,7 @@ def branch_table(results: Sequence[Scores]) -> Table:
 def bin_table(results: Sequence[Scores], pairs: PairsShown) -> Table:
     """Return pairs by baseline in the paper's bins, beside the paper's own table."""
     keys = (*_TEXT_OF_BRANCH, "baseline")
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     for labels, group in _groups(results, keys, pairs=pairs):
         rows.extend(_row(one, labels, found) for one, found in group)
         if pairs == "primary" and labels[:2] == ("seen_map", "Uniform"):
@@ -234,7 +234,7 @@ def stratum_table(results: Sequence[Scores], column: str, *, edges: Sequence[flo
         "" if each is None else each.item() if hasattr(each, "item") else each for each in plain
     ]
     named = dict(zip(rows_used, strata(plain, name=column, edges=edges), strict=True))
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     for labels, group in _groups(results, (*_TEXT_OF_BRANCH, column), pairs="primary", named=named):
         rows.extend(_row(one, labels, found) for one, found in group)
     return _table(
@@ -248,7 +248,7 @@ def stratum_table(results: Sequence[Scores], column: str, *, edges: Sequence[flo
 
 def explaining_table(results: Sequence[Scores]) -> Table:
     """Return what explains the scores, by branch: matches, fits, ceilings, shares."""
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     for labels, group in _groups(results, _TEXT_OF_BRANCH, pairs="primary"):
         rows.extend(_row(one, labels, found) for one, found in group)
     wanted = _frame_columns(results[0].protocol, headline="no")
@@ -264,7 +264,7 @@ def explaining_table(results: Sequence[Scores]) -> Table:
 
 def control_table(results: Sequence[Scores]) -> Table:
     """Return all pairs of the selection together, beside the paper's calibration controls."""
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     for one in results:
         rows.append(_row(one, (), list(one.pairs)))
         rows.extend(paper_row(row, ()) for row in reference_rows("controls", control=one.name))
@@ -319,10 +319,10 @@ def _rank(key: str, label: str) -> tuple[float, str]:
 
 def _row(
     one: Scores, labels: Labels, pairs: Sequence[PairMeans], *, distances: bool = False
-) -> Row:
+) -> TableRow:
     scored = [pair for pair in pairs if not pair.fault]
     columns = scored[0].tallies if scored else {}
-    return Row(
+    return TableRow(
         method=one.name,
         labels=labels,
         scenes=len({pair.scene for pair in scored}),
@@ -345,7 +345,7 @@ def _frame_columns(
 
 def _table(  # noqa: PLR0913 - the parts of one table
     results: Sequence[Scores],
-    rows: Sequence[Row],
+    rows: Sequence[TableRow],
     *,
     name: str,
     title: str,

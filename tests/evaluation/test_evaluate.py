@@ -398,7 +398,7 @@ def test_pairs_that_are_no_left_and_right_are_refused(scored_index, right_views,
 
 
 def test_a_folder_that_is_none_is_refused(scored_index, protocol, tmp_path):
-    with pytest.raises(EvaluationError, match="nowhere: is no folder of predictions"):
+    with pytest.raises(EvaluationError, match="nowhere: not a predictions folder"):
         scored(scored_index, tmp_path / "nowhere", protocol)
 
 
@@ -433,18 +433,18 @@ def test_what_metrics_are_computed_with_is_loaded_once_for_all_scenes(
     from stereogenbench_data.evaluation import protocol
 
     loaded = []
-    load = protocol.load_keypoint_matcher
+    load = protocol.load_model
 
     def counted(*arguments):
         loaded.append(arguments)
         return load(*arguments)
 
-    monkeypatch.setattr(protocol, "load_keypoint_matcher", counted)
+    monkeypatch.setattr(protocol, "load_model", counted)
     matches = EvaluationProtocol(metrics=("e_match",), size=SIZE)
     scored(scored_index, right_views, matches, frames=[0])
 
     assert len(loaded) == 1
-    assert protocol.tools_of.cache_info().currsize == 0
+    assert protocol.models_of.cache_info().currsize == 0
 
 
 def test_progress_counts_frames_of_pairs_up_to_all(scored_index, right_views, protocol):

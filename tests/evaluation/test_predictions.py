@@ -8,8 +8,8 @@ from av.video.reformatter import VideoReformatter
 from PIL import Image
 
 from stereogenbench_data.evaluation.predictions import (
+    PairFrames,
     PredictionFault,
-    Wanted,
     find_prediction,
     frame_name,
     item_name,
@@ -19,7 +19,7 @@ from stereogenbench_data.evaluation.predictions import (
 )
 
 SCENE = "eval/MapSeenInTrain/Uniform/Town/scene_000001"
-WANTED = Wanted(SCENE, (0, 1), (0, 2), 3, (8, 16), (32, 32))
+WANTED = PairFrames(SCENE, (0, 1), (0, 2), 3, (8, 16), (32, 32))
 
 
 def picture(level, *, size=(8, 16)):

@@ -15,9 +15,9 @@ from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.models.interfaces import (
     Picture,
     Settings,
-    require_opencv,
     require_pictures,
 )
+from stereogenbench_data.evaluation.models.opencv import require_opencv
 
 _PEAK: Final = 255.0
 _WINDOW_PX: Final = 11

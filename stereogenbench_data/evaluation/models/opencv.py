@@ -1,21 +1,36 @@
 """Matching without learned weights, by OpenCV: SIFT for keypoints, SGBM for disparity."""
 
+from types import ModuleType
 from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.errors import EvaluationError, ExtraError
 from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
 from stereogenbench_data.evaluation.models.interfaces import (
     Keypoints,
     Picture,
     Settings,
-    require_opencv,
     require_pictures,
 )
 
 _DESCRIPTOR_DIM: Final = 128
+
+
+def require_opencv() -> ModuleType:
+    """Return the module ``cv2``.
+
+    Raises:
+        ExtraError: If it is not installed.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise ExtraError(
+            "SSIM, SIFT and SGBM need OpenCV: pip install 'stereogenbench-data[evaluation]'"
+        ) from error
+    return cv2
 
 
 class Sift:
