@@ -1,4 +1,9 @@
-"""LPIPS, version 0.1 on AlexNet: a weighted distance of two pictures' normalised activations."""
+"""LPIPS, version 0.1 on AlexNet: a weighted distance of two pictures' normalised activations.
+
+The network of the package lpips gives the same distances to 1e-8. It is not used, because
+importing it needs torchvision, each release of which fits one release of torch only; the package
+is needed for its file of weights.
+"""
 
 from importlib.util import find_spec
 from pathlib import Path
