@@ -244,7 +244,7 @@ def require_comparable(results: Sequence[Scores]) -> None:
         EvaluationError: Naming the first two that differ, and in what.
     """
     if not results:
-        raise EvaluationError("a table needs the scores of one method at least, got none.")
+        raise EvaluationError("a table needs the scores of at least one method, got none.")
     first = results[0]
     for other in results[1:]:
         for what, here, there in (

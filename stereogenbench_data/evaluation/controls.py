@@ -1,7 +1,7 @@
 """Calibration controls: right views whose scores are known in kind, which give the metrics a scale.
 
 The rendered target, the left view itself, the same scene from the wrong camera, and the right view
-of another scene. They are no methods, and are scored together: each view is decoded once.
+of another scene. They are not methods. All are scored together: each view is decoded once.
 
 Source: the StereoGenBench paper, appendix on metric definitions and calibration controls.
 """
@@ -267,7 +267,7 @@ def _of(column: str, one: Scores, what: str, holds: Callable[[float], bool]) -> 
     return Relation(
         f"{_label(column)} of {one.name} {what}",
         None if mean is None else holds(mean),
-        _told(column, [one]),
+        _means_text(column, [one]),
     )
 
 
@@ -279,7 +279,7 @@ def _ordered(column: str, lower: Sequence[Scores], *, below: Sequence[Scores]) -
     return Relation(
         f"{_label(column)} of {names[0]} is below that of {names[1]}",
         max(low) < min(high) if whole else None,
-        _told(column, [*lower, *below]),
+        _means_text(column, [*lower, *below]),
     )
 
 
@@ -322,7 +322,7 @@ def _label(column: str) -> str:
     return f"median {label}" if column in HEAVY_TAILED else label
 
 
-def _told(column: str, sides: Sequence[Scores]) -> str:
+def _means_text(column: str, sides: Sequence[Scores]) -> str:
     digits = COLUMNS[column].digits
     texts = []
     for one in sides:

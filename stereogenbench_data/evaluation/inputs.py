@@ -126,7 +126,7 @@ def export_inputs(
     return [item_name(*pair.place) for pair in wanted]
 
 
-def _begin(root: Path, told: Mapping[str, Any]) -> None:
+def _begin(root: Path, content: Mapping[str, Any]) -> None:
     """Write what the folder holds, or refuse one that holds something else."""
     path = root / INPUTS_JSON
     try:
@@ -136,7 +136,7 @@ def _begin(root: Path, told: Mapping[str, Any]) -> None:
                 raise EvaluationError(
                     f"{root}: is not empty and holds no {INPUTS_JSON}: choose a new folder."
                 )
-            write_whole(path, json.dumps(told).encode())
+            write_whole(path, json.dumps(content).encode())
         there = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         if isinstance(error, EvaluationError):
@@ -144,7 +144,7 @@ def _begin(root: Path, told: Mapping[str, Any]) -> None:
         cure = cure_of(error, _ELSEWHERE) if isinstance(error, OSError) else _ELSEWHERE
         raise StorageError(f"{path}: cannot be read or written ({error}). {cure}") from error
     differing = [
-        name for name in told if not isinstance(there, dict) or there.get(name) != told[name]
+        name for name in content if not isinstance(there, dict) or there.get(name) != content[name]
     ]
     if differing:
         raise EvaluationError(

@@ -79,7 +79,7 @@ class PartialResults:
         Args:
             scene: The scene's key.
             scores: Its scores by candidate and pair.
-            stamps: What the right views were told by when they were scored.
+            stamps: What identified the right views when they were scored.
 
         Raises:
             StorageError: If they cannot be written.
@@ -125,7 +125,7 @@ class PartialResults:
 
         Args:
             scene: The scene's key.
-            stamps: What the right views are told by now.
+            stamps: What identifies the right views now.
             columns: The columns that scores have.
 
         Raises:
@@ -226,7 +226,7 @@ def _plain(number: float) -> float | str:
 
 
 def _read_json(path: Path) -> Any:
-    """Return a document, None where there is none or a kill cut it short."""
+    """Return a document; None if there is none, or if a kill cut it short."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

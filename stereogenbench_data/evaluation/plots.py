@@ -46,8 +46,8 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
             "plots need matplotlib: pip install 'stereogenbench-data[plots]'."
         ) from None
     written = []
-    for column, told in COLUMNS.items():
-        if told.better == "neither" or not _points(results, column):
+    for column, facts in COLUMNS.items():
+        if facts.better == "neither" or not _points(results, column):
             continue
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
         FigureCanvasAgg(figure)
@@ -75,7 +75,7 @@ def _scored(pairs: Iterable[PairMeans], column: str) -> list[PairMeans]:
 
 
 def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
-    protocol, told = results[0].protocol, COLUMNS[column]
+    protocol, facts = results[0].protocol, COLUMNS[column]
     for one, colour in zip(results, _cycle(len(results)), strict=True):
         pairs = _scored(one.pairs, column)
         if not pairs:
@@ -93,7 +93,7 @@ def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
     if metric is not None and protocol.is_papers(column):
         heights += _draw_reference(axes, results, metric)
     _draw_edges(axes, results)
-    better = f"{told.better} is better"
+    better = f"{facts.better} is better"
     axes.set_ylabel(f"{protocol.label(column)} ({better})")
     axes.set_xlabel("baseline in cm")
     # Intervals of few scenes may reach far beyond all that was seen: they are cut off.

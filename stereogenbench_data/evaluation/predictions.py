@@ -1,6 +1,6 @@
-"""Right views on disk: where each belongs, what it must be, and how its frames are read.
+"""The right views that are scored: written by a method, or returned when it is called.
 
-Of the pair of cameras 00 and 01 of a scene, the frames are in one of
+Written, of the pair of cameras 00 and 01 of a scene, the frames are in one of
 
     PREDICTIONS/<scene key>/00-01/000.png ...      or PREDICTIONS/<scene key>/00-01.mp4 (.mkv)
     PREDICTIONS/<item>/000.png ...                 or PREDICTIONS/<item>.mp4 (.mkv)
@@ -47,7 +47,7 @@ class PredictionFault(EvaluationError):
 
 @dataclass(frozen=True, slots=True)
 class PairFrames:
-    """What the prediction of one pair must hold.
+    """The frames of one pair that are scored, and what its prediction must hold.
 
     Attributes:
         scene: The scene's key.
@@ -69,6 +69,11 @@ class PairFrames:
     def place(self) -> tuple[str, Pair]:
         """The scene's key and the pair."""
         return self.scene, self.pair
+
+    @property
+    def label(self) -> str:
+        """The scene and the pair as messages show them."""
+        return f"{self.scene}, cameras {pair_name(self.pair)}"
 
 
 class FrameReader(Protocol):
@@ -130,10 +135,10 @@ def find_prediction(root: Path, wanted: PairFrames) -> Path:
         return found[0]
     if found:
         raise PredictionFault(
-            f"{_told(wanted)}: has several predictions, {found[0]} and {found[1]}: keep one."
+            f"{wanted.label}: has several predictions, {found[0]} and {found[1]}: keep one."
         )
     raise PredictionFault(
-        f"{_told(wanted)}: has no prediction in {root}; expected a folder or video "
+        f"{wanted.label}: has no prediction in {root}; expected a folder or video "
         f"{places[0].relative_to(root)} or {places[1].name}."
     )
 
@@ -155,7 +160,7 @@ def open_prediction(path: Path, wanted: PairFrames) -> FrameReader:
     """Open a prediction that `find_prediction` found.
 
     Raises:
-        PredictionFault: If it has another number of frames, or is no video.
+        PredictionFault: If it has another number of frames, or is not a video.
     """
     if path.is_dir():
         return _PngReader(path, wanted)
@@ -170,14 +175,14 @@ class _PngReader:
         missing = [frame for frame in wanted.frames if frame_name(frame) not in there]
         if missing:
             raise PredictionFault(
-                f"{_told(wanted)}: {folder} lacks {len(missing)} of {len(wanted.frames)} frames, "
+                f"{wanted.label}: {folder} lacks {len(missing)} of {len(wanted.frames)} frames, "
                 f"the first is {frame_name(missing[0])}."
             )
         known = {frame_name(frame) for frame in range(wanted.scene_frames)}
         odd = sorted(name for name in there - known if name.endswith(".png"))
         if odd:
             raise PredictionFault(
-                f"{_told(wanted)}: {folder} holds {odd[0]}, and the scene has "
+                f"{wanted.label}: {folder} holds {odd[0]}, and the scene has "
                 f"{wanted.scene_frames} frames, {frame_name(0)} to "
                 f"{frame_name(wanted.scene_frames - 1)}."
             )
@@ -198,11 +203,11 @@ class _PngReader:
                     f"{path}: cannot be read ({error.strerror}). {cure_of(error)}"
                 ) from error
             raise PredictionFault(
-                f"{_told(self._wanted)}: {path} is no picture that can be read ({error})."
+                f"{self._wanted.label}: {path} cannot be read as a picture ({error})."
             ) from error
         except Image.DecompressionBombError as error:
             raise PredictionFault(
-                f"{_told(self._wanted)}: {path} is too large ({error})."
+                f"{self._wanted.label}: {path} is too large ({error})."
             ) from error
         return np.ascontiguousarray(pixels.transpose(2, 0, 1))
 
@@ -210,7 +215,7 @@ class _PngReader:
         if image.mode != "RGB" or bits != b"\x08":
             depth = f" of {bits[0]} bits" if bits else ""
             raise PredictionFault(
-                f"{_told(self._wanted)}: {path} has pixels of mode {image.mode}{depth}: write "
+                f"{self._wanted.label}: {path} has pixels of mode {image.mode}{depth}: write "
                 f"8-bit RGB."
             )
         _require_size((image.height, image.width), path, self._wanted)
@@ -236,7 +241,7 @@ class _VideoFileReader:
         if count == len(self._wanted.frames):
             return {frame: place for place, frame in enumerate(self._wanted.frames)}
         raise PredictionFault(
-            f"{_told(self._wanted)}: {self._path} holds {count} frames; expected "
+            f"{self._wanted.label}: {self._path} holds {count} frames; expected "
             f"{self._wanted.scene_frames} (the scene's) or {len(self._wanted.frames)} (those "
             f"evaluated)."
         )
@@ -250,7 +255,7 @@ class _VideoFileReader:
         try:
             yield
         except (MediaError, StorageError) as error:
-            raise PredictionFault(f"{_told(self._wanted)}: {error}") from error
+            raise PredictionFault(f"{self._wanted.label}: {error}") from error
 
     def close(self) -> None:
         self._reader.close()
@@ -285,7 +290,7 @@ def require_picture(picture: Any, wanted: PairFrames, *, where: str) -> None:
     """
     if picture.shape != (3, *wanted.size) or picture.dtype != np.uint8:
         raise PredictionFault(
-            f"{_told(wanted)}: {where} gave {picture.dtype} {tuple(picture.shape)} for a frame; "
+            f"{wanted.label}: {where} gave {picture.dtype} {tuple(picture.shape)} for a frame; "
             f"expected uint8 {(3, *wanted.size)}."
         )
 
@@ -293,14 +298,10 @@ def require_picture(picture: Any, wanted: PairFrames, *, where: str) -> None:
 def _require_size(found: Size, path: Path, wanted: PairFrames) -> None:
     if found not in (wanted.size, wanted.stored_size):
         raise PredictionFault(
-            f"{_told(wanted)}: {path} is {found[1]}x{found[0]}; expected "
+            f"{wanted.label}: {path} is {found[1]}x{found[0]}; expected "
             f"{wanted.size[1]}x{wanted.size[0]}, or the scene's own "
             f"{wanted.stored_size[1]}x{wanted.stored_size[0]}."
         )
-
-
-def _told(wanted: PairFrames) -> str:
-    return f"{wanted.scene}, cameras {pair_name(wanted.pair)}"
 
 
 Method = Callable[[dict[str, Any]], Any]
@@ -413,7 +414,7 @@ class CalledMethod:
         return self.tier.inputs
 
     def stamp(self, wanted: PairFrames) -> str:
-        """Return the name: what a callable computes cannot be told from outside."""
+        """Return the name: a change of what a callable computes cannot be seen."""
         return f"called {self.name}"
 
     def open(self, index: SceneIndex) -> "CalledMethod":
@@ -451,7 +452,7 @@ def _as_pictures(given: Any, *, count: int, wanted: PairFrames, where: str) -> S
         array = np.asarray(given)
     except (RuntimeError, TypeError, ValueError) as error:
         raise PredictionFault(
-            f"{wanted.scene}: {where} returned a {type(given).__name__} that is no one array "
+            f"{wanted.scene}: {where} returned a {type(given).__name__} that is not one array "
             f"({error}); expected ({count}, 3, {wanted.size[0]}, {wanted.size[1]})."
         ) from error
     if array.ndim != 4 or len(array) != count or array.size == 0:

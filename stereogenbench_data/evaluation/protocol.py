@@ -173,7 +173,7 @@ class MetricModels:
         """
         protocol = self.protocol
         height, width = protocol.size
-        told: dict[str, Any] = {
+        settings: dict[str, Any] = {
             "size": f"{width}x{height}",
             "resize": RESIZE,
             "depth": "as the files state" if protocol.depth is None else repr(protocol.depth),
@@ -191,8 +191,8 @@ class MetricModels:
         parts: Mapping[str, Any] = self.pair_metrics | self.image_features | self.video_features
         for name in protocol.metrics:
             found = of_metric[name]() if name in of_metric else parts[name].settings
-            told[name] = dict(found)
-        return told
+            settings[name] = dict(found)
+        return settings
 
 
 @lru_cache(maxsize=1)

@@ -108,8 +108,8 @@ def score_scene(
 
     Args:
         work: What to score.
-        after_frames: Called with how many frames of pairs were scored since; there the work may
-            be called off.
+        after_frames: Called with how many frames of pairs were scored since; it may raise to
+            stop the work.
         models: What the metrics are computed with, where they were loaded before.
 
     Raises:

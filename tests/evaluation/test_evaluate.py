@@ -139,7 +139,7 @@ def test_floats_of_0_to_1_are_rounded_to_8_bits(scored_index, protocol):
         (lambda inputs: inputs["left"].float()[..., :0], r"returned float32 \(3, 3, 48, 0\)"),
         (
             lambda inputs: [each[:, : 9 + n] for n, each in enumerate(inputs["left"].numpy())],
-            r"returned a list that is no one array",
+            r"returned a list that is not one array",
         ),
     ],
 )
@@ -210,7 +210,7 @@ def test_two_predictions_of_one_pair_are_told_not_taken_for_none(scored_index, c
     ("spoil", "message"),
     [
         (lambda path: path.unlink(), r"lacks 1 of 4 frames, the first is 003\.png"),
-        (lambda path: path.write_bytes(b"no picture"), r"003\.png is no picture that can be read"),
+        (lambda path: path.write_bytes(b"no picture"), r"003\.png cannot be read as a picture"),
         (
             lambda path: Image.new("RGB", (10, 10)).save(path),
             r"003\.png is 10x10; expected 64x48",

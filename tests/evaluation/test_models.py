@@ -106,7 +106,7 @@ def test_a_file_that_holds_more_than_tensors_is_not_run(tmp_path):
     path = tmp_path / "weights.pth"
     torch.save({"run": Path("/")}, path)
 
-    with pytest.raises(EvaluationError, match="cannot be read as tensors alone"):
+    with pytest.raises(EvaluationError, match="cannot be read as tensors only"):
         read_weights(path, what="a network")
 
 

@@ -43,7 +43,7 @@ class FeatureStatistics:
         """Return the spread of samples.
 
         Raises:
-            EvaluationError: If they are no table of finite numbers.
+            EvaluationError: If they are not a table of finite numbers.
         """
         if features.ndim != 2:
             raise EvaluationError(f"features must be of shape (n, dim), got {features.shape}.")

@@ -98,7 +98,7 @@ class DeDoDeMatcher:
         """Return the keypoints of a picture that the detector is surest of.
 
         Raises:
-            EvaluationError: If it is no picture.
+            EvaluationError: If it is not a picture.
         """
         require_pictures(picture)
         image = torch.from_numpy(picture.copy()).to(self._device).float()[None] / 255

@@ -79,7 +79,7 @@ class I3dFeatures:
         """Return the features of each clip.
 
         Raises:
-            EvaluationError: If they are no clips, or too short.
+            EvaluationError: If they are not clips, or too short.
         """
         require_clips(clips)
         if clips.shape[1] < _MIN_FRAMES:

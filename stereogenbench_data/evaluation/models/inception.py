@@ -83,7 +83,7 @@ class InceptionFeatures:
         """Return the features of each picture.
 
         Raises:
-            EvaluationError: If they are no pictures.
+            EvaluationError: If they are not pictures.
         """
         require_batch(pictures)
         features = np.empty((len(pictures), _DIM))

@@ -89,7 +89,7 @@ class Lpips:
         """Return the distance of each picture from its target.
 
         Raises:
-            EvaluationError: If they are no pictures of one size and number.
+            EvaluationError: If they are not pictures of one size and number.
         """
         require_batch(predicted)
         require_batch(target)

@@ -67,7 +67,7 @@ class Sift:
         """Return the strongest keypoints of a picture.
 
         Raises:
-            EvaluationError: If it is no picture.
+            EvaluationError: If it is not a picture.
         """
         require_pictures(picture)
         grey = self._cv2.cvtColor(
@@ -161,7 +161,7 @@ class Sgbm:
         """Return the left picture's disparity in pixels; nan where it has no answer.
 
         Raises:
-            EvaluationError: If the two are no pictures of one size, or narrower than the search.
+            EvaluationError: If the two are not pictures of one size, or narrower than the search.
         """
         require_pictures(left, right)
         if left.shape[-1] <= self._disparities:

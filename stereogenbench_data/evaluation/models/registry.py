@@ -1,4 +1,4 @@
-"""The models that metrics are computed with, by name; each is imported when it is asked for.
+"""The models that metrics are computed with, by name; each is imported when first used.
 
 To add a model, write a class with the members of its kind in `interfaces` and name it here.
 """

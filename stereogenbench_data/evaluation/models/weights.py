@@ -1,4 +1,4 @@
-"""Learned weights: files that the user fetches once, and of which only tensors are read."""
+"""Files of learned weights: the user fetches them once, and only tensors are read from them."""
 
 import hashlib
 from collections.abc import Mapping
@@ -89,7 +89,7 @@ def read_weights(path: Path, *, what: str) -> Mapping[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (UnpicklingError, RuntimeError, EOFError, KeyError, ValueError) as error:
         raise EvaluationError(
-            f"{path}: these weights of {what} cannot be read as tensors alone "
+            f"{path}: these weights of {what} cannot be read as tensors only "
             f"({str(error).splitlines()[0] if str(error) else type(error).__name__}). Fetch the "
             "file again; if you trust it, load it once by its authors' code and store its tensors "
             "with torch.save."
