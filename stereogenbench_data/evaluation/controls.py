@@ -118,17 +118,13 @@ class _OtherViewReader:
         views = []
         for sample in samples:
             frame = min(int(sample["frame_index"]), last)
-            address = Address(row, _another(camera), (camera,), (frame,))
+            address = Address(row, 0 if camera else 1, (camera,), (frame,))
             loaded = self._loader.load(address, clip="frame", generator=np.random.default_rng(0))
             views.append(loaded["right"])
         return views
 
     def close(self) -> None:
         self._loader.close()
-
-
-def _another(camera: int) -> int:
-    return 0 if camera else 1
 
 
 def wrong_camera(left: int, right: int) -> int:
@@ -233,7 +229,10 @@ def relations(results: Sequence[Scores]) -> list[Relation]:
     metrics = target.protocol.metrics
     judged: list[Relation] = []
     if "psnr" in metrics:
-        judged.append(_identical(target))
+        identical = cell(target.pairs, "psnr").infinite
+        frames = sum(pair.frames for pair in target.pairs)
+        what = f"every frame of the {TARGET} is identical"
+        judged.append(Relation(what, identical == frames, f"{identical} of {frames}"))
         judged.append(_ordered("psnr", [random], below=[copied, wrong]))
     if "ssim" in metrics:
         judged.append(_ordered("ssim", [copied, wrong, random], below=[target]))
@@ -250,16 +249,6 @@ def relations(results: Sequence[Scores]) -> list[Relation]:
         judged.append(_ordered(sd, [target], below=[wrong]))
         judged.append(_slope(wrong))
     return judged
-
-
-def _identical(target: Scores) -> Relation:
-    found = cell(target.pairs, "psnr")
-    frames = sum(pair.frames for pair in target.pairs)
-    return Relation(
-        f"every frame of the {TARGET} is identical",
-        found.infinite == frames,
-        f"{found.infinite} of {frames}",
-    )
 
 
 def _of(column: str, one: Scores, what: str, holds: Callable[[float], bool]) -> Relation:

@@ -91,7 +91,9 @@ class PartialResults:
                     "stamp": stamps[place],
                     "fault": found.fault,
                     "columns": {
-                        name: [_plain(number) for number in numbers]
+                        name: [
+                            number if math.isfinite(number) else str(number) for number in numbers
+                        ]
                         for name, numbers in found.columns.items()
                     },
                 }
@@ -219,10 +221,6 @@ def _pair_scores(entry: Mapping[str, Any], arrays: Mapping[str, Any], place: str
 
 def _place_name(place: tuple[str, Pair]) -> str:
     return f"{place[0]}/{pair_name(place[1])}"
-
-
-def _plain(number: float) -> float | str:
-    return number if math.isfinite(number) else str(number)
 
 
 def _read_json(path: Path) -> Any:

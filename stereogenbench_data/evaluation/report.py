@@ -255,13 +255,10 @@ def plain(table: Table) -> dict[str, Any]:
 def heading(table: Table, column: str) -> str:
     """Return the head of a column: its name, what it was measured with, which way is better."""
     if column not in COLUMNS:
-        return f"{_distance_label(column)}↓"
+        name = column.upper() if column in ("fid", "fvd") else f"FD{column.removeprefix('fd')}"
+        return f"{name}↓"
     median = " [median]" if column in HEAVY_TAILED else ""
     return f"{table.protocol.label(column)}{_ARROWS[COLUMNS[column].better]}{median}"
-
-
-def _distance_label(name: str) -> str:
-    return name.upper() if name in ("fid", "fvd") else f"FD{name.removeprefix('fd')}"
 
 
 def _texts(table: Table) -> tuple[list[str], list[list[str]]]:

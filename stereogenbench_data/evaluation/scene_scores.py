@@ -352,7 +352,11 @@ class PairScorer:
             for picture, frame in zip(given, frames, strict=True)
         ]
         for picture, target in zip(pictures, targets, strict=True):
-            for name, number in self._frame(picture, target).items():
+            numbers: dict[str, float] = {}
+            for name in self._models.protocol.metrics:
+                if name in _OF_FRAME:
+                    numbers |= _OF_FRAME[name](picture, target, self._models)
+            for name, number in numbers.items():
                 self._columns[name].append(float(number))
         for name, metric in self._models.pair_metrics.items():
             rendered = np.stack([target.right for target in targets])
@@ -363,13 +367,6 @@ class PairScorer:
         if self._models.video_features:
             rendered_views = (target.right for target in targets)
             self._clip.extend(zip(pictures, rendered_views, strict=True))
-
-    def _frame(self, picture: Any, target: TargetFrame) -> dict[str, float]:
-        found: dict[str, float] = {}
-        for name in self._models.protocol.metrics:
-            if name in _OF_FRAME:
-                found |= _OF_FRAME[name](picture, target, self._models)
-        return found
 
     def _merge(self, name: str, predicted: Any, target: Any) -> None:
         for spreads, features in ((self._predicted, predicted), (self._target, target)):
@@ -389,14 +386,6 @@ class PairScorer:
             predicted, target = (np.stack(views)[None] for views in zip(*self._clip, strict=True))
             self._merge(name, features(predicted), features(target))
         return PairScores(self._columns, self._predicted, self._target)
-
-
-def _psnr(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
-    return {"psnr": psnr_db(picture, target.right)}
-
-
-def _ssim(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
-    return {"ssim": ssim(picture, target.right)}
 
 
 def _p_psnr(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
@@ -445,8 +434,8 @@ def _sd(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, fl
 
 
 _OF_FRAME: Mapping[str, Any] = {
-    "psnr": _psnr,
-    "ssim": _ssim,
+    "psnr": lambda picture, target, models: {"psnr": psnr_db(picture, target.right)},
+    "ssim": lambda picture, target, models: {"ssim": ssim(picture, target.right)},
     "p_psnr": _p_psnr,
     "e_match": _e_match,
     "sd": _sd,

@@ -3,7 +3,7 @@
 A table holds methods of one tier only: rows of different tiers answer different questions.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
@@ -23,7 +23,12 @@ from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.metrics.scale import SD_OF_THE_PAPER
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
-from stereogenbench_data.evaluation.reference import TableName, reference_rows, reference_table
+from stereogenbench_data.evaluation.reference import (
+    ReferenceRow,
+    TableName,
+    reference_rows,
+    reference_table,
+)
 from stereogenbench_data.schema.release import BASELINE_BINS, FAMILIES, FRAME_COUNT, baseline_bin
 
 _SOURCES: Mapping[str, tuple[TableName, ...]] = {
@@ -180,16 +185,15 @@ def tables_of(
 
 def branch_table(results: Sequence[Scores]) -> Table:
     """Return primary pairs by evaluation branch, beside the paper's main tables."""
-    rows: list[TableRow] = []
-    for labels, group in _groups(results, _TEXT_OF_BRANCH, pairs="primary"):
-        rows.extend(_row(one, labels, found, distances=True) for one, found in group)
+
+    def paper(labels: Labels) -> list[ReferenceRow]:
         subset, family = labels
-        name: Literal["main", "unseen"] = "unseen" if subset == "unseen_map" else "main"
-        if subset:
-            rows.extend(
-                paper_row(row, labels)
-                for row in reference_rows(name, tier=results[0].tier, subset=subset, family=family)
-            )
+        if not subset:
+            return []
+        name: TableName = "unseen" if subset == "unseen_map" else "main"
+        return reference_rows(name, tier=results[0].tier, subset=subset, family=family)
+
+    rows = _rows(results, _TEXT_OF_BRANCH, distances="show", paper=paper)
     distances = {name for row in rows for name in row.distances}
     return _table(
         results,
@@ -203,15 +207,14 @@ def branch_table(results: Sequence[Scores]) -> Table:
 
 def bin_table(results: Sequence[Scores], pairs: PairsShown) -> Table:
     """Return pairs by baseline in the paper's bins, beside the paper's own table."""
+
+    def paper(labels: Labels) -> list[ReferenceRow]:
+        if pairs != "primary" or labels[:2] != ("seen_map", "Uniform"):
+            return []
+        return reference_rows("bins", tier=results[0].tier, baseline_bin_cm=labels[2])
+
     keys = (*_TEXT_OF_BRANCH, "baseline")
-    rows: list[TableRow] = []
-    for labels, group in _groups(results, keys, pairs=pairs):
-        rows.extend(_row(one, labels, found) for one, found in group)
-        if pairs == "primary" and labels[:2] == ("seen_map", "Uniform"):
-            rows.extend(
-                paper_row(row, labels)
-                for row in reference_rows("bins", tier=results[0].tier, baseline_bin_cm=labels[2])
-            )
+    rows = _rows(results, keys, pairs=pairs, paper=paper)
     shown = "primary pairs" if pairs == "primary" else "all pairs"
     return _table(results, rows, name=f"bins_{pairs}", title=f"Baseline in cm, {shown}", keys=keys)
 
@@ -234,31 +237,25 @@ def stratum_table(results: Sequence[Scores], column: str, *, edges: Sequence[flo
         "" if each is None else each.item() if hasattr(each, "item") else each for each in plain
     ]
     named = dict(zip(rows_used, strata(plain, name=column, edges=edges), strict=True))
-    rows: list[TableRow] = []
-    for labels, group in _groups(results, (*_TEXT_OF_BRANCH, column), pairs="primary", named=named):
-        rows.extend(_row(one, labels, found) for one, found in group)
+    keys = (*_TEXT_OF_BRANCH, column)
     return _table(
         results,
-        rows,
+        _rows(results, keys, named=named),
         name=f"by_{column}",
         title=f"By {column}, primary pairs",
-        keys=(*_TEXT_OF_BRANCH, column),
+        keys=keys,
     )
 
 
 def explaining_table(results: Sequence[Scores]) -> Table:
     """Return what explains the scores, by branch: matches, fits, ceilings, shares."""
-    rows: list[TableRow] = []
-    for labels, group in _groups(results, _TEXT_OF_BRANCH, pairs="primary"):
-        rows.extend(_row(one, labels, found) for one, found in group)
-    wanted = _frame_columns(results[0].protocol, headline="no")
     return _table(
         results,
-        rows,
+        _rows(results, _TEXT_OF_BRANCH),
         name="explanations",
         title="What explains the scores, primary pairs",
         keys=_TEXT_OF_BRANCH,
-        columns=wanted,
+        columns=_frame_columns(results[0].protocol, headline="no"),
     )
 
 
@@ -271,14 +268,25 @@ def control_table(results: Sequence[Scores]) -> Table:
     return _table(results, rows, name="controls", title="Calibration controls", keys=())
 
 
-def _groups(
+def _rows(
     results: Sequence[Scores],
     keys: Sequence[str],
     *,
-    pairs: PairsShown,
+    pairs: PairsShown = "primary",
     named: Mapping[int, str] | None = None,
-) -> list[tuple[Labels, list[tuple[Scores, list[PairMeans]]]]]:
-    """Return the groups in the order of tables, each with the pairs of every method."""
+    distances: Literal["show", "hide"] = "hide",
+    paper: Callable[[Labels], Sequence[ReferenceRow]] = lambda labels: (),
+) -> list[TableRow]:
+    """Return the rows of groups in the order of tables: every method's, then the paper's.
+
+    Args:
+        results: Each method's scores.
+        keys: What groups are made by: "subset", "family", "baseline" or a column of the index.
+        pairs: Which pairs are in them.
+        named: For a column of the index, the group of each row of the index.
+        distances: Whether distances between sets are shown.
+        paper: Returns the paper's rows of a group.
+    """
     index = results[0].index
 
     def labels_of(pair: PairMeans) -> Labels:
@@ -296,14 +304,18 @@ def _groups(
         (one, grouped((p for p in one.pairs if pairs == "all" or p.is_primary), labels_of))
         for one in results
     ]
-    every = sorted(
+    rows = []
+    for labels in sorted(
         {labels for _, groups in by_method for labels in groups},
         key=lambda labels: [_rank(key, label) for key, label in zip(keys, labels, strict=True)],
-    )
-    return [
-        (labels, [(one, groups[labels]) for one, groups in by_method if labels in groups])
-        for labels in every
-    ]
+    ):
+        rows += [
+            _row(one, labels, groups[labels], distances=distances)
+            for one, groups in by_method
+            if labels in groups
+        ]
+        rows += [paper_row(row, labels) for row in paper(labels)]
+    return rows
 
 
 def _rank(key: str, label: str) -> tuple[float, str]:
@@ -318,7 +330,11 @@ def _rank(key: str, label: str) -> tuple[float, str]:
 
 
 def _row(
-    one: Scores, labels: Labels, pairs: Sequence[PairMeans], *, distances: bool = False
+    one: Scores,
+    labels: Labels,
+    pairs: Sequence[PairMeans],
+    *,
+    distances: Literal["show", "hide"] = "hide",
 ) -> TableRow:
     scored = [pair for pair in pairs if not pair.fault]
     columns = scored[0].tallies if scored else {}
@@ -329,7 +345,7 @@ def _row(
         frames=sum(pair.frames for pair in scored),
         missing=len(pairs) - len(scored),
         cells={name: cell(scored, name) for name in columns},
-        distances=one.distances.get(labels, {}) if distances else {},
+        distances=one.distances.get(labels, {}) if distances == "show" else {},
     )
 
 
