@@ -20,13 +20,7 @@ from torch import nn
 from torch.nn import functional
 
 from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings, require_batch
-from stereogenbench_data.evaluation.models.weights import (
-    Weights,
-    fingerprint,
-    load_into,
-    read_weights,
-    weights_path,
-)
+from stereogenbench_data.evaluation.models.weights import Weights, fingerprint, load_weights
 
 INCEPTION: Final = Weights(
     what="FID's Inception",
@@ -66,9 +60,8 @@ class InceptionFeatures:
             ExtraError: If the file is missing.
             EvaluationError: If it does not hold this network's weights.
         """
-        path = weights_path(INCEPTION, folder=weights)
         network = Inception()
-        load_into(network, read_weights(path, what=INCEPTION.what), path=path)
+        path = load_weights(network, INCEPTION, folder=weights)
         self._network = network.to(device)
         self._device = device
         self.settings: Settings = {

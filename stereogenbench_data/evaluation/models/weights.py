@@ -73,6 +73,18 @@ def weights_path(weights: Weights, *, folder: Path | None) -> Path:
     return path
 
 
+def load_weights(network: torch.nn.Module, weights: Weights, *, folder: Path | None) -> Path:
+    """Give a network its weights, make it ready for use and freeze it; return the file's path.
+
+    Raises:
+        ExtraError: If the file is not there.
+        EvaluationError: If it is damaged, or does not hold this network's weights.
+    """
+    path = weights_path(weights, folder=folder)
+    load_into(network, read_weights(path, what=weights.what), path=path)
+    return path
+
+
 def fingerprint(path: Path) -> str:
     """Return the sha256 of a file of weights, as 64 hexadecimal digits, for the settings."""
     with path.open("rb") as file:
