@@ -24,12 +24,10 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.results import Spread
-from stereogenbench_data.evaluation import scene_scores as scoring
-from stereogenbench_data.evaluation.evaluate import selected
 from stereogenbench_data.evaluation.predictions import PredictionFolder, frame_name, item_name
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
-from stereogenbench_data.evaluation.running import Extent
-from stereogenbench_data.evaluation.scene_scores import one_thread
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol, MetricModels
+from stereogenbench_data.evaluation.running import Workload, select_workload
+from stereogenbench_data.evaluation.scene_scores import SceneWork, one_thread, score_scene
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import depth_name, rgb_name
@@ -96,13 +94,13 @@ def measure(
         )
         synthesise(root, request, workers=workers or os.cpu_count() or 1)
         protocol = EvaluationProtocol()
-        extent = selected(root, protocol, inputs=(), options={})
-        _write_right_views(extent, predictions)
+        workload = select_workload(root, protocol, inputs=(), options={})
+        _write_right_views(workload, predictions)
         with one_thread():
-            _decode(extent, predictions)  # once unmeasured: files in memory, libraries loaded
+            _decode(workload, predictions)  # once unmeasured: files in memory, libraries loaded
             found = [
-                (_seconds(lambda: _decode(extent, predictions)),
-                 *_score(extent, predictions, protocol))
+                (_seconds(lambda: _decode(workload, predictions)),
+                 *_score(workload, predictions, protocol))
                 for _ in range(rounds)
             ]  # fmt: skip
     beside = Spread.of((scored - matched) / decoded for decoded, scored, matched in found)
@@ -133,30 +131,30 @@ def _seconds(work: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
-def _write_right_views(extent: Extent, folder: Path) -> None:
-    ((wanted,),) = extent.wanted
-    scene = extent.index.scene(extent.rows[0])
+def _write_right_views(workload: Workload, folder: Path) -> None:
+    ((wanted,),) = workload.pairs
+    scene = workload.index.scene(workload.rows[0])
     target = folder / item_name(wanted.scene, wanted.pair)
     target.mkdir(parents=True)
-    with closing(_streams(extent)) as streams:
+    with closing(_streams(workload)) as streams:
         for frame in wanted.frames:
             view = streams.rgb(scene, rgb_name(wanted.pair[1]), frame, size=wanted.size)
             picture = Image.fromarray(np.ascontiguousarray(view.transpose(1, 2, 0)))
             picture.save(target / frame_name(frame), compress_level=1)
 
 
-def _streams(extent: Extent) -> Streams:
-    index = extent.index
+def _streams(workload: Workload) -> Streams:
+    index = workload.index
     return Streams(MemberSource(index.root, shards=index.shards, revision=index.digest))
 
 
-def _decode(extent: Extent, predictions: Path) -> None:
+def _decode(workload: Workload, predictions: Path) -> None:
     """Decode and resize all that scoring reads, and nothing else."""
-    ((wanted,),) = extent.wanted
-    scene = extent.index.scene(extent.rows[0])
+    ((wanted,),) = workload.pairs
+    scene = workload.index.scene(workload.rows[0])
     encoding = DepthEncoding(unit_m=scene.depth_unit_m[0])
     folder = predictions / item_name(wanted.scene, wanted.pair)
-    with closing(_streams(extent)) as streams:
+    with closing(_streams(workload)) as streams:
         for frame in wanted.frames:
             for camera in wanted.pair:
                 streams.rgb(scene, rgb_name(camera), frame, size=wanted.size)
@@ -166,19 +164,21 @@ def _decode(extent: Extent, predictions: Path) -> None:
                 np.ascontiguousarray(np.asarray(picture).transpose(2, 0, 1))
 
 
-def _score(extent: Extent, predictions: Path, protocol: EvaluationProtocol) -> tuple[float, float]:
+def _score(
+    workload: Workload, predictions: Path, protocol: EvaluationProtocol
+) -> tuple[float, float]:
     """Return how long scoring took, and its matchers."""
     watch = Stopwatch()
-    tools = Tools(protocol)
-    tools.keypoint_matcher = TimedMatcher(tools.keypoint_matcher, watch)
-    tools.stereo_matcher = TimedMatcher(tools.stereo_matcher, watch)
-    work = scoring.SceneWork(
-        index=extent.index,
-        wanted=extent.wanted[0],
+    models = MetricModels(protocol)
+    models.keypoint_matcher = TimedMatcher(models.keypoint_matcher, watch)
+    models.stereo_matcher = TimedMatcher(models.stereo_matcher, watch)
+    work = SceneWork(
+        index=workload.index,
+        pairs=workload.pairs[0],
         protocol=protocol,
-        candidates=(PredictionFolder("right views", predictions),),
+        sources=(PredictionFolder("right views", predictions),),
     )
-    seconds = _seconds(lambda: scoring.score_scene(work, lambda done: None, tools=tools))
+    seconds = _seconds(lambda: score_scene(work, lambda done: None, models=models))
     return seconds, watch.seconds
 
 

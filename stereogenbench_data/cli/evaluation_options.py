@@ -148,7 +148,7 @@ def protocol_of(  # noqa: PLR0913 - one parameter an option
 ) -> "EvaluationProtocol":
     """Return the protocol that options ask for."""
     from stereogenbench_data.evaluation.columns import require_metrics
-    from stereogenbench_data.evaluation.models.registry import Where
+    from stereogenbench_data.evaluation.models.registry import ModelOptions
     from stereogenbench_data.evaluation.protocol import EvaluationProtocol
     from stereogenbench_data.schema.records import DepthEncoding
 
@@ -159,5 +159,5 @@ def protocol_of(  # noqa: PLR0913 - one parameter an option
         stereo_matcher=stereo_matcher,
         fit=fit,
         depth=None if depth_unit_m is None else DepthEncoding(unit_m=depth_unit_m),
-        where=Where(device=device, weights=weights, checkout=checkout),
+        models=ModelOptions(device=device, weights=weights, checkout=checkout),
     )

@@ -184,16 +184,12 @@ def strata(values: Sequence[Any], *, name: str, edges: Sequence[float] = ()) -> 
     if not edges:
         if len(set(known)) <= _DISTINCT_VALUES:
             return [f"{number:g}" if math.isfinite(number) else "not known" for number in numbers]
-        edges = _quarters(known)
+        ordered = sorted(known)
+        last = len(ordered) - 1
+        quarters = (ordered[round(part * last / _QUARTERS)] for part in range(1, _QUARTERS))
+        inner = {float(f"{number:.4g}") for number in quarters}
+        edges = sorted(inner | {ordered[0], ordered[-1]})
     return [_between(number, edges) for number in numbers]
-
-
-def _quarters(known: Sequence[float]) -> list[float]:
-    ordered = sorted(known)
-    places = [round(part * (len(ordered) - 1) / _QUARTERS) for part in range(_QUARTERS + 1)]
-    return sorted(
-        {float(f"{ordered[place]:.4g}") for place in places[1:-1]} | {ordered[0], ordered[-1]}
-    )
 
 
 def _between(number: float, edges: Sequence[float]) -> str:
@@ -244,7 +240,7 @@ def require_comparable(results: Sequence[Scores]) -> None:
         EvaluationError: Naming the first two that differ, and in what.
     """
     if not results:
-        raise EvaluationError("a table needs the scores of one method at least, got none.")
+        raise EvaluationError("a table needs the scores of at least one method, got none.")
     first = results[0]
     for other in results[1:]:
         for what, here, there in (

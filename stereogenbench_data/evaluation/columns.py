@@ -40,7 +40,7 @@ _SD_FITS: Final = {
 
 def _fit_columns(fit: str) -> dict[str, Column]:
     """Return what explains SD by one fit."""
-    told: dict[str, tuple[str, int, str]] = {
+    explained: dict[str, tuple[str, int, str]] = {
         "slope": ("a", 4, "slope of true on found disparity"),
         "offset_px": ("b", 2, "px; offset of the fit"),
         "valid": ("fit pixels", 3, "share of pixels in the fit"),
@@ -52,7 +52,7 @@ def _fit_columns(fit: str) -> dict[str, Column]:
         f"sd_{fit}_{name}": Column(
             f"{label} {_SD_FITS[fit]}", "neither", digits, meaning, "stereo_matcher", fit
         )
-        for name, (label, digits, meaning) in told.items()
+        for name, (label, digits, meaning) in explained.items()
     }
 
 
@@ -120,7 +120,7 @@ VIDEO_DISTANCES: Final[dict[str, str]] = {"fvd": "i3d", "fd-motion": "motion-sta
 
 METRICS: Final = (*FRAME_METRICS, *IMAGE_DISTANCES, *VIDEO_DISTANCES)
 OFFLINE_METRICS: Final = ("psnr", "ssim", "e_match", "p_psnr", "sd")
-"""What is computed unless asked otherwise: nothing that needs weights."""
+"""What is computed by default: nothing that needs weights."""
 
 
 def require_metrics(names: Any) -> tuple[str, ...]:
@@ -135,14 +135,14 @@ def require_metrics(names: Any) -> tuple[str, ...]:
     >>> require_metrics("ssim,psnr")
     ('psnr', 'ssim')
     """
-    asked = names.split(",") if isinstance(names, str) else list(names)
-    wanted = {str(name).strip() for name in asked}
+    given = names.split(",") if isinstance(names, str) else list(names)
+    wanted = {str(name).strip() for name in given}
     unknown = sorted(wanted - set(METRICS))
     if unknown or not wanted:
         raise EvaluationError(
             f"there is no metric {unknown[0]!r}: choose among {', '.join(METRICS)}."
             if unknown
-            else f"no metric was asked for: choose among {', '.join(METRICS)}."
+            else f"no metric was given: choose among {', '.join(METRICS)}."
         )
     return tuple(name for name in METRICS if name in wanted)
 

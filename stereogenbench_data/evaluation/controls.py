@@ -1,7 +1,7 @@
 """Calibration controls: right views whose scores are known in kind, which give the metrics a scale.
 
 The rendered target, the left view itself, the same scene from the wrong camera, and the right view
-of another scene. They are no methods, and are scored together: each view is decoded once.
+of another scene. They are not methods. All are scored together: each view is decoded once.
 
 Source: the StereoGenBench paper, appendix on metric definitions and calibration controls.
 """
@@ -13,14 +13,17 @@ from typing import Any, Final, Unpack
 import numpy as np
 
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine import LOCAL
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.aggregate import CONTROL, Scores, cell
 from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
-from stereogenbench_data.evaluation.evaluate import EvaluationOptions, scored, selected
-from stereogenbench_data.evaluation.predictions import Wanted
+from stereogenbench_data.evaluation.predictions import PairFrames
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.evaluation.running import Run
+from stereogenbench_data.evaluation.running import (
+    EvaluationOptions,
+    Run,
+    score_workload,
+    select_workload,
+)
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.load import SampleLoader
@@ -54,7 +57,7 @@ class SameFrame:
         """The view."""
         return (self.view,)
 
-    def stamp(self, wanted: Wanted) -> str:
+    def stamp(self, wanted: PairFrames) -> str:
         """Return what it is."""
         return f"its {self.view} view"
 
@@ -62,7 +65,7 @@ class SameFrame:
         """Begin with a scene."""
         return self
 
-    def read(self, wanted: Wanted, samples: Sequence[Sample]) -> list[Any]:
+    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
         """Return the view of each sample."""
         return [sample[self.view] for sample in samples]
 
@@ -86,23 +89,23 @@ class OtherView:
     donors: Mapping[str, str] = field(default_factory=dict)
     inputs: tuple[str, ...] = ()
 
-    def source(self, wanted: Wanted) -> tuple[str, int]:
+    def source(self, wanted: PairFrames) -> tuple[str, int]:
         """Return the scene and the camera that the view of a pair is taken from."""
         if self.donors:
             return self.donors[wanted.scene], wanted.pair[1]
         return wanted.scene, wrong_camera(*wanted.pair)
 
-    def stamp(self, wanted: Wanted) -> str:
+    def stamp(self, wanted: PairFrames) -> str:
         """Return where its views are taken from."""
         scene, camera = self.source(wanted)
         return f"camera {camera:02d} of {scene}"
 
-    def open(self, index: SceneIndex) -> "_OtherViews":
+    def open(self, index: SceneIndex) -> "_OtherViewReader":
         """Begin with a scene."""
-        return _OtherViews(self, index)
+        return _OtherViewReader(self, index)
 
 
-class _OtherViews:
+class _OtherViewReader:
     def __init__(self, control: OtherView, index: SceneIndex) -> None:
         self._control = control
         self._index = index
@@ -110,24 +113,20 @@ class _OtherViews:
         request = Request(kind="pairs", fields=("right",), layout="single", size=control.size)
         self._loader = SampleLoader(index, request)
 
-    def read(self, wanted: Wanted, samples: Sequence[Sample]) -> list[Any]:
+    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
         scene, camera = self._control.source(wanted)
         row = self._rows[scene]
         last = int(self._index.column("frames")[row]) - 1
         views = []
         for sample in samples:
             frame = min(int(sample["frame_index"]), last)
-            address = Address(row, _another(camera), (camera,), (frame,))
+            address = Address(row, 0 if camera else 1, (camera,), (frame,))
             loaded = self._loader.load(address, clip="frame", generator=np.random.default_rng(0))
             views.append(loaded["right"])
         return views
 
     def close(self) -> None:
         self._loader.close()
-
-
-def _another(camera: int) -> int:
-    return 0 if camera else 1
 
 
 def wrong_camera(left: int, right: int) -> int:
@@ -181,21 +180,21 @@ def score_controls(
         EvaluationError: If there are fewer than two scenes; or as `evaluate`.
     """
     protocol = protocol or EvaluationProtocol()
-    extent = selected(data, protocol, inputs=(), options=options)
-    donors = derangement([pairs[0].scene for pairs in extent.wanted], seed=seed)
+    workload = select_workload(data, protocol, inputs=(), options=options)
+    donors = derangement([pairs[0].scene for pairs in workload.pairs], seed=seed)
     run = Run(
         protocol=protocol,
-        candidates=(
+        sources=(
             SameFrame(TARGET, "right"),
             SameFrame(COPIED_LEFT, "left"),
             OtherView(WRONG_BASELINE, protocol.size),
             OtherView(RANDOM_RIGHT, protocol.size, donors=donors),
         ),
-        workers=options.get("workers"),
-        engine=options.get("engine", LOCAL),
-        beside=donors,
+        tier=CONTROL,
+        donors=donors,
+        settings={"seed": seed},
     )
-    return scored(extent, run, options=options, tier=CONTROL, about={"seed": seed})
+    return score_workload(workload, run, options)
 
 
 _SLOPE_TOLERANCE: Final = 0.1
@@ -232,7 +231,10 @@ def relations(results: Sequence[Scores]) -> list[Relation]:
     metrics = target.protocol.metrics
     judged: list[Relation] = []
     if "psnr" in metrics:
-        judged.append(_identical(target))
+        identical = cell(target.pairs, "psnr").infinite
+        frames = sum(pair.frames for pair in target.pairs)
+        what = f"every frame of the {TARGET} is identical"
+        judged.append(Relation(what, identical == frames, f"{identical} of {frames}"))
         judged.append(_ordered("psnr", [random], below=[copied, wrong]))
     if "ssim" in metrics:
         judged.append(_ordered("ssim", [copied, wrong, random], below=[target]))
@@ -251,22 +253,12 @@ def relations(results: Sequence[Scores]) -> list[Relation]:
     return judged
 
 
-def _identical(target: Scores) -> Relation:
-    found = cell(target.pairs, "psnr")
-    frames = sum(pair.frames for pair in target.pairs)
-    return Relation(
-        f"every frame of the {TARGET} is identical",
-        found.infinite == frames,
-        f"{found.infinite} of {frames}",
-    )
-
-
 def _of(column: str, one: Scores, what: str, holds: Callable[[float], bool]) -> Relation:
     mean = _middle(column, one)
     return Relation(
         f"{_label(column)} of {one.name} {what}",
         None if mean is None else holds(mean),
-        _told(column, [one]),
+        _means_text(column, [one]),
     )
 
 
@@ -278,7 +270,7 @@ def _ordered(column: str, lower: Sequence[Scores], *, below: Sequence[Scores]) -
     return Relation(
         f"{_label(column)} of {names[0]} is below that of {names[1]}",
         max(low) < min(high) if whole else None,
-        _told(column, [*lower, *below]),
+        _means_text(column, [*lower, *below]),
     )
 
 
@@ -321,7 +313,7 @@ def _label(column: str) -> str:
     return f"median {label}" if column in HEAVY_TAILED else label
 
 
-def _told(column: str, sides: Sequence[Scores]) -> str:
+def _means_text(column: str, sides: Sequence[Scores]) -> str:
     digits = COLUMNS[column].digits
     texts = []
     for one in sides:

@@ -26,17 +26,20 @@ from PIL import Image
 from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.engine import LOCAL, Advance
 from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
-from stereogenbench_data.evaluation.evaluate import selected
-from stereogenbench_data.evaluation.predictions import Wanted, frame_name, item_name
+from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, item_name
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
-from stereogenbench_data.evaluation.running import Progress, no_progress
+from stereogenbench_data.evaluation.running import (
+    Progress,
+    frame_counter,
+    no_progress,
+    select_workload,
+)
 from stereogenbench_data.evaluation.tiers import Tier, require_tier
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Address, Selection
-from stereogenbench_data.sources.files import write_atomic
 
 INPUTS_JSON: Final = "inputs.json"
 CAMERA_JSON: Final = "camera.json"
@@ -59,7 +62,7 @@ class ExportOptions(Selection, total=False):
 @dataclass(frozen=True, slots=True)
 class _ItemWork:
     index: SceneIndex
-    wanted: Wanted
+    wanted: PairFrames
     tier: Tier
     depth: DepthEncoding | None
     folder: Path
@@ -93,43 +96,27 @@ def export_inputs(
     """
     known, root = require_tier(tier), Path(out)
     protocol = EvaluationProtocol(metrics=("psnr",), size=size, depth=depth)
-    extent = selected(data, protocol, inputs=known.inputs, options=options)
-    wanted = [each for pairs in extent.wanted for each in pairs]
-    rows = {str(key): row for row, key in enumerate(extent.index.column("key"))}
+    workload = select_workload(data, protocol, inputs=known.inputs, options=options)
+    wanted = [pair for pairs in workload.pairs for pair in pairs]
     _begin(
         root,
         {
             "tier": known.name,
             "size": f"{size[1]}x{size[0]}",
             "frames": [list(each) for each in sorted({each.frames for each in wanted})],
-            "data": extent.index.digest,
+            "data": workload.index.digest,
         },
     )
     works = [
-        _ItemWork(
-            SceneIndex.from_scenes(
-                [extent.index.scene(rows[each.scene])],
-                extent.index.root,
-                shards=extent.index.shards,
-                retry=extent.index.retry,
-            ),
-            each,
-            known,
-            depth,
-            root / item_name(each.scene, each.pair),
-        )
-        for each in wanted
-        if not (root / item_name(each.scene, each.pair)).is_dir()
+        _ItemWork(workload.index_of([row]), pair, known, depth, root / item_name(*pair.place))
+        for row, pairs in zip(workload.rows, workload.pairs, strict=True)
+        for pair in pairs
+        if not (root / item_name(*pair.place)).is_dir()
     ]
     progress = options.get("progress", no_progress)
-    done, total = extent.frames - sum(len(work.wanted.frames) for work in works), extent.frames
-
-    def after_frames(count: int) -> None:
-        nonlocal done
-        done += count
-        progress(done, total)
-
-    after_frames(0)
+    total = workload.frames
+    done = total - sum(len(work.wanted.frames) for work in works)
+    after_frames = frame_counter(progress, done=done, total=total)
     with closing(
         LOCAL.map(
             _write_item,
@@ -142,10 +129,10 @@ def export_inputs(
         for _ in written:
             after_frames(0)
     progress(total, total)
-    return [item_name(each.scene, each.pair) for each in wanted]
+    return [item_name(*pair.place) for pair in wanted]
 
 
-def _begin(root: Path, told: Mapping[str, Any]) -> None:
+def _begin(root: Path, content: Mapping[str, Any]) -> None:
     """Write what the folder holds, or refuse one that holds something else."""
     path = root / INPUTS_JSON
     try:
@@ -155,7 +142,7 @@ def _begin(root: Path, told: Mapping[str, Any]) -> None:
                 raise EvaluationError(
                     f"{root}: is not empty and holds no {INPUTS_JSON}: choose a new folder."
                 )
-            write_atomic(path, json.dumps(told).encode())
+            write_atomic(path, json.dumps(content).encode())
         there = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         if isinstance(error, EvaluationError):
@@ -163,7 +150,7 @@ def _begin(root: Path, told: Mapping[str, Any]) -> None:
         cure = cure_of(error, _ELSEWHERE) if isinstance(error, OSError) else _ELSEWHERE
         raise StorageError(f"{path}: cannot be read or written ({error}). {cure}") from error
     differing = [
-        name for name in told if not isinstance(there, dict) or there.get(name) != told[name]
+        name for name in content if not isinstance(there, dict) or there.get(name) != content[name]
     ]
     if differing:
         raise EvaluationError(

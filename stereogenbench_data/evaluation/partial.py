@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
-from stereogenbench_data.evaluation.metrics.frechet import Spread
+from stereogenbench_data.evaluation.metrics.frechet import FeatureStatistics
 from stereogenbench_data.evaluation.predictions import Pair, pair_name
 from stereogenbench_data.evaluation.scene_scores import PairScores, SceneScores
 from stereogenbench_data.sources.files import write_atomic
@@ -79,7 +79,7 @@ class PartialResults:
         Args:
             scene: The scene's key.
             scores: Its scores by candidate and pair.
-            stamps: What the right views were told by when they were scored.
+            stamps: What identified the right views when they were scored.
 
         Raises:
             StorageError: If they cannot be written.
@@ -91,7 +91,9 @@ class PartialResults:
                     "stamp": stamps[place],
                     "fault": found.fault,
                     "columns": {
-                        name: [_plain(number) for number in numbers]
+                        name: [
+                            number if math.isfinite(number) else str(number) for number in numbers
+                        ]
                         for name, numbers in found.columns.items()
                     },
                 }
@@ -125,7 +127,7 @@ class PartialResults:
 
         Args:
             scene: The scene's key.
-            stamps: What the right views are told by now.
+            stamps: What identifies the right views now.
             columns: The columns that scores have.
 
         Raises:
@@ -213,7 +215,7 @@ def _pair_scores(entry: Mapping[str, Any], arrays: Mapping[str, Any], place: str
             count, mean, root = (
                 arrays[f"{start}{name}/{part}"] for part in ("count", "mean", "root")
             )
-            spreads[name] = Spread(int(count), mean, root)
+            spreads[name] = FeatureStatistics(int(count), mean, root)
     return scores
 
 
@@ -221,12 +223,8 @@ def _place_name(place: tuple[str, Pair]) -> str:
     return f"{place[0]}/{pair_name(place[1])}"
 
 
-def _plain(number: float) -> float | str:
-    return number if math.isfinite(number) else str(number)
-
-
 def _read_json(path: Path) -> Any:
-    """Return a document, None where there is none or a kill cut it short."""
+    """Return a document; None if there is none, or if a kill cut it short."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

@@ -4,6 +4,7 @@ Methods of one plot are of one tier and scored in one way.
 """
 
 from collections.abc import Iterable, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,8 +47,8 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
             "plots need matplotlib: pip install 'stereogenbench-data[plots]'."
         ) from None
     written = []
-    for column, told in COLUMNS.items():
-        if told.better == "neither" or not _points(results, column):
+    for column, facts in COLUMNS.items():
+        if facts.better == "neither" or not any(_scored(one.pairs, column) for one in results):
             continue
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
         FigureCanvasAgg(figure)
@@ -66,17 +67,13 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
     return written
 
 
-def _points(results: Sequence[Scores], column: str) -> bool:
-    return any(_scored(one.pairs, column) for one in results)
-
-
 def _scored(pairs: Iterable[PairMeans], column: str) -> list[PairMeans]:
     return [pair for pair in pairs if column in pair.tallies and pair.tallies[column].finite]
 
 
 def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
-    protocol, told = results[0].protocol, COLUMNS[column]
-    for one, colour in zip(results, _cycle(len(results)), strict=True):
+    protocol, facts = results[0].protocol, COLUMNS[column]
+    for one, colour in zip(results, cycle(_COLOURS), strict=False):
         pairs = _scored(one.pairs, column)
         if not pairs:
             axes.plot([], [], color=colour, label=f"{one.name}: no finite number")
@@ -93,7 +90,7 @@ def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
     if metric is not None and protocol.is_papers(column):
         heights += _draw_reference(axes, results, metric)
     _draw_edges(axes, results)
-    better = f"{told.better} is better"
+    better = f"{facts.better} is better"
     axes.set_ylabel(f"{protocol.label(column)} ({better})")
     axes.set_xlabel("baseline in cm")
     # Intervals of few scenes may reach far beyond all that was seen: they are cut off.
@@ -106,10 +103,6 @@ def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
     axes.set_title(f"{protocol.label(column)} by baseline, {tier}", fontsize=11)
     axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     axes.spines[["top", "right"]].set_visible(False)
-
-
-def _cycle(count: int) -> list[str]:
-    return [_COLOURS[place % len(_COLOURS)] for place in range(count)]
 
 
 def _draw_sweeps(axes: Any, pairs: Sequence[PairMeans], column: str, colour: str) -> None:

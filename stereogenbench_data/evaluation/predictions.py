@@ -1,6 +1,6 @@
-"""Right views on disk: where each belongs, what it must be, and how its frames are read.
+"""The right views that are scored: written by a method, or returned when it is called.
 
-Of the pair of cameras 00 and 01 of a scene, the frames are in one of
+Written, of the pair of cameras 00 and 01 of a scene, the frames are in one of
 
     PREDICTIONS/<scene key>/00-01/000.png ...      or PREDICTIONS/<scene key>/00-01.mp4 (.mkv)
     PREDICTIONS/<item>/000.png ...                 or PREDICTIONS/<item>.mp4 (.mkv)
@@ -46,8 +46,8 @@ class PredictionFault(EvaluationError):
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
-    """What the prediction of one pair must hold.
+class PairFrames:
+    """The frames of one pair that are scored, and what its prediction must hold.
 
     Attributes:
         scene: The scene's key.
@@ -65,8 +65,18 @@ class Wanted:
     size: Size
     stored_size: Size
 
+    @property
+    def place(self) -> tuple[str, Pair]:
+        """The scene's key and the pair."""
+        return self.scene, self.pair
 
-class Frames(Protocol):
+    @property
+    def label(self) -> str:
+        """The scene and the pair as messages show them."""
+        return f"{self.scene}, cameras {pair_name(self.pair)}"
+
+
+class FrameReader(Protocol):
     """The opened frames of one prediction."""
 
     def read(self, frame: int) -> Any:
@@ -105,7 +115,7 @@ def frame_name(frame: int) -> str:
     return f"{frame:03d}.png"
 
 
-def find_prediction(root: Path, wanted: Wanted) -> Path:
+def find_prediction(root: Path, wanted: PairFrames) -> Path:
     """Return the folder of pictures or the video that holds a pair's prediction.
 
     Raises:
@@ -125,10 +135,10 @@ def find_prediction(root: Path, wanted: Wanted) -> Path:
         return found[0]
     if found:
         raise PredictionFault(
-            f"{_told(wanted)}: has several predictions, {found[0]} and {found[1]}: keep one."
+            f"{wanted.label}: has several predictions, {found[0]} and {found[1]}: keep one."
         )
     raise PredictionFault(
-        f"{_told(wanted)}: has no prediction in {root}; expected a folder or video "
+        f"{wanted.label}: has no prediction in {root}; expected a folder or video "
         f"{places[0].relative_to(root)} or {places[1].name}."
     )
 
@@ -146,33 +156,33 @@ def stamp_prediction(path: Path) -> str:
     return digest.hexdigest()[:_ITEM_DIGITS]
 
 
-def open_prediction(path: Path, wanted: Wanted) -> Frames:
+def open_prediction(path: Path, wanted: PairFrames) -> FrameReader:
     """Open a prediction that `find_prediction` found.
 
     Raises:
-        PredictionFault: If it has another number of frames, or is no video.
+        PredictionFault: If it has another number of frames, or is not a video.
     """
     if path.is_dir():
-        return _PngFrames(path, wanted)
-    return _VideoFrames(path, wanted)
+        return _PngReader(path, wanted)
+    return _VideoFileReader(path, wanted)
 
 
-class _PngFrames:
-    def __init__(self, folder: Path, wanted: Wanted) -> None:
+class _PngReader:
+    def __init__(self, folder: Path, wanted: PairFrames) -> None:
         self._folder = folder
         self._wanted = wanted
         there = {file.name for file in folder.iterdir()}
         missing = [frame for frame in wanted.frames if frame_name(frame) not in there]
         if missing:
             raise PredictionFault(
-                f"{_told(wanted)}: {folder} lacks {len(missing)} of {len(wanted.frames)} frames, "
+                f"{wanted.label}: {folder} lacks {len(missing)} of {len(wanted.frames)} frames, "
                 f"the first is {frame_name(missing[0])}."
             )
         known = {frame_name(frame) for frame in range(wanted.scene_frames)}
         odd = sorted(name for name in there - known if name.endswith(".png"))
         if odd:
             raise PredictionFault(
-                f"{_told(wanted)}: {folder} holds {odd[0]}, and the scene has "
+                f"{wanted.label}: {folder} holds {odd[0]}, and the scene has "
                 f"{wanted.scene_frames} frames, {frame_name(0)} to "
                 f"{frame_name(wanted.scene_frames - 1)}."
             )
@@ -193,11 +203,11 @@ class _PngFrames:
                     f"{path}: cannot be read ({error.strerror}). {cure_of(error)}"
                 ) from error
             raise PredictionFault(
-                f"{_told(self._wanted)}: {path} is no picture that can be read ({error})."
+                f"{self._wanted.label}: {path} cannot be read as a picture ({error})."
             ) from error
         except Image.DecompressionBombError as error:
             raise PredictionFault(
-                f"{_told(self._wanted)}: {path} is too large ({error})."
+                f"{self._wanted.label}: {path} is too large ({error})."
             ) from error
         return np.ascontiguousarray(pixels.transpose(2, 0, 1))
 
@@ -205,7 +215,7 @@ class _PngFrames:
         if image.mode != "RGB" or bits != b"\x08":
             depth = f" of {bits[0]} bits" if bits else ""
             raise PredictionFault(
-                f"{_told(self._wanted)}: {path} has pixels of mode {image.mode}{depth}: write "
+                f"{self._wanted.label}: {path} has pixels of mode {image.mode}{depth}: write "
                 f"8-bit RGB."
             )
         _require_size((image.height, image.width), path, self._wanted)
@@ -214,8 +224,8 @@ class _PngFrames:
         """Nothing is kept open."""
 
 
-class _VideoFrames:
-    def __init__(self, path: Path, wanted: Wanted) -> None:
+class _VideoFileReader:
+    def __init__(self, path: Path, wanted: PairFrames) -> None:
         self._path = path
         self._wanted = wanted
         with self._faults():
@@ -231,7 +241,7 @@ class _VideoFrames:
         if count == len(self._wanted.frames):
             return {frame: place for place, frame in enumerate(self._wanted.frames)}
         raise PredictionFault(
-            f"{_told(self._wanted)}: {self._path} holds {count} frames; expected "
+            f"{self._wanted.label}: {self._path} holds {count} frames; expected "
             f"{self._wanted.scene_frames} (the scene's) or {len(self._wanted.frames)} (those "
             f"evaluated)."
         )
@@ -245,7 +255,7 @@ class _VideoFrames:
         try:
             yield
         except (MediaError, StorageError) as error:
-            raise PredictionFault(f"{_told(self._wanted)}: {error}") from error
+            raise PredictionFault(f"{self._wanted.label}: {error}") from error
 
     def close(self) -> None:
         self._reader.close()
@@ -272,7 +282,7 @@ def scaled_rgb(picture: Any, *, size: Size, scaler: VideoReformatter) -> Any:
     return np.stack([plane_numbers(frame, plane, dtype="u1") for plane in _RED_GREEN_BLUE])
 
 
-def require_picture(picture: Any, wanted: Wanted, *, where: str) -> None:
+def require_picture(picture: Any, wanted: PairFrames, *, where: str) -> None:
     """Refuse what a method returned unless it is a right view of the evaluated size.
 
     Raises:
@@ -280,22 +290,18 @@ def require_picture(picture: Any, wanted: Wanted, *, where: str) -> None:
     """
     if picture.shape != (3, *wanted.size) or picture.dtype != np.uint8:
         raise PredictionFault(
-            f"{_told(wanted)}: {where} gave {picture.dtype} {tuple(picture.shape)} for a frame; "
+            f"{wanted.label}: {where} gave {picture.dtype} {tuple(picture.shape)} for a frame; "
             f"expected uint8 {(3, *wanted.size)}."
         )
 
 
-def _require_size(found: Size, path: Path, wanted: Wanted) -> None:
+def _require_size(found: Size, path: Path, wanted: PairFrames) -> None:
     if found not in (wanted.size, wanted.stored_size):
         raise PredictionFault(
-            f"{_told(wanted)}: {path} is {found[1]}x{found[0]}; expected "
+            f"{wanted.label}: {path} is {found[1]}x{found[0]}; expected "
             f"{wanted.size[1]}x{wanted.size[0]}, or the scene's own "
             f"{wanted.stored_size[1]}x{wanted.stored_size[0]}."
         )
-
-
-def _told(wanted: Wanted) -> str:
-    return f"{wanted.scene}, cameras {pair_name(wanted.pair)}"
 
 
 Method = Callable[[dict[str, Any]], Any]
@@ -303,10 +309,10 @@ Method = Callable[[dict[str, Any]], Any]
 uint8, or floats of 0 to 1, (n, 3, h, w)."""
 
 
-class Views(Protocol):
+class PredictionReader(Protocol):
     """The right views of one scene while it is scored."""
 
-    def read(self, wanted: Wanted, samples: Sequence[Sample]) -> Sequence[Any]:
+    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> Sequence[Any]:
         """Return the right view of each sample, frames of one pair in order: uint8 (3, h, w).
 
         Each is of the evaluated size, or of that of the scene's own pictures.
@@ -318,7 +324,7 @@ class Views(Protocol):
         ...
 
 
-class Candidate(Protocol):
+class PredictionSource(Protocol):
     """A source of right views."""
 
     @property
@@ -331,7 +337,7 @@ class Candidate(Protocol):
         """Fields of a sample that it needs."""
         ...
 
-    def stamp(self, wanted: Wanted) -> str:
+    def stamp(self, wanted: PairFrames) -> str:
         """Return a text that changes when the right views of a pair do.
 
         Raises:
@@ -339,7 +345,7 @@ class Candidate(Protocol):
         """
         ...
 
-    def open(self, index: SceneIndex) -> Views:
+    def open(self, index: SceneIndex) -> PredictionReader:
         """Begin with a scene; the index holds it, and scenes that are read beside it."""
         ...
 
@@ -358,7 +364,7 @@ class PredictionFolder:
     root: Path
     inputs: tuple[str, ...] = ()
 
-    def stamp(self, wanted: Wanted) -> str:
+    def stamp(self, wanted: PairFrames) -> str:
         """Return a text that changes when the files do.
 
         Raises:
@@ -366,17 +372,17 @@ class PredictionFolder:
         """
         return stamp_prediction(find_prediction(self.root, wanted))
 
-    def open(self, index: SceneIndex) -> "_FolderViews":
+    def open(self, index: SceneIndex) -> "_FolderReader":
         """Begin to read a scene's predictions."""
-        return _FolderViews(self.root)
+        return _FolderReader(self.root)
 
 
-class _FolderViews:
+class _FolderReader:
     def __init__(self, root: Path) -> None:
         self._root = root
-        self._open: dict[Pair, Frames] = {}
+        self._open: dict[Pair, FrameReader] = {}
 
-    def read(self, wanted: Wanted, samples: Sequence[Sample]) -> list[Any]:
+    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
         if wanted.pair not in self._open:
             self._open[wanted.pair] = open_prediction(find_prediction(self._root, wanted), wanted)
         frames = self._open[wanted.pair]
@@ -407,15 +413,15 @@ class CalledMethod:
         """Fields of a sample that it needs."""
         return self.tier.inputs
 
-    def stamp(self, wanted: Wanted) -> str:
-        """Return the name: what a callable computes cannot be told from outside."""
+    def stamp(self, wanted: PairFrames) -> str:
+        """Return the name: a change of what a callable computes cannot be seen."""
         return f"called {self.name}"
 
     def open(self, index: SceneIndex) -> "CalledMethod":
         """Begin with a scene."""
         return self
 
-    def read(self, wanted: Wanted, samples: Sequence[Sample]) -> Sequence[Any]:
+    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> Sequence[Any]:
         """Return what the method makes of a batch, as uint8 pictures."""
         given = self.method(batch_of([self.tier.inputs_of(sample) for sample in samples]))
         pictures = _as_pictures(given, count=len(samples), wanted=wanted, where=self.name)
@@ -437,7 +443,7 @@ def batch_of(inputs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _as_pictures(given: Any, *, count: int, wanted: Wanted, where: str) -> Sequence[Any]:
+def _as_pictures(given: Any, *, count: int, wanted: PairFrames, where: str) -> Sequence[Any]:
     """Return a method's answer as an array of uint8 where it holds floats of 0 to 1."""
     if hasattr(given, "detach"):
         tensor = given.detach().cpu()
@@ -446,7 +452,7 @@ def _as_pictures(given: Any, *, count: int, wanted: Wanted, where: str) -> Seque
         array = np.asarray(given)
     except (RuntimeError, TypeError, ValueError) as error:
         raise PredictionFault(
-            f"{wanted.scene}: {where} returned a {type(given).__name__} that is no one array "
+            f"{wanted.scene}: {where} returned a {type(given).__name__} that is not one array "
             f"({error}); expected ({count}, 3, {wanted.size[0]}, {wanted.size[1]})."
         ) from error
     if array.ndim != 4 or len(array) != count or array.size == 0:

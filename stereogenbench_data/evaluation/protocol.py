@@ -1,4 +1,4 @@
-"""The protocol: every choice that scores depend on, and the tools that these choices name."""
+"""The protocol: every choice that scores depend on, and the models that these choices name."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -34,14 +34,7 @@ from stereogenbench_data.evaluation.models.interfaces import (
     StereoMatcher,
     VideoFeatures,
 )
-from stereogenbench_data.evaluation.models.registry import (
-    Where,
-    load_image_features,
-    load_keypoint_matcher,
-    load_pair_metric,
-    load_stereo_matcher,
-    load_video_features,
-)
+from stereogenbench_data.evaluation.models.registry import ModelKind, ModelOptions, load_model
 from stereogenbench_data.schema.records import DepthEncoding
 
 PAPER_SIZE: Final = (480, 832)
@@ -72,7 +65,7 @@ class EvaluationProtocol:
         fit: The fit of SD by which relations between controls are judged. Every report shows SD
             "filtered" and by "least_squares", whatever this is, and "theil_sen" if it is that.
         depth: A depth contract instead of the one that files and release state.
-        where: Where learned parts run and where their weights are.
+        models: Where learned models run and where their weights are.
         batch_frames: How many frames are held, and given to learned parts, at a time.
     """
 
@@ -82,7 +75,7 @@ class EvaluationProtocol:
     stereo_matcher: str = "sgbm"
     fit: FitMethod = "filtered"
     depth: DepthEncoding | None = None
-    where: Where = field(default_factory=Where)
+    models: ModelOptions = field(default_factory=ModelOptions)
     batch_frames: int = 8
 
     def __post_init__(self) -> None:
@@ -128,8 +121,8 @@ class EvaluationProtocol:
         return not backend or getattr(self, backend) == PAPER_BACKENDS[backend]
 
 
-class Tools:
-    """What a protocol's metrics are computed with, loaded when first used."""
+class MetricModels:
+    """The models that a protocol's metrics are computed with, loaded when first used."""
 
     def __init__(self, protocol: EvaluationProtocol) -> None:
         """Take the protocol; nothing is loaded yet."""
@@ -138,38 +131,38 @@ class Tools:
     @cached_property
     def keypoint_matcher(self) -> KeypointMatcher:
         """What finds the matches of E_match."""
-        return load_keypoint_matcher(self.protocol.keypoint_matcher, self.protocol.where)
+        matcher: KeypointMatcher = self._load("keypoint matcher", self.protocol.keypoint_matcher)
+        return matcher
 
     @cached_property
     def stereo_matcher(self) -> StereoMatcher:
         """What finds the disparity of SD."""
-        return load_stereo_matcher(self.protocol.stereo_matcher, self.protocol.where)
+        matcher: StereoMatcher = self._load("stereo matcher", self.protocol.stereo_matcher)
+        return matcher
 
     @cached_property
     def pair_metrics(self) -> dict[str, PairMetric]:
         """The learned metrics of pairs of pictures, by column."""
-        return {
-            name: load_pair_metric(name, self.protocol.where)
-            for name in self.protocol.metrics
-            if name == "lpips"
-        }
+        return self._load_metrics("pair metric", {"lpips": "lpips"})
 
     @cached_property
     def image_features(self) -> dict[str, ImageFeatures]:
         """The features of each distance between sets of frames."""
-        return {
-            name: load_image_features(IMAGE_DISTANCES[name], self.protocol.where)
-            for name in self.protocol.metrics
-            if name in IMAGE_DISTANCES
-        }
+        return self._load_metrics("image features", IMAGE_DISTANCES)
 
     @cached_property
     def video_features(self) -> dict[str, VideoFeatures]:
         """The features of each distance between sets of clips."""
+        return self._load_metrics("video features", VIDEO_DISTANCES)
+
+    def _load(self, kind: ModelKind, name: str) -> Any:
+        return load_model(kind, name, self.protocol.models)
+
+    def _load_metrics(self, kind: ModelKind, names: Mapping[str, str]) -> dict[str, Any]:
         return {
-            name: load_video_features(VIDEO_DISTANCES[name], self.protocol.where)
-            for name in self.protocol.metrics
-            if name in VIDEO_DISTANCES
+            metric: self._load(kind, names[metric])
+            for metric in self.protocol.metrics
+            if metric in names
         }
 
     def settings(self) -> dict[str, Any]:
@@ -180,7 +173,7 @@ class Tools:
         """
         protocol = self.protocol
         height, width = protocol.size
-        told: dict[str, Any] = {
+        settings: dict[str, Any] = {
             "size": f"{width}x{height}",
             "resize": RESIZE,
             "depth": "as the files state" if protocol.depth is None else repr(protocol.depth),
@@ -198,17 +191,17 @@ class Tools:
         parts: Mapping[str, Any] = self.pair_metrics | self.image_features | self.video_features
         for name in protocol.metrics:
             found = of_metric[name]() if name in of_metric else parts[name].settings
-            told[name] = dict(found)
-        return told
+            settings[name] = dict(found)
+        return settings
 
 
 @lru_cache(maxsize=1)
-def tools_of(protocol: EvaluationProtocol) -> Tools:
-    """Return the tools of a protocol, kept for the next scene that this process scores.
+def models_of(protocol: EvaluationProtocol) -> MetricModels:
+    """Return the models of a protocol, kept for the next scene that this process scores.
 
-    ``tools_of.cache_clear()`` lets go of what was loaded.
+    ``models_of.cache_clear()`` lets go of what was loaded.
     """
-    return Tools(protocol)
+    return MetricModels(protocol)
 
 
 def _versions() -> dict[str, str]:

@@ -14,7 +14,7 @@ from typing import Final, Literal
 from stereogenbench_data.errors import EvaluationError
 
 TableName = Literal["main", "unseen", "bins", "controls"]
-Row = Mapping[str, str]
+ReferenceRow = Mapping[str, str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class ReferenceTable:
 
     name: str
     source: str
-    rows: tuple[Row, ...]
+    rows: tuple[ReferenceRow, ...]
 
 
 SOURCES: Final[dict[str, str]] = {
@@ -101,7 +101,7 @@ def reference_table(name: TableName) -> ReferenceTable:
     return ReferenceTable(name, SOURCES[name], tuple(csv.DictReader(text.splitlines())))
 
 
-def reference_rows(name: TableName, **where: str) -> list[Row]:
+def reference_rows(name: TableName, **where: str) -> list[ReferenceRow]:
     """Return the rows of a table whose columns have the given values.
 
     Raises:

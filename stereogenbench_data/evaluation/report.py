@@ -16,7 +16,7 @@ from stereogenbench_data.evaluation.controls import Relation
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.predictions import pair_name
 from stereogenbench_data.evaluation.reference import DISCREPANCIES, PAPER
-from stereogenbench_data.evaluation.tables import Row, Table
+from stereogenbench_data.evaluation.tables import Table, TableRow
 from stereogenbench_data.evaluation.tiers import TIERS
 from stereogenbench_data.schema.problems import counted, markdown_text
 from stereogenbench_data.sources.files import write_atomic
@@ -24,7 +24,7 @@ from stereogenbench_data.sources.files import write_atomic
 Verdict = Mapping[bool | None, str]
 
 FORMAT: Final = 2
-_GAPS_TOLD: Final = 20
+_GAPS_SHOWN: Final = 20
 _VERDICTS: Final[Verdict] = {True: "holds", False: "DOES NOT HOLD", None: "cannot be told"}
 
 
@@ -39,7 +39,7 @@ def document(
         found: Relations of calibration controls.
     """
     first = results[0]
-    told: dict[str, Any] = {
+    content: dict[str, Any] = {
         "format": FORMAT,
         "tier": first.tier,
         "methods": [one.name for one in results],
@@ -50,10 +50,10 @@ def document(
         "paper": {"title": PAPER, "discrepancies": dict(DISCREPANCIES)},
     }
     if found:
-        told["relations"] = [
+        content["relations"] = [
             {"what": each.what, "holds": each.holds, "found": each.found} for each in found
         ]
-    return told
+    return content
 
 
 def page(
@@ -65,13 +65,19 @@ def page(
     tier = "" if first.tier == CONTROL else f", tier {first.tier}: {TIERS[first.tier].meaning}"
     lines = [f"# {names}{tier}", ""]
     for one in results:
-        told = _coverage(one)
+        covered = _coverage(one)
         lines.append(
-            f"- {markdown_text(one.name)}: {counted(told['pairs'], 'pair')} of "
-            f"{counted(told['scenes'], 'scene')}, {counted(told['frames'], 'frame')}"
-            + (f", {counted(len(told['missing']), 'pair')} missing" if told["missing"] else "")
+            f"- {markdown_text(one.name)}: {counted(covered['pairs'], 'pair')} of "
+            f"{counted(covered['scenes'], 'scene')}, {counted(covered['frames'], 'frame')}"
+            + (
+                f", {counted(len(covered['missing']), 'pair')} missing"
+                if covered["missing"]
+                else ""
+            )
         )
-        lines += [f"  - missing: {markdown_text(each)}" for each in told["missing"][:_GAPS_TOLD]]
+        lines += [
+            f"  - missing: {markdown_text(each)}" for each in covered["missing"][:_GAPS_SHOWN]
+        ]
     lines += ["", *(f"{markdown(table)}" for table in tables)]
     if found:
         lines += ["### Relations between the controls", ""]
@@ -124,7 +130,7 @@ def write_report(
 
 
 def pairs_csv(results: Sequence[Scores]) -> str:
-    """Return the scores of every pair of every scene as CSV, empty where there is none."""
+    """Return the scores of every pair of every scene as CSV, empty where there is no score."""
     columns = list(dict.fromkeys(name for one in results for p in one.pairs for name in p.tallies))
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
@@ -249,13 +255,10 @@ def plain(table: Table) -> dict[str, Any]:
 def heading(table: Table, column: str) -> str:
     """Return the head of a column: its name, what it was measured with, which way is better."""
     if column not in COLUMNS:
-        return f"{_distance_label(column)}↓"
+        name = column.upper() if column in ("fid", "fvd") else f"FD{column.removeprefix('fd')}"
+        return f"{name}↓"
     median = " [median]" if column in HEAVY_TAILED else ""
     return f"{table.protocol.label(column)}{_ARROWS[COLUMNS[column].better]}{median}"
-
-
-def _distance_label(name: str) -> str:
-    return name.upper() if name in ("fid", "fvd") else f"FD{name.removeprefix('fd')}"
 
 
 def _texts(table: Table) -> tuple[list[str], list[list[str]]]:
@@ -275,7 +278,7 @@ def _texts(table: Table) -> tuple[list[str], list[list[str]]]:
     return head, rows
 
 
-def _cell_text(table: Table, row: Row, column: str) -> str:
+def _cell_text(table: Table, row: TableRow, column: str) -> str:
     if row.is_papers:
         text = row.printed.get(column, ABSENT).replace("inf", "∞")
         marked = column in COLUMNS and not table.protocol.is_papers(column) and text != ABSENT
@@ -323,7 +326,7 @@ def _tex(text: str) -> str:
     return "---" if text == ABSENT else "".join(_LATEX.get(letter, letter) for letter in text)
 
 
-def _csv_lines(table: Table, row: Row) -> list[list[Any]]:
+def _csv_lines(table: Table, row: TableRow) -> list[list[Any]]:
     group = "; ".join(f"{k}={v}" for k, v in zip(table.keys, row.labels, strict=True))
     source = "paper" if row.is_papers else "scored"
     lines: list[list[Any]] = []
@@ -347,8 +350,8 @@ def _blank(number: float | None) -> float | str:
     return "" if number is None else number
 
 
-def _plain_row(table: Table, row: Row) -> dict[str, Any]:
-    told: dict[str, Any] = {
+def _plain_row(table: Table, row: TableRow) -> dict[str, Any]:
+    plain_row: dict[str, Any] = {
         "method": row.method,
         "source": "paper" if row.is_papers else "scored",
         "group": dict(zip(table.keys, row.labels, strict=True)),
@@ -356,12 +359,14 @@ def _plain_row(table: Table, row: Row) -> dict[str, Any]:
         "frames": row.frames,
     }
     if row.is_papers:
-        return told | {"printed": dict(row.printed)}
+        return plain_row | {"printed": dict(row.printed)}
     cells = {name: asdict(row.cells[name]) for name in table.columns if name in row.cells}
-    told |= {"missing_pairs": row.missing, "cells": cells}
+    plain_row |= {"missing_pairs": row.missing, "cells": cells}
     if row.distances:
-        told["distances"] = {name: _plain_distance(each) for name, each in row.distances.items()}
-    return told
+        plain_row["distances"] = {
+            name: _plain_distance(each) for name, each in row.distances.items()
+        }
+    return plain_row
 
 
 def _plain_distance(found: FrechetDistance) -> dict[str, Any]:

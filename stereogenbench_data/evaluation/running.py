@@ -1,59 +1,132 @@
-"""Scoring a selection: scenes in parallel processes, each kept on disk as it is done."""
+"""Running an evaluation: scenes in parallel processes, each kept on disk as it is done."""
 
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
-from typing import Final
+from pathlib import Path
+from typing import Any, Final, TypedDict
 
-from stereogenbench_data.datasets.mapped import StereoPairs
-from stereogenbench_data.engine import LOCAL, Advance, Engine
+from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.engine import LOCAL, Engine
 from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, grouped, tally
+from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
+from stereogenbench_data.evaluation.metrics.frechet import (
+    FeatureStatistics,
+    FrechetDistance,
+    frechet_distance,
+)
 from stereogenbench_data.evaluation.partial import PartialResults
-from stereogenbench_data.evaluation.predictions import Candidate, Pair, PredictionFault, Wanted
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.evaluation.scene_scores import SceneScores, SceneWork, score_scene
+from stereogenbench_data.evaluation.predictions import (
+    PairFrames,
+    PredictionFault,
+    PredictionFolder,
+    PredictionSource,
+)
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol, models_of
+from stereogenbench_data.evaluation.scene_scores import SceneWork, score_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.problems import counted
-from stereogenbench_data.selection.plan import Plan
+from stereogenbench_data.selection.plan import Plan, Selection
 from stereogenbench_data.selection.windows import Random
 
 Progress = Callable[[int, int], None]
-Place = tuple[str, Pair]
 
-_TOLD: Final = 2
+_FAULTS_SHOWN: Final = 2
+_BRANCH: Final = ("subset", "family")
 
 
-def no_progress(done: int, total: int) -> None:
-    """Say nothing."""
+class RunOptions(TypedDict, total=False):
+    """How an evaluation is run; none of it changes a score.
+
+    Attributes:
+        out: A folder that keeps partial results, so that a stopped evaluation goes on; without
+            it they are lost.
+        workers: How many processes score scenes, None for one a core. A callable is called, and
+            its right views scored, in this process.
+        engine: Where scenes are scored, `engine.LOCAL` or an `engine.RayCluster`; a callable
+            stays in this process.
+        allow_missing: How many right views of pairs may be missing or unusable; they are counted
+            in the tables. 0 makes the first an error.
+        progress: Called with (frames done, frames in all).
+    """
+
+    out: str | Path | None
+    workers: int | None
+    engine: Engine
+    allow_missing: int
+    progress: Progress
+
+
+class EvaluationOptions(RunOptions, Selection, total=False):
+    """How an evaluation is run, and which scenes, pairs and frames it is of.
+
+    ``pairs`` is "primary" unless given, ``frames`` "all".
+    """
 
 
 @dataclass(frozen=True, slots=True)
-class Extent:
+class Workload:
     """What is scored: the scenes of an index with their pairs and frames.
 
     Attributes:
         index: The index.
         rows: The scenes' rows, ascending.
-        wanted: For each scene, what is to be scored of its pairs.
+        pairs: For each scene, what is scored of its pairs.
     """
 
     index: SceneIndex
     rows: tuple[int, ...]
-    wanted: tuple[tuple[Wanted, ...], ...]
+    pairs: tuple[tuple[PairFrames, ...], ...]
 
     @property
     def frames(self) -> int:
         """How many frames of pairs there are."""
-        return sum(len(each.frames) for pairs in self.wanted for each in pairs)
+        return sum(len(pair.frames) for pairs in self.pairs for pair in pairs)
+
+    def index_of(self, rows: Sequence[int]) -> SceneIndex:
+        """Return an index of a few rows, small enough to be sent to a process with its work."""
+        return SceneIndex.from_scenes(
+            [self.index.scene(row) for row in rows],
+            self.index.root,
+            shards=self.index.shards,
+            retry=self.index.retry,
+        )
 
 
-def extent_of(pairs: StereoPairs, *, size: tuple[int, int]) -> Extent:
-    """Return what a dataset's selection has to be scored.
+def select_workload(
+    data: Data,
+    protocol: EvaluationProtocol,
+    *,
+    inputs: Sequence[str],
+    options: Mapping[str, Any],
+) -> Workload:
+    """Return what is to be scored, once it is known that its data can be read.
+
+    Args:
+        data: What `StereoPairs` takes.
+        protocol: Which fields, at which size.
+        inputs: Fields that are needed besides those of the protocol.
+        options: The selection; `RunOptions` among it are passed over.
 
     Raises:
-        EvaluationError: If its samples are clips, random frames, sweeps or right to left.
+        SelectionError: If nothing matches.
+        MediaError: If depth that a metric needs cannot have been stored whole.
+        EvaluationError: If the samples are clips, random frames, sweeps or right to left.
     """
-    plan = pairs.plan
+    selection: dict[str, Any] = {
+        key: value for key, value in options.items() if key not in RunOptions.__optional_keys__
+    }
+    selection.setdefault("frames", "all")
+    dataset = StereoPairs(
+        data,
+        fields=tuple(dict.fromkeys((*protocol.fields, *inputs))),
+        size=protocol.size,
+        depth=protocol.depth,
+        **selection,
+    )
+    plan = dataset.plan
     chosen = plan.pairs
     if plan.windows.is_clip or isinstance(plan.windows, Random):
         raise EvaluationError(
@@ -65,13 +138,19 @@ def extent_of(pairs: StereoPairs, *, size: tuple[int, int]) -> Extent:
             "a right view is generated from the view to its left: choose pairs='primary', "
             "'adjacent', 'all' or (left, right) numbers."
         )
-    wanted = [_wanted(pairs.index, plan, place, size=size) for place in range(len(plan.scene_rows))]
-    return Extent(pairs.index, tuple(int(row) for row in plan.scene_rows), tuple(wanted))
+    return Workload(
+        index=dataset.index,
+        rows=tuple(int(row) for row in plan.scene_rows),
+        pairs=tuple(
+            _pairs_of_scene(dataset.index, plan, place, size=protocol.size)
+            for place in range(len(plan.scene_rows))
+        ),
+    )
 
 
-def _wanted(
+def _pairs_of_scene(
     index: SceneIndex, plan: Plan, place: int, *, size: tuple[int, int]
-) -> tuple[Wanted, ...]:
+) -> tuple[PairFrames, ...]:
     scene = index.scene(int(plan.scene_rows[place]))
     windows = plan.windows.count(scene.frames)
     frames = tuple(
@@ -79,7 +158,7 @@ def _wanted(
     )
     first, last = int(plan.first_pair[place]), int(plan.first_pair[place + 1])
     return tuple(
-        Wanted(
+        PairFrames(
             scene=scene.id.key,
             pair=(int(plan.pairs.source[number]), int(plan.pairs.targets[number, 0])),
             frames=frames,
@@ -93,62 +172,133 @@ def _wanted(
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """How a selection is scored.
+    """What a workload is scored by, and what its results are kept under.
 
     Attributes:
         protocol: The choices that scores depend on.
-        candidates: Whose right views are scored.
-        allow_missing: How many right views of pairs may be missing or unusable, and are counted.
-        workers: How many processes, None for one a core.
-        engine: Where they are.
-        beside: For each scene, by key, the one that candidates read beside it, if any.
+        sources: Whose right views are scored.
+        tier: What the sources were given.
+        donors: For each scene, by key, another one that sources read views of, if any.
+        settings: What else the scores depend on, as plain values.
     """
 
     protocol: EvaluationProtocol
-    candidates: tuple[Candidate, ...]
-    allow_missing: int = 0
-    workers: int | None = None
-    engine: Engine = LOCAL
-    beside: Mapping[str, str] = field(default_factory=dict)
+    sources: tuple[PredictionSource, ...]
+    tier: str
+    donors: Mapping[str, str] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
 
-def score_all(extent: Extent, run: Run, *, partial: PartialResults, progress: Progress) -> None:
-    """Score what is not scored yet, and keep each scene's scores as soon as it is done.
+def score_workload(
+    workload: Workload, run: Run, options: RunOptions | EvaluationOptions
+) -> list[Scores]:
+    """Return the scores of every source; scenes that ``out`` holds scores of are not scored again.
 
     Raises:
         PredictionFault: If a right view is missing or is not what it must be, and is not allowed.
-        EvaluationError: If more are than are allowed, or those scored before were changed since.
+        EvaluationError: If more are than are allowed, if ``out`` holds results of other settings,
+            or if right views that were scored before have changed since.
         StorageError: If data or results cannot be read or written.
+        ExtraError: If a package or weights that a metric needs are not there.
     """
-    stamps: dict[str, dict[Place, str]] = {}
+    folders = [str(each.root) for each in run.sources if isinstance(each, PredictionFolder)]
+    try:
+        settings = models_of(run.protocol).settings()
+        state = {
+            "tier": run.tier,
+            "methods": [source.name for source in run.sources],
+            "data": workload.index.digest,
+            "frames": sorted({pair.frames for pairs in workload.pairs for pair in pairs}),
+            "pairs": sorted({pair.pair for pairs in workload.pairs for pair in pairs}),
+            "settings": settings,
+            **({"predictions": folders} if folders else {}),
+            **run.settings,
+        }
+        with ExitStack() as stack:
+            out = options.get("out")
+            if out is None:
+                out = stack.enter_context(tempfile.TemporaryDirectory(prefix="stereogenbench-"))
+            partial = PartialResults(Path(out), settings=state)
+            _score_missing_scenes(workload, run, partial, options)
+            results = []
+            for source in run.sources:
+                means = tuple(_pair_means(workload, partial, source.name))
+                results.append(
+                    Scores(
+                        name=source.name,
+                        tier=run.tier,
+                        protocol=run.protocol,
+                        settings=settings,
+                        index=workload.index,
+                        pairs=means,
+                        distances=_distances(workload, partial, source.name, means, run.protocol),
+                    )
+                )
+        return results
+    finally:
+        models_of.cache_clear()
+
+
+def _score_missing_scenes(
+    workload: Workload,
+    run: Run,
+    partial: PartialResults,
+    options: RunOptions | EvaluationOptions,
+) -> None:
+    """Score what is not scored yet, and keep each scene's scores as soon as it is done."""
+    allowed = options.get("allow_missing", 0)
+    stamps: dict[str, dict[tuple[str, tuple[int, int]], str]] = {}
     works: list[SceneWork] = []
     missing: list[str] = []
     faults: list[str] = []
-    done = 0
-    rows = {str(key): row for row, key in enumerate(extent.index.column("key"))}
-    for pairs in extent.wanted:
+    done_frames = 0
+    rows = {str(key): row for row, key in enumerate(workload.index.column("key"))}
+    for row, pairs in zip(workload.rows, workload.pairs, strict=True):
         scene = pairs[0].scene
         stamps[scene] = {
-            (candidate.name, each.pair): _stamp(candidate, each, missing=missing)
-            for candidate in run.candidates
-            for each in pairs
+            (source.name, pair.pair): _stamp(source, pair, missing=missing)
+            for source in run.sources
+            for pair in pairs
         }
         if partial.is_done(scene, stamps=stamps[scene], columns=run.protocol.columns):
-            done += sum(len(each.frames) for each in pairs)
+            done_frames += sum(len(pair.frames) for pair in pairs)
             faults.extend(partial.faults(scene))
             continue
-        needed = sorted({rows[scene], rows[run.beside.get(scene, scene)]})
         works.append(
             SceneWork(
-                index=_part_of(extent.index, needed),
-                wanted=pairs,
+                index=workload.index_of(sorted({row, rows[run.donors.get(scene, scene)]})),
+                pairs=pairs,
                 protocol=run.protocol,
-                candidates=run.candidates,
-                faults="count" if run.allow_missing else "raise",
+                sources=run.sources,
+                faults="count" if allowed else "raise",
             )
         )
-    _require_few(missing, allowed=run.allow_missing)
-    total = extent.frames
+    _require_few(missing, allowed=allowed)
+    progress = options.get("progress", no_progress)
+    after_frames = frame_counter(progress, done=done_frames, total=workload.frames)
+    _require_few(faults, allowed=allowed)
+    with closing(
+        options.get("engine", LOCAL).map(
+            score_scene,
+            works,
+            name=lambda work: work.scene,
+            workers=options.get("workers"),
+            advance=after_frames,
+        )
+    ) as results:
+        for scene, scores in results:
+            partial.write(scene, scores, stamps=stamps[scene])
+            faults.extend(found.fault for found in scores.values() if found.fault)
+            _require_few(faults, allowed=allowed)
+    progress(workload.frames, workload.frames)
+
+
+def no_progress(done: int, total: int) -> None:
+    """Say nothing."""
+
+
+def frame_counter(progress: Progress, *, done: int, total: int) -> Callable[[int], None]:
+    """Return what is called with how many frames were done since, and reports how many are."""
 
     def after_frames(count: int) -> None:
         nonlocal done
@@ -156,32 +306,13 @@ def score_all(extent: Extent, run: Run, *, partial: PartialResults, progress: Pr
         progress(done, total)
 
     after_frames(0)
-    _require_few(faults, allowed=run.allow_missing)
-    for scene, scores in _scored(works, run, after_frames=after_frames):
-        partial.write(scene, scores, stamps=stamps[scene])
-        faults.extend(found.fault for found in scores.values() if found.fault)
-        _require_few(faults, allowed=run.allow_missing)
-    progress(total, total)
+    return after_frames
 
 
-def _scored(
-    works: Sequence[SceneWork], run: Run, *, after_frames: Advance
-) -> Iterator[tuple[str, SceneScores]]:
-    results = run.engine.map(
-        _score, works, name=lambda work: work.scene, workers=run.workers, advance=after_frames
-    )
-    with closing(results):
-        yield from results
-
-
-def _score(work: SceneWork, after_frames: Advance) -> tuple[str, SceneScores]:
-    return work.scene, score_scene(work, after_frames)
-
-
-def _stamp(candidate: Candidate, wanted: Wanted, *, missing: list[str]) -> str:
+def _stamp(source: PredictionSource, wanted: PairFrames, *, missing: list[str]) -> str:
     """Return the stamp of a pair's right views; "" where there are none, which is noted."""
     try:
-        return candidate.stamp(wanted)
+        return source.stamp(wanted)
     except PredictionFault as fault:
         missing.append(str(fault))
         return ""
@@ -190,18 +321,60 @@ def _stamp(candidate: Candidate, wanted: Wanted, *, missing: list[str]) -> str:
 def _require_few(faults: Sequence[str], *, allowed: int) -> None:
     if len(faults) <= allowed:
         return
-    more = f"; and {len(faults) - _TOLD} more" if len(faults) > _TOLD else ""
+    shown = "; ".join(each.rstrip(".") for each in faults[:_FAULTS_SHOWN])
+    more = f"; and {len(faults) - _FAULTS_SHOWN} more" if len(faults) > _FAULTS_SHOWN else ""
     raise EvaluationError(
         f"{counted(len(faults), 'prediction')} missing or unusable, and {allowed} allowed "
-        f"(--allow-missing): {'; '.join(each.rstrip('.') for each in faults[:_TOLD])}{more}."
+        f"(--allow-missing): {shown}{more}."
     )
 
 
-def _part_of(index: SceneIndex, rows: Sequence[int]) -> SceneIndex:
-    """Return an index of a few rows, small enough to be sent to a process with its work."""
-    return SceneIndex.from_scenes(
-        [index.scene(row) for row in rows],
-        index.root,
-        shards=index.shards,
-        retry=index.retry,
-    )
+def _pair_means(workload: Workload, partial: PartialResults, name: str) -> Iterator[PairMeans]:
+    """Yield the averages of every pair; one scene's frames are in memory at a time."""
+    for row, pairs in zip(workload.rows, workload.pairs, strict=True):
+        scene = workload.index.scene(row)
+        found = partial.read(scene.id.key, [(name, each.pair) for each in pairs])
+        for each in pairs:
+            scores = found[name, each.pair]
+            yield PairMeans(
+                row=row,
+                scene=each.scene,
+                pair=each.pair,
+                is_primary=each.pair == scene.rig.primary_pair,
+                baseline_cm=scene.rig.baseline_cm(*each.pair),
+                frames=len(each.frames),
+                tallies={column: tally(numbers) for column, numbers in scores.columns.items()},
+                fault=scores.fault,
+            )
+
+
+def _distances(
+    workload: Workload,
+    partial: PartialResults,
+    name: str,
+    pairs: Sequence[PairMeans],
+    protocol: EvaluationProtocol,
+) -> dict[Labels, dict[str, FrechetDistance]]:
+    """Return the distances between sets of each branch; features are merged scene by scene."""
+    metrics = [each for each in protocol.metrics if each in {**IMAGE_DISTANCES, **VIDEO_DISTANCES}]
+    if not metrics:
+        return {}
+
+    def branch_of(pair: PairMeans) -> Labels:
+        return tuple(str(workload.index.column(key)[pair.row] or "") for key in _BRANCH)
+
+    distances = {}
+    scored_pairs = (pair for pair in pairs if pair.is_primary and not pair.fault)
+    for labels, group in grouped(scored_pairs, branch_of).items():
+        sides: dict[tuple[str, str], FeatureStatistics] = {}
+        for pair in group:
+            found = partial.read(pair.scene, [(name, pair.pair)])[name, pair.pair]
+            for side, statistics in (("predicted", found.predicted), ("target", found.target)):
+                for metric in metrics:
+                    new, before = statistics[metric], sides.get((metric, side))
+                    sides[metric, side] = new if before is None else before.merged(new)
+        distances[labels] = {
+            metric: frechet_distance(sides[metric, "predicted"], sides[metric, "target"])
+            for metric in metrics
+        }
+    return distances

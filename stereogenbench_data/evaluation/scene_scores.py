@@ -16,7 +16,7 @@ from av.video.reformatter import VideoReformatter
 
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.metrics.frechet import Spread
+from stereogenbench_data.evaluation.metrics.frechet import FeatureStatistics
 from stereogenbench_data.evaluation.metrics.matching import (
     TargetMatches,
     match_error,
@@ -30,43 +30,200 @@ from stereogenbench_data.evaluation.metrics.pixels import (
     ssim,
 )
 from stereogenbench_data.evaluation.metrics.scale import fit_scale
-from stereogenbench_data.evaluation.models.interfaces import (
-    KeypointMatcher,
-    Keypoints,
-    Settings,
-    require_opencv,
-)
+from stereogenbench_data.evaluation.models.interfaces import KeypointMatcher, Keypoints, Settings
+from stereogenbench_data.evaluation.models.opencv import require_opencv
 from stereogenbench_data.evaluation.predictions import (
-    Candidate,
     Pair,
+    PairFrames,
     PredictionFault,
-    Views,
-    Wanted,
+    PredictionReader,
+    PredictionSource,
     scaled_rgb,
 )
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools, tools_of
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol, MetricModels, models_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import PAIR_FIELDS, Sample
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.selection.plan import Address
 
+Faults = Literal["raise", "count"]
+
+_STORED_RIGHT: Final = Request(kind="pairs", fields=("right",), layout="single")
+
 
 @dataclass(slots=True)
 class PairScores:
-    """The scores of one candidate's right views of one pair.
+    """The scores of one source's right views of one pair.
 
     Attributes:
         columns: For each column, a number for each frame; nan where there is none.
-        predicted: For each distance, the spread of the features of the right views.
+        predicted: For each distance, the statistics of the features of the right views.
         target: The same of the rendered views.
         fault: "", or why there are no scores.
     """
 
     columns: dict[str, list[float]] = field(default_factory=dict)
-    predicted: dict[str, Spread] = field(default_factory=dict)
-    target: dict[str, Spread] = field(default_factory=dict)
+    predicted: dict[str, FeatureStatistics] = field(default_factory=dict)
+    target: dict[str, FeatureStatistics] = field(default_factory=dict)
     fault: str = ""
+
+
+SceneScores = dict[tuple[str, Pair], PairScores]
+"""The scores of a scene, by the source's name and the pair."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneWork:
+    """One scene to score.
+
+    Attributes:
+        index: An index that holds the scene, and scenes that sources read views of.
+        pairs: What is scored of each pair, the same frames for all.
+        protocol: How.
+        sources: Whose right views are scored.
+        faults: "raise" at a prediction that is not what it must be, or "count" it.
+    """
+
+    index: SceneIndex
+    pairs: tuple[PairFrames, ...]
+    protocol: EvaluationProtocol
+    sources: tuple[PredictionSource, ...]
+    faults: Faults = "raise"
+
+    @property
+    def scene(self) -> str:
+        """The key of the scene."""
+        return self.pairs[0].scene
+
+    @property
+    def row(self) -> int:
+        """The scene's row in the index."""
+        return list(self.index.column("key")).index(self.scene)
+
+
+def score_scene(
+    work: SceneWork, after_frames: Advance, *, models: MetricModels | None = None
+) -> tuple[str, SceneScores]:
+    """Return a scene's key, and the scores of each source and pair of it.
+
+    Args:
+        work: What to score.
+        after_frames: Called with how many frames of pairs were scored since; it may raise to
+            stop the work.
+        models: What the metrics are computed with, where they were loaded before.
+
+    Raises:
+        PredictionFault: If a prediction is not what it must be, and faults are not counted.
+        StorageError: If a file of the data is missing or altered.
+        MediaError: If a video of the data does not decode.
+        ExtraError: If a package or weights that a metric needs are not there.
+    """
+    models = models or models_of(work.protocol)
+    with ExitStack() as stack:
+        scorers: dict[tuple[str, Pair], PairScorer] = {}
+        for source in work.sources:
+            reader = stack.enter_context(closing(source.open(work.index)))
+            for wanted in work.pairs:
+                scorers[source.name, wanted.pair] = PairScorer(
+                    models, reader, wanted, faults=work.faults
+                )
+        stored = stack.enter_context(closing(SampleLoader(work.index, _STORED_RIGHT)))
+        row = work.row
+        for samples in _batches(work):
+            matcher = None
+            if "e_match" in work.protocol.metrics:
+                matcher = _CachedKeypoints(models.keypoint_matcher)
+            for wanted in work.pairs:
+                targets = [
+                    TargetFrame(
+                        sample,
+                        matcher,
+                        stored_right=partial(_stored_right, stored, row, wanted.pair, sample),
+                    )
+                    for sample in samples[wanted.pair]
+                ]
+                for source in work.sources:
+                    scorers[source.name, wanted.pair].add(targets)
+                after_frames(len(targets))
+    with one_thread():
+        return work.scene, {place: scorer.scores() for place, scorer in scorers.items()}
+
+
+def _batches(work: SceneWork) -> Iterator[dict[Pair, list[Sample]]]:
+    """Yield the samples of a few frames of each pair; equal pictures are one array."""
+    needed = {*work.protocol.fields, *(each for source in work.sources for each in source.inputs)}
+    request = Request(
+        kind="pairs",
+        fields=tuple(name for name in PAIR_FIELDS if name in needed),
+        layout="single",
+        size=work.protocol.size,
+        depth=work.protocol.depth,
+    )
+    row, frames, step = work.row, work.pairs[0].frames, work.protocol.batch_frames
+    with closing(SampleLoader(work.index, request)) as loader:
+        for start in range(0, len(frames), step):
+            samples: dict[Pair, list[Sample]] = {wanted.pair: [] for wanted in work.pairs}
+            for frame in frames[start : start + step]:
+                pictures: dict[int, Any] = {}
+                for source, target in samples:
+                    address = Address(row, source, (target,), (frame,))
+                    sample = loader.load(address, clip="frame", generator=np.random.default_rng(0))
+                    sample["left"] = pictures.setdefault(source, sample["left"])
+                    sample["right"] = pictures.setdefault(target, sample["right"])
+                    samples[source, target].append(sample)
+            yield samples
+
+
+def _stored_right(loader: SampleLoader, row: int, pair: Pair, sample: Sample) -> Any:
+    """Return the right view of a sample at its stored size."""
+    address = Address(row, pair[0], (pair[1],), (int(sample["frame_index"]),))
+    return loader.load(address, clip="frame", generator=np.random.default_rng(0))["right"]
+
+
+@dataclass(frozen=True, slots=True)
+class _CachedKeypoints:
+    """A keypoint matcher that keeps what it found in each picture, by the picture's identity."""
+
+    matcher: KeypointMatcher
+    found: dict[int, tuple[Any, Keypoints]] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.matcher.name
+
+    @property
+    def settings(self) -> Settings:
+        return self.matcher.settings
+
+    def detect(self, picture: Any) -> Keypoints:
+        if id(picture) not in self.found:
+            # The picture is kept too, so that no other takes its identity.
+            self.found[id(picture)] = picture, self.matcher.detect(picture)
+        return self.found[id(picture)][1]
+
+    def match(self, left: Keypoints, right: Keypoints) -> Any:
+        return self.matcher.match(left, right)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let OpenCV and torch compute with the calling thread only while the block runs.
+
+    Scores are then the same to the last digit, whatever else the process does.
+
+    Raises:
+        ExtraError: If OpenCV is not installed.
+    """
+    opencv = require_opencv()
+    before = opencv.getNumThreads(), torch.get_num_threads()
+    opencv.setNumThreads(1)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        opencv.setNumThreads(before[0])
+        torch.set_num_threads(before[1])
 
 
 class TargetFrame:
@@ -75,7 +232,6 @@ class TargetFrame:
     def __init__(
         self,
         sample: Sample,
-        protocol: EvaluationProtocol,
         matcher: KeypointMatcher | None,
         *,
         stored_right: Callable[[], Any],
@@ -84,12 +240,10 @@ class TargetFrame:
 
         Args:
             sample: Its fields, pictures at the evaluated size.
-            protocol: How it is scored.
             matcher: The matcher of keypoints, if one is needed.
             stored_right: Returns the rendered right view at its stored size.
         """
         self.sample = sample
-        self.protocol = protocol
         self._matcher = matcher
         self._stored_right = stored_right
 
@@ -103,7 +257,7 @@ class TargetFrame:
             self._stored_right(), size=self.right.shape[1:], scaler=VideoReformatter()
         )
         sample = {**self.sample, "right": right}
-        return TargetFrame(sample, self.protocol, self._matcher, stored_right=self._stored_right)
+        return TargetFrame(sample, self._matcher, stored_right=self._stored_right)
 
     @property
     def left(self) -> Any:
@@ -119,7 +273,7 @@ class TargetFrame:
     def matcher(self) -> KeypointMatcher:
         """The matcher of keypoints."""
         if self._matcher is None:
-            raise EvaluationError("keypoints are matched for e_match alone: ask for that metric.")
+            raise EvaluationError("keypoints are only matched for e_match: ask for that metric.")
         return self._matcher
 
     @cached_property
@@ -139,22 +293,56 @@ class TargetFrame:
 
 
 class PairScorer:
-    """Gathers the scores of one candidate's right views of one pair."""
+    """Gathers the scores of one source's right views of one pair."""
 
-    def __init__(self, tools: Tools) -> None:
-        """Begin with no frame."""
-        self.fault = ""
-        self._tools = tools
-        self._columns: dict[str, list[float]] = {name: [] for name in tools.protocol.columns}
-        self._predicted: dict[str, Spread] = {}
-        self._target: dict[str, Spread] = {}
+    def __init__(
+        self,
+        models: MetricModels,
+        reader: PredictionReader,
+        wanted: PairFrames,
+        *,
+        faults: Faults = "raise",
+    ) -> None:
+        """Begin with no frame.
+
+        Args:
+            models: What the metrics are computed with.
+            reader: Reads the source's right views of the scene.
+            wanted: The pair.
+            faults: "raise" at a prediction that is not what it must be, or "count" it.
+        """
+        self._models = models
+        self._reader = reader
+        self._wanted = wanted
+        self._faults = faults
+        self._fault = ""
+        self._columns: dict[str, list[float]] = {name: [] for name in models.protocol.columns}
+        self._predicted: dict[str, FeatureStatistics] = {}
+        self._target: dict[str, FeatureStatistics] = {}
         self._clip: list[tuple[Any, Any]] = []
 
-    def add(self, given: Sequence[Any], frames: Sequence[TargetFrame]) -> None:
-        """Score some frames: right views, and what they are compared with.
+    def add(self, frames: Sequence[TargetFrame]) -> None:
+        """Read the right views of some frames, in order, and score them.
 
         A view of the stored size is scaled, and compared with the rendered one scaled likewise.
+        After a fault that is counted the pair's other frames are passed over.
+
+        Raises:
+            PredictionFault: If a prediction is not what it must be, and faults are not counted.
         """
+        if self._fault:
+            return
+        try:
+            given = self._reader.read(self._wanted, [frame.sample for frame in frames])
+        except PredictionFault as fault:
+            if self._faults == "raise":
+                raise
+            self._fault = str(fault)
+            return
+        with one_thread():
+            self._score(given, frames)
+
+    def _score(self, given: Sequence[Any], frames: Sequence[TargetFrame]) -> None:
         scaler = VideoReformatter()
         pictures = [
             scaled_rgb(picture, size=frame.right.shape[1:], scaler=scaler)
@@ -165,35 +353,32 @@ class PairScorer:
             for picture, frame in zip(given, frames, strict=True)
         ]
         for picture, target in zip(pictures, targets, strict=True):
-            for name, number in self._frame(picture, target).items():
+            numbers: dict[str, float] = {}
+            for name in self._models.protocol.metrics:
+                if name in _OF_FRAME:
+                    numbers |= _OF_FRAME[name](picture, target, self._models)
+            for name, number in numbers.items():
                 self._columns[name].append(float(number))
-        for name, metric in self._tools.pair_metrics.items():
+        for name, metric in self._models.pair_metrics.items():
             rendered = np.stack([target.right for target in targets])
             self._columns[name].extend(metric(np.stack(pictures), rendered).tolist())
-        for name, features in self._tools.image_features.items():
+        for name, features in self._models.image_features.items():
             shown = features(np.stack(pictures))
             self._merge(name, shown, features(np.stack([target.right for target in targets])))
-        if self._tools.video_features:
+        if self._models.video_features:
             rendered_views = (target.right for target in targets)
             self._clip.extend(zip(pictures, rendered_views, strict=True))
 
-    def _frame(self, picture: Any, target: TargetFrame) -> dict[str, float]:
-        found: dict[str, float] = {}
-        for name in self._tools.protocol.metrics:
-            if name in _OF_FRAME:
-                found |= _OF_FRAME[name](picture, target, self._tools)
-        return found
-
     def _merge(self, name: str, predicted: Any, target: Any) -> None:
         for spreads, features in ((self._predicted, predicted), (self._target, target)):
-            new = Spread.of(features)
+            new = FeatureStatistics.of(features)
             spreads[name] = spreads[name].merged(new) if name in spreads else new
 
     def scores(self) -> PairScores:
         """Return what was gathered."""
-        if self.fault:
-            return PairScores(fault=self.fault)
-        for name, features in self._tools.video_features.items():
+        if self._fault:
+            return PairScores(fault=self._fault)
+        for name, features in self._models.video_features.items():
             if len(self._clip) < features.min_frames:
                 raise EvaluationError(
                     f"{name} needs clips of at least {features.min_frames} frames, and "
@@ -204,15 +389,7 @@ class PairScorer:
         return PairScores(self._columns, self._predicted, self._target)
 
 
-def _psnr(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float]:
-    return {"psnr": psnr_db(picture, target.right)}
-
-
-def _ssim(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float]:
-    return {"ssim": ssim(picture, target.right)}
-
-
-def _p_psnr(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float]:
+def _p_psnr(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
     score = patch_psnr(target.left, picture)
     return {
         "p_psnr": score.mean_db,
@@ -222,7 +399,7 @@ def _p_psnr(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float]
     }
 
 
-def _e_match(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float]:
+def _e_match(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
     score = match_error(picture, against=target.matches, matcher=target.matcher)
     return {
         "e_match": score.error,
@@ -233,11 +410,11 @@ def _e_match(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float
     }
 
 
-def _sd(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float]:
+def _sd(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
     """Return SD by each fit of the protocol, all of one disparity map."""
-    estimated_px = tools.stereo_matcher(target.left, picture)
+    estimated_px = models.stereo_matcher(target.left, picture)
     found: dict[str, float] = {}
-    for method in tools.protocol.fits:
+    for method in models.protocol.fits:
         fit = fit_scale(
             estimated_px,
             target.sample["disparity"][0],
@@ -258,210 +435,9 @@ def _sd(picture: Any, target: TargetFrame, tools: Tools) -> dict[str, float]:
 
 
 _OF_FRAME: Mapping[str, Any] = {
-    "psnr": _psnr,
-    "ssim": _ssim,
+    "psnr": lambda picture, target, models: {"psnr": psnr_db(picture, target.right)},
+    "ssim": lambda picture, target, models: {"ssim": ssim(picture, target.right)},
     "p_psnr": _p_psnr,
     "e_match": _e_match,
     "sd": _sd,
 }
-
-
-def use_one_thread() -> None:
-    """Let OpenCV and torch compute in this process with the calling thread alone.
-
-    Raises:
-        ExtraError: If OpenCV is not installed.
-    """
-    require_opencv().setNumThreads(1)
-    torch.set_num_threads(1)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let OpenCV and torch compute with the calling thread alone while the block runs.
-
-    Raises:
-        ExtraError: If OpenCV is not installed.
-    """
-    opencv = require_opencv()
-    before = opencv.getNumThreads(), torch.get_num_threads()
-    use_one_thread()
-    try:
-        yield
-    finally:
-        opencv.setNumThreads(before[0])
-        torch.set_num_threads(before[1])
-
-
-Faults = Literal["raise", "count"]
-
-
-@dataclass(frozen=True, slots=True)
-class SceneWork:
-    """One scene to score.
-
-    Attributes:
-        index: An index that holds the scene, and scenes that candidates take views from.
-        wanted: What is to be scored of each pair, the same frames for all.
-        protocol: How.
-        candidates: Whose right views are scored.
-        faults: "raise" at a prediction that is not what it must be, or "count" it.
-    """
-
-    index: SceneIndex
-    wanted: tuple[Wanted, ...]
-    protocol: EvaluationProtocol
-    candidates: tuple[Candidate, ...]
-    faults: Faults = "raise"
-
-    @property
-    def scene(self) -> str:
-        """The key of the scene."""
-        return self.wanted[0].scene
-
-
-_STORED_RIGHT: Final = Request(kind="pairs", fields=("right",), layout="single")
-
-SceneScores = dict[tuple[str, Pair], PairScores]
-
-
-def score_scene(
-    work: SceneWork, after_frames: Advance, *, tools: Tools | None = None
-) -> SceneScores:
-    """Return the scores of each candidate and pair of a scene.
-
-    Args:
-        work: What to score.
-        after_frames: Called with how many frames of pairs were scored since; there the work may
-            be called off.
-        tools: What the metrics are computed with, where they were loaded before.
-
-    Raises:
-        PredictionFault: If a prediction is not what it must be, and faults are not counted.
-        StorageError: If a file of the data is missing or altered.
-        MediaError: If a video of the data does not decode.
-        ExtraError: If a package or weights that a metric needs are not there.
-    """
-    tools = tools or tools_of(work.protocol)
-    scorers = {
-        (candidate.name, wanted.pair): PairScorer(tools)
-        for candidate in work.candidates
-        for wanted in work.wanted
-    }
-    with ExitStack() as stack:
-        views = {
-            candidate.name: stack.enter_context(closing(candidate.open(work.index)))
-            for candidate in work.candidates
-        }
-        stored = stack.enter_context(closing(SampleLoader(work.index, _STORED_RIGHT)))
-        for frames in _loaded(work):
-            for wanted in work.wanted:
-                targets = [
-                    TargetFrame(
-                        sample,
-                        tools.protocol,
-                        frames.matcher(tools),
-                        stored_right=partial(_stored_right, stored, work, wanted.pair, sample),
-                    )
-                    for sample in frames.samples[wanted.pair]
-                ]
-                for name, given in views.items():
-                    scorer = scorers[name, wanted.pair]
-                    _score(scorer, given, wanted, targets, faults=work.faults)
-                after_frames(len(targets))
-    with one_thread():
-        return {place: scorer.scores() for place, scorer in scorers.items()}
-
-
-def _stored_right(loader: SampleLoader, work: SceneWork, pair: Pair, sample: Sample) -> Any:
-    """Return the right view of a sample at its stored size."""
-    row = list(work.index.column("key")).index(work.scene)
-    address = Address(row, pair[0], (pair[1],), (int(sample["frame_index"]),))
-    return loader.load(address, clip="frame", generator=np.random.default_rng(0))["right"]
-
-
-def _score(
-    scorer: PairScorer,
-    views: Views,
-    wanted: Wanted,
-    targets: Sequence[TargetFrame],
-    *,
-    faults: Faults,
-) -> None:
-    if scorer.fault:
-        return
-    try:
-        pictures = views.read(wanted, [target.sample for target in targets])
-    except PredictionFault as fault:
-        if faults == "raise":
-            raise
-        scorer.fault = str(fault)
-        return
-    with one_thread():
-        scorer.add(pictures, targets)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _LoadedFrames:
-    """The samples of some frames; pictures of one camera and frame are one array."""
-
-    samples: dict[Pair, list[Sample]]
-    found: dict[int, tuple[Any, Keypoints]] = field(default_factory=dict)
-
-    def matcher(self, tools: Tools) -> KeypointMatcher | None:
-        """Return the matcher, which looks at each of these pictures once."""
-        if "e_match" not in tools.protocol.metrics:
-            return None
-        return _OnceAPicture(tools.keypoint_matcher, self.found)
-
-
-def _loaded(work: SceneWork) -> Iterator[_LoadedFrames]:
-    """Yield the samples of a few frames after each other."""
-    needed = {*work.protocol.fields, *(each for one in work.candidates for each in one.inputs)}
-    request = Request(
-        kind="pairs",
-        fields=tuple(name for name in PAIR_FIELDS if name in needed),
-        layout="single",
-        size=work.protocol.size,
-        depth=work.protocol.depth,
-    )
-    rows = {str(key): row for row, key in enumerate(work.index.column("key"))}
-    frames = work.wanted[0].frames
-    with closing(SampleLoader(work.index, request)) as loader:
-        for start in range(0, len(frames), work.protocol.batch_frames):
-            chosen = frames[start : start + work.protocol.batch_frames]
-            samples: dict[Pair, list[Sample]] = {wanted.pair: [] for wanted in work.wanted}
-            for frame in chosen:
-                pictures: dict[int, Any] = {}
-                for source, target in samples:
-                    address = Address(rows[work.scene], source, (target,), (frame,))
-                    sample = loader.load(address, clip="frame", generator=np.random.default_rng(0))
-                    sample["left"] = pictures.setdefault(source, sample["left"])
-                    sample["right"] = pictures.setdefault(target, sample["right"])
-                    samples[source, target].append(sample)
-            yield _LoadedFrames(samples)
-
-
-@dataclass(frozen=True, slots=True)
-class _OnceAPicture:
-    """A keypoint matcher that keeps what it found in each picture, by the picture's identity."""
-
-    matcher: KeypointMatcher
-    found: dict[int, tuple[Any, Keypoints]]
-
-    @property
-    def name(self) -> str:
-        return self.matcher.name
-
-    @property
-    def settings(self) -> Settings:
-        return self.matcher.settings
-
-    def detect(self, picture: Any) -> Keypoints:
-        if id(picture) not in self.found:
-            # The picture is kept too, so that no other takes its identity.
-            self.found[id(picture)] = picture, self.matcher.detect(picture)
-        return self.found[id(picture)][1]
-
-    def match(self, left: Keypoints, right: Keypoints) -> Any:
-        return self.matcher.match(left, right)

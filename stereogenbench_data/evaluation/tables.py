@@ -3,7 +3,7 @@
 A table holds methods of one tier only: rows of different tiers answer different questions.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
@@ -23,7 +23,12 @@ from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.metrics.scale import SD_OF_THE_PAPER
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
-from stereogenbench_data.evaluation.reference import TableName, reference_rows, reference_table
+from stereogenbench_data.evaluation.reference import (
+    ReferenceRow,
+    TableName,
+    reference_rows,
+    reference_table,
+)
 from stereogenbench_data.schema.release import BASELINE_BINS, FAMILIES, FRAME_COUNT, baseline_bin
 
 _SOURCES: Mapping[str, tuple[TableName, ...]] = {
@@ -34,7 +39,7 @@ _SOURCES: Mapping[str, tuple[TableName, ...]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class TableRow:
     """One row: a method's scores of one group, or a row of the paper as printed.
 
     Attributes:
@@ -82,11 +87,11 @@ class Table:
     keys: tuple[str, ...]
     protocol: EvaluationProtocol
     columns: tuple[str, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[TableRow, ...]
     notes: tuple[str, ...] = ()
 
 
-def paper_row(row: Mapping[str, str], labels: Labels) -> Row:
+def paper_row(row: Mapping[str, str], labels: Labels) -> TableRow:
     """Return a row of one of the paper's tables, its numbers as printed."""
     printed = {}
     for name in (*FRAME_METRICS, "fid", "fvd"):
@@ -95,7 +100,7 @@ def paper_row(row: Mapping[str, str], labels: Labels) -> Row:
             interval = row.get(f"{name}_ci95", "")
             headline = FRAME_METRICS.get(name, (name,))[0]
             printed[headline] = f"{value} ± {interval}" if interval else value
-    return Row(
+    return TableRow(
         method=f"{row.get('method') or row['control']} (paper)",
         labels=labels,
         scenes=int(row["n_scenes"]) if "n_scenes" in row else None,
@@ -105,7 +110,7 @@ def paper_row(row: Mapping[str, str], labels: Labels) -> Row:
 
 
 def notes_of(
-    results: Sequence[Scores], rows: Sequence[Row], *, name: str, columns: Sequence[str]
+    results: Sequence[Scores], rows: Sequence[TableRow], *, name: str, columns: Sequence[str]
 ) -> list[str]:
     """Return what to know when reading a table: sources, and what is not comparable."""
     protocol = results[0].protocol
@@ -180,16 +185,15 @@ def tables_of(
 
 def branch_table(results: Sequence[Scores]) -> Table:
     """Return primary pairs by evaluation branch, beside the paper's main tables."""
-    rows: list[Row] = []
-    for labels, group in _groups(results, _TEXT_OF_BRANCH, pairs="primary"):
-        rows.extend(_row(one, labels, found, distances=True) for one, found in group)
+
+    def paper(labels: Labels) -> list[ReferenceRow]:
         subset, family = labels
-        name: Literal["main", "unseen"] = "unseen" if subset == "unseen_map" else "main"
-        if subset:
-            rows.extend(
-                paper_row(row, labels)
-                for row in reference_rows(name, tier=results[0].tier, subset=subset, family=family)
-            )
+        if not subset:
+            return []
+        name: TableName = "unseen" if subset == "unseen_map" else "main"
+        return reference_rows(name, tier=results[0].tier, subset=subset, family=family)
+
+    rows = _rows(results, _TEXT_OF_BRANCH, distances="show", paper=paper)
     distances = {name for row in rows for name in row.distances}
     return _table(
         results,
@@ -203,15 +207,14 @@ def branch_table(results: Sequence[Scores]) -> Table:
 
 def bin_table(results: Sequence[Scores], pairs: PairsShown) -> Table:
     """Return pairs by baseline in the paper's bins, beside the paper's own table."""
+
+    def paper(labels: Labels) -> list[ReferenceRow]:
+        if pairs != "primary" or labels[:2] != ("seen_map", "Uniform"):
+            return []
+        return reference_rows("bins", tier=results[0].tier, baseline_bin_cm=labels[2])
+
     keys = (*_TEXT_OF_BRANCH, "baseline")
-    rows: list[Row] = []
-    for labels, group in _groups(results, keys, pairs=pairs):
-        rows.extend(_row(one, labels, found) for one, found in group)
-        if pairs == "primary" and labels[:2] == ("seen_map", "Uniform"):
-            rows.extend(
-                paper_row(row, labels)
-                for row in reference_rows("bins", tier=results[0].tier, baseline_bin_cm=labels[2])
-            )
+    rows = _rows(results, keys, pairs=pairs, paper=paper)
     shown = "primary pairs" if pairs == "primary" else "all pairs"
     return _table(results, rows, name=f"bins_{pairs}", title=f"Baseline in cm, {shown}", keys=keys)
 
@@ -234,51 +237,56 @@ def stratum_table(results: Sequence[Scores], column: str, *, edges: Sequence[flo
         "" if each is None else each.item() if hasattr(each, "item") else each for each in plain
     ]
     named = dict(zip(rows_used, strata(plain, name=column, edges=edges), strict=True))
-    rows: list[Row] = []
-    for labels, group in _groups(results, (*_TEXT_OF_BRANCH, column), pairs="primary", named=named):
-        rows.extend(_row(one, labels, found) for one, found in group)
+    keys = (*_TEXT_OF_BRANCH, column)
     return _table(
         results,
-        rows,
+        _rows(results, keys, named=named),
         name=f"by_{column}",
         title=f"By {column}, primary pairs",
-        keys=(*_TEXT_OF_BRANCH, column),
+        keys=keys,
     )
 
 
 def explaining_table(results: Sequence[Scores]) -> Table:
     """Return what explains the scores, by branch: matches, fits, ceilings, shares."""
-    rows: list[Row] = []
-    for labels, group in _groups(results, _TEXT_OF_BRANCH, pairs="primary"):
-        rows.extend(_row(one, labels, found) for one, found in group)
-    wanted = _frame_columns(results[0].protocol, headline="no")
     return _table(
         results,
-        rows,
+        _rows(results, _TEXT_OF_BRANCH),
         name="explanations",
         title="What explains the scores, primary pairs",
         keys=_TEXT_OF_BRANCH,
-        columns=wanted,
+        columns=_frame_columns(results[0].protocol, headline="no"),
     )
 
 
 def control_table(results: Sequence[Scores]) -> Table:
     """Return all pairs of the selection together, beside the paper's calibration controls."""
-    rows: list[Row] = []
+    rows: list[TableRow] = []
     for one in results:
         rows.append(_row(one, (), list(one.pairs)))
         rows.extend(paper_row(row, ()) for row in reference_rows("controls", control=one.name))
     return _table(results, rows, name="controls", title="Calibration controls", keys=())
 
 
-def _groups(
+def _rows(
     results: Sequence[Scores],
     keys: Sequence[str],
     *,
-    pairs: PairsShown,
+    pairs: PairsShown = "primary",
     named: Mapping[int, str] | None = None,
-) -> list[tuple[Labels, list[tuple[Scores, list[PairMeans]]]]]:
-    """Return the groups in the order of tables, each with the pairs of every method."""
+    distances: Literal["show", "hide"] = "hide",
+    paper: Callable[[Labels], Sequence[ReferenceRow]] = lambda labels: (),
+) -> list[TableRow]:
+    """Return the rows of groups in the order of tables: every method's, then the paper's.
+
+    Args:
+        results: Each method's scores.
+        keys: What groups are made by: "subset", "family", "baseline" or a column of the index.
+        pairs: Which pairs are in them.
+        named: For a column of the index, the group of each row of the index.
+        distances: Whether distances between sets are shown.
+        paper: Returns the paper's rows of a group.
+    """
     index = results[0].index
 
     def labels_of(pair: PairMeans) -> Labels:
@@ -296,14 +304,18 @@ def _groups(
         (one, grouped((p for p in one.pairs if pairs == "all" or p.is_primary), labels_of))
         for one in results
     ]
-    every = sorted(
+    rows = []
+    for labels in sorted(
         {labels for _, groups in by_method for labels in groups},
         key=lambda labels: [_rank(key, label) for key, label in zip(keys, labels, strict=True)],
-    )
-    return [
-        (labels, [(one, groups[labels]) for one, groups in by_method if labels in groups])
-        for labels in every
-    ]
+    ):
+        rows += [
+            _row(one, labels, groups[labels], distances=distances)
+            for one, groups in by_method
+            if labels in groups
+        ]
+        rows += [paper_row(row, labels) for row in paper(labels)]
+    return rows
 
 
 def _rank(key: str, label: str) -> tuple[float, str]:
@@ -318,18 +330,22 @@ def _rank(key: str, label: str) -> tuple[float, str]:
 
 
 def _row(
-    one: Scores, labels: Labels, pairs: Sequence[PairMeans], *, distances: bool = False
-) -> Row:
+    one: Scores,
+    labels: Labels,
+    pairs: Sequence[PairMeans],
+    *,
+    distances: Literal["show", "hide"] = "hide",
+) -> TableRow:
     scored = [pair for pair in pairs if not pair.fault]
     columns = scored[0].tallies if scored else {}
-    return Row(
+    return TableRow(
         method=one.name,
         labels=labels,
         scenes=len({pair.scene for pair in scored}),
         frames=sum(pair.frames for pair in scored),
         missing=len(pairs) - len(scored),
         cells={name: cell(scored, name) for name in columns},
-        distances=one.distances.get(labels, {}) if distances else {},
+        distances=one.distances.get(labels, {}) if distances == "show" else {},
     )
 
 
@@ -345,7 +361,7 @@ def _frame_columns(
 
 def _table(  # noqa: PLR0913 - the parts of one table
     results: Sequence[Scores],
-    rows: Sequence[Row],
+    rows: Sequence[TableRow],
     *,
     name: str,
     title: str,

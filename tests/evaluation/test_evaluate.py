@@ -139,7 +139,7 @@ def test_floats_of_0_to_1_are_rounded_to_8_bits(scored_index, protocol):
         (lambda inputs: inputs["left"].float()[..., :0], r"returned float32 \(3, 3, 48, 0\)"),
         (
             lambda inputs: [each[:, : 9 + n] for n, each in enumerate(inputs["left"].numpy())],
-            r"returned a list that is no one array",
+            r"returned a list that is not one array",
         ),
     ],
 )
@@ -210,7 +210,7 @@ def test_two_predictions_of_one_pair_are_told_not_taken_for_none(scored_index, c
     ("spoil", "message"),
     [
         (lambda path: path.unlink(), r"lacks 1 of 4 frames, the first is 003\.png"),
-        (lambda path: path.write_bytes(b"no picture"), r"003\.png is no picture that can be read"),
+        (lambda path: path.write_bytes(b"no picture"), r"003\.png cannot be read as a picture"),
         (
             lambda path: Image.new("RGB", (10, 10)).save(path),
             r"003\.png is 10x10; expected 64x48",
@@ -398,7 +398,7 @@ def test_pairs_that_are_no_left_and_right_are_refused(scored_index, right_views,
 
 
 def test_a_folder_that_is_none_is_refused(scored_index, protocol, tmp_path):
-    with pytest.raises(EvaluationError, match="nowhere: is no folder of predictions"):
+    with pytest.raises(EvaluationError, match="nowhere: not a predictions folder"):
         scored(scored_index, tmp_path / "nowhere", protocol)
 
 
@@ -433,18 +433,18 @@ def test_what_metrics_are_computed_with_is_loaded_once_for_all_scenes(
     from stereogenbench_data.evaluation import protocol
 
     loaded = []
-    load = protocol.load_keypoint_matcher
+    load = protocol.load_model
 
     def counted(*arguments):
         loaded.append(arguments)
         return load(*arguments)
 
-    monkeypatch.setattr(protocol, "load_keypoint_matcher", counted)
+    monkeypatch.setattr(protocol, "load_model", counted)
     matches = EvaluationProtocol(metrics=("e_match",), size=SIZE)
     scored(scored_index, right_views, matches, frames=[0])
 
     assert len(loaded) == 1
-    assert protocol.tools_of.cache_info().currsize == 0
+    assert protocol.models_of.cache_info().currsize == 0
 
 
 def test_progress_counts_frames_of_pairs_up_to_all(scored_index, right_views, protocol):

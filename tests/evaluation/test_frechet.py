@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scipy.linalg import sqrtm
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.metrics.frechet import Spread, frechet_distance
+from stereogenbench_data.evaluation.metrics.frechet import FeatureStatistics, frechet_distance
 
 
 def distance(one: np.ndarray, two: np.ndarray) -> float:
-    return frechet_distance(Spread.of(one), Spread.of(two)).value
+    return frechet_distance(FeatureStatistics.of(one), FeatureStatistics.of(two)).value
 
 
 def by_matrix_root(one: np.ndarray, two: np.ndarray) -> float:
@@ -80,7 +80,7 @@ def test_fewer_samples_than_features_are_no_difficulty(samples, others):
     rng = np.random.default_rng(samples)
     one, two = rng.normal(size=(samples, 8)), rng.normal(size=(others, 8)) + 0.3
 
-    found = frechet_distance(Spread.of(one), Spread.of(two))
+    found = frechet_distance(FeatureStatistics.of(one), FeatureStatistics.of(two))
 
     assert found.value == pytest.approx(by_sixty_digits(one, two), rel=1e-9)
     assert found.underdetermined
@@ -92,7 +92,9 @@ def test_gaussians_along_the_axes_are_as_far_apart_as_their_formula_says():
         """Return four points of variances 4/3 x^2 and 4/3 y^2."""
         return np.array([(x, y), (x, -y), (-x, y), (-x, -y)]) + at
 
-    found = frechet_distance(Spread.of(corners(3, 1, at=0)), Spread.of(corners(1, 2, at=5)))
+    found = frechet_distance(
+        FeatureStatistics.of(corners(3, 1, at=0)), FeatureStatistics.of(corners(1, 2, at=5))
+    )
 
     assert found.value == pytest.approx(2 * 5**2 + 4 / 3 * ((3 - 1) ** 2 + (1 - 2) ** 2), rel=1e-12)
     assert not found.underdetermined
@@ -103,12 +105,12 @@ def test_gaussians_along_the_axes_are_as_far_apart_as_their_formula_says():
 def test_gathered_in_parts_a_set_spreads_as_it_does_at_once(seed, cuts):
     rng = np.random.default_rng(seed)
     samples = mixed(rng, 300, 5, offset=1e3)
-    parts = [Spread.of(part) for part in np.split(samples, sorted(cuts))]
+    parts = [FeatureStatistics.of(part) for part in np.split(samples, sorted(cuts))]
 
-    gathered = Spread.empty(5)
+    gathered = FeatureStatistics.empty(5)
     for part in parts:
         gathered = gathered.merged(part)
-    backwards = Spread.empty(5)
+    backwards = FeatureStatistics.empty(5)
     for part in parts[::-1]:
         backwards = part.merged(backwards)
 
@@ -143,17 +145,17 @@ def test_moving_both_sets_changes_nothing_and_moving_one_adds_the_square():
 
 
 def test_the_spread_of_stored_arrays_is_the_spread():
-    spread = Spread.of(np.random.default_rng(0).normal(size=(9, 3)))
-    back = Spread(spread.count, spread.mean, spread.root)
+    spread = FeatureStatistics.of(np.random.default_rng(0).normal(size=(9, 3)))
+    back = FeatureStatistics(spread.count, spread.mean, spread.root)
 
     assert frechet_distance(back, spread).value == frechet_distance(spread, spread).value
 
 
 @pytest.mark.parametrize("few", [0, 1])
 def test_below_two_samples_there_is_no_distance(few):
-    many = Spread.of(np.random.default_rng(0).normal(size=(9, 3)))
+    many = FeatureStatistics.of(np.random.default_rng(0).normal(size=(9, 3)))
 
-    found = frechet_distance(Spread.of(np.zeros((few, 3))), many)
+    found = frechet_distance(FeatureStatistics.of(np.zeros((few, 3))), many)
 
     assert math.isnan(found.value)
     assert found.underdetermined
@@ -161,10 +163,10 @@ def test_below_two_samples_there_is_no_distance(few):
 
 def test_features_that_cannot_be_gathered_are_named():
     with pytest.raises(EvaluationError, match=r"shape \(n, dim\), got \(4,\)"):
-        Spread.of(np.zeros(4))
+        FeatureStatistics.of(np.zeros(4))
     with pytest.raises(EvaluationError, match=r"1 of 3 samples .* not finite, sample 2 first"):
-        Spread.of(np.array([[0.0], [1.0], [np.nan]]))
+        FeatureStatistics.of(np.array([[0.0], [1.0], [np.nan]]))
     with pytest.raises(EvaluationError, match="sets of 2 and of 3 features cannot be compared"):
-        Spread.empty(2).merged(Spread.empty(3))
+        FeatureStatistics.empty(2).merged(FeatureStatistics.empty(3))
     with pytest.raises(EvaluationError, match="sets of 2 and of 3 features cannot be compared"):
-        frechet_distance(Spread.empty(2), Spread.empty(3))
+        frechet_distance(FeatureStatistics.empty(2), FeatureStatistics.empty(3))

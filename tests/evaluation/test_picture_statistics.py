@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.metrics.frechet import Spread, frechet_distance
+from stereogenbench_data.evaluation.metrics.frechet import FeatureStatistics, frechet_distance
 from stereogenbench_data.evaluation.models.interfaces import ImageFeatures, VideoFeatures
 from stereogenbench_data.evaluation.models.picture_statistics import (
     ColourStatistics,
@@ -51,7 +51,7 @@ def test_the_more_pictures_are_changed_the_farther_they_are():
     features = ColourStatistics()
 
     def apart(others):
-        sides = (Spread.of(features(side)) for side in (others, pictures))
+        sides = (FeatureStatistics.of(features(side)) for side in (others, pictures))
         return frechet_distance(*sides).value
 
     assert apart(pictures) < 1e-6 < apart(pictures + np.uint8(5)) < apart(pictures + np.uint8(50))

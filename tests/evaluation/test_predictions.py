@@ -8,8 +8,8 @@ from av.video.reformatter import VideoReformatter
 from PIL import Image
 
 from stereogenbench_data.evaluation.predictions import (
+    PairFrames,
     PredictionFault,
-    Wanted,
     find_prediction,
     frame_name,
     item_name,
@@ -19,7 +19,7 @@ from stereogenbench_data.evaluation.predictions import (
 )
 
 SCENE = "eval/MapSeenInTrain/Uniform/Town/scene_000001"
-WANTED = Wanted(SCENE, (0, 1), (0, 2), 3, (8, 16), (32, 32))
+WANTED = PairFrames(SCENE, (0, 1), (0, 2), 3, (8, 16), (32, 32))
 
 
 def picture(level, *, size=(8, 16)):
@@ -168,7 +168,7 @@ def test_a_link_to_nowhere_is_a_picture_that_cannot_be_read(item):
     (item / frame_name(2)).symlink_to(item / "gone.png")
 
     assert stamp_prediction(item)
-    with pytest.raises(PredictionFault, match=r"002\.png is no picture that can be read"):
+    with pytest.raises(PredictionFault, match=r"002\.png cannot be read as a picture"):
         open_prediction(item, WANTED).read(2)
 
 
@@ -186,7 +186,7 @@ def test_a_damaged_picture_is_named(item, damage):
     }
     path.write_bytes(changed[damage])
 
-    with pytest.raises(PredictionFault, match=r"00-01: .*002\.png is no picture that can be read"):
+    with pytest.raises(PredictionFault, match=r"00-01: .*002\.png cannot be read as a picture"):
         open_prediction(item, WANTED).read(2)
 
 

@@ -1,6 +1,7 @@
 """SD: hand-worked lines, and SGBM on photographs with measured disparity."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.metrics.scale import fit_scale, scale_settings
 from stereogenbench_data.evaluation.models.interfaces import StereoMatcher
 from stereogenbench_data.evaluation.models.opencv import Sgbm
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, Tools
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol, MetricModels
 from stereogenbench_data.evaluation.scene_scores import PairScorer, TargetFrame
 
 METHODS = ("filtered", "least_squares", "theil_sen")
@@ -208,19 +209,20 @@ def test_a_frames_record_has_sd_by_every_fit_of_one_estimate(
     estimated = 2 * truth
     estimated.reshape(-1)[:outliers] += 900
     calls = []
-    tools = Tools(EvaluationProtocol(metrics=("sd",), fit="theil_sen"))
-    tools.stereo_matcher = lambda left, right: calls.append(1) or estimated
+    models = MetricModels(EvaluationProtocol(metrics=("sd",), fit="theil_sen"))
+    models.stereo_matcher = lambda left, right: calls.append(1) or estimated
     picture = np.zeros((3, *SIZE), dtype=np.uint8)
     sample = {
         "left": picture, "right": picture, "disparity": truth[None], "visible": EVERYWHERE[None],
     }  # fmt: skip
-    frame = TargetFrame(sample, tools.protocol, None, stored_right=lambda: picture)
-    scorer = PairScorer(tools)
+    frame = TargetFrame(sample, None, stored_right=lambda: picture)
+    reader = SimpleNamespace(read=lambda wanted, samples: [picture])
+    scorer = PairScorer(models, reader, wanted=None)
 
-    scorer.add([picture], [frame])
+    scorer.add([frame])
     columns = scorer.scores().columns
 
-    assert tuple(columns) == tools.protocol.columns
+    assert tuple(columns) == models.protocol.columns
     assert columns["sd_filtered"] == [pytest.approx(filtered, abs=1e-3)]
     assert columns["sd_theil_sen"] == [pytest.approx(0.5, abs=0.02)]
     assert columns["sd_least_squares"] == [pytest.approx(least_squares, abs=0.02)]

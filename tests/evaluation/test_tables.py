@@ -281,5 +281,5 @@ def test_latex_has_its_signs_escaped_and_its_columns_counted(scores):
 
 
 def test_a_table_needs_a_method():
-    with pytest.raises(EvaluationError, match="scores of one method at least, got none"):
+    with pytest.raises(EvaluationError, match="at least one method, got none"):
         tables_of([])

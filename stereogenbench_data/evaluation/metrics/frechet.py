@@ -17,7 +17,7 @@ from stereogenbench_data.errors import EvaluationError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spread:
+class FeatureStatistics:
     """How many samples a set of features has, where they lie and how they spread, in float64.
 
     Its arrays may be stored and given back. Sets are merged in any grouping with the same result
@@ -34,16 +34,16 @@ class Spread:
     root: Float64[np.ndarray, "rows dim"]
 
     @classmethod
-    def empty(cls, dim: int) -> "Spread":
+    def empty(cls, dim: int) -> "FeatureStatistics":
         """Return the spread of no samples."""
         return cls(count=0, mean=np.zeros(dim), root=np.zeros((0, dim)))
 
     @classmethod
-    def of(cls, features: Float[np.ndarray, "n dim"]) -> "Spread":
+    def of(cls, features: Float[np.ndarray, "n dim"]) -> "FeatureStatistics":
         """Return the spread of samples.
 
         Raises:
-            EvaluationError: If they are no table of finite numbers.
+            EvaluationError: If they are not a table of finite numbers.
         """
         if features.ndim != 2:
             raise EvaluationError(f"features must be of shape (n, dim), got {features.shape}.")
@@ -65,7 +65,7 @@ class Spread:
         """How many features a sample has."""
         return len(self.mean)
 
-    def merged(self, other: "Spread") -> "Spread":
+    def merged(self, other: "FeatureStatistics") -> "FeatureStatistics":
         """Return the spread of the samples of both.
 
         Raises:
@@ -77,7 +77,7 @@ class Spread:
         count = self.count + other.count
         between = other.mean - self.mean
         apart = math.sqrt(self.count * other.count / count) * between
-        return Spread(
+        return FeatureStatistics(
             count=count,
             mean=self.mean + between * (other.count / count),
             root=_compressed(np.vstack([self.root, other.root, apart]), at_most=2 * self.dim),
@@ -103,7 +103,7 @@ class FrechetDistance:
     underdetermined: bool
 
 
-def frechet_distance(predicted: Spread, target: Spread) -> FrechetDistance:
+def frechet_distance(predicted: FeatureStatistics, target: FeatureStatistics) -> FrechetDistance:
     """Return the Fréchet distance of Gaussians fitted to two sets of features.
 
     ||m1 - m2||^2 + tr S1 + tr S2 - 2 tr (S1 S2)^(1/2), with covariances over n - 1.
@@ -141,7 +141,7 @@ def _compressed(
     return np.asarray(np.linalg.qr(root, mode="r"))
 
 
-def _require_alike(one: Spread, other: Spread) -> None:
+def _require_alike(one: FeatureStatistics, other: FeatureStatistics) -> None:
     if one.dim != other.dim:
         raise EvaluationError(
             f"sets of {one.dim} and of {other.dim} features cannot be compared: "

@@ -68,7 +68,7 @@ def target_matches(
     exactly if it is the same keypoint.
 
     Raises:
-        EvaluationError: If the two are no pictures of one size.
+        EvaluationError: If the two are not pictures of one size.
     """
     require_pictures(left, target)
     keypoints = matcher.detect(left)
@@ -87,7 +87,7 @@ def match_error(
     """Return E_match of a predicted right picture.
 
     Raises:
-        EvaluationError: If it is no picture of the target's size, or the matcher another.
+        EvaluationError: If it is not a picture of the target's size, or the matcher another.
     """
     require_pictures(predicted)
     if predicted.shape[1:] != against.size_px or matcher.name != against.matcher:

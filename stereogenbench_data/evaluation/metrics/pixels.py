@@ -15,9 +15,9 @@ from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.models.interfaces import (
     Picture,
     Settings,
-    require_opencv,
     require_pictures,
 )
+from stereogenbench_data.evaluation.models.opencv import require_opencv
 
 _PEAK: Final = 255.0
 _WINDOW_PX: Final = 11
@@ -55,7 +55,7 @@ def psnr_db(predicted: Picture, target: Picture) -> float:
         Infinity where the two are identical: count these, an average of them says nothing.
 
     Raises:
-        EvaluationError: If they are no pictures of one size.
+        EvaluationError: If they are not pictures of one size.
     """
     require_pictures(predicted, target)
     error = predicted.astype(np.int32)
@@ -74,7 +74,7 @@ def ssim(predicted: Picture, target: Picture) -> float:
     gives with gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255.
 
     Raises:
-        EvaluationError: If they are no pictures of one size, or smaller than the window.
+        EvaluationError: If they are not pictures of one size, or smaller than the window.
         ExtraError: If OpenCV is not installed.
 
     Source: Wang, Bovik, Sheikh & Simoncelli, IEEE TIP 13(4), 2004.
@@ -189,7 +189,7 @@ def patch_psnr(left: Picture, right: Picture) -> PatchScore:
         right: The right picture of the same size.
 
     Raises:
-        EvaluationError: If they are no pictures of one size.
+        EvaluationError: If they are not pictures of one size.
     """
     require_pictures(left, right)
     squared = _least_squared_error(left, right).reshape(-1)

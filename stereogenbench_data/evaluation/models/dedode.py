@@ -24,9 +24,7 @@ from stereogenbench_data.evaluation.models.weights import (
     fetch,
     fingerprint,
     install,
-    load_into,
-    read_weights,
-    weights_path,
+    load_weights,
 )
 
 _RELEASE: Final = "https://github.com/Parskatt/DeDoDe/releases/download/dedode_pretrained_models/"
@@ -76,17 +74,16 @@ class DeDoDeMatcher:
         network: Any = kornia.feature.DeDoDe(
             detector_model="L", descriptor_model="B", amp_dtype=torch.float32
         )
-        paths = [weights_path(kind, folder=weights) for kind in (DETECTOR, DESCRIPTOR)]
-        for part, path in zip((network.detector, network.descriptor), paths, strict=True):
-            load_into(part, read_weights(path, what="DeDoDe"), path=path)
+        detector = load_weights(network.detector, DETECTOR, folder=weights)
+        descriptor = load_weights(network.descriptor, DESCRIPTOR, folder=weights)
         self._network = network.to(device)
         self._device = device
         self.name = f"DeDoDe (kornia {kornia.__version__})"
         self.settings: Settings = {
             "detector": "L-upright",
-            "detector_sha256": fingerprint(paths[0]),
+            "detector_sha256": fingerprint(detector),
             "descriptor": "B-upright",
-            "descriptor_sha256": fingerprint(paths[1]),
+            "descriptor_sha256": fingerprint(descriptor),
             "keypoints": KEYPOINTS,
             "ratio": RATIO,
             "matching": "mutual nearest neighbours, ratio in both directions",
@@ -98,7 +95,7 @@ class DeDoDeMatcher:
         """Return the keypoints of a picture that the detector is surest of.
 
         Raises:
-            EvaluationError: If it is no picture.
+            EvaluationError: If it is not a picture.
         """
         require_pictures(picture)
         image = torch.from_numpy(picture.copy()).to(self._device).float()[None] / 255

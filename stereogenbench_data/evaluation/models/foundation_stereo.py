@@ -90,7 +90,7 @@ class FoundationStereoMatcher:
         """Return the left picture's disparity in pixels; nan where the network gives none.
 
         Raises:
-            EvaluationError: If the two are no pictures of one size.
+            EvaluationError: If the two are not pictures of one size.
         """
         require_pictures(left, right)
         height, width = left.shape[1:]

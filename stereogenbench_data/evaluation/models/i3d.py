@@ -14,13 +14,7 @@ from torch.nn import functional
 
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.models.interfaces import Clips, Settings, require_clips
-from stereogenbench_data.evaluation.models.weights import (
-    Weights,
-    fingerprint,
-    load_into,
-    read_weights,
-    weights_path,
-)
+from stereogenbench_data.evaluation.models.weights import Weights, fingerprint, load_weights
 
 I3D: Final = Weights(
     what="FVD's I3D",
@@ -62,9 +56,8 @@ class I3dFeatures:
             ExtraError: If the file is missing.
             EvaluationError: If it does not hold this network's weights.
         """
-        path = weights_path(I3D, folder=weights)
         network = InflatedInception()
-        load_into(network, read_weights(path, what=I3D.what), path=path)
+        path = load_weights(network, I3D, folder=weights)
         self._network = network.to(device)
         self._device = device
         self.settings: Settings = {
@@ -79,7 +72,7 @@ class I3dFeatures:
         """Return the features of each clip.
 
         Raises:
-            EvaluationError: If they are no clips, or too short.
+            EvaluationError: If they are not clips, or too short.
         """
         require_clips(clips)
         if clips.shape[1] < _MIN_FRAMES:

@@ -2,11 +2,16 @@
 
 That network is not the one of torchvision: its average pools leave the border out, its last pool
 takes the maximum, and pictures come to it through TensorFlow 1's bilinear resize, which samples
-at the corner of a pixel and does not smooth. Tensors are named as in the files of its weights.
+at the corner of a pixel and does not smooth. Layers are named as in the file of its weights.
+
+The network of torch-fidelity 0.4 gives the same features bit for bit. It is not used, because
+importing it needs torchvision, each release of which fits one release of torch only, and because
+it unpickles the file of weights without restriction.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import torch
@@ -15,13 +20,7 @@ from torch import nn
 from torch.nn import functional
 
 from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings, require_batch
-from stereogenbench_data.evaluation.models.weights import (
-    Weights,
-    fingerprint,
-    load_into,
-    read_weights,
-    weights_path,
-)
+from stereogenbench_data.evaluation.models.weights import Weights, fingerprint, load_weights
 
 INCEPTION: Final = Weights(
     what="FID's Inception",
@@ -61,9 +60,8 @@ class InceptionFeatures:
             ExtraError: If the file is missing.
             EvaluationError: If it does not hold this network's weights.
         """
-        path = weights_path(INCEPTION, folder=weights)
         network = Inception()
-        load_into(network, read_weights(path, what=INCEPTION.what), path=path)
+        path = load_weights(network, INCEPTION, folder=weights)
         self._network = network.to(device)
         self._device = device
         self.settings: Settings = {
@@ -78,7 +76,7 @@ class InceptionFeatures:
         """Return the features of each picture.
 
         Raises:
-            EvaluationError: If they are no pictures.
+            EvaluationError: If they are not pictures.
         """
         require_batch(pictures)
         features = np.empty((len(pictures), _DIM))
@@ -99,17 +97,17 @@ class Inception(nn.Module):
         self.Conv2d_2b_3x3 = _Conv(32, 64, 3, padding=1)
         self.Conv2d_3b_1x1 = _Conv(64, 80, 1)
         self.Conv2d_4a_3x3 = _Conv(80, 192, 3)
-        self.Mixed_5b = _MixedA(192, pooled=32)
-        self.Mixed_5c = _MixedA(256, pooled=64)
-        self.Mixed_5d = _MixedA(288, pooled=64)
-        self.Mixed_6a = _MixedB()
-        self.Mixed_6b = _MixedC(between=128)
-        self.Mixed_6c = _MixedC(between=160)
-        self.Mixed_6d = _MixedC(between=160)
-        self.Mixed_6e = _MixedC(between=192)
-        self.Mixed_7a = _MixedD()
-        self.Mixed_7b = _MixedE(1280, pool="mean")
-        self.Mixed_7c = _MixedE(2048, pool="max")
+        self.Mixed_5b = _Mixed(192, _layers_5(pooled=32), pool="mean")
+        self.Mixed_5c = _Mixed(256, _layers_5(pooled=64), pool="mean")
+        self.Mixed_5d = _Mixed(288, _layers_5(pooled=64), pool="mean")
+        self.Mixed_6a = _Mixed(288, _LAYERS_6A, pool="halve")
+        self.Mixed_6b = _Mixed(768, _layers_6(between=128), pool="mean")
+        self.Mixed_6c = _Mixed(768, _layers_6(between=160), pool="mean")
+        self.Mixed_6d = _Mixed(768, _layers_6(between=160), pool="mean")
+        self.Mixed_6e = _Mixed(768, _layers_6(between=192), pool="mean")
+        self.Mixed_7a = _Mixed(768, _LAYERS_7A, pool="halve")
+        self.Mixed_7b = _Mixed(1280, _LAYERS_7, pool="mean")
+        self.Mixed_7c = _Mixed(2048, _LAYERS_7, pool="max")
         self.fc = nn.Linear(_DIM, _CLASSES)
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
@@ -142,128 +140,117 @@ class _Conv(nn.Module):
         return functional.relu(self.bn(self.conv(x)))
 
 
-class _Branches(nn.Module):
-    """Branches side by side, of convolutions that are made here by the names of their weights."""
+@dataclass(frozen=True, slots=True)
+class _Layer:
+    """A convolution within a block.
 
-    def chain(self, x: torch.Tensor, branch: str, *steps: str) -> torch.Tensor:
-        """Return what a branch's convolutions make of x, one after the other."""
-        for step in steps:
-            x = self.get_submodule(f"{branch}_{step}")(x)
-        return x
+    Attributes:
+        of: The layer before it; "input" and "pool" are the block's input and its pool.
+        outputs: How many channels it makes.
+        kernel: (rows, columns).
+        step: "same" keeps the size, "halve" has a stride of 2 and no padding.
+    """
+
+    of: str
+    outputs: int
+    kernel: tuple[int, int] = (1, 1)
+    step: Literal["same", "halve"] = "same"
 
 
-class _MixedA(_Branches):
-    def __init__(self, inputs: int, *, pooled: int) -> None:
+_Layers = dict[str, _Layer]
+
+
+def _layers_5(*, pooled: int) -> _Layers:
+    return {
+        "branch1x1": _Layer("input", 64),
+        "branch5x5_1": _Layer("input", 48),
+        "branch5x5_2": _Layer("branch5x5_1", 64, (5, 5)),
+        "branch3x3dbl_1": _Layer("input", 64),
+        "branch3x3dbl_2": _Layer("branch3x3dbl_1", 96, (3, 3)),
+        "branch3x3dbl_3": _Layer("branch3x3dbl_2", 96, (3, 3)),
+        "branch_pool": _Layer("pool", pooled),
+    }
+
+
+_LAYERS_6A: Final[_Layers] = {
+    "branch3x3": _Layer("input", 384, (3, 3), "halve"),
+    "branch3x3dbl_1": _Layer("input", 64),
+    "branch3x3dbl_2": _Layer("branch3x3dbl_1", 96, (3, 3)),
+    "branch3x3dbl_3": _Layer("branch3x3dbl_2", 96, (3, 3), "halve"),
+}
+
+
+def _layers_6(*, between: int) -> _Layers:
+    return {
+        "branch1x1": _Layer("input", 192),
+        "branch7x7_1": _Layer("input", between),
+        "branch7x7_2": _Layer("branch7x7_1", between, (1, 7)),
+        "branch7x7_3": _Layer("branch7x7_2", 192, (7, 1)),
+        "branch7x7dbl_1": _Layer("input", between),
+        "branch7x7dbl_2": _Layer("branch7x7dbl_1", between, (7, 1)),
+        "branch7x7dbl_3": _Layer("branch7x7dbl_2", between, (1, 7)),
+        "branch7x7dbl_4": _Layer("branch7x7dbl_3", between, (7, 1)),
+        "branch7x7dbl_5": _Layer("branch7x7dbl_4", 192, (1, 7)),
+        "branch_pool": _Layer("pool", 192),
+    }
+
+
+_LAYERS_7A: Final[_Layers] = {
+    "branch3x3_1": _Layer("input", 192),
+    "branch3x3_2": _Layer("branch3x3_1", 320, (3, 3), "halve"),
+    "branch7x7x3_1": _Layer("input", 192),
+    "branch7x7x3_2": _Layer("branch7x7x3_1", 192, (1, 7)),
+    "branch7x7x3_3": _Layer("branch7x7x3_2", 192, (7, 1)),
+    "branch7x7x3_4": _Layer("branch7x7x3_3", 192, (3, 3), "halve"),
+}
+
+_LAYERS_7: Final[_Layers] = {
+    "branch1x1": _Layer("input", 320),
+    "branch3x3_1": _Layer("input", 384),
+    "branch3x3_2a": _Layer("branch3x3_1", 384, (1, 3)),
+    "branch3x3_2b": _Layer("branch3x3_1", 384, (3, 1)),
+    "branch3x3dbl_1": _Layer("input", 448),
+    "branch3x3dbl_2": _Layer("branch3x3dbl_1", 384, (3, 3)),
+    "branch3x3dbl_3a": _Layer("branch3x3dbl_2", 384, (1, 3)),
+    "branch3x3dbl_3b": _Layer("branch3x3dbl_2", 384, (3, 1)),
+    "branch_pool": _Layer("pool", 192),
+}
+
+
+class _Mixed(nn.Module):
+    """A block of branches side by side; what no layer takes up is joined, in the layers' order."""
+
+    def __init__(
+        self, inputs: int, layers: _Layers, *, pool: Literal["mean", "max", "halve"]
+    ) -> None:
         super().__init__()
-        self.branch1x1 = _Conv(inputs, 64, 1)
-        self.branch5x5_1 = _Conv(inputs, 48, 1)
-        self.branch5x5_2 = _Conv(48, 64, 5, padding=2)
-        self.branch3x3dbl_1 = _Conv(inputs, 64, 1)
-        self.branch3x3dbl_2 = _Conv(64, 96, 3, padding=1)
-        self.branch3x3dbl_3 = _Conv(96, 96, 3, padding=1)
-        self.branch_pool = _Conv(inputs, pooled, 1)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return torch.cat(
-            [
-                self.branch1x1(x),
-                self.chain(x, "branch5x5", "1", "2"),
-                self.chain(x, "branch3x3dbl", "1", "2", "3"),
-                self.branch_pool(_mean_pool(x)),
-            ],
-            dim=1,
-        )
-
-
-class _MixedB(_Branches):
-    def __init__(self) -> None:
-        super().__init__()
-        self.branch3x3 = _Conv(288, 384, 3, stride=2)
-        self.branch3x3dbl_1 = _Conv(288, 64, 1)
-        self.branch3x3dbl_2 = _Conv(64, 96, 3, padding=1)
-        self.branch3x3dbl_3 = _Conv(96, 96, 3, stride=2)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        double = self.chain(x, "branch3x3dbl", "1", "2", "3")
-        return torch.cat([self.branch3x3(x), double, functional.max_pool2d(x, 3, 2)], dim=1)
-
-
-class _MixedC(_Branches):
-    def __init__(self, *, between: int) -> None:
-        super().__init__()
-        self.branch1x1 = _Conv(768, 192, 1)
-        self.branch7x7_1 = _Conv(768, between, 1)
-        self.branch7x7_2 = _Conv(between, between, (1, 7), padding=(0, 3))
-        self.branch7x7_3 = _Conv(between, 192, (7, 1), padding=(3, 0))
-        self.branch7x7dbl_1 = _Conv(768, between, 1)
-        self.branch7x7dbl_2 = _Conv(between, between, (7, 1), padding=(3, 0))
-        self.branch7x7dbl_3 = _Conv(between, between, (1, 7), padding=(0, 3))
-        self.branch7x7dbl_4 = _Conv(between, between, (7, 1), padding=(3, 0))
-        self.branch7x7dbl_5 = _Conv(between, 192, (1, 7), padding=(0, 3))
-        self.branch_pool = _Conv(768, 192, 1)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return torch.cat(
-            [
-                self.branch1x1(x),
-                self.chain(x, "branch7x7", "1", "2", "3"),
-                self.chain(x, "branch7x7dbl", "1", "2", "3", "4", "5"),
-                self.branch_pool(_mean_pool(x)),
-            ],
-            dim=1,
-        )
-
-
-class _MixedD(_Branches):
-    def __init__(self) -> None:
-        super().__init__()
-        self.branch3x3_1 = _Conv(768, 192, 1)
-        self.branch3x3_2 = _Conv(192, 320, 3, stride=2)
-        self.branch7x7x3_1 = _Conv(768, 192, 1)
-        self.branch7x7x3_2 = _Conv(192, 192, (1, 7), padding=(0, 3))
-        self.branch7x7x3_3 = _Conv(192, 192, (7, 1), padding=(3, 0))
-        self.branch7x7x3_4 = _Conv(192, 192, 3, stride=2)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        small = self.chain(x, "branch3x3", "1", "2")
-        large = self.chain(x, "branch7x7x3", "1", "2", "3", "4")
-        return torch.cat([small, large, functional.max_pool2d(x, 3, 2)], dim=1)
-
-
-class _MixedE(_Branches):
-    def __init__(self, inputs: int, *, pool: str) -> None:
-        super().__init__()
+        self.layers = layers
         self.pool = pool
-        self.branch1x1 = _Conv(inputs, 320, 1)
-        self.branch3x3_1 = _Conv(inputs, 384, 1)
-        self.branch3x3_2a = _Conv(384, 384, (1, 3), padding=(0, 1))
-        self.branch3x3_2b = _Conv(384, 384, (3, 1), padding=(1, 0))
-        self.branch3x3dbl_1 = _Conv(inputs, 448, 1)
-        self.branch3x3dbl_2 = _Conv(448, 384, 3, padding=1)
-        self.branch3x3dbl_3a = _Conv(384, 384, (1, 3), padding=(0, 1))
-        self.branch3x3dbl_3b = _Conv(384, 384, (3, 1), padding=(1, 0))
-        self.branch_pool = _Conv(inputs, 192, 1)
+        channels = {"input": inputs, "pool": inputs}
+        for name, layer in layers.items():
+            same = layer.step == "same"
+            padding = (layer.kernel[0] // 2, layer.kernel[1] // 2) if same else 0
+            conv = _Conv(
+                channels[layer.of], layer.outputs, layer.kernel, stride=1 if same else 2,
+                padding=padding,
+            )  # fmt: skip
+            self.add_module(name, conv)
+            channels[name] = layer.outputs
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        single = self.branch3x3_1(x)
-        double = self.chain(x, "branch3x3dbl", "1", "2")
-        pooled = _mean_pool(x) if self.pool == "mean" else functional.max_pool2d(x, 3, 1, 1)
-        return torch.cat(
-            [
-                self.branch1x1(x),
-                self.branch3x3_2a(single),
-                self.branch3x3_2b(single),
-                self.branch3x3dbl_3a(double),
-                self.branch3x3dbl_3b(double),
-                self.branch_pool(pooled),
-            ],
-            dim=1,
-        )
+        made = {"input": x, "pool": self._pooled(x)}
+        for name, layer in self.layers.items():
+            made[name] = self.get_submodule(name)(made[layer.of])
+        taken = {"input", *(layer.of for layer in self.layers.values())}
+        pool_last = [*self.layers, "pool"]
+        return torch.cat([made[name] for name in pool_last if name not in taken], dim=1)
 
-
-def _mean_pool(x: torch.Tensor) -> torch.Tensor:
-    """Return 3 x 3 means of what lies inside."""
-    return functional.avg_pool2d(x, 3, stride=1, padding=1, count_include_pad=False)
+    def _pooled(self, x: torch.Tensor) -> torch.Tensor:
+        if self.pool == "mean":
+            return functional.avg_pool2d(x, 3, stride=1, padding=1, count_include_pad=False)
+        if self.pool == "max":
+            return functional.max_pool2d(x, 3, stride=1, padding=1)
+        return functional.max_pool2d(x, 3, stride=2)
 
 
 def _resized(pictures: torch.Tensor) -> torch.Tensor:

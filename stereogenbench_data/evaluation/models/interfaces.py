@@ -6,13 +6,12 @@ answers depend on, so that a score can be told apart from one that was measured 
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from stereogenbench_data.errors import EvaluationError, ExtraError
+from stereogenbench_data.errors import EvaluationError
 
 Picture = UInt8[np.ndarray, "3 h w"]
 Pictures = UInt8[np.ndarray, "n 3 h w"]
@@ -169,18 +168,3 @@ def require_clips(clips: Clips) -> None:
             "clips must be uint8 RGB of shape (n, t, 3, h, w), "
             f"got {clips.dtype} of shape {clips.shape}."
         )
-
-
-def require_opencv() -> ModuleType:
-    """Return the module ``cv2``.
-
-    Raises:
-        ExtraError: If it is not installed.
-    """
-    try:
-        import cv2
-    except ImportError as error:
-        raise ExtraError(
-            "SSIM, SIFT and SGBM need OpenCV: pip install 'stereogenbench-data[evaluation]'"
-        ) from error
-    return cv2

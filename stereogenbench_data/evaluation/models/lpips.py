@@ -1,4 +1,9 @@
-"""LPIPS, version 0.1 on AlexNet: a weighted distance of two pictures' normalised activations."""
+"""LPIPS, version 0.1 on AlexNet: a weighted distance of two pictures' normalised activations.
+
+The network of the package lpips gives the same distances to 1e-8. It is not used, because
+importing it needs torchvision, each release of which fits one release of torch only; the package
+is needed for its file of weights.
+"""
 
 from importlib.util import find_spec
 from pathlib import Path
@@ -84,7 +89,7 @@ class Lpips:
         """Return the distance of each picture from its target.
 
         Raises:
-            EvaluationError: If they are no pictures of one size and number.
+            EvaluationError: If they are not pictures of one size and number.
         """
         require_batch(predicted)
         require_batch(target)

@@ -1,21 +1,36 @@
 """Matching without learned weights, by OpenCV: SIFT for keypoints, SGBM for disparity."""
 
+from types import ModuleType
 from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.errors import EvaluationError, ExtraError
 from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
 from stereogenbench_data.evaluation.models.interfaces import (
     Keypoints,
     Picture,
     Settings,
-    require_opencv,
     require_pictures,
 )
 
 _DESCRIPTOR_DIM: Final = 128
+
+
+def require_opencv() -> ModuleType:
+    """Return the module ``cv2``.
+
+    Raises:
+        ExtraError: If it is not installed.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise ExtraError(
+            "SSIM, SIFT and SGBM need OpenCV: pip install 'stereogenbench-data[evaluation]'"
+        ) from error
+    return cv2
 
 
 class Sift:
@@ -52,7 +67,7 @@ class Sift:
         """Return the strongest keypoints of a picture.
 
         Raises:
-            EvaluationError: If it is no picture.
+            EvaluationError: If it is not a picture.
         """
         require_pictures(picture)
         grey = self._cv2.cvtColor(
@@ -146,7 +161,7 @@ class Sgbm:
         """Return the left picture's disparity in pixels; nan where it has no answer.
 
         Raises:
-            EvaluationError: If the two are no pictures of one size, or narrower than the search.
+            EvaluationError: If the two are not pictures of one size, or narrower than the search.
         """
         require_pictures(left, right)
         if left.shape[-1] <= self._disparities:

@@ -49,7 +49,7 @@ class ColourStatistics:
         """Return the features of each picture.
 
         Raises:
-            EvaluationError: If they are no pictures of at least 8 x 8 pixels.
+            EvaluationError: If they are not pictures of at least 8 x 8 pixels.
         """
         require_batch(pictures)
         _require_size(pictures)
@@ -82,7 +82,7 @@ class MotionStatistics:
         """Return the features of each clip.
 
         Raises:
-            EvaluationError: If they are no clips of two frames and 8 x 8 pixels or more.
+            EvaluationError: If they are not clips of two frames and 8 x 8 pixels or more.
         """
         require_clips(clips)
         _require_size(clips)

@@ -1,4 +1,4 @@
-"""Learned weights: files that the user fetches once, and of which only tensors are read."""
+"""Files of learned weights: the user fetches them once, and only tensors are read from them."""
 
 import hashlib
 from collections.abc import Mapping
@@ -73,6 +73,18 @@ def weights_path(weights: Weights, *, folder: Path | None) -> Path:
     return path
 
 
+def load_weights(network: torch.nn.Module, weights: Weights, *, folder: Path | None) -> Path:
+    """Give a network its weights, make it ready for use and freeze it; return the file's path.
+
+    Raises:
+        ExtraError: If the file is not there.
+        EvaluationError: If it is damaged, or does not hold this network's weights.
+    """
+    path = weights_path(weights, folder=folder)
+    load_into(network, read_weights(path, what=weights.what), path=path)
+    return path
+
+
 def fingerprint(path: Path) -> str:
     """Return the sha256 of a file of weights, as 64 hexadecimal digits, for the settings."""
     with path.open("rb") as file:
@@ -89,7 +101,7 @@ def read_weights(path: Path, *, what: str) -> Mapping[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (UnpicklingError, RuntimeError, EOFError, KeyError, ValueError) as error:
         raise EvaluationError(
-            f"{path}: these weights of {what} cannot be read as tensors alone "
+            f"{path}: these weights of {what} cannot be read as tensors only "
             f"({str(error).splitlines()[0] if str(error) else type(error).__name__}). Fetch the "
             "file again; if you trust it, load it once by its authors' code and store its tensors "
             "with torch.save."

@@ -1,7 +1,8 @@
-"""Systems by name, and what is said of each whose package or weights are not at hand."""
+"""Models by name, and what is said of each whose package or weights are not at hand."""
 
 import re
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -9,63 +10,58 @@ import pytest
 import torch
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
-from stereogenbench_data.evaluation.models import registry as backends
 from stereogenbench_data.evaluation.models.dedode import DESCRIPTOR, DETECTOR
 from stereogenbench_data.evaluation.models.i3d import I3D
 from stereogenbench_data.evaluation.models.inception import INCEPTION
-from stereogenbench_data.evaluation.models.registry import (
-    Where,
-    load_image_features,
-    load_keypoint_matcher,
-    load_pair_metric,
-    load_stereo_matcher,
-    load_video_features,
-)
+from stereogenbench_data.evaluation.models.registry import MODELS, ModelOptions, load_model
 from stereogenbench_data.evaluation.models.weights import read_weights, weights_path
-
-LOADERS = {
-    "KEYPOINT_MATCHERS": load_keypoint_matcher,
-    "STEREO_MATCHERS": load_stereo_matcher,
-    "PAIR_METRICS": load_pair_metric,
-    "IMAGE_FEATURES": load_image_features,
-    "VIDEO_FEATURES": load_video_features,
-}
 
 
 @pytest.mark.parametrize(
-    ("load", "name"),
+    ("kind", "name"),
     [
-        (load_keypoint_matcher, "sift"),
-        (load_stereo_matcher, "sgbm"),
-        (load_image_features, "colour-statistics"),
-        (load_video_features, "motion-statistics"),
+        ("keypoint matcher", "sift"),
+        ("stereo matcher", "sgbm"),
+        ("image features", "colour-statistics"),
+        ("video features", "motion-statistics"),
     ],
 )
-def test_what_needs_no_weights_is_loaded_by_name_and_names_its_choices(load, name):
-    system = load(name)
+def test_what_needs_no_weights_is_loaded_by_name_and_names_its_choices(kind, name):
+    system = load_model(kind, name)
 
     assert system.name
     assert system.settings
 
 
-@pytest.mark.parametrize("names", LOADERS)
-def test_an_unknown_name_is_answered_with_the_known_ones(names):
-    known = ", ".join(getattr(backends, names))
+@pytest.mark.parametrize("kind", MODELS)
+def test_an_unknown_name_is_answered_with_the_known_ones(kind):
+    known = ", ".join(MODELS[kind])
 
-    with pytest.raises(EvaluationError, match=re.escape(f"one of {known}, got 'raft'")):
-        LOADERS[names]("raft")
+    with pytest.raises(
+        EvaluationError, match=re.escape(f"{kind} must be one of {known}, got 'raft'")
+    ):
+        load_model(kind, "raft")
 
 
 @pytest.mark.parametrize(
-    ("load", "name", "weights"),
+    "entry", [entry for models in MODELS.values() for entry in models.values()], ids=str
+)
+def test_every_model_of_the_registry_can_be_imported(entry):
+    module, _, name = entry.path.partition(":")
+
+    assert getattr(import_module(f"stereogenbench_data.evaluation.models.{module}"), name).__doc__
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "weights"),
     [
-        (load_image_features, "inception", INCEPTION),
-        (load_video_features, "i3d", I3D),
+        ("image features", "inception", INCEPTION),
+        ("video features", "i3d", I3D),
     ],
 )
-def test_missing_weights_are_named_with_source_licence_and_place(load, name, weights, tmp_path):
+def test_missing_weights_are_named_with_source_licence_and_place(kind, name, weights, tmp_path):
     with pytest.raises(ExtraError, match=re.escape(str(tmp_path / weights.file))) as caught:
-        load(name, Where(weights=tmp_path))
+        load_model(kind, name, ModelOptions(weights=tmp_path))
 
     assert weights.source in str(caught.value)
     assert f"licence: {weights.licence}" in str(caught.value)
@@ -80,17 +76,17 @@ def test_weights_are_looked_for_where_torch_hub_keeps_them(monkeypatch, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("load", "name", "package"),
-    [(load_keypoint_matcher, "dedode", "kornia"), (load_pair_metric, "lpips", "lpips")],
+    ("kind", "name", "package"),
+    [("keypoint matcher", "dedode", "kornia"), ("pair metric", "lpips", "lpips")],
 )
 def test_a_missing_package_is_named_with_its_extra_and_its_weights(
-    monkeypatch, tmp_path, load, name, package
+    monkeypatch, tmp_path, kind, name, package
 ):
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.setattr("stereogenbench_data.evaluation.models.lpips.find_spec", lambda _: None)
 
     with pytest.raises(ExtraError, match=rf"pip install 'stereogenbench-data\[{name}\]'") as caught:
-        load(name, Where(weights=tmp_path))
+        load_model(kind, name, ModelOptions(weights=tmp_path))
 
     assert "https://" in str(caught.value)
     assert "licence: " in str(caught.value)
@@ -100,17 +96,17 @@ def test_a_missing_package_is_named_with_its_extra_and_its_weights(
 @pytest.mark.parametrize("name", ["sift", "sgbm"])
 def test_without_opencv_the_stand_ins_name_the_extra(monkeypatch, name):
     monkeypatch.setitem(sys.modules, "cv2", None)
-    load = load_keypoint_matcher if name == "sift" else load_stereo_matcher
+    kind = "keypoint matcher" if name == "sift" else "stereo matcher"
 
     with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[evaluation\]'"):
-        load(name)
+        load_model(kind, name)
 
 
 def test_a_file_that_holds_more_than_tensors_is_not_run(tmp_path):
     path = tmp_path / "weights.pth"
     torch.save({"run": Path("/")}, path)
 
-    with pytest.raises(EvaluationError, match="cannot be read as tensors alone"):
+    with pytest.raises(EvaluationError, match="cannot be read as tensors only"):
         read_weights(path, what="a network")
 
 
@@ -127,14 +123,14 @@ def test_a_file_of_something_else_is_named(tmp_path):
     torch.save(torch.zeros(3), tmp_path / I3D.file)
 
     with pytest.raises(EvaluationError, match="are a Tensor, not a table of tensors"):
-        load_video_features("i3d", Where(weights=tmp_path))
+        load_model("video features", "i3d", ModelOptions(weights=tmp_path))
 
 
 def test_weights_of_another_network_are_named(tmp_path):
     torch.save({"conv.weight": torch.zeros(3)}, tmp_path / I3D.file)
 
     with pytest.raises(EvaluationError, match="not the weights of InflatedInception: Missing key"):
-        load_video_features("i3d", Where(weights=tmp_path))
+        load_model("video features", "i3d", ModelOptions(weights=tmp_path))
 
 
 KORNIA = '''
@@ -173,7 +169,7 @@ def test_dedode_is_given_its_weights_and_the_picture_as_kornia_wants_it(monkeypa
     picture = np.zeros((3, 6, 8), dtype=np.uint8)
     picture[:, 2, 5] = 255
 
-    matcher = load_keypoint_matcher("dedode", Where(weights=tmp_path))
+    matcher = load_model("keypoint matcher", "dedode", ModelOptions(weights=tmp_path))
     found = matcher.detect(picture)
 
     assert matcher.name == "DeDoDe (kornia 0.test)"
@@ -190,7 +186,7 @@ def test_dedode_without_its_second_file_says_which(monkeypatch, tmp_path):
     torch.save(torch.nn.Linear(1, 1).state_dict(), tmp_path / DETECTOR.file)
 
     with pytest.raises(ExtraError, match=r"descriptor B-upright are not at .*_descriptor_B.pth"):
-        load_keypoint_matcher("dedode", Where(weights=tmp_path))
+        load_model("keypoint matcher", "dedode", ModelOptions(weights=tmp_path))
     monkeypatch.delitem(sys.modules, "kornia")
 
 
@@ -243,7 +239,7 @@ def test_foundation_stereo_is_padded_for_and_its_answer_cut_to_the_picture(check
     left, right = (rng.integers(10, 256, (3, 37, 50)).astype(np.uint8) for _ in range(2))
     right[0, 3, 4] = 9
 
-    matcher = load_stereo_matcher("foundation-stereo", Where(checkout=checkout))
+    matcher = load_model("stereo matcher", "foundation-stereo", ModelOptions(checkout=checkout))
     disparity = matcher(left, right)
 
     expected = left[0] * np.float32(0.5)
@@ -263,7 +259,7 @@ def test_foundation_stereo_is_padded_for_and_its_answer_cut_to_the_picture(check
 )
 def test_without_a_checkout_the_repository_weights_and_licence_are_named(place, lacking):
     with pytest.raises(ExtraError, match=f"FoundationStereo {lacking}: clone") as caught:
-        load_stereo_matcher("foundation-stereo", Where(checkout=place))
+        load_model("stereo matcher", "foundation-stereo", ModelOptions(checkout=place))
 
     for told in ("github.com/NVlabs/FoundationStereo", "drive.google.com", "non-commercial"):
         assert told in str(caught.value)
@@ -275,23 +271,25 @@ def test_a_checkout_without_weights_configuration_or_requirements_is_told_what_i
     folder = checkout / "pretrained_models" / "23-51-11"
     (folder / "cfg.yaml").unlink()
     with pytest.raises(ExtraError, match=r"cfg\.yaml is missing: it comes with the weights"):
-        load_stereo_matcher("foundation-stereo", Where(checkout=checkout))
+        load_model("stereo matcher", "foundation-stereo", ModelOptions(checkout=checkout))
 
     monkeypatch.setitem(sys.modules, "omegaconf", None)
     with pytest.raises(ExtraError, match=r"needs more than is installed .*omegaconf"):
-        load_stereo_matcher("foundation-stereo", Where(checkout=checkout))
+        load_model("stereo matcher", "foundation-stereo", ModelOptions(checkout=checkout))
 
     (folder / "model_best_bp2.pth").unlink()
     with pytest.raises(ExtraError, match=r"are not at .*model_best_bp2\.pth"):
-        load_stereo_matcher("foundation-stereo", Where(checkout=checkout))
+        load_model("stereo matcher", "foundation-stereo", ModelOptions(checkout=checkout))
 
 
 def test_another_module_of_the_same_name_is_not_taken_for_foundation_stereo(checkout, tmp_path):
-    load_stereo_matcher("foundation-stereo", Where(checkout=checkout))
+    load_model("stereo matcher", "foundation-stereo", ModelOptions(checkout=checkout))
     other = tmp_path / "other"
     (other / "core").mkdir(parents=True)
     (other / "core" / "foundation_stereo.py").write_text(FOUNDATION_STEREO)
 
     weights = checkout / "pretrained_models" / "23-51-11"
     with pytest.raises(EvaluationError, match="another module named core is loaded"):
-        load_stereo_matcher("foundation-stereo", Where(checkout=other, weights=weights))
+        load_model(
+            "stereo matcher", "foundation-stereo", ModelOptions(checkout=other, weights=weights)
+        )
