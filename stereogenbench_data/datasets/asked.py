@@ -9,10 +9,9 @@ from stereogenbench_data.datasets.batch_buffers import Buffers
 from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS, require_fields
 from stereogenbench_data.samples.request import Request, Transform
+from stereogenbench_data.samples.size import require_size
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT
-
-LARGEST_SIDE_PX: Final = 16384
 
 Check = Literal["read", "opened", "metadata"]
 """Which videos are compared with their checksums: see `StereoPairs`."""
@@ -34,30 +33,10 @@ def requested(
         kind=kind,
         fields=require_fields(fields, known=PAIR_FIELDS if kind == "pairs" else VIEW_FIELDS),
         layout=layout,
-        size=require_size(size),
+        size=None if size is None else require_size(size),
         depth=require_depth(depth),
         transform=require_transform(transform),
     )
-
-
-def require_size(size: Any) -> tuple[int, int] | None:
-    """Return a (height, width) in pixels, or None.
-
-    Raises:
-        FieldError: If it is not two whole numbers of 1 to 16384.
-    """
-    if size is None:
-        return None
-    try:
-        height, width = (int(side) for side in size)
-        whole = (height, width) == tuple(size)
-    except (TypeError, ValueError):
-        whole = False
-    if not whole or not (0 < height <= LARGEST_SIDE_PX and 0 < width <= LARGEST_SIDE_PX):
-        raise FieldError(
-            f"size must be (height, width) of 1 to {LARGEST_SIDE_PX} pixels, got {size!r}."
-        )
-    return height, width
 
 
 def require_transform(transform: Any) -> Transform | None:

@@ -46,6 +46,7 @@ from stereogenbench_data.samples.load import (
 )
 from stereogenbench_data.samples.needed import require_videos
 from stereogenbench_data.samples.places import Room, fresh_room
+from stereogenbench_data.samples.size import warn_if_swapped
 from stereogenbench_data.samples.whole_depth import require_whole_depth
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
@@ -74,6 +75,9 @@ class _MappedScenes(Dataset[Sample]):
         require_videos(index, plan, request)
         require_whole_depth(index, plan, request)
         _warn_of_odd_scenes(index, plan, request)
+        if request.size is not None:
+            rig = index.scene(int(plan.scene_rows[0])).rig
+            warn_if_swapped(request.size, stored=(rig.image_height_px, rig.image_width_px))
         self.index = index
         self.plan = plan
         opened = _opens_checked(require_check(check), plan)
@@ -310,7 +314,7 @@ class StereoPairs(_MappedScenes):
         data: Data,
         *,
         fields: Iterable[str] = DEFAULT_PAIR_FIELDS,
-        size: tuple[int, int] | None = None,
+        size: tuple[int, int] | str | None = None,
         transform: Transform | None = None,
         depth: DepthEncoding | None = None,
         seed: int = 0,
@@ -325,8 +329,9 @@ class StereoPairs(_MappedScenes):
             data: A folder in the released layout; a folder of shards, or its URL; an index of
                 either; or a `SceneIndex`.
             fields: Names of the fields wanted; only what they need is read and decoded.
-            size: (height, width) in pixels that pictures are scaled to while they are decoded;
-                intrinsics and disparity follow. None keeps the stored size.
+            size: (height, width) in pixels, or a text "WIDTHxHEIGHT", that pictures are scaled to
+                while they are decoded; intrinsics and disparity follow. None keeps the stored size.
+                `SwappedSizeWarning` is given where the two look exchanged.
             transform: What changes pictures and cameras together, such as `Compose`.
             depth: A depth contract instead of the one that files and release state.
             seed: Seed of random frames, transforms and the balanced subsample.
@@ -380,7 +385,7 @@ class SceneViews(_MappedScenes):
         cameras: Sequence[int] | Literal["all", "each"] = "all",
         frames: FramesSpec = "first",
         fields: Iterable[str] = DEFAULT_VIEW_FIELDS,
-        size: tuple[int, int] | None = None,
+        size: tuple[int, int] | str | None = None,
         transform: Transform | None = None,
         depth: DepthEncoding | None = None,
         seed: int = 0,
@@ -396,7 +401,7 @@ class SceneViews(_MappedScenes):
             cameras: Camera numbers to stack, "all" six, or "each" as a sample by itself.
             frames: As for `StereoPairs`.
             fields: Names of the fields wanted; only what they need is read and decoded.
-            size: (height, width) in pixels, as for `StereoPairs`.
+            size: As for `StereoPairs`.
             transform: As for `StereoPairs`; a flip, which swaps the views of a pair, is refused.
             depth: A depth contract instead of the one that files and release state.
             seed: Seed of random frames and transforms.
