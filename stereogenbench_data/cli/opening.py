@@ -31,9 +31,9 @@ def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
 
     folder = None if is_remote(data) else local_path(data)
     if folder is None or root is not None or not folder.is_dir():
-        return _opened(data, root)
+        return open_index(data, root=root)
     if (folder / INDEX_NAME).is_file():
-        return _opened(data, root)
+        return open_index(data, root=root)
     with progress_bar("reading scenes", unit="scenes") as progress:
         report = walk(folder, progress=progress)
     if not report.scenes:
@@ -47,8 +47,16 @@ def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
     return SceneIndex.from_report(report)
 
 
-def _opened(data: str, root: str | None) -> "SceneIndex":
-    """Return an index that exists; its warnings are said as a command says things."""
+def open_index(data: str, *, root: str | None = None) -> "SceneIndex":
+    """Return the index of some data; stderr is told what it warns of.
+
+    Args:
+        data: What the command was given.
+        root: Where an index file's data are, by the user's word.
+
+    Raises:
+        StorageError: If there is no such data, or a scene of it is broken.
+    """
     from stereogenbench_data.index.stale import StaleIndexWarning
     from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
 

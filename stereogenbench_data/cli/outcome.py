@@ -1,10 +1,11 @@
 """How a command ends: what is said of an error, in one or two lines, and the exit status."""
 
-import contextlib
 import errno
 import os
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Final, TextIO
 
@@ -27,6 +28,16 @@ _CURES: Final = {
     errno.EISDIR: "Name a file, not a folder.",
     errno.EADDRINUSE: "Choose another port.",
 }
+
+
+@contextmanager
+def resumable() -> Iterator[None]:
+    """Say on Ctrl-C that the command goes on from here if it is run again: for its function."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo("stopped; run the same command again to go on from here", err=True)
+        raise typer.Exit(STOPPED) from None
 
 
 class OutcomeTold:
@@ -110,7 +121,7 @@ def _is_said_elsewhere(error: BaseException) -> bool:
 
 def _forget(stream: TextIO) -> None:
     """Point a stream at nothing, so that what is left of it is not written when Python ends."""
-    with contextlib.suppress(OSError, ValueError):
+    with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 

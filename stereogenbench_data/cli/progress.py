@@ -21,6 +21,8 @@ from rich.text import Text
 
 Report = Callable[[int, int], None]
 
+_BYTES_IN: Final = {"MB": 1_000_000}
+"""Units of which the bar is told in bytes."""
 _ROOM_FOR_BAR: Final = 60
 _LOGGED_EVERY_S: Final = 60
 
@@ -55,7 +57,13 @@ class _RateColumn(ProgressColumn):
 
 @contextmanager
 def progress_bar(doing: str, *, unit: str) -> Iterator[Report]:
-    """Show a bar while the block runs; it yields what is to be called with (done, total)."""
+    """Show a bar while the block runs; it yields what is to be called with (done, total).
+
+    Args:
+        doing: What the command does, such as "packing".
+        unit: What is counted. Of "MB", done and total are told in bytes.
+    """
+    divisor = _BYTES_IN.get(unit, 1)
     console = Console(stderr=True)
     columns = (
         TextColumn(doing),
@@ -70,7 +78,7 @@ def progress_bar(doing: str, *, unit: str) -> Iterator[Report]:
 
         def report(done: int, total: int) -> None:
             nonlocal told
-            bar.update(task, completed=done, total=total)
+            bar.update(task, completed=-(-done // divisor), total=-(-total // divisor))
             if not console.is_terminal and time.monotonic() - told >= _LOGGED_EVERY_S:
                 told = time.monotonic()
                 console.print(bar)

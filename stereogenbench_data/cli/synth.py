@@ -3,13 +3,17 @@
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import typer
 
-from stereogenbench_data.cli.options import JsonOption, complete_from
+from stereogenbench_data.cli.options import (
+    JsonOption,
+    complete_from,
+    workers_option,
+)
+from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import (
     FAMILIES,
@@ -19,13 +23,11 @@ from stereogenbench_data.schema.release import (
     Subset,
 )
 
-if TYPE_CHECKING:
-    from stereogenbench_data.synthesis.request import SynthRequest
-
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
 """As in `synthesis.request`, which is imported when scenes are drawn, not for the help."""
 
 
+@resumable()
 def synth(  # noqa: PLR0913 - one parameter an option
     out: Annotated[Path, typer.Argument(help="Folder to write train/ or eval/ into.")],
     *,
@@ -53,9 +55,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
     rotation: Annotated[
         RotationForm, typer.Option(help="How trajectory.json records rotations.")
     ] = "rotator",
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes that draw (default: one a core).")
-    ] = None,
+    workers: Annotated[int | None, workers_option("Processes that draw")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Draw scenes with exact depth, poses and intrinsics, in the released layout.
@@ -63,6 +63,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
     Scenes that the same request wrote before are kept, so a run that was stopped goes on if it
     is run again. Scene i is the same for any number of scenes and workers.
     """
+    from stereogenbench_data.synthesis.produce import synthesise
     from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
     request = SynthRequest(
@@ -79,19 +80,9 @@ def synth(  # noqa: PLR0913 - one parameter an option
             rotation=rotation, depth_unit_m=depth_unit_m, depth_tag=depth_tag or None
         ),
     )
-    try:
-        keys = _drawn(out, request, workers=workers or os.cpu_count() or 1)
-    except KeyboardInterrupt:
-        typer.echo("stopped; run the same command again to go on from here", err=True)
-        raise typer.Exit(STOPPED) from None
+    with progress_bar("drawing", unit="frames") as progress:
+        keys = synthesise(out, request, workers=workers or os.cpu_count() or 1, progress=progress)
     if as_json:
         typer.echo(json.dumps({"root": str(out), "scenes": keys}, indent=2))
     else:
         typer.echo(f"{out}: {counted(len(keys), 'scene')} in {request.folder}")
-
-
-def _drawn(out: Path, request: "SynthRequest", *, workers: int) -> list[str]:
-    from stereogenbench_data.synthesis.produce import synthesise
-
-    with progress_bar("drawing", unit="frames") as report:
-        return synthesise(out, request, workers=workers, progress=report)

@@ -168,13 +168,13 @@ def test_a_descriptor_is_told_as_json(small_shards, tmp_path):
 
 
 def shown_progress(monkeypatch, *, width, every_s):
-    """Return what is printed of three steps where stderr is no terminal."""
+    """Return what is printed of three megabytes where stderr is no terminal."""
     console = Console(width=width, force_terminal=False, color_system=None)
     monkeypatch.setattr(progress, "Console", lambda **_: console)
     monkeypatch.setattr(progress, "_LOGGED_EVERY_S", every_s)
     with console.capture() as captured, progress.progress_bar("packing", unit="MB") as report:
         for done in (1, 2, 3):
-            report(done, 3)
+            report(done * 1_000_000, 3_000_000)
     return captured.get().splitlines()
 
 
