@@ -15,7 +15,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.results import Spread
+from benchmarks.results import Say, spread_of
 from stereogenbench_data.evaluation import scoring
 from stereogenbench_data.evaluation.candidates import PredictionFolder
 from stereogenbench_data.evaluation.evaluate import selected
@@ -80,7 +79,7 @@ class TimedMatcher:
         return self._call(*views) if self._call else None
 
 
-def measure_evaluation(*, rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
+def measure_evaluation(*, rounds: int, say: Say) -> dict[str, Any]:
     """Return the section of the results on scoring."""
     say(f"evaluation: drawing and scoring {FRAMES} frames")
     return measure(frames=FRAMES, size_px=1280, rounds=rounds)
@@ -106,7 +105,7 @@ def measure(
                  *_score(extent, predictions, protocol))
                 for _ in range(rounds)
             ]  # fmt: skip
-    beside = Spread.of((scored - matched) / decoded for decoded, scored, matched in found)
+    beside = spread_of((scored - matched) / decoded for decoded, scored, matched in found)
     decoding_s, scoring_s, matchers_s = (
         statistics.median(times) for times in zip(*found, strict=True)
     )
@@ -119,7 +118,7 @@ def measure(
         "decoding_and_resizing_s": round(decoding_s, 3),
         "matchers_s": round(matchers_s, 3),
         "scoring_s": round(scoring_s, 3),
-        "beside_matchers_over_decoding": asdict(beside),
+        "beside_matchers_over_decoding": beside,
         "limit": LIMIT,
         "versions": {
             "python": sys.version.split()[0],
