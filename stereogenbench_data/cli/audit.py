@@ -129,7 +129,7 @@ def _frames(text: str) -> int:
         return 0
     if not text.isdecimal() or int(text) < 1:
         raise typer.BadParameter(
-            f"{text!r} is no number of frames, nor 'all'.", param_hint="--frames"
+            f"{text!r} is neither a number of frames, such as 5, nor 'all'.", param_hint="--frames"
         )
     return int(text)
 

@@ -53,16 +53,16 @@ def download(  # noqa: PLR0913 - one parameter an option
     kinds = ("rgb", "depth") if streams == "both" else (streams,)
     wanted = plan_download(index, rows.tolist(), cameras=numbers, streams=kinds)
     size = wanted.size_bytes / 1e6
-    scenes_told, files_told = counted(len(rows), "scene"), counted(len(wanted.files), "file")
-    typer.echo(f"{scenes_told}, {files_told}, {size:,.1f} MB", err=True)
+    scenes, files = counted(len(rows), "scene"), counted(len(wanted.files), "file")
+    typer.echo(f"{scenes}, {files}, {size:,.1f} MB", err=True)
     if not dry_run:
         with progress_bar("downloading", unit="MB") as progress:
             fetched(index, wanted, dest, workers=workers, progress=progress)
-    told = {"scenes": len(rows), "files": len(wanted.files), "bytes": wanted.size_bytes}
+    summary = {"scenes": len(rows), "files": len(wanted.files), "bytes": wanted.size_bytes}
     if as_json:
-        typer.echo(json.dumps(told | {"dest": None if dry_run else str(dest)}, indent=2))
+        typer.echo(json.dumps(summary | {"dest": None if dry_run else str(dest)}, indent=2))
     elif not dry_run:
-        typer.echo(f"{dest}: {scenes_told}, {size:,.1f} MB")
+        typer.echo(f"{dest}: {scenes}, {size:,.1f} MB")
 
 
 def _cameras(text: str) -> list[int]:

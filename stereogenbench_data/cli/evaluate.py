@@ -36,7 +36,7 @@ def parse_pairs(text: str) -> Any:
     """Return the pairs that an option names, as `StereoPairs` takes them.
 
     Raises:
-        typer.BadParameter: If it names none.
+        typer.BadParameter: If the text does not name any.
     """
     if text in ("primary", "adjacent", "all"):
         return text
@@ -53,7 +53,7 @@ def parse_frames(text: str) -> Any:
     """Return the frames that an option names, as `StereoPairs` takes them.
 
     Raises:
-        typer.BadParameter: If it names none.
+        typer.BadParameter: If the text does not name any.
     """
     if text in ("all", "first"):
         return text
@@ -86,7 +86,7 @@ def parse_strata(texts: list[str] | None) -> dict[str, tuple[float, ...]]:
     """Return columns to stratify by, with their edges.
 
     Raises:
-        typer.BadParameter: If an edge is no number.
+        typer.BadParameter: If an edge is not a number.
     """
     strata: dict[str, tuple[float, ...]] = {}
     for text in texts or []:
@@ -95,7 +95,7 @@ def parse_strata(texts: list[str] | None) -> dict[str, tuple[float, ...]]:
             strata[column] = tuple(float(edge) for edge in edges.split(",")) if edges else ()
         except ValueError:
             raise typer.BadParameter(
-                f"{text!r}: its edges {edges!r} are no numbers, such as 18,35.", param_hint="--by"
+                f"{text!r}: its edges {edges!r} are not numbers, such as 18,35.", param_hint="--by"
             ) from None
     return strata
 
@@ -138,7 +138,7 @@ class PairsOptions(SceneOptions):
         """Return the options of `StereoPairs` that select.
 
         Raises:
-            typer.BadParameter: If the pairs or the frames are none.
+            typer.BadParameter: If the text of the pairs or of the frames cannot be parsed.
         """
         baseline = {} if self.baseline_cm is None else {"baseline_cm": self.baseline_cm}
         chosen = {"pairs": parse_pairs(self.pairs), "frames": parse_frames(self.frames)}
@@ -195,7 +195,7 @@ class ProtocolOptions:
         """Return the protocol that the options ask for.
 
         Raises:
-            typer.BadParameter: If the size is none.
+            typer.BadParameter: If the size is not WIDTHxHEIGHT.
             EvaluationError: If a metric, a matcher or a fit is not known.
         """
         from stereogenbench_data.evaluation.backends import Where

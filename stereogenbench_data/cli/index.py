@@ -71,7 +71,8 @@ def index(  # noqa: PLR0913 - one parameter an option
     wanted = _passing(split, family or [], map_name or [])
     if wanted is not None and out is None:
         raise typer.BadParameter(
-            "an index of a part is named by you: --out FILE", param_hint="--out"
+            "the index of a part needs a file of its own: name it with --out FILE.",
+            param_hint="--out",
         )
     if target.is_dir():
         raise typer.BadParameter(
@@ -80,7 +81,7 @@ def index(  # noqa: PLR0913 - one parameter an option
         )
     if target.exists() and not target.is_file():
         raise typer.BadParameter(
-            f"{target} is no regular file, which an index would replace.", param_hint="--out"
+            f"{target} is not a regular file, and an index would replace it.", param_hint="--out"
         )
     root_told(root, beside=target.parent)  # before hours of work, whether it may be written
     done_before = target.with_name(f"{target.name}.journal")

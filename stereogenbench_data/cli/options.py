@@ -60,7 +60,7 @@ def _options_of(group: Any) -> list[inspect.Parameter]:
 
 
 def complete_from(values: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return what a shell's completion asks: which of the values begin with what was typed."""
+    """Return a function for shell completion: the values that begin with what was typed."""
     known = sorted(values)
     return lambda incomplete: [
         value for value in known if value.lower().startswith(incomplete.lower())
@@ -68,7 +68,7 @@ def complete_from(values: Iterable[str]) -> Callable[[str], list[str]]:
 
 
 def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
-    """Return the keys of scenes that begin with what was typed, where DATA has an index."""
+    """Return the keys of scenes that begin with what was typed, if DATA has an index."""
     from stereogenbench_data.errors import StereoGenBenchError
     from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
 

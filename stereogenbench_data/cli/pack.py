@@ -97,7 +97,7 @@ def _part(text: str) -> tuple[int, int]:
     number, _, count = text.partition("/")
     if not (number.isdecimal() and count.isdecimal()):
         raise typer.BadParameter(
-            f"{text!r} is no part: write I/N, such as 1/4", param_hint="--part"
+            f"{text!r} is not a part: write I/N, such as 1/4.", param_hint="--part"
         )
     return int(number), int(count)
 
@@ -164,8 +164,8 @@ def unpack(
             source.shards, out, root=source.data_root, workers=workers, progress=progress
         )
     if as_json:
-        told = {"unpacked": list(report.unpacked), "kept": list(report.kept)}
-        typer.echo(json.dumps({"out": str(out)} | told, indent=2))
+        summary = {"unpacked": list(report.unpacked), "kept": list(report.kept)}
+        typer.echo(json.dumps({"out": str(out)} | summary, indent=2))
         return
     were = "was" if len(report.kept) == 1 else "were"
     typer.echo(

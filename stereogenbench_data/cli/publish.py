@@ -1,4 +1,4 @@
-"""``stereogenbench croissant``, ``card``, ``upload``: what the world is told of packed shards."""
+"""``stereogenbench croissant``, ``card``, ``upload``: describe packed shards and publish them."""
 
 import json
 from dataclasses import asdict
@@ -66,7 +66,9 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         _check(data, mapping or [], as_json=as_json)
         return
     if out is None:
-        raise typer.BadParameter("name the descriptor to write: -o FILE", param_hint="--out")
+        raise typer.BadParameter(
+            "the descriptor needs a file: name it with -o FILE.", param_hint="--out"
+        )
     from stereogenbench_data.bridges import about
     from stereogenbench_data.bridges.croissant import Publication, write_descriptor
     from stereogenbench_data.index.table import SceneIndex
@@ -82,22 +84,25 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     descriptor = write_descriptor(index, out, publication=publication)
     files, records = len(descriptor["distribution"]), len(descriptor["recordSet"])
     if as_json:
-        told = {"descriptor": str(out), "distribution": files, "record_sets": records}
-        typer.echo(json.dumps(told, indent=2))
+        summary = {"descriptor": str(out), "distribution": files, "record_sets": records}
+        typer.echo(json.dumps(summary, indent=2))
     else:
         typer.echo(f"{out}: {files} files and sets of files, {counted(records, 'record set')}")
 
 
 def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
     if data is None:
-        raise typer.BadParameter("name the descriptor to check", param_hint="DATA")
+        raise typer.BadParameter("--check needs a descriptor: name its file.", param_hint="DATA")
     from stereogenbench_data.bridges.croissant_check import check_descriptor
 
     places = {}
     for each in mapping:
         name, equals, path = each.partition("=")
         if not equals:
-            raise typer.BadParameter(f"{each!r} is not ID=PATH", param_hint="--map-file")
+            raise typer.BadParameter(
+                f"{each!r} is not ID=PATH, such as shards.tar=data/shards.tar.",
+                param_hint="--map-file",
+            )
         places[name] = Path(path)
     problems = check_descriptor(Path(data), mapping=places)
     if as_json:

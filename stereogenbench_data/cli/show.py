@@ -105,6 +105,6 @@ def _cameras(text: str) -> tuple[int, int]:
     left, _, right = text.replace(",", "-").partition("-")
     if not (left.strip().isdecimal() and right.strip().isdecimal()):
         raise typer.BadParameter(
-            f"{text!r} is no pair: write two cameras, such as 0-5.", param_hint="--pair"
+            f"{text!r} is not a pair: write two cameras, such as 0-5.", param_hint="--pair"
         )
     return int(left), int(right)

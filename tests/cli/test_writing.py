@@ -127,7 +127,7 @@ def test_an_index_does_not_replace_a_device_or_a_pipe(small_release, tmp_path):
     shown = invoke("index", small_release, "-o", pipe)
 
     assert shown.exit_code == 2
-    assert "is no regular file" in " ".join(shown.stderr.replace("│", " ").split())
+    assert "is not a regular file" in " ".join(shown.stderr.replace("│", " ").split())
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
