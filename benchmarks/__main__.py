@@ -15,12 +15,11 @@ from benchmarks.clock import MeasurementError, in_a_fork
 from benchmarks.equality import differences
 from benchmarks.evaluation import measure_evaluation
 from benchmarks.ffmpeg_links import link_libraries
-from benchmarks.machine import machine
 from benchmarks.material import Material, facts, prepared
 from benchmarks.plots import plot_all
 from benchmarks.profile import measure_profile
 from benchmarks.race import Plan, run_races
-from benchmarks.results import Results
+from benchmarks.results import Results, machine
 from benchmarks.start import measure_memory, measure_start
 from benchmarks.tables import tables
 from benchmarks.tried import measure_tried

@@ -15,7 +15,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.results import Spread
+from benchmarks.results import Say, spread_of
 from stereogenbench_data.evaluation.predictions import PredictionFolder, frame_name, item_name
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, MetricModels
 from stereogenbench_data.evaluation.running import Workload, select_workload
@@ -77,7 +76,7 @@ class TimedMatcher:
         return self._call(*views) if self._call else None
 
 
-def measure_evaluation(*, rounds: int, say: Callable[[str], None]) -> dict[str, Any]:
+def measure_evaluation(*, rounds: int, say: Say) -> dict[str, Any]:
     """Return the section of the results on scoring."""
     say(f"evaluation: drawing and scoring {FRAMES} frames")
     return measure(frames=FRAMES, size_px=1280, rounds=rounds)
@@ -103,7 +102,7 @@ def measure(
                  *_score(workload, predictions, protocol))
                 for _ in range(rounds)
             ]  # fmt: skip
-    beside = Spread.of((scored - matched) / decoded for decoded, scored, matched in found)
+    beside = spread_of((scored - matched) / decoded for decoded, scored, matched in found)
     decoding_s, scoring_s, matchers_s = (
         statistics.median(times) for times in zip(*found, strict=True)
     )
@@ -116,7 +115,7 @@ def measure(
         "decoding_and_resizing_s": round(decoding_s, 3),
         "matchers_s": round(matchers_s, 3),
         "scoring_s": round(scoring_s, 3),
-        "beside_matchers_over_decoding": asdict(beside),
+        "beside_matchers_over_decoding": beside,
         "limit": LIMIT,
         "versions": {
             "python": sys.version.split()[0],

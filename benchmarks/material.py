@@ -2,17 +2,23 @@
 
 Four scenes of two families are drawn. The trees `many` and `eight` hold hard links to their files
 under other keys: as many scenes open at a time as in a real epoch, without drawing for hours.
+
+Four of them are encoded again at lower bit rates, their depth linked: what a faster depth codec
+gives depends on what decoding the pictures costs, and that on their rate.
 """
 
 import json
 import os
-from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
-from benchmarks.reencoded import DRAWN_CRF, OTHER_CRFS, reencode_tree
+import av
+
+from benchmarks.results import Say
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member, Scene, SceneId
@@ -22,10 +28,14 @@ from stereogenbench_data.shards.plan import DepthCodec
 from stereogenbench_data.synthesis import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
-Say = Callable[[str], None]
-
 FAMILIES: Final = (("IPD_Gaussian", 11), ("Uniform", 12))
 """The families drawn, two scenes each, with their seeds."""
+
+DRAWN_CRF: Final = 18
+"""The constant rate factor of the drawn pictures."""
+
+OTHER_CRFS: Final = (26, 34)
+"""Those of the trees made here."""
 
 MANY: Final = 64
 EIGHT: Final = 8
@@ -132,7 +142,7 @@ def prepared(
     _index_and_pack(material, say=say, workers=workers)
     for crf in crfs:
         other = material.at_rate(crf)
-        reencode_tree(material.release, other.release, crf=crf, workers=workers, say=say)
+        _reencode_tree(material.release, other.release, crf=crf, workers=workers, say=say)
         _link(other.release, other.eight, scenes=FOUR)
         _index_and_pack(other, say=say, workers=workers)
     if not material.full_index.exists():
@@ -156,6 +166,58 @@ def _draw(material: Material, *, say: Say, workers: int) -> None:
                 say(f"drawing {family}: {done} of {total} frames")
 
         synthesise(material.release, request, workers=workers, progress=progress)
+
+
+def _reencode_tree(release: Path, tree: Path, *, crf: int, workers: int, say: Say) -> None:
+    """Make a tree like another, with the pictures at another constant rate factor.
+
+    All other files are hard links. What is there already is kept.
+
+    Args:
+        release: The tree to encode again, in the released layout.
+        tree: Where the new one goes.
+        crf: The constant rate factor; all else is x264's default, as where pictures are drawn.
+        workers: Processes that encode, one thread each.
+        say: Is told what is being done.
+    """
+    todo = []
+    for file in sorted(path for path in release.rglob("scene_*/*") if path.is_file()):
+        made = tree / file.relative_to(release)
+        made.parent.mkdir(parents=True, exist_ok=True)
+        if made.exists():
+            continue
+        if file.suffix == ".mp4":
+            todo.append((file, made))
+        else:
+            os.link(file, made)
+    if not todo:
+        return
+    say(f"encoding {len(todo)} videos at rate factor {crf}")
+    with ProcessPoolExecutor(workers) as pool:
+        running = [pool.submit(_reencode, file, made, crf=crf) for file, made in todo]
+        for encoded in running:
+            encoded.result()
+
+
+def _reencode(file: Path, made: Path, *, crf: int) -> None:
+    """Encode an H.264 video again at another constant rate factor, whole or not at all."""
+    part = made.with_name(f"{made.name}.part")
+    options = {"crf": str(crf), "x264-params": "cpu-independent=1"}
+    with (
+        av.open(file) as source,
+        av.open(part, "w", format="mp4", container_options={"fflags": "+bitexact"}) as target,
+    ):
+        stream = target.add_stream("libx264", rate=int(FRAME_RATE_HZ), options=options)
+        told = source.streams.video[0]
+        stream.width, stream.height, stream.pix_fmt = told.width, told.height, "yuv420p"
+        stream.codec_context.thread_count = 1
+        for number, decoded in enumerate(source.decode(told)):
+            frame = decoded.reformat(format="yuv420p")
+            frame.pts, frame.time_base = number, Fraction(1, int(FRAME_RATE_HZ))
+            frame.pict_type = av.video.frame.PictureType.NONE  # the encoder's own choice
+            target.mux(stream.encode(frame))
+        target.mux(stream.encode(None))
+    part.replace(made)
 
 
 def _link(release: Path, tree: Path, *, scenes: int) -> None:

@@ -1,14 +1,15 @@
 """The pictures of the results, from the JSON file."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from benchmarks.field import CONTESTANTS, LIMIT, NO_DEPTH, OURS, title
-from benchmarks.race_tables import rgb_mbit_s
-from benchmarks.reencoded import DRAWN_CRF, OTHER_CRFS
-from benchmarks.results import Spread, entry, rates, ratios, shares
+from benchmarks.material import DRAWN_CRF, OTHER_CRFS
+from benchmarks.results import Spread, entry, rates, ratios, sent_mb, shares
+from benchmarks.tables import rgb_mbit_s
 from benchmarks.workloads import RATED, RATES, WORKLOADS, Workload
 
 _INK: Final = "#222222"
@@ -64,14 +65,19 @@ def _colour(name: str) -> str:
     return _OURS if name.startswith(OURS) else _OTHERS
 
 
+def _medians(spreads: Iterable[Spread]) -> tuple[np.ndarray, np.ndarray]:
+    """Return medians, and how far the quartiles are below and above them, shaped (2, n)."""
+    kept = [(each.low, each.median, each.high) for each in spreads]
+    low, middle, high = np.array(kept).reshape(-1, 3).T
+    return middle, np.stack([middle - low, high - middle])
+
+
 def _bars(axes: Any, names: list[str], spreads: list[Spread], *, form: str) -> None:
     """Draw horizontal bars of medians with quartiles, each with its number."""
     places = np.arange(len(names))[::-1]
-    middle = np.array([spread.median for spread in spreads])
-    low = middle - [spread.low for spread in spreads]
-    high = np.array([spread.high for spread in spreads]) - middle
+    middle, errors = _medians(spreads)
     axes.barh(places, middle, color=[_colour(name) for name in names], height=0.7)
-    axes.errorbar(middle, places, xerr=[low, high], fmt="none", ecolor=_INK, elinewidth=1)
+    axes.errorbar(middle, places, xerr=errors, fmt="none", ecolor=_INK, elinewidth=1)
     for place, spread in zip(places, spreads, strict=True):
         axes.annotate(
             f" {spread.median:{form}}", (spread.high, place), va="center", fontsize=8, color=_INK
@@ -120,12 +126,10 @@ def _workers(race: dict[str, Any]) -> Any:
         shown = {count: spread for count, spread in spreads.items() if spread is not None}
         if not shown:
             continue
-        middle = np.array([spread.median for spread in shown.values()])
-        low = middle - [spread.low for spread in shown.values()]
-        high = np.array([spread.high for spread in shown.values()]) - middle
+        middle, errors = _medians(shown.values())
         places = [workers.index(count) for count in shown]
         axes.errorbar(
-            places, middle, yerr=[low, high], color=colour, marker=marker, capsize=3,
+            places, middle, yerr=errors, color=colour, marker=marker, capsize=3,
             label=title(name),
         )  # fmt: skip
     axes.set_xticks(range(len(workers)), [str(count) for count in workers])
@@ -162,11 +166,9 @@ def _by_rate(sections: dict[str, Any]) -> Any:
         for entrant, label, colour, marker in lines:
             spreads = {mbit_s: _to_limit(race, entrant) for mbit_s, race in found.items()}
             shown = {mbit_s: each for mbit_s, each in spreads.items() if each is not None}
-            middle = np.array([each.median for each in shown.values()])
-            low = middle - [each.low for each in shown.values()]
-            high = np.array([each.high for each in shown.values()]) - middle
+            middle, errors = _medians(shown.values())
             axes.errorbar(
-                list(shown), middle, yerr=[low, high], color=colour, marker=marker, capsize=3,
+                list(shown), middle, yerr=errors, color=colour, marker=marker, capsize=3,
                 label=label,
             )  # fmt: skip
         for mbit_s, race in found.items():
@@ -209,14 +211,7 @@ def _web(races: dict[str, Any], workloads: list[Workload]) -> Any:
             if rates(rounds, entry(name, workers)) is not None
         ]
         _bars(speed, names, [rates(rounds, entry(name, workers)) for name in names], form=".1f")
-        sent = [
-            Spread.of(
-                found[entry(name, workers)]["bytes"] / found[entry(name, workers)]["samples"] / 1e6
-                for found in rounds
-                if entry(name, workers) in found
-            )
-            for name in names
-        ]
+        sent = [sent_mb(rounds, entry(name, workers)) for name in names]
         _bars(traffic, names, sent, form=".2f")
         traffic.set_yticks([])
         speed.set_title(workload.title)

@@ -6,6 +6,7 @@ does beside making batches (handing them over, waiting for room) is "queueing".
 """
 
 import functools
+import statistics
 import time
 from collections.abc import Callable
 from importlib import import_module
@@ -17,10 +18,9 @@ import torch
 from benchmarks.clock import in_a_fork
 from benchmarks.contestants import ours
 from benchmarks.material import Material
-from benchmarks.results import Spread
+from benchmarks.results import Say
 from benchmarks.workloads import WORKLOADS, Job
 
-Say = Callable[[str], None]
 Label = Callable[..., str]
 
 PROFILED: Final = ("all-frames", "all-pairs-832")
@@ -114,7 +114,7 @@ def measure_profile(material: Material, *, rounds: int, say: Say) -> dict[str, A
                     "title": workload.title,
                     "missing": runs[0]["missing"],
                     "ms_a_sample": {
-                        label: Spread.of(run["ms"][label] for run in runs).median
+                        label: statistics.median(run["ms"][label] for run in runs)
                         for label in LABELS
                     },
                 }

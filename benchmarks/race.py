@@ -1,7 +1,6 @@
 """Races: rounds in which every entrant of a workload runs once, in turn, on the same samples."""
 
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,11 +8,9 @@ from typing import Any
 from benchmarks.clock import MeasurementError, measured
 from benchmarks.field import CONTESTANTS, entrants, why_not
 from benchmarks.material import Material
-from benchmarks.results import Results, entry
+from benchmarks.results import Results, Say, entry
 from benchmarks.server import WebServer, serving
 from benchmarks.workloads import Job, Workload
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +26,7 @@ class Plan:
     resume: bool = False
 
 
-class Clock:
+class TimeLeft:
     """An estimate of the time left, from what each measurement took before."""
 
     def __init__(self, results: Results, workloads: list[Workload], *, rounds: int) -> None:
@@ -52,7 +49,7 @@ class Clock:
         """Note that one measurement is not to come."""
         self._left[what] = max(0, self._left.get(what, 0) - 1)
 
-    def left(self) -> str:
+    def text(self) -> str:
         """Return the time left as m:ss, about."""
         mean = sum(self._took.values()) / len(self._took) if self._took else 5.0
         seconds = sum(count * self._took.get(what, mean) for what, count in self._left.items())
@@ -67,7 +64,7 @@ def run_races(
     Returns:
         What failed in them.
     """
-    clock = Clock(results, workloads, rounds=plan.rounds)
+    left = TimeLeft(results, workloads, rounds=plan.rounds)
     with ExitStack() as stack:
         server = None
         if any(workload.source == "web" for workload in workloads):
@@ -75,7 +72,7 @@ def run_races(
             server = stack.enter_context(serving(material.root, home=home))
         for workload in workloads:
             serves = server if workload.source == "web" else None
-            _race(workload, material, results, plan=plan, say=say, clock=clock, server=serves)
+            _race(workload, material, results, plan=plan, say=say, left=left, server=serves)
     return [
         f"{workload.name}: {name}: {why}"
         for workload in workloads
@@ -91,7 +88,7 @@ def _race(  # noqa: PLR0913 - one race's surroundings
     *,
     plan: Plan,
     say: Say,
-    clock: Clock,
+    left: TimeLeft,
     server: WebServer | None,
 ) -> None:
     job = Job(workload, material, url=server.url if server else None)
@@ -112,9 +109,9 @@ def _race(  # noqa: PLR0913 - one race's surroundings
     for number in range(plan.rounds):
         if number < len(section["rounds"]):
             for entrant in field:
-                clock.skip(f"{workload.name} {entry(*entrant)}")
+                left.skip(f"{workload.name} {entry(*entrant)}")
             continue
-        say(f"{workload.name}: round {number + 1} of {plan.rounds}, about {clock.left()} left")
+        say(f"{workload.name}: round {number + 1} of {plan.rounds}, about {left.text()} left")
         turn = number % max(1, len(field))
         in_turn = field[turn:] + field[:turn]
         found = {}
@@ -126,7 +123,7 @@ def _race(  # noqa: PLR0913 - one race's surroundings
                 section["failed"][entry(name, workers)] = str(error)[-500:]
                 say(f"{workload.name}: {name} failed: {str(error)[-300:]}")
             finally:
-                clock.spent(f"{workload.name} {entry(name, workers)}", time.perf_counter() - began)
+                left.spent(f"{workload.name} {entry(name, workers)}", time.perf_counter() - began)
         section["rounds"].append(found)
         results.put_race(workload.name, section)
 

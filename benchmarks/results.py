@@ -1,12 +1,21 @@
-"""Results as they come: one JSON file, written whole after every round, and what it says."""
+"""The results file: written whole after every round, with the machine that it was measured on."""
 
 import json
-from collections.abc import Iterable
+import os
+import platform
+import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
 
+import av
 import numpy as np
+
+Say = Callable[[str], None]
+"""What reports progress."""
 
 FORMAT: Final = 2
 
@@ -110,3 +119,54 @@ def cpu_ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
         for found in rounds
         if entrant in found and to in found
     )
+
+
+def sent_mb(rounds: list[Round], entrant: str) -> Spread | None:
+    """Return the megabytes that an entrant fetched a sample, None where none were counted."""
+    return Spread.of(
+        found[entrant]["bytes"] / found[entrant]["samples"] / 1e6
+        for found in rounds
+        if "bytes" in found.get(entrant, {})
+    )
+
+
+def spread_of(values: Iterable[float]) -> dict[str, float]:
+    """Return the median and the quartiles of some numbers, as the results file keeps them."""
+    spread = Spread.of(values)
+    return {} if spread is None else {
+        "median": spread.median, "low": spread.low, "high": spread.high
+    }  # fmt: skip
+
+
+_PACKAGES: Final = (
+    "stereogenbench-data", "av", "numpy", "torch", "pyarrow", "webdataset", "datasets",
+    "torchcodec", "decord", "blosc2",
+)  # fmt: skip
+
+
+def machine() -> dict[str, Any]:
+    """Return what results depend on beside the code."""
+    model = re.search(r"model name\s*: (.*)", _read("/proc/cpuinfo"))
+    memory = re.search(r"MemTotal:\s*(\d+)", _read("/proc/meminfo"))
+    return {
+        "when": datetime.now(UTC).isoformat(timespec="seconds"),
+        "cpu": model[1] if model else platform.processor(),
+        "cores": os.cpu_count(),
+        "memory_gb": round(int(memory[1]) / 1e6, 1) if memory else None,
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "ffmpeg of PyAV": av.ffmpeg_version_info,
+        "load before": os.getloadavg()[0],
+        "versions": {name: _version(name) for name in _PACKAGES},
+    }
+
+
+def _read(path: str) -> str:
+    return Path(path).read_text() if Path(path).exists() else ""
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,12 +12,10 @@ import numpy as np
 from benchmarks.clock import in_a_fork
 from benchmarks.contestants import limit
 from benchmarks.material import Material
-from benchmarks.results import Spread
+from benchmarks.results import Say, spread_of
 from benchmarks.workloads import WORKLOADS, Job, Wanted
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.table import SceneIndex
-
-Say = Callable[[str], None]
 
 IMPORTS: Final = {
     "python alone": "pass",
@@ -80,25 +77,20 @@ def measure_start(material: Material, *, rounds: int, say: Say) -> dict[str, Any
         "imports_torch": bool(torch_free.returncode),
         "index_scenes": index[0]["scenes"],
         "index_pairs": index[0]["pairs"],
-        "index_open_s": _spread(found["open_s"] for found in index),
-        "index_select_s": _spread(found["select_s"] for found in index),
-        "index_both_s": _spread(found["open_s"] + found["select_s"] for found in index),
-        "first_batch_s": {name: _spread(times) for name, times in first.items()},
-        "first_batch_ratio": _spread(
+        "index_open_s": spread_of(found["open_s"] for found in index),
+        "index_select_s": spread_of(found["select_s"] for found in index),
+        "index_both_s": spread_of(found["open_s"] + found["select_s"] for found in index),
+        "first_batch_s": {name: spread_of(times) for name, times in first.items()},
+        "first_batch_ratio": spread_of(
             theirs / own for own, theirs in zip(first["ours"], first["naive"], strict=True)
         ),
-        "resuming": {name: _spread(found[name] for found in resumed) for name in resumed[0]},
+        "resuming": {name: spread_of(found[name] for found in resumed) for name in resumed[0]},
         "resuming_to_bare": {
-            name: _spread(found[name] / found[f"bare_{name}"] for found in resumed)
+            name: spread_of(found[name] / found[f"bare_{name}"] for found in resumed)
             for name in ("start_s", "resume_s")
         },
         "rounds": rounds,
     }
-
-
-def _spread(values: Any) -> dict[str, float]:
-    spread = Spread.of(values)
-    return {"median": spread.median, "low": spread.low, "high": spread.high}
 
 
 def _python(*words: str, rounds: int) -> dict[str, float]:
@@ -108,7 +100,7 @@ def _python(*words: str, rounds: int) -> dict[str, float]:
         began = time.perf_counter()
         subprocess.run([sys.executable, *words], check=True, capture_output=True)
         times.append(time.perf_counter() - began)
-    return _spread(times)
+    return spread_of(times)
 
 
 def _open_and_select(material: Material) -> dict[str, float]:

@@ -1,10 +1,13 @@
 """The Markdown of the results: everything in it is worked out from the JSON file."""
 
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from typing import Any
 
-from benchmarks.markdown import table
-from benchmarks.race_tables import by_rate, headlines, race_table
-from benchmarks.workloads import RATES, WORKLOADS
+from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, NO_DEPTH, OURS, title
+from benchmarks.material import DRAWN_CRF, OTHER_CRFS
+from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios, sent_mb, shares
+from benchmarks.workloads import RATED, RATES, WORKLOADS, Workload
 from stereogenbench_data.schema.problems import counted
 
 
@@ -56,19 +59,19 @@ def _how(sections: dict[str, Any]) -> str:
 
 
 def _ms(value: dict[str, float]) -> str:
-    return f"{value['median'] * 1e3:.0f} ({value['low'] * 1e3:.0f} to {value['high'] * 1e3:.0f})"
+    return spread_text(value, ".0f", scale=1e3)
 
 
 def _start(start: dict[str, Any]) -> str:
     rows = [[name, _ms(value), ""] for name, value in start["imports_s"].items()]
-    rows += [
-        [f"`{name}`", _ms(value), _below(value, 0.4) if name.endswith("bench --help") else ""]
-        for name, value in start["commands_s"].items()
-    ]
+    for name, value in start["commands_s"].items():
+        mark = at_most(value["median"], 0.4, scale=1e3) if name == "stereogenbench --help" else ""
+        rows.append([f"`{name}`", _ms(value), mark])
+    both = start["index_both_s"]
     rows += [
         [f"open an index of {start['index_scenes']:,} scenes", _ms(start["index_open_s"]), ""],
         [f"select {start['index_pairs']:,} pairs of a family", _ms(start["index_select_s"]), ""],
-        ["both", _ms(start["index_both_s"]), _below(start["index_both_s"], 0.2)],
+        ["both", _ms(both), at_most(both["median"], 0.2, scale=1e3)],
         ["first batch of a fresh process, no file cached: ours",
          _ms(start["first_batch_s"]["ours"]), ""],
         ["the same: naive", _ms(start["first_batch_s"]["naive"]), ""],
@@ -93,23 +96,17 @@ def _resuming(start: dict[str, Any]) -> str:
         times, to_bare = start["resuming"], start["resuming_to_bare"].get(name)
         beside = ["", ""]
         if to_bare is not None:
-            spread = f"{to_bare['median']:.2f} ({to_bare['low']:.2f} to {to_bare['high']:.2f})"
-            beside = [_ms(times[f"bare_{name}"]), spread]
+            beside = [_ms(times[f"bare_{name}"]), spread_text(to_bare)]
         rows.append([what, _ms(times[name]), *beside])
     head = ("", "ours, ms", "a bare loop to the same frames, ms", "ours to the loop, times")
     return table(head, rows)
-
-
-def _below(value: dict[str, float], wanted_s: float) -> str:
-    reached = "reached" if value["median"] <= wanted_s else "**missed**"
-    return f"{wanted_s * 1e3:g} {reached}"
 
 
 def _memory(memory: dict[str, Any]) -> str:
     peak = memory["peak_mb"]
     rows = [
         ["peak of the larger worker, MB", f"{peak:.0f}",
-         f"1500 {'reached' if peak <= 1500 else '**missed**'}"],
+         at_most(peak, 1500)],
         ["the same without shared memory, MB", f"{memory['peak_private_mb']:.0f}", ""],
         ["growth from the third to the last quarter, MB a 1,000 batches",
          f"{memory['growth_mb_per_1000']:.0f}", "0"],
@@ -186,7 +183,7 @@ def _kernels(found: dict[str, Any]) -> str:
                 f"{ns['median']:.2f}",
                 f"{ns['conversions']:.2f} ({ns['conversions_low']:.2f} to "
                 f"{ns['conversions_high']:.2f})",
-                f"{most:.2f} {'reached' if ns['conversions'] <= most else '**missed**'}",
+                at_most(ns["conversions"], most, ".2f"),
             ]
         )  # fmt: skip
     head = (
@@ -208,7 +205,7 @@ def _tried(found: dict[str, Any]) -> str:
             times, alike = way["times"], "not compared"
             if "psnr_db" in way:
                 alike = "equal" if way["psnr_db"] is None else f"{way['psnr_db']:.0f} dB"
-            spread = f"{times['median']:.2f} ({times['low']:.2f} to {times['high']:.2f})"
+            spread = spread_text(times)
             ms = (f"{way['cpu_ms']:.2f}", f"{way['wall_ms']:.2f}")
             rows.append([way["name"], *ms, "" if way is ways[0] else spread, alike])
         head = (
@@ -229,8 +226,8 @@ def _evaluation(found: dict[str, Any]) -> str:
         ["scoring, s", f"{found['scoring_s']:.2f}", ""],
         ["of it the matchers, s", f"{found['matchers_s']:.2f}", ""],
         ["scoring beside the matchers, in decodings",
-         f"{beside['median']:.2f} ({beside['low']:.2f} to {beside['high']:.2f})",
-         f"{most:g} {'reached' if beside['median'] <= most else '**missed**'}"],
+         spread_text(beside),
+         at_most(beside["median"], most)],
     ]  # fmt: skip
     text = (
         f"## Scoring\n\nOne scene of {found['frames']} frames of {found['stored_px']} px, scored "
@@ -253,3 +250,149 @@ def _profile(profile: dict[str, Any]) -> str:
     rows.append(["all", *(f"{sum(profile[n]['ms_a_sample'].values()):.2f}" for n in names)])
     head = ("ms a sample, one worker", *names)
     return "## Where the time goes\n\n" + table(head, rows)
+
+
+def headlines(races: dict[str, Any]) -> str:
+    """Return the table of our ratios beside those that are to be reached."""
+    rows = []
+    for workload in WORKLOADS:
+        if workload.name not in races or workload.target is None:
+            continue
+        rounds, workers = races[workload.name]["rounds"], workload.workers[0]
+        own = entry(OURS, workers)
+        limit = ratios(rounds, own, to=entry(LIMIT, workers))
+        naive = ratios(rounds, own, to=entry(NAIVE, workers))
+        blosc2 = ratios(rounds, entry("ours-blosc2", workers), to=entry(LIMIT, workers))
+        best = ratios(rounds, entry(NO_DEPTH, workers), to=entry(LIMIT, workers))
+        rows.append(
+            [
+                workload.title, spread_text(limit), at_least(limit, workload.target.limit),
+                spread_text(naive, ".1f"), at_least(naive, workload.target.naive),
+                spread_text(blosc2), at_least(blosc2, workload.blosc2), spread_text(best),
+            ]
+        )  # fmt: skip
+    head = (
+        "ours, 2 workers", "to the limit", "target", "to naive", "target",
+        "blosc2 shards to the released codecs' limit", "target", "that limit, depth for nothing",
+    )  # fmt: skip
+    return "## Headlines\n\n" + table(head, rows)
+
+
+def by_rate(sections: dict[str, Any]) -> str:
+    """Return the table of what blosc2 depth gives by the bit rate of the pictures."""
+    rows = []
+    for name in RATED:
+        for crf in (DRAWN_CRF, *OTHER_CRFS):
+            race = sections["races"].get(name if crf == DRAWN_CRF else f"{name}-crf{crf}")
+            if race is None:
+                continue
+            rounds, workers = race["rounds"], race["settings"]["workers"][0]
+            limit, free, shards, blosc2 = (
+                entry(name, workers) for name in (LIMIT, NO_DEPTH, "ours-shards", "ours-blosc2")
+            )
+            rows.append(
+                [
+                    next(workload.title for workload in WORKLOADS if workload.name == name),
+                    str(crf), f"{rgb_mbit_s(sections, crf):.1f}",
+                    spread_text(shares(rounds, limit, without=free)),
+                    spread_text(ratios(rounds, free, to=limit)),
+                    spread_text(ratios(rounds, shards, to=limit)),
+                    spread_text(ratios(rounds, blosc2, to=limit)),
+                    spread_text(ratios(rounds, blosc2, to=shards)),
+                ]
+            )  # fmt: skip
+    head = (
+        "2 workers", "rate factor", "Mbit/s a camera", "depth's share of the limit's time",
+        "the limit with depth for nothing, to the limit", "ours, released shards, to the limit",
+        "ours, blosc2 shards, to the limit", "ours, blosc2 to released shards",
+    )  # fmt: skip
+    text = "## What blosc2 depth gives by the pictures' rate\n\n" + table(head, rows)
+    return text + "\n![What depth's codec gives by the pictures' rate](rates.png)\n"
+
+
+def rgb_mbit_s(sections: dict[str, Any], crf: int) -> float:
+    """Return the pictures' Mbit/s a camera at a constant rate factor."""
+    data = sections["data"]
+    found: float = (data if crf == DRAWN_CRF else data["other_rates"][str(crf)])["rgb_mbit_s"]
+    return found
+
+
+def race_table(workload: Workload, race: dict[str, Any]) -> str:
+    """Return the table of one race: a row for each contestant and number of workers."""
+    rounds = race["rounds"]
+    names = {name for found in rounds for name in found}
+    is_web = workload.source == "web"
+    where = "ours from local files" if is_web else "the limit"
+    rows = []
+    for workers in sorted(workload.workers):
+        base, naive = entry(OURS if is_web else LIMIT, workers), entry(NAIVE, workers)
+        first = (LIMIT, NO_DEPTH, OURS)
+        for name in (*first, *(n for n in _order(names) if n not in first)):
+            entrant = entry(name, workers)
+            if entrant not in names:
+                continue
+            rows.append(
+                [
+                    title(name), str(workers), rate_text(rates(rounds, entrant)),
+                    spread_text(ratios(rounds, entrant, to=base)) if entrant != base else "",
+                    spread_text(cpu_ratios(rounds, entrant, to=base)) if entrant != base else "",
+                    *(
+                        [rate_text(sent_mb(rounds, entrant))]
+                        if is_web
+                        else [spread_text(ratios(rounds, entrant, to=naive), ".1f")]
+                        if name != NAIVE
+                        else [""]
+                    ),
+                ]
+            )  # fmt: skip
+    head = [
+        "", "workers", "samples/s", *(f"to {where}{how}" for how in ("", ", by processor time")),
+        "MB a sample" if is_web else "to naive",
+    ]  # fmt: skip
+    slices = f"{race['settings']['samples']} samples of {counted(workload.scenes, 'scene')}"
+    failed = [f"- {title(name.split('/')[0])}: {why}" for name, why in race["failed"].items()]
+    text = f"## {workload.title}\n\n{counted(len(rounds), 'round')}, {slices}.\n\n"
+    text += table(head, rows)
+    return text + (
+        "\nDid not race, or failed in a round:\n" + "\n".join(failed) + "\n" if failed else ""
+    )
+
+
+def _order(names: set[str]) -> list[str]:
+    found = {name.split("/")[0] for name in names}
+    return [name for name in CONTESTANTS if name in found]
+
+
+def table(head: Iterable[str], rows: list[list[str]]) -> str:
+    """Return a table, numbers to the right."""
+    titles = list(head)
+    lines = [titles, ["---"] + ["---:"] * (len(titles) - 1), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+
+
+def spread_text(
+    spread: Spread | Mapping[str, float] | None, form: str = ".2f", *, scale: float = 1
+) -> str:
+    """Return median (low to high quartile), times a scale."""
+    if spread is None:
+        return ""
+    kept = asdict(spread) if isinstance(spread, Spread) else spread
+    median, low, high = (f"{kept[name] * scale:{form}}" for name in ("median", "low", "high"))
+    return f"{median} ({low} to {high})"
+
+
+def rate_text(spread: Spread | None) -> str:
+    """Return the median alone."""
+    return "" if spread is None else f"{spread.median:.3g}"
+
+
+def at_least(spread: Spread | None, wanted: float | None) -> str:
+    """Return the ratio wanted, and whether the median reaches it."""
+    if spread is None or wanted is None:
+        return ""
+    return f"{wanted:g} {'reached' if spread.median >= wanted else '**missed**'}"
+
+
+def at_most(value: float, wanted: float, form: str = "g", *, scale: float = 1) -> str:
+    """Return what a value may be, times a scale, and whether it is no more."""
+    return f"{wanted * scale:{form}} {'reached' if value <= wanted else '**missed**'}"

@@ -4,6 +4,7 @@ One process, files in the page cache; the ways of a group take turns. Processor 
 a loader keeps every core busy anyway: what only spreads work over cores gives it nothing.
 """
 
+import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,10 +18,8 @@ from av.video.frame import VideoFrame
 from av.video.reformatter import Interpolation, VideoReformatter
 
 from benchmarks.material import Material
-from benchmarks.results import Spread
+from benchmarks.results import Say, spread_of
 from stereogenbench_data.media.video import VideoReader, read_rgb
-
-Say = Callable[[str], None]
 
 PLACES: Final = (10, 30, 50, 70)
 """The pictures that are asked for at random, as shares of 81."""
@@ -71,15 +70,15 @@ def measure_tried(material: Material, *, rounds: int, say: Say) -> dict[str, Any
 
 def _noted(way: Way, own: Way, times: dict[str, list[tuple[float, float]]]) -> dict[str, Any]:
     """Return what is noted of a way: milliseconds a picture, and how many times its own way's."""
-    ratio = Spread.of(
+    ratio = spread_of(
         (theirs / way.pictures) / (ours / own.pictures)
         for (theirs, _), (ours, _) in zip(times[way.name], times[own.name], strict=True)
     )
     noted: dict[str, Any] = {
         "name": way.name,
-        "cpu_ms": Spread.of(cpu_s / way.pictures * 1e3 for cpu_s, _ in times[way.name]).median,
-        "wall_ms": Spread.of(wall_s / way.pictures * 1e3 for _, wall_s in times[way.name]).median,
-        "times": {"median": ratio.median, "low": ratio.low, "high": ratio.high},
+        "cpu_ms": statistics.median(cpu_s for cpu_s, _ in times[way.name]) / way.pictures * 1e3,
+        "wall_ms": statistics.median(wall_s for _, wall_s in times[way.name]) / way.pictures * 1e3,
+        "times": ratio,
     }
     if way.result is not None and own.result is not None:
         mean_square = float(np.mean((way.result().astype(np.float64) - own.result()) ** 2))

@@ -13,8 +13,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from benchmarks.material import EIGHT, Material
-from benchmarks.reencoded import DRAWN_CRF, OTHER_CRFS
+from benchmarks.material import DRAWN_CRF, EIGHT, OTHER_CRFS, Material
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.table import SceneIndex
 

@@ -1,172 +1,40 @@
 """Train and evaluate on StereoGenBench: every stereo pair of six-camera scenes, right to the pixel.
 
-Names are imported when first used, so that what does not need torch starts without it. Not even
-`typing` is imported at first: the command takes care of Ctrl-C only after this module.
+Public names are imported when they are first used: what does not need torch starts without it.
+Which names there are, and where from, stands in `__init__.pyi`. Nothing is imported at first, not
+even `typing`: the command takes care of Ctrl-C only after this module.
 """
 
-from __future__ import annotations
 
-from importlib import import_module
-
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import Any
-
-    from stereogenbench_data.datasets.adapters import to_raft_stereo, to_torchvision
-    from stereogenbench_data.datasets.batches import EpochBatches
-    from stereogenbench_data.datasets.loader import PairsLoader
-    from stereogenbench_data.datasets.mapped import SceneViews, StereoPairs
-    from stereogenbench_data.datasets.streamed import StereoPairStream
-    from stereogenbench_data.datasets.tensors import collate
-    from stereogenbench_data.errors import (
-        DescriptorError,
-        EvaluationError,
-        ExtraError,
-        FieldError,
-        GeometryError,
-        MediaError,
-        PassError,
-        SchemaError,
-        SelectionError,
-        StateError,
-        StereoGenBenchError,
-        StorageError,
-        SynthesisError,
-        WorkerError,
-    )
-    from stereogenbench_data.evaluation.controls import score_controls
-    from stereogenbench_data.evaluation.evaluate import evaluate
-    from stereogenbench_data.evaluation.inputs import export_inputs
-    from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-    from stereogenbench_data.evaluation.report import write_report
-    from stereogenbench_data.evaluation.tables import tables_of
-    from stereogenbench_data.index.table import SceneIndex
-    from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS
-    from stereogenbench_data.samples.transforms import (
-        ColorJitter,
-        Compose,
-        Crop,
-        Eraser,
-        HorizontalFlip,
-        Letterbox,
-        RandomCrop,
-        RandomScale,
-        Resize,
-    )
-    from stereogenbench_data.schema.records import DepthEncoding
-    from stereogenbench_data.selection.order import order_quality
-    from stereogenbench_data.sources.cache import ShardCache
-    from stereogenbench_data.sources.retry import RetryPolicy
-
-_HOMES = {
-    "datasets.adapters": ("to_raft_stereo", "to_torchvision"),
-    "datasets.batches": ("EpochBatches",),
-    "datasets.loader": ("PairsLoader",),
-    "datasets.mapped": ("SceneViews", "StereoPairs"),
-    "datasets.streamed": ("StereoPairStream",),
-    "datasets.tensors": ("collate",),
-    "errors": (
-        "DescriptorError",
-        "EvaluationError",
-        "ExtraError",
-        "FieldError",
-        "GeometryError",
-        "MediaError",
-        "PassError",
-        "PassError",
-        "SchemaError",
-        "SelectionError",
-        "StateError",
-        "StereoGenBenchError",
-        "StorageError",
-        "SynthesisError",
-        "WorkerError",
-    ),
-    "evaluation.controls": ("score_controls",),
-    "evaluation.evaluate": ("evaluate",),
-    "evaluation.inputs": ("export_inputs",),
-    "evaluation.protocol": ("EvaluationProtocol",),
-    "evaluation.report": ("write_report",),
-    "evaluation.tables": ("tables_of",),
-    "samples.fields": ("PAIR_FIELDS", "VIEW_FIELDS"),
-    "samples.transforms": (
-        "ColorJitter",
-        "Compose",
-        "Crop",
-        "Eraser",
-        "HorizontalFlip",
-        "Letterbox",
-        "RandomCrop",
-        "RandomScale",
-        "Resize",
-    ),
-    "schema.records": ("DepthEncoding",),
-    "selection.order": ("order_quality",),
-    "sources.cache": ("ShardCache",),
-    "index.table": ("SceneIndex",),
-    "sources.retry": ("RetryPolicy",),
-}
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
-
-__all__ = [
-    "PAIR_FIELDS",
-    "VIEW_FIELDS",
-    "ColorJitter",
-    "Compose",
-    "Crop",
-    "DepthEncoding",
-    "DescriptorError",
-    "EpochBatches",
-    "Eraser",
-    "EvaluationError",
-    "EvaluationProtocol",
-    "ExtraError",
-    "FieldError",
-    "GeometryError",
-    "HorizontalFlip",
-    "Letterbox",
-    "MediaError",
-    "PairsLoader",
-    "PassError",
-    "RandomCrop",
-    "RandomScale",
-    "Resize",
-    "RetryPolicy",
-    "SceneIndex",
-    "SceneViews",
-    "SchemaError",
-    "SelectionError",
-    "ShardCache",
-    "StateError",
-    "StereoGenBenchError",
-    "StereoPairStream",
-    "StereoPairs",
-    "StorageError",
-    "SynthesisError",
-    "WorkerError",
-    "collate",
-    "evaluate",
-    "export_inputs",
-    "order_quality",
-    "score_controls",
-    "tables_of",
-    "to_raft_stereo",
-    "to_torchvision",
-    "write_report",
-]
-
-
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import a public name from the module that holds it."""
     if name == "__version__":
         from importlib.metadata import version
 
         return version("stereogenbench-data")
-    if name not in _HOME_OF:
+    if name.startswith("_") and name != "__all__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    modules = _modules()
+    if name == "__all__":
+        return sorted(modules)
+    if name not in modules:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    found = globals()[name] = getattr(import_module(modules[name]), name)
+    return found
 
 
 def __dir__() -> list[str]:
     """Return the public names."""
-    return sorted([*__all__, "__version__"])
+    return sorted([*_modules(), "__version__"])
+
+
+def _modules() -> dict[str, str]:
+    """Return the module of each public name, as the stub beside this file imports it."""
+    from ast import ImportFrom, parse
+    from pathlib import Path
+
+    stub = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+    imports = [node for node in parse(stub).body if isinstance(node, ImportFrom)]
+    return {each.names[0].name: str(each.module) for each in imports}

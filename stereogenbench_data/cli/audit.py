@@ -9,25 +9,17 @@ from typing import Annotated, Any, Literal
 import typer
 
 from stereogenbench_data.cli.options import (
-    CaptionOption,
-    DataArgument,
+    DataOptions,
     EngineOption,
-    FamilyOption,
-    FocalOption,
     JsonOption,
-    MapOption,
     OutOption,
-    RootOption,
-    SceneOption,
-    SplitOption,
-    SubsetOption,
+    SceneOptions,
     WorkersOption,
     complete_from,
-    scene_filters,
+    grouped,
 )
-from stereogenbench_data.cli.outcome import FINDINGS
+from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.cli.writing import write_report, writing
 
 _ALL = "all"
@@ -39,10 +31,11 @@ def _complete_limit(incomplete: str) -> list[str]:
     return complete_from(f"{limit.name}=" for limit in fields(AuditLimits))(incomplete)
 
 
+@grouped
+@resumable()
 def audit(  # noqa: PLR0913 - one parameter an option
-    data: DataArgument,
+    source: DataOptions,
     *,
-    data_root: RootOption = None,
     scenes: Annotated[
         int | None, typer.Option("--scenes", min=1, help="Audit so many, drawn at random [all].")
     ] = None,
@@ -50,13 +43,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
     frames: Annotated[
         str, typer.Option(help="Frames of each scene, evenly spread; 'all' as the paper did.")
     ] = "5",
-    split: SplitOption = None,
-    subset: SubsetOption = None,
-    family: FamilyOption = None,
-    map_name: MapOption = None,
-    scene: SceneOption = None,
-    focal_mm: FocalOption = None,
-    caption: CaptionOption = None,
+    chosen: SceneOptions,
     depth_unit_m: Annotated[
         float | None, typer.Option(help="Metres in a stored unit of depth [as tagged, else 0.1].")
     ] = None,
@@ -110,7 +97,9 @@ def audit(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.engine import engine_of
 
     if out is not None and out.is_dir():
-        raise typer.BadParameter(f"{out} is a folder: name a file, such as {out / 'audit.md'}.")
+        raise typer.BadParameter(
+            f"{out} is a folder: name a file, such as {out / 'audit.md'}.", param_hint="--out"
+        )
     request = AuditRequest(
         sample=scenes,
         frames=_frames(frames),
@@ -118,41 +107,28 @@ def audit(  # noqa: PLR0913 - one parameter an option
         depth=_contract(depth_unit_m, depth_kind, accept),
         limits=AuditLimits.parse(limit or []),
     )
-    filters = scene_filters(
-        split=split,
-        subset=subset,
-        family=family,
-        map=map_name,
-        scenes=scene,
-        focal_mm=focal_mm,
-        caption=caption,
-    )
-    where = engine_of(engine)
-    try:
-        with progress_bar("reading the index", unit="scenes") as progress:
-            index = open_for_audit(
-                data,
-                root=data_root,
-                workers=workers,
-                engine=where,
-                progress=progress,
-                **filters,
-            )
-        notes = journal or _journal(out, data, request)
-        kept = audit_journal(notes, index, request)
-        with writing(notes), kept, progress_bar("auditing", unit="frames") as progress:
-            report = audited(
-                index,
-                request,
-                workers=workers,
-                engine=where,
-                progress=progress,
-                journal=kept,
-                **filters,
-            )
-    except KeyboardInterrupt:
-        typer.echo("stopped; run the same command again to go on from here", err=True)
-        raise typer.Exit(STOPPED) from None
+    filters, where = chosen.filters(), engine_of(engine)
+    with progress_bar("reading the index", unit="scenes") as progress:
+        index = open_for_audit(
+            source.data,
+            root=source.data_root,
+            workers=workers,
+            engine=where,
+            progress=progress,
+            **filters,
+        )
+    notes = journal or _journal(out, source.data, request)
+    kept = audit_journal(notes, index, request)
+    with writing(notes), kept, progress_bar("auditing", unit="frames") as progress:
+        report = audited(
+            index,
+            request,
+            workers=workers,
+            engine=where,
+            progress=progress,
+            journal=kept,
+            **filters,
+        )
     document, markdown = json.dumps(report.to_json(), indent=1), audit_markdown(report)
     if out is not None:
         write_report(out, document if out.suffix == ".json" else markdown)
@@ -166,7 +142,9 @@ def _frames(text: str) -> int:
     if text == _ALL:
         return 0
     if not text.isdecimal() or int(text) < 1:
-        raise typer.BadParameter(f"{text!r} is no number of frames, nor 'all'")
+        raise typer.BadParameter(
+            f"{text!r} is neither a number of frames, such as 5, nor 'all'.", param_hint="--frames"
+        )
     return int(text)
 
 

@@ -6,15 +6,19 @@ from typing import Annotated
 
 import typer
 
-from stereogenbench_data.cli.opening import open_data
-from stereogenbench_data.cli.options import DataArgument, DepthUnitOption, RootOption
+from stereogenbench_data.cli.options import (
+    DataOptions,
+    DepthUnitOption,
+    depth_of,
+    grouped,
+)
 from stereogenbench_data.schema.problems import counted
 
 
+@grouped
 def browse(
-    data: DataArgument,
+    source: DataOptions,
     *,
-    data_root: RootOption = None,
     port: Annotated[
         int, typer.Option("--port", min=0, max=65535, help="Port [any that is free].")
     ] = 0,
@@ -33,12 +37,15 @@ def browse(
     from stereogenbench_data.audit.browser.server import PageServer
     from stereogenbench_data.audit.browser.service import Service
     from stereogenbench_data.audit.scene_reader import SceneReader
-    from stereogenbench_data.schema.records import DepthEncoding
     from stereogenbench_data.sources.location import is_remote, shown
 
-    index = open_data(data, root=data_root)
-    shown_data = shown(data) if is_remote(data) else str(Path(data).expanduser().resolve())
-    depth = None if depth_unit_m is None else DepthEncoding(unit_m=depth_unit_m)
+    index = source.open()
+    shown_data = (
+        shown(source.data)
+        if is_remote(source.data)
+        else str(Path(source.data).expanduser().resolve())
+    )
+    depth = depth_of(depth_unit_m)
     reader = SceneReader(index, depth=depth)
     service = Service(Catalogue(index, shown_data=shown_data, depth=depth), reader)
     with PageServer(service, port=port) as server:

@@ -12,23 +12,17 @@ from typer.core import TyperGroup
 from stereogenbench_data.cli.audit import audit
 from stereogenbench_data.cli.bench import bench
 from stereogenbench_data.cli.browse import browse
-from stereogenbench_data.cli.card import card
-from stereogenbench_data.cli.controls import controls
-from stereogenbench_data.cli.croissant import croissant
 from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
-from stereogenbench_data.cli.evaluate import evaluate
-from stereogenbench_data.cli.export_inputs import export_inputs
+from stereogenbench_data.cli.evaluate import controls, evaluate, export_inputs
 from stereogenbench_data.cli.index import index
-from stereogenbench_data.cli.outcome import OutcomeTold
-from stereogenbench_data.cli.pack import pack
+from stereogenbench_data.cli.outcome import ErrorsReported
+from stereogenbench_data.cli.pack import pack, unpack, verify
+from stereogenbench_data.cli.publish import card, croissant, upload
 from stereogenbench_data.cli.show import show
 from stereogenbench_data.cli.stats import stats
 from stereogenbench_data.cli.stopping import stop_by_exception
 from stereogenbench_data.cli.synth import synth
-from stereogenbench_data.cli.unpack import unpack
-from stereogenbench_data.cli.upload import upload
-from stereogenbench_data.cli.verify import verify
 
 _START: Final = "Have scenes"
 _LOOK: Final = "Look at them"
@@ -40,14 +34,14 @@ _DEBUG: Final = "--debug"
 
 
 class _Commands(TyperGroup):
-    """The commands as a group in which every error is said, unless --debug shows it whole."""
+    """The group of commands: errors are reported in short, or whole with --debug."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run what was asked for."""
         stop_by_exception()
         if ctx.params.get("debug"):
             return super().invoke(ctx)
-        with OutcomeTold():
+        with ErrorsReported():
             return super().invoke(ctx)
 
 
@@ -144,5 +138,5 @@ def run() -> None:
     arguments = [each for each in sys.argv[1:] if each != _DEBUG]
     if len(arguments) < len(sys.argv) - 1:
         arguments.insert(0, _DEBUG)
-    with nullcontext() if _DEBUG in arguments else OutcomeTold():
+    with nullcontext() if _DEBUG in arguments else ErrorsReported():
         app(arguments, prog_name="stereogenbench")

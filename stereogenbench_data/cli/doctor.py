@@ -8,21 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stereogenbench_data.cli.opening import open_data
 from stereogenbench_data.cli.options import (
-    CaptionOption,
-    DataArgument,
-    FamilyOption,
-    FocalOption,
+    DataOptions,
     JsonOption,
-    MapOption,
     OutOption,
-    RootOption,
-    SceneOption,
-    SplitOption,
-    SubsetOption,
+    SceneOptions,
     WorkersOption,
-    scene_filters,
+    grouped,
 )
 from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.cli.progress import progress_bar
@@ -50,19 +42,13 @@ _DB_NOTE = (
 )
 
 
+@grouped
 def doctor(  # noqa: PLR0913 - one parameter an option
-    data: DataArgument,
+    source: DataOptions,
     *,
-    data_root: RootOption = None,
     scenes: Annotated[int, typer.Option("--scenes", min=1, help="Look at so many scenes.")] = 6,
     frames: Annotated[int, typer.Option(min=1, help="Frames of each scene.")] = 4,
-    split: SplitOption = None,
-    subset: SubsetOption = None,
-    family: FamilyOption = None,
-    map_name: MapOption = None,
-    scene: SceneOption = None,
-    focal_mm: FocalOption = None,
-    caption: CaptionOption = None,
+    chosen: SceneOptions,
     unit_m: Annotated[
         float | None,
         typer.Option(help="Ask about this many metres in a stored unit [as tagged, else 0.1]."),
@@ -94,11 +80,8 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     if out is not None:
         require_picture_file(out)
     depth = DepthEncoding(unit_m=unit_m, kind=kind, form=form, frame_lag=frame_lag)
-    filters: Any = scene_filters(
-        split=split, subset=subset, family=family, map=map_name, scenes=scene,
-        focal_mm=focal_mm, caption=caption,
-    )  # fmt: skip
-    index = open_data(data, root=data_root)
+    filters: Any = chosen.filters()
+    index = source.open()
     with progress_bar("examining", unit="scenes") as progress:
         report = diagnose(
             index,

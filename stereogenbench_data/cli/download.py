@@ -7,29 +7,21 @@ from typing import Annotated, Any, Literal
 import typer
 
 from stereogenbench_data.cli.options import (
-    CaptionOption,
-    DataArgument,
-    FamilyOption,
-    FocalOption,
+    DataOptions,
     JsonOption,
-    MapOption,
-    RootOption,
-    SceneOption,
-    SplitOption,
-    SubsetOption,
-    scene_filters,
+    SceneOptions,
+    grouped,
 )
+from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.schema.problems import counted
 
-_MEGABYTE = 1_000_000
 
-
+@grouped
+@resumable()
 def download(  # noqa: PLR0913 - one parameter an option
-    data: DataArgument,
+    source: DataOptions,
     *,
-    data_root: RootOption = None,
     dest: Annotated[Path, typer.Option("--dest", help="Folder to write into.")],
     cameras: Annotated[
         str, typer.Option(help="Numbers of the cameras wanted, such as 0,1.")
@@ -37,13 +29,7 @@ def download(  # noqa: PLR0913 - one parameter an option
     streams: Annotated[
         Literal["both", "rgb", "depth"], typer.Option(help="Which videos.")
     ] = "both",
-    split: SplitOption = None,
-    subset: SubsetOption = None,
-    family: FamilyOption = None,
-    map_name: MapOption = None,
-    scene: SceneOption = None,
-    focal_mm: FocalOption = None,
-    caption: CaptionOption = None,
+    chosen: SceneOptions,
     workers: Annotated[int, typer.Option(min=1, help="Files fetched at a time.")] = 8,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say how much it would be, and fetch nothing.")
@@ -61,40 +47,22 @@ def download(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.shards.download import plan_download
 
     numbers = _cameras(cameras)
-    index = SceneIndex.open(data, root=data_root)
-    filters: Any = scene_filters(
-        split=split,
-        subset=subset,
-        family=family,
-        map=map_name,
-        scenes=scene,
-        focal_mm=focal_mm,
-        caption=caption,
-    )
+    filters: Any = chosen.filters()
+    index = SceneIndex.open(source.data, root=source.data_root)
     rows = filter_scenes(index, filters)
     kinds = ("rgb", "depth") if streams == "both" else (streams,)
     wanted = plan_download(index, rows.tolist(), cameras=numbers, streams=kinds)
-    size = wanted.size_bytes / _MEGABYTE
-    scenes_told, files_told = counted(len(rows), "scene"), counted(len(wanted.files), "file")
-    typer.echo(f"{scenes_told}, {files_told}, {size:,.1f} MB", err=True)
+    size = wanted.size_bytes / 1e6
+    scenes, files = counted(len(rows), "scene"), counted(len(wanted.files), "file")
+    typer.echo(f"{scenes}, {files}, {size:,.1f} MB", err=True)
     if not dry_run:
-        try:
-            with progress_bar("downloading", unit="MB") as bar:
-                fetched(
-                    index,
-                    wanted,
-                    dest,
-                    workers=workers,
-                    progress=lambda done, total: bar(-(-done // _MEGABYTE), -(-total // _MEGABYTE)),
-                )
-        except KeyboardInterrupt:
-            typer.echo("stopped; run the same command again to go on from here", err=True)
-            raise typer.Exit(STOPPED) from None
-    told = {"scenes": len(rows), "files": len(wanted.files), "bytes": wanted.size_bytes}
+        with progress_bar("downloading", unit="MB") as progress:
+            fetched(index, wanted, dest, workers=workers, progress=progress)
+    summary = {"scenes": len(rows), "files": len(wanted.files), "bytes": wanted.size_bytes}
     if as_json:
-        typer.echo(json.dumps(told | {"dest": None if dry_run else str(dest)}, indent=2))
+        typer.echo(json.dumps(summary | {"dest": None if dry_run else str(dest)}, indent=2))
     elif not dry_run:
-        typer.echo(f"{dest}: {scenes_told}, {size:,.1f} MB")
+        typer.echo(f"{dest}: {scenes}, {size:,.1f} MB")
 
 
 def _cameras(text: str) -> list[int]:

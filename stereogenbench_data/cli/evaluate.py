@@ -1,93 +1,327 @@
-"""``stereogenbench evaluate``: score right views that a method wrote, as the paper does."""
+"""``stereogenbench evaluate``, ``export-inputs``, ``controls``: scores as the paper has them.
+
+Their options are the same: which scenes, pairs and frames, which metrics, with what.
+"""
 
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stereogenbench_data.cli.evaluation_options import (
-    OFFLINE,
-    PAPER_SIZE,
-    BaselineOption,
-    ByOption,
-    CheckoutOption,
-    DeviceOption,
-    FitOption,
-    FramesOption,
-    KeypointsOption,
-    MetricsOption,
-    PairsOption,
-    PlotsOption,
-    ReportOption,
-    SizeOption,
-    StereoOption,
-    TierOption,
-    WeightsOption,
-    parse_by,
-    parse_frames_option,
-    parse_pairs,
-    protocol_of,
-)
-from stereogenbench_data.cli.opening import open_data
 from stereogenbench_data.cli.options import (
-    CaptionOption,
-    DataArgument,
+    DataOptions,
     DepthUnitOption,
     EngineOption,
-    FamilyOption,
-    FocalOption,
     JsonOption,
-    MapOption,
-    RootOption,
-    SceneOption,
+    SceneOptions,
     SplitOption,
-    SubsetOption,
     WorkersOption,
-    scene_filters,
+    depth_of,
+    grouped,
 )
+from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.stopping import STOPPED
+from stereogenbench_data.schema.problems import counted
+
+if TYPE_CHECKING:
+    from stereogenbench_data.evaluation.aggregate import Scores
+    from stereogenbench_data.evaluation.controls import Relation
+    from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+    from stereogenbench_data.evaluation.tables import Table
 
 
+def parse_pairs(text: str) -> Any:
+    """Return the pairs that an option names, as `StereoPairs` takes them.
+
+    Raises:
+        typer.BadParameter: If the text does not name any.
+    """
+    if text in ("primary", "adjacent", "all"):
+        return text
+    pairs = [each.split("-") for each in text.split(",")]
+    if not all(len(pair) == 2 and all(map(str.isdecimal, pair)) for pair in pairs):
+        raise typer.BadParameter(
+            f"{text!r} is not primary, adjacent, all or pairs such as 0-1,0-5.",
+            param_hint="--pairs",
+        )
+    return [(int(left), int(right)) for left, right in pairs]
+
+
+def parse_frames(text: str) -> Any:
+    """Return the frames that an option names, as `StereoPairs` takes them.
+
+    Raises:
+        typer.BadParameter: If the text does not name any.
+    """
+    if text in ("all", "first"):
+        return text
+    every, _, step = text.partition(":")
+    if every == "every" and step.isdecimal():
+        return ("every", int(step))
+    if all(map(str.isdecimal, text.split(","))):
+        return [int(number) for number in text.split(",")]
+    raise typer.BadParameter(
+        f"{text!r} is not all, first, every:K or numbers such as 0,40,80.", param_hint="--frames"
+    )
+
+
+def parse_picture_size(text: str) -> tuple[int, int]:
+    """Return (height, width) of an option that says WIDTHxHEIGHT.
+
+    Raises:
+        typer.BadParameter: If it does not.
+    """
+    from stereogenbench_data.errors import FieldError
+    from stereogenbench_data.samples.size import parse_size
+
+    try:
+        return parse_size(text)
+    except FieldError as error:
+        raise typer.BadParameter(str(error), param_hint="--size") from None
+
+
+def parse_strata(texts: list[str] | None) -> dict[str, tuple[float, ...]]:
+    """Return columns to stratify by, with their edges.
+
+    Raises:
+        typer.BadParameter: If an edge is not a number.
+    """
+    strata: dict[str, tuple[float, ...]] = {}
+    for text in texts or []:
+        column, _, edges = text.partition(":")
+        try:
+            strata[column] = tuple(float(edge) for edge in edges.split(",")) if edges else ()
+        except ValueError:
+            raise typer.BadParameter(
+                f"{text!r}: its edges {edges!r} are not numbers, such as 18,35.", param_hint="--by"
+            ) from None
+    return strata
+
+
+TierOption = Annotated[
+    str,
+    typer.Option(
+        "--tier",
+        help="What the method was given: G0 target geometry, G1 camera, G2 the left view alone.",
+    ),
+]
+SizeOption = Annotated[
+    str,
+    typer.Option(
+        "--size",
+        help="WIDTHxHEIGHT at which everything is scored [the paper's].",
+    ),
+]
+PAPER_SIZE = "832x480"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsOptions(SceneOptions):
+    """Which pairs and frames of which scenes are scored."""
+
+    pairs: Annotated[
+        str,
+        typer.Option("--pairs", help="primary, adjacent, all, or pairs such as 0-1,0-5."),
+    ] = "primary"
+    frames: Annotated[
+        str,
+        typer.Option("--frames", help="all, first, every:K, or numbers such as 0,40,80."),
+    ] = "all"
+    baseline_cm: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--baseline-cm", help="Shortest and longest baseline, in cm."),
+    ] = None
+
+    def selection(self) -> dict[str, Any]:
+        """Return the options of `StereoPairs` that select.
+
+        Raises:
+            typer.BadParameter: If the text of the pairs or of the frames cannot be parsed.
+        """
+        baseline = {} if self.baseline_cm is None else {"baseline_cm": self.baseline_cm}
+        chosen = {"pairs": parse_pairs(self.pairs), "frames": parse_frames(self.frames)}
+        return self.filters() | baseline | chosen
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalPairsOptions(PairsOptions):
+    """The same, of the split that is for evaluation."""
+
+    split: SplitOption = "eval"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProtocolOptions:
+    """Which metrics are computed, and with what."""
+
+    size: SizeOption = PAPER_SIZE
+    metrics: Annotated[
+        str,
+        typer.Option(
+            "--metrics",
+            help="Of psnr, ssim, lpips, e_match, p_psnr, sd, fid, fvd, fd-colour, fd-motion.",
+        ),
+    ] = "psnr,ssim,e_match,p_psnr,sd"
+    keypoint_matcher: Annotated[
+        str, typer.Option("--keypoint-matcher", help="For E_match: sift, or dedode (the paper's).")
+    ] = "sift"
+    stereo_matcher: Annotated[
+        str,
+        typer.Option("--stereo-matcher", help="For SD: sgbm, or foundation-stereo (the paper's)."),
+    ] = "sgbm"
+    fit: Annotated[
+        str,
+        typer.Option(
+            "--fit",
+            help="The fit of SD that relations are judged by: filtered, least_squares or "
+            "theil_sen. Reports always show the first two.",
+        ),
+    ] = "filtered"
+    depth_unit_m: DepthUnitOption = None
+    weights: Annotated[
+        Path | None,
+        typer.Option(
+            "--weights", "--checkpoint", help="Folder of weights [torch.hub's checkpoints]."
+        ),
+    ] = None
+    checkout: Annotated[
+        Path | None, typer.Option("--checkout", help="Clone of FoundationStereo's repository.")
+    ] = None
+    device: Annotated[str, typer.Option("--device", help="Where learned parts run.")] = "cpu"
+
+    def protocol(self) -> "EvaluationProtocol":
+        """Return the protocol that the options ask for.
+
+        Raises:
+            typer.BadParameter: If the size is not WIDTHxHEIGHT.
+            EvaluationError: If a metric, a matcher or a fit is not known.
+        """
+        from stereogenbench_data.evaluation.columns import require_metrics
+        from stereogenbench_data.evaluation.models.registry import ModelOptions
+        from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+
+        fit: Any = self.fit
+        return EvaluationProtocol(
+            metrics=require_metrics(self.metrics),
+            size=parse_picture_size(self.size),
+            keypoint_matcher=self.keypoint_matcher,
+            stereo_matcher=self.stereo_matcher,
+            fit=fit,
+            depth=depth_of(self.depth_unit_m),
+            models=ModelOptions(device=self.device, weights=self.weights, checkout=self.checkout),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions:
+    """Where scores are reported."""
+
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder of the report, which keeps partial results too."),
+    ] = None
+    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw metric by baseline.")] = (
+        True
+    )
+    as_json: JsonOption = False
+
+    def write(
+        self,
+        folder: Path,
+        results: "Sequence[Scores]",
+        tables: "Sequence[Table]",
+        *,
+        found: "Sequence[Relation]" = (),
+    ) -> None:
+        """Write the files of the report, and print its page, or as JSON what is in it."""
+        from stereogenbench_data.evaluation.report import document, page, write_report
+
+        files = write_report(
+            folder, results, tables, found=found, plots="write" if self.plots else "skip"
+        )
+        if self.as_json:
+            typer.echo(json.dumps(document(results, tables, found=found), allow_nan=False))
+        else:
+            typer.echo(page(results, tables, found=found).rstrip())
+        names = ", ".join(str(path.relative_to(folder)) for path in files)
+        typer.echo(f"{folder}: {names}", err=True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlsReportOptions(ReportOptions):
+    """The same, without plots unless they are asked for."""
+
+    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw metric by baseline.")] = (
+        False
+    )
+
+
+@grouped
+@resumable()
+def export_inputs(  # noqa: PLR0913 - one parameter an option
+    source: DataOptions,
+    out: Annotated[Path, typer.Argument(help="Folder to write into.")],
+    *,
+    tier: TierOption,
+    chosen: PairsOptions,
+    size: SizeOption = PAPER_SIZE,
+    depth_unit_m: DepthUnitOption = None,
+    workers: WorkersOption = None,
+) -> None:
+    """Write the inputs of a tier: left views as PNG; G0 adds geometry, G1 the camera.
+
+    One folder an item, a pair of a scene, with a name that tells neither. Write what the method
+    makes of it as PREDICTIONS/ITEM/000.png ... or PREDICTIONS/ITEM.mp4, then run `stereogenbench
+    evaluate` with the same selection. A stopped run goes on if it is run again.
+    """
+    from stereogenbench_data.evaluation.inputs import export_inputs as exported
+
+    size_px, selection = parse_picture_size(size), chosen.selection()
+    index = source.open()
+    with progress_bar("writing", unit="frames") as progress:
+        items = exported(
+            index,
+            out,
+            tier=tier,
+            size=size_px,
+            depth=depth_of(depth_unit_m),
+            workers=workers,
+            progress=progress,
+            **selection,
+        )
+    typer.echo(f"{out}: {counted(len(items), 'item')} of tier {tier}")
+
+
+@grouped
+@resumable()
 def evaluate(  # noqa: PLR0913 - one parameter an option
-    data: DataArgument,
+    source: DataOptions,
     predictions: Annotated[
         Path, typer.Argument(help="Folder of right views: ITEM/000.png ... or ITEM.mp4.")
     ],
     *,
-    data_root: RootOption = None,
     tier: TierOption,
     name: Annotated[
         str | None, typer.Option("--name", help="What tables call the method [the folder's name].")
     ] = None,
-    split: SplitOption = None,
-    subset: SubsetOption = None,
-    family: FamilyOption = None,
-    map_name: MapOption = None,
-    scene: SceneOption = None,
-    focal_mm: FocalOption = None,
-    caption: CaptionOption = None,
-    pairs: PairsOption = "primary",
-    frames: FramesOption = "all",
-    baseline_cm: BaselineOption = None,
-    size: SizeOption = PAPER_SIZE,
-    metrics: MetricsOption = OFFLINE,
-    keypoint_matcher: KeypointsOption = "sift",
-    stereo_matcher: StereoOption = "sgbm",
-    fit: FitOption = "filtered",
-    depth_unit_m: DepthUnitOption = None,
-    weights: WeightsOption = None,
-    checkout: CheckoutOption = None,
-    device: DeviceOption = "cpu",
-    by: ByOption = None,
+    chosen: PairsOptions,
+    scoring: ProtocolOptions,
+    by: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--by",
+            help="Column of the index to stratify by, such as map_name, or focal_mm:18,35,85 with "
+            "edges; may be given again.",
+        ),
+    ] = None,
     allow_missing: Annotated[
         int,
         typer.Option(min=0, help="Pairs whose right view may be missing or unusable; counted."),
     ] = 0,
-    out: ReportOption = None,
-    plots: PlotsOption = True,
-    as_json: JsonOption = False,
+    report: ReportOptions,
     workers: WorkersOption = None,
     engine: EngineOption = "local",
 ) -> None:
@@ -100,58 +334,71 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     """
     from stereogenbench_data.engine import engine_of
     from stereogenbench_data.evaluation.evaluate import evaluate as evaluated
-    from stereogenbench_data.evaluation.report import document, page, write_report
     from stereogenbench_data.evaluation.tables import tables_of
 
-    protocol = protocol_of(
-        metrics=metrics,
-        size=size,
-        keypoint_matcher=keypoint_matcher,
-        stereo_matcher=stereo_matcher,
-        fit=fit,
-        depth_unit_m=depth_unit_m,
-        weights=weights,
-        checkout=checkout,
-        device=device,
-    )
-    strata = parse_by(by)
+    protocol, selection = scoring.protocol(), chosen.selection()
+    strata = parse_strata(by)
     called = name or predictions.resolve().name
-    folder = out or Path("evaluation") / f"{called}-{tier}"
-    options = scene_filters(
-        split=split,
-        subset=subset,
-        family=family,
-        map=map_name,
-        scenes=scene,
-        focal_mm=focal_mm,
-        caption=caption,
-        baseline_cm=baseline_cm,
-    )
-    index = open_data(data, root=data_root)
-    try:
-        with progress_bar("scoring", unit="frames") as progress:
-            scores = evaluated(
-                index,
-                predictions,
-                tier=tier,
-                name=called,
-                protocol=protocol,
-                out=folder / "partial",
-                workers=workers,
-                engine=engine_of(engine, device=device),
-                allow_missing=allow_missing,
-                progress=progress,
-                pairs=parse_pairs(pairs),
-                frames=parse_frames_option(frames),
-                **options,
-            )
-    except KeyboardInterrupt:
-        typer.echo("stopped; run the same command again to go on from here", err=True)
-        raise typer.Exit(STOPPED) from None
-    tables = tables_of([scores], by=strata)
-    files = write_report(folder, [scores], tables, plots="write" if plots else "skip")
-    if as_json:
-        typer.echo(json.dumps(document([scores], tables), allow_nan=False))
-    else:
-        typer.echo(page([scores], tables).rstrip())
-    typer.echo(f"{folder}: {', '.join(str(path.relative_to(folder)) for path in files)}", err=True)
+    folder = report.out or Path("evaluation") / f"{called}-{tier}"
+    index = source.open()
+    with progress_bar("scoring", unit="frames") as progress:
+        scores = evaluated(
+            index,
+            predictions,
+            tier=tier,
+            name=called,
+            protocol=protocol,
+            out=folder / "partial",
+            workers=workers,
+            engine=engine_of(engine, device=scoring.device),
+            allow_missing=allow_missing,
+            progress=progress,
+            **selection,
+        )
+    report.write(folder, [scores], tables_of([scores], by=strata))
+
+
+@grouped
+@resumable()
+def controls(  # noqa: PLR0913 - one parameter an option
+    source: DataOptions,
+    *,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Decides whose right view stands in for whose.")
+    ] = 0,
+    chosen: EvalPairsOptions,
+    scoring: ProtocolOptions,
+    report: ControlsReportOptions,
+    workers: WorkersOption = None,
+    engine: EngineOption = "local",
+) -> None:
+    """Score the calibration controls: what a perfect, a copied, a wrong and a random view get.
+
+    The rendered target, the left view, the same scene from the next camera (02 for 01), and the
+    right view of another scene. Prints the paper's own controls beside them, and whether the
+    relations between them hold; the exit status is 1 if one does not. The report goes to --out
+    [evaluation/controls], and a stopped run goes on if it is run again.
+    """
+    from stereogenbench_data.engine import engine_of
+    from stereogenbench_data.evaluation.controls import relations, score_controls
+    from stereogenbench_data.evaluation.tables import branch_table, control_table, explaining_table
+
+    protocol, selection = scoring.protocol(), chosen.selection()
+    folder = report.out or Path("evaluation") / "controls"
+    index = source.open()
+    with progress_bar("scoring", unit="frames") as progress:
+        results = score_controls(
+            index,
+            protocol=protocol,
+            seed=seed,
+            out=folder / "partial",
+            workers=workers,
+            engine=engine_of(engine, device=scoring.device),
+            progress=progress,
+            **selection,
+        )
+    found = relations(results)
+    tables = [control_table(results), branch_table(results), explaining_table(results)]
+    report.write(folder, results, tables, found=found)
+    if any(each.holds is False for each in found):
+        raise typer.Exit(FINDINGS)

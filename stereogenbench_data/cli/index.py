@@ -14,9 +14,10 @@ from stereogenbench_data.cli.options import (
     JsonOption,
     MapOption,
     SplitOption,
+    workers_option,
 )
+from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.cli.writing import writing
 from stereogenbench_data.schema.problems import counted, plain_line
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 _INDEX_NAME = "index.parquet"
 
 
+@resumable()
 def index(  # noqa: PLR0913 - one parameter an option
     root: Annotated[
         str, typer.Argument(help="Folder that holds train/ and eval/, or its URL (hf://, s3://).")
@@ -37,9 +39,7 @@ def index(  # noqa: PLR0913 - one parameter an option
             "--out", "-o", help=f"Index file to write [ROOT/{_INDEX_NAME}; for a URL here]."
         ),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes that read scenes [one a core].")
-    ] = None,
+    workers: Annotated[int | None, workers_option("Processes that read scenes")] = None,
     engine: EngineOption = "local",
     valid_depth: Annotated[
         bool,
@@ -73,43 +73,43 @@ def index(  # noqa: PLR0913 - one parameter an option
     wanted = _passing(split, family or [], map_name or [])
     if wanted is not None and out is None:
         raise typer.BadParameter(
-            "an index of a part is named by you: --out FILE", param_hint="--out"
+            "the index of a part needs a file of its own: name it with --out FILE.",
+            param_hint="--out",
         )
     if target.is_dir():
         raise typer.BadParameter(
-            f"{target} is a folder: name a file, such as {target / _INDEX_NAME}."
+            f"{target} is a folder: name a file, such as {target / _INDEX_NAME}.",
+            param_hint="--out",
         )
     if target.exists() and not target.is_file():
-        raise typer.BadParameter(f"{target} is no regular file, which an index would replace.")
+        raise typer.BadParameter(
+            f"{target} is not a regular file, and an index would replace it.", param_hint="--out"
+        )
     recorded_root(root, beside=target.parent)  # before hours of work, whether it may be written
     done_before = target.with_name(f"{target.name}.journal")
-    try:
-        with (
-            writing(done_before),
-            SceneJournal(done_before, walk=f"{_whole(root)} valid_depth={mode}") as journal,
-            progress_bar("indexing", unit="scenes") as progress,
-        ):
-            report = walk(
-                root,
-                workers=workers,
-                engine=engine_of(engine),
-                progress=progress,
-                journal=journal,
-                valid_depth=mode,
-                wanted=wanted,
-            )
-            if report.scenes:
-                SceneIndex.from_report(report).write(target)
-                journal.delete()
-    except KeyboardInterrupt:
-        console.print("stopped; run the same command again to go on from here")
-        raise typer.Exit(STOPPED) from None
+    with (
+        writing(done_before),
+        SceneJournal(done_before, walk=f"{_whole(root)} valid_depth={mode}") as journal,
+        progress_bar("indexing", unit="scenes") as progress,
+    ):
+        report = walk(
+            root,
+            workers=workers,
+            engine=engine_of(engine),
+            progress=progress,
+            journal=journal,
+            valid_depth=mode,
+            wanted=wanted,
+        )
+        if report.scenes:
+            SceneIndex.from_report(report).write(target)
+            journal.delete()
     if as_json:
         found = {"scenes": len(report.scenes), "incomplete": dict(report.incomplete)}
         found |= {"broken": dict(report.broken), "notes": list(report.notes)}
         written = {"index": str(target) if report.scenes else None}
         typer.echo(json.dumps(written | found, indent=2))
-        raise typer.Exit(1 if report.broken or not report.scenes else 0)
+        raise typer.Exit(FINDINGS if report.broken or not report.scenes else 0)
     _list(console, "incomplete, left out", report.incomplete)
     _list(console, "broken, left out", report.broken)
     _list(console, "to know", {note: note for note in report.notes})
@@ -118,7 +118,7 @@ def index(  # noqa: PLR0913 - one parameter an option
             f"{plain_line(shown(root))}: no scene is whole, so there is nothing to index",
             markup=False,
         )
-        raise typer.Exit(1)
+        raise typer.Exit(FINDINGS)
     typer.echo(f"{target}: {counted(len(report.scenes), 'scene')}")
     if not is_remote(root) and target.parent.resolve() != local_path(root).resolve():
         console.print(
@@ -127,7 +127,7 @@ def index(  # noqa: PLR0913 - one parameter an option
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
     if report.broken:
-        raise typer.Exit(1)
+        raise typer.Exit(FINDINGS)
 
 
 def _whole(root: str) -> str:

@@ -1,16 +1,66 @@
-"""Options that several commands share: which scenes, JSON output, worker processes."""
+"""Options that several commands share, and groups of them, each declared once.
 
+A command takes a group as one parameter: a dataclass whose fields are options. `grouped` gives
+typer one option a field, in the parameter's place.
+"""
+
+import inspect
 from collections.abc import Callable, Iterable
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stereogenbench_data.cli.opening import open_data
 from stereogenbench_data.schema.release import FAMILIES, TRAIN_MAPS, UNSEEN_MAPS
+
+if TYPE_CHECKING:
+    from stereogenbench_data.index.table import SceneIndex
+    from stereogenbench_data.schema.records import DepthEncoding
+
+
+def grouped(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command that typer sees with one option for each field of its groups.
+
+    Args:
+        command: A function. Each parameter whose type is a dataclass is a group of options.
+    """
+    parameters = inspect.signature(command).parameters.values()
+    groups: dict[str, Any] = {
+        each.name: each.annotation for each in parameters if is_dataclass(each.annotation)
+    }
+
+    @wraps(command)
+    def called(**values: Any) -> None:
+        for name, group in groups.items():
+            values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
+        command(**values)
+
+    options = []
+    for each in parameters:
+        options += _options_of(each.annotation) if each.name in groups else [each]
+    options = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    called.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    called.__annotations__ = {option.name: option.annotation for option in options}
+    return called
+
+
+def _options_of(group: Any) -> list[inspect.Parameter]:
+    return [
+        inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if field.default is MISSING else field.default,
+            annotation=field.type,
+        )
+        for field in fields(group)
+    ]
 
 
 def complete_from(values: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return what a shell's completion asks: which of the values begin with what was typed."""
+    """Return a function for shell completion: the values that begin with what was typed."""
     known = sorted(values)
     return lambda incomplete: [
         value for value in known if value.lower().startswith(incomplete.lower())
@@ -18,7 +68,7 @@ def complete_from(values: Iterable[str]) -> Callable[[str], list[str]]:
 
 
 def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
-    """Return the keys of scenes that begin with what was typed, where DATA has an index."""
+    """Return the keys of scenes that begin with what was typed, if DATA has an index."""
     from stereogenbench_data.errors import StereoGenBenchError
     from stereogenbench_data.index.parquet import INDEX_NAME
     from stereogenbench_data.index.table import SceneIndex
@@ -34,9 +84,18 @@ def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
     return complete_from(map(str, keys))(incomplete)
 
 
-DataArgument = Annotated[
-    str, typer.Argument(help="Released tree, folder of shards, index file, or the URL of either.")
-]
+def depth_of(unit_m: float | None) -> "DepthEncoding | None":
+    """Return the depth contract that ``--depth-unit-m`` asks for, None for that of the data."""
+    from stereogenbench_data.schema.records import DepthEncoding
+
+    return None if unit_m is None else DepthEncoding(unit_m=unit_m)
+
+
+def workers_option(processes: str = "Processes") -> Any:
+    """Return ``--workers`` with a help text that begins with what the processes do."""
+    return typer.Option("--workers", min=1, help=f"{processes} [one a core].")
+
+
 RootOption = Annotated[
     str | None,
     typer.Option(
@@ -48,14 +107,6 @@ RootOption = Annotated[
 SplitOption = Annotated[
     str | None,
     typer.Option("--split", help="train or eval.", autocompletion=complete_from(("train", "eval"))),
-]
-SubsetOption = Annotated[
-    str | None,
-    typer.Option(
-        "--subset",
-        help="seen_map or unseen_map (of eval scenes).",
-        autocompletion=complete_from(("seen_map", "unseen_map")),
-    ),
 ]
 FamilyOption = Annotated[
     list[str] | None,
@@ -73,19 +124,6 @@ MapOption = Annotated[
         autocompletion=complete_from(TRAIN_MAPS | UNSEEN_MAPS),
     ),
 ]
-SceneOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--scene", help="Key of a scene; may be given again.", autocompletion=complete_scene
-    ),
-]
-FocalOption = Annotated[
-    tuple[float, float] | None,
-    typer.Option("--focal-mm", help="Shortest and longest focal length, in mm."),
-]
-CaptionOption = Annotated[
-    str | None, typer.Option("--caption", help="Words that must all be in the description.")
-]
 DepthUnitOption = Annotated[
     float | None,
     typer.Option(
@@ -94,7 +132,7 @@ DepthUnitOption = Annotated[
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")]
-WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes [one a core].")]
+WorkersOption = Annotated[int | None, workers_option()]
 EngineOption = Annotated[
     str,
     typer.Option(
@@ -107,11 +145,67 @@ EngineOption = Annotated[
 OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
 
 
-def scene_filters(**options: Any) -> dict[str, Any]:
-    """Return the filters that were given, by their names in `SceneFilters`, to pass as keywords.
+@dataclass(frozen=True, kw_only=True)
+class DataOptions:
+    """The data that a command reads."""
 
-    Args:
-        **options: split, subset, family, map, scenes, focal_mm, caption as the options give them;
-            what is None or empty is left out.
-    """
-    return {name: value for name, value in options.items() if value not in (None, [], ())}
+    data: Annotated[
+        str,
+        typer.Argument(help="Released tree, folder of shards, index file, or the URL of either."),
+    ]
+    data_root: RootOption = None
+
+    def open(self) -> "SceneIndex":
+        """Return the index of the data as `open_data` does."""
+        return open_data(self.data, root=self.data_root)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardsOptions:
+    """The shards that a command reads."""
+
+    shards: Annotated[str, typer.Argument(help="Folder of shards, or its index file.")]
+    data_root: RootOption = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Which scenes of the data a command takes."""
+
+    split: SplitOption = None
+    subset: Annotated[
+        str | None,
+        typer.Option(
+            "--subset",
+            help="seen_map or unseen_map (of eval scenes).",
+            autocompletion=complete_from(("seen_map", "unseen_map")),
+        ),
+    ] = None
+    family: FamilyOption = None
+    map_name: MapOption = None
+    scene: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--scene", help="Key of a scene; may be given again.", autocompletion=complete_scene
+        ),
+    ] = None
+    focal_mm: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--focal-mm", help="Shortest and longest focal length, in mm."),
+    ] = None
+    caption: Annotated[
+        str | None, typer.Option("--caption", help="Words that must all be in the description.")
+    ] = None
+
+    def filters(self) -> dict[str, Any]:
+        """Return the filters that were given, by their names in `SceneFilters`."""
+        options = {
+            "split": self.split,
+            "subset": self.subset,
+            "family": self.family,
+            "map": self.map_name,
+            "scenes": self.scene,
+            "focal_mm": self.focal_mm,
+            "caption": self.caption,
+        }
+        return {name: value for name, value in options.items() if value not in (None, [], ())}

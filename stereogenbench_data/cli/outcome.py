@@ -1,10 +1,11 @@
-"""How a command ends: what is said of an error, in one or two lines, and the exit status."""
+"""How a command ends: an error is reported in one or two lines, with an exit status."""
 
-import contextlib
 import errno
 import os
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from types import TracebackType
 from typing import Final, TextIO
 
@@ -15,11 +16,11 @@ from stereogenbench_data.errors import StereoGenBenchError, cure_of
 from stereogenbench_data.schema.problems import plain_line
 
 FINDINGS: Final = 1
-"""Exit status where something is wrong with the data."""
+"""Exit status if something is wrong with the data."""
 NOT_DONE: Final = 2
-"""Exit status where the command could not do what it was asked to."""
+"""Exit status if the command failed."""
 PIPE_CLOSED: Final = 141
-"""Exit status where whoever read the output has closed it, as ``head`` does."""
+"""Exit status if the reader closed the output, as ``head`` does."""
 
 _CURES: Final = {
     errno.ENOENT: "Check the path.",
@@ -29,15 +30,25 @@ _CURES: Final = {
 }
 
 
-class OutcomeTold:
-    """A context in which every error ends the command: it is said on stderr, without a traceback.
+@contextmanager
+def resumable() -> Iterator[None]:
+    """Report on Ctrl-C that the command resumes if it is run again. Decorates its function."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo("stopped; run the same command again to go on from here", err=True)
+        raise typer.Exit(STOPPED) from None
 
-    Errors that say themselves what to do (`typer.Exit`, usage errors) pass. What the block printed
-    is written out before it ends, so that a closed pipe is noticed here.
+
+class ErrorsReported:
+    """A context in which every error ends the command with a message instead of a traceback.
+
+    Exits and usage errors pass: the command line's framework reports them. The context flushes
+    stdout before it ends, so that it notices a closed pipe.
     """
 
-    def __enter__(self) -> "OutcomeTold":
-        """Say warnings in one line, too."""
+    def __enter__(self) -> "ErrorsReported":
+        """Print warnings in one line, too."""
         self._formatwarning = warnings.formatwarning
         warnings.formatwarning = _warning_line
         return self
@@ -48,42 +59,42 @@ class OutcomeTold:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Turn what was raised into a message and an exit status."""
+        """Turn an exception into a message and an exit status."""
         warnings.formatwarning = self._formatwarning
-        error = _unwritten() or error
+        error = _flush_error() or error
         if isinstance(error, BrokenPipeError):
-            _forget(sys.stdout)
+            _discard(sys.stdout)
             raise SystemExit(PIPE_CLOSED) from None
         if isinstance(error, KeyboardInterrupt):
-            _say("stopped")
+            _print_error("stopped")
             raise SystemExit(STOPPED) from None
         message = "" if error is None else _message(error)
         if message:
-            _say(message)
+            _print_error(message)
             raise SystemExit(NOT_DONE) from None
 
 
-def _unwritten() -> OSError | None:
-    """Write out what was printed; return why that failed, None where it did not."""
+def _flush_error() -> OSError | None:
+    """Flush stdout; return the error if that fails, else None."""
     try:
         if sys.stdout is not None:  # as it is where the shell closed it
             sys.stdout.flush()
     except OSError as error:
-        _forget(sys.stdout)
+        _discard(sys.stdout)
         return error
     return None
 
 
-def _say(message: str) -> None:
-    """Write a line to stderr; where that cannot be, the exit status alone has to tell."""
+def _print_error(message: str) -> None:
+    """Print a message on stderr; if that fails, only the exit status is left."""
     try:
         typer.echo("\n".join(map(plain_line, message.split("\n"))), err=True)
     except OSError:
-        _forget(sys.stderr)
+        _discard(sys.stderr)
 
 
 def _message(error: BaseException) -> str:
-    """Return what is said of an error, nothing of one that says itself what is to happen."""
+    """Return the message for an error; empty if the framework reports it."""
     if isinstance(error, StereoGenBenchError):
         return f"{type(error).__name__}: {error}"
     if isinstance(error, OSError) and error.errno is not None:
@@ -92,7 +103,7 @@ def _message(error: BaseException) -> str:
         return f"{type(error).__name__}: {where}{error.strerror}. {cure}".rstrip()
     if isinstance(error, MemoryError):
         return "MemoryError: memory is short. Use fewer workers or smaller pictures."
-    if _is_said_elsewhere(error):
+    if _is_reported_elsewhere(error):
         return ""
     first_line = str(error).strip().partition("\n")[0]
     return (
@@ -101,16 +112,16 @@ def _message(error: BaseException) -> str:
     )
 
 
-def _is_said_elsewhere(error: BaseException) -> bool:
-    """Return whether the command's framework knows what to do: exits, usage errors."""
+def _is_reported_elsewhere(error: BaseException) -> bool:
+    """Return whether the framework reports an error: exits, usage errors."""
     return not isinstance(error, Exception) or isinstance(
         error, (typer.Exit, typer.Abort, EOFError)
     ) or type(error).__module__.startswith(("typer.", "click."))  # fmt: skip
 
 
-def _forget(stream: TextIO) -> None:
-    """Point a stream at nothing, so that what is left of it is not written when Python ends."""
-    with contextlib.suppress(OSError, ValueError):
+def _discard(stream: TextIO) -> None:
+    """Point a stream at the null device, so that Python does not flush it again when it ends."""
+    with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 

@@ -1,6 +1,6 @@
 """The progress bar of every long command: done, rate and time left, on stderr.
 
-Where stderr is no terminal, such as in the log of a batch job, it is a line a minute.
+If stderr is not a terminal, as in the log of a batch job, a line is printed every minute.
 """
 
 import time
@@ -21,6 +21,8 @@ from rich.text import Text
 
 Report = Callable[[int, int], None]
 
+_BYTES_IN: Final = {"MB": 1_000_000}
+"""Units whose progress is reported in bytes, and the bytes in each."""
 _ROOM_FOR_BAR: Final = 60
 _LOGGED_EVERY_S: Final = 60
 
@@ -55,7 +57,13 @@ class _RateColumn(ProgressColumn):
 
 @contextmanager
 def progress_bar(doing: str, *, unit: str) -> Iterator[Report]:
-    """Show a bar while the block runs; it yields what is to be called with (done, total)."""
+    """Show a bar while the block runs; yield a function to call with (done, total).
+
+    Args:
+        doing: What the command does, such as "packing".
+        unit: What is counted. For "MB", pass done and total in bytes.
+    """
+    divisor = _BYTES_IN.get(unit, 1)
     console = Console(stderr=True)
     columns = (
         TextColumn(doing),
@@ -66,13 +74,13 @@ def progress_bar(doing: str, *, unit: str) -> Iterator[Report]:
     )
     with Progress(*columns, console=console) as bar:
         task = bar.add_task(doing, total=None)
-        told = time.monotonic()
+        last_line_s = time.monotonic()
 
         def report(done: int, total: int) -> None:
-            nonlocal told
-            bar.update(task, completed=done, total=total)
-            if not console.is_terminal and time.monotonic() - told >= _LOGGED_EVERY_S:
-                told = time.monotonic()
+            nonlocal last_line_s
+            bar.update(task, completed=-(-done // divisor), total=-(-total // divisor))
+            if not console.is_terminal and time.monotonic() - last_line_s >= _LOGGED_EVERY_S:
+                last_line_s = time.monotonic()
                 console.print(bar)
 
         yield report

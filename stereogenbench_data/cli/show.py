@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereogenbench_data.cli.opening import open_data
 from stereogenbench_data.cli.options import (
-    DataArgument,
+    DataOptions,
     DepthUnitOption,
-    RootOption,
     complete_scene,
+    depth_of,
+    grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 _CLIPS = (".mp4", ".gif")
 
 
+@grouped
 def show(  # noqa: PLR0913 - one parameter an option
-    data: DataArgument,
+    source: DataOptions,
     scene: Annotated[
         str | None,
         typer.Argument(
@@ -31,7 +32,6 @@ def show(  # noqa: PLR0913 - one parameter an option
         ),
     ] = None,
     *,
-    data_root: RootOption = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -57,7 +57,6 @@ def show(  # noqa: PLR0913 - one parameter an option
     left, right, disparity and anaglyph over time.
     """
     from stereogenbench_data.audit.scene_reader import SceneReader
-    from stereogenbench_data.schema.records import DepthEncoding
     from stereogenbench_data.selection.filters import find_scene
 
     cameras = None if pair is None else _cameras(pair)
@@ -65,12 +64,11 @@ def show(  # noqa: PLR0913 - one parameter an option
     if out is not None and out.suffix.lower() not in (_CLIPS if clip else (".png",)):
         wanted = "a clip is .mp4 or .gif" if clip else "a sheet is .png"
         raise typer.BadParameter(f"{out}: {wanted}, by its ending.", param_hint="--out")
-    index = open_data(data, root=data_root)
+    index = source.open()
     row = 0 if scene is None else find_scene(index, scene)
     key = index.scene(row).id.key
     target = out or Path(key.replace("/", "_") + (".mp4" if clip else ".png"))
-    depth = None if depth_unit_m is None else DepthEncoding(unit_m=depth_unit_m)
-    reader = SceneReader(index, depth=depth)
+    reader = SceneReader(index, depth=depth_of(depth_unit_m))
     with writing(target):
         if clip:
             _write_clip(reader, row, target, pair=cameras, size=size)
@@ -107,6 +105,6 @@ def _cameras(text: str) -> tuple[int, int]:
     left, _, right = text.replace(",", "-").partition("-")
     if not (left.strip().isdecimal() and right.strip().isdecimal()):
         raise typer.BadParameter(
-            f"{text!r} is no pair: write two cameras, such as 0-5.", param_hint="--pair"
+            f"{text!r} is not a pair: write two cameras, such as 0-5.", param_hint="--pair"
         )
     return int(left), int(right)

@@ -7,36 +7,22 @@ from typing import Annotated, Literal
 
 import typer
 
-from stereogenbench_data.cli.opening import open_data
 from stereogenbench_data.cli.options import (
-    CaptionOption,
-    DataArgument,
-    FamilyOption,
-    FocalOption,
+    DataOptions,
     JsonOption,
-    MapOption,
     OutOption,
-    RootOption,
-    SceneOption,
-    SplitOption,
-    SubsetOption,
-    scene_filters,
+    SceneOptions,
+    grouped,
 )
 from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.cli.writing import write_report, writing
 
 
-def stats(  # noqa: PLR0913 - one parameter an option
-    data: DataArgument,
+@grouped
+def stats(
+    source: DataOptions,
     *,
-    data_root: RootOption = None,
-    split: SplitOption = None,
-    subset: SubsetOption = None,
-    family: FamilyOption = None,
-    map_name: MapOption = None,
-    scene: SceneOption = None,
-    focal_mm: FocalOption = None,
-    caption: CaptionOption = None,
+    chosen: SceneOptions,
     compare: Annotated[
         Literal["auto", "always", "never"],
         typer.Option(
@@ -62,16 +48,8 @@ def stats(  # noqa: PLR0913 - one parameter an option
         statistics_markdown,
     )
 
-    index = open_data(data, root=data_root)
-    filters = scene_filters(
-        split=split,
-        subset=subset,
-        family=family,
-        map=map_name,
-        scenes=scene,
-        focal_mm=focal_mm,
-        caption=caption,
-    )
+    index = source.open()
+    filters = chosen.filters()
     found = statistics(index, **filters)
     splits = {"always": tuple(SPLITS), "never": ()}.get(compare)
     lines = compared(found, splits=release_sized_splits(found) if splits is None else splits)

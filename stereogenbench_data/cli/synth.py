@@ -6,9 +6,14 @@ from typing import Annotated, Literal
 
 import typer
 
-from stereogenbench_data.cli.options import EngineOption, JsonOption, complete_from
+from stereogenbench_data.cli.options import (
+    EngineOption,
+    JsonOption,
+    complete_from,
+    workers_option,
+)
+from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import (
     FAMILIES,
@@ -22,6 +27,7 @@ RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"
 """As in `synthesis.request`, which is imported when scenes are drawn, not for the help."""
 
 
+@resumable()
 def synth(  # noqa: PLR0913 - one parameter an option
     out: Annotated[Path, typer.Argument(help="Folder to write train/ or eval/ into.")],
     *,
@@ -49,9 +55,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
     rotation: Annotated[
         RotationForm, typer.Option(help="How trajectory.json records rotations.")
     ] = "rotator",
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes that draw (default: one a core).")
-    ] = None,
+    workers: Annotated[int | None, workers_option("Processes that draw")] = None,
     engine: EngineOption = "local",
     as_json: JsonOption = False,
 ) -> None:
@@ -78,14 +82,10 @@ def synth(  # noqa: PLR0913 - one parameter an option
             rotation=rotation, depth_unit_m=depth_unit_m, depth_tag=depth_tag or None
         ),
     )
-    try:
-        with progress_bar("drawing", unit="frames") as progress:
-            keys = synthesise(
-                out, request, workers=workers, engine=engine_of(engine), progress=progress
-            )
-    except KeyboardInterrupt:
-        typer.echo("stopped; run the same command again to go on from here", err=True)
-        raise typer.Exit(STOPPED) from None
+    with progress_bar("drawing", unit="frames") as progress:
+        keys = synthesise(
+            out, request, workers=workers, engine=engine_of(engine), progress=progress
+        )
     if as_json:
         typer.echo(json.dumps({"root": str(out), "scenes": keys}, indent=2))
     else:

@@ -1,4 +1,4 @@
-"""What commands write: reports whole or not at all, and errors that name the place."""
+"""How commands write: a report whole or not at all, and errors that name the file."""
 
 import errno
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ _OF_WRITING: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 @contextmanager
 def writing(place: Path) -> Iterator[None]:
-    """Let an error of the system that only writing brings, and that names no file, name this."""
+    """Add the file's name to errors of the disk that lack one, such as a full disk."""
     try:
         yield
     except OSError as error:
@@ -21,13 +21,13 @@ def writing(place: Path) -> Iterator[None]:
 
 
 def write_report(path: Path, text: str) -> None:
-    """Write a report, in folders that are made if need be; a file of that name is replaced.
+    """Write a report as UTF-8; make its folders, and replace a file of that name.
 
-    It is UTF-8; bytes of file names that are none become question marks.
+    Bytes of file names that are not UTF-8 become question marks.
 
     Raises:
-        OSError: If it cannot be written; then the file that was there is as before, unless it is
-            a device or a pipe.
+        OSError: If it cannot be written. An existing file keeps its content, unless it is a
+            device or a pipe.
     """
     from stereogenbench_data.sources.files import open_output
 

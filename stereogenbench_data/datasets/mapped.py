@@ -247,7 +247,7 @@ class StereoPairs(_MappedScenes):
         data: Data,
         *,
         fields: Iterable[str] = DEFAULT_PAIR_FIELDS,
-        size: tuple[int, int] | None = None,
+        size: tuple[int, int] | str | None = None,
         transform: Transform | None = None,
         depth: DepthEncoding | None = None,
         seed: int = 0,
@@ -262,8 +262,9 @@ class StereoPairs(_MappedScenes):
             data: A folder in the released layout; a folder of shards, or its URL; an index of
                 either; or a `SceneIndex`.
             fields: Names of the fields wanted; only what they need is read and decoded.
-            size: (height, width) in pixels that pictures are scaled to while they are decoded;
-                intrinsics and disparity follow. None keeps the stored size.
+            size: (height, width) in pixels, or a text "WIDTHxHEIGHT", that pictures are scaled to
+                while they are decoded; intrinsics and disparity follow. None keeps the stored size.
+                `SwappedSizeWarning` is given where the two look exchanged.
             transform: What changes pictures and cameras together, such as `Compose`.
             depth: A depth contract instead of the one that files and release state.
             seed: Seed of random frames, transforms and the balanced subsample.
@@ -317,7 +318,7 @@ class SceneViews(_MappedScenes):
         cameras: Sequence[int] | Literal["all", "each"] = "all",
         frames: FramesSpec = "first",
         fields: Iterable[str] = DEFAULT_VIEW_FIELDS,
-        size: tuple[int, int] | None = None,
+        size: tuple[int, int] | str | None = None,
         transform: Transform | None = None,
         depth: DepthEncoding | None = None,
         seed: int = 0,
@@ -333,7 +334,7 @@ class SceneViews(_MappedScenes):
             cameras: Camera numbers to stack, "all" six, or "each" as a sample by itself.
             frames: As for `StereoPairs`.
             fields: Names of the fields wanted; only what they need is read and decoded.
-            size: (height, width) in pixels, as for `StereoPairs`.
+            size: As for `StereoPairs`.
             transform: As for `StereoPairs`; a flip, which swaps the views of a pair, is refused.
             depth: A depth contract instead of the one that files and release state.
             seed: Seed of random frames and transforms.

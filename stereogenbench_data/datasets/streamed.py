@@ -31,7 +31,7 @@ class StreamOptions(Selection, EpochOptions, total=False):
     """What `StereoPairs` takes, and `EpochOptions`; ``seed`` is the seed of both."""
 
     fields: Iterable[str]
-    size: tuple[int, int] | None
+    size: tuple[int, int] | str | None
     transform: Transform | None
     depth: DepthEncoding | None
     cache: ShardCache | None

@@ -40,6 +40,7 @@ from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Address, Selection
+from stereogenbench_data.sources.files import write_atomic
 
 INPUTS_JSON: Final = "inputs.json"
 CAMERA_JSON: Final = "camera.json"

@@ -35,6 +35,7 @@ from stereogenbench_data.evaluation.models.interfaces import (
     VideoFeatures,
 )
 from stereogenbench_data.evaluation.models.registry import ModelKind, ModelOptions, load_model
+from stereogenbench_data.samples.size import require_size
 from stereogenbench_data.schema.records import DepthEncoding
 
 PAPER_SIZE: Final = (480, 832)
@@ -81,6 +82,7 @@ class EvaluationProtocol:
     def __post_init__(self) -> None:
         """Put metrics in order, and refuse what cannot be."""
         object.__setattr__(self, "metrics", require_metrics(self.metrics))
+        object.__setattr__(self, "size", require_size(self.size))
         require_fit(self.fit)
         if self.batch_frames < 1:
             raise EvaluationError(f"batch_frames must be at least 1, got {self.batch_frames}.")

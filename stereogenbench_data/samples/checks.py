@@ -11,6 +11,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.samples.derive import RECTIFIED_PX
 from stereogenbench_data.samples.request import Request
+from stereogenbench_data.samples.size import warn_if_swapped
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name
 from stereogenbench_data.selection.plan import Plan
@@ -24,7 +25,7 @@ def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
     """Check, by the index alone, that the samples of a plan can be made as requested.
 
     Warns with `OddSceneWarning` where rigs are not rectified, or where a scene's cameras state
-    several units of depth.
+    several units of depth, and with `SwappedSizeWarning` where height and width look exchanged.
 
     Raises:
         StorageError: If the index lacks a video that a sample needs; it names the first scene and
@@ -36,6 +37,9 @@ def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
     if request.streams & {"source_depth", "target_depth"}:
         _require_whole_depth(index, plan, request)
     _warn_of_odd_scenes(index, plan, request)
+    if request.size is not None and len(plan.scene_rows):
+        rig = index.scene(int(plan.scene_rows[0])).rig
+        warn_if_swapped(request.size, stored=(rig.image_height_px, rig.image_width_px))
 
 
 def _require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:

@@ -15,10 +15,9 @@ from stereogenbench_data.samples.fields import (
     require_fields,
     streams_of,
 )
+from stereogenbench_data.samples.size import require_size
 from stereogenbench_data.samples.views import Views
 from stereogenbench_data.schema.records import DepthEncoding
-
-LARGEST_SIDE_PX: Final = 16384
 
 Clip = Literal["frame", "clip"]
 Kind = Literal["pairs", "views"]
@@ -106,25 +105,10 @@ def parse_request(
         kind=kind,
         fields=require_fields(fields, known=PAIR_FIELDS if kind == "pairs" else VIEW_FIELDS),
         layout=layout,
-        size=_require_size(size),
+        size=None if size is None else require_size(size),
         depth=_require_depth(depth),
         transform=_require_transform(transform, kind=kind),
     )
-
-
-def _require_size(size: Any) -> tuple[int, int] | None:
-    if size is None:
-        return None
-    try:
-        height, width = (int(side) for side in size)
-        whole = (height, width) == tuple(size)
-    except (TypeError, ValueError):
-        whole = False
-    if not whole or not (0 < height <= LARGEST_SIDE_PX and 0 < width <= LARGEST_SIDE_PX):
-        raise FieldError(
-            f"size must be (height, width) of 1 to {LARGEST_SIDE_PX} pixels, got {size!r}."
-        )
-    return height, width
 
 
 def _require_depth(depth: Any) -> DepthEncoding | None:

@@ -2,8 +2,7 @@
 
 import pytest
 
-from benchmarks.material import Material, prepared
-from benchmarks.reencoded import OTHER_CRFS
+from benchmarks.material import OTHER_CRFS, Material, prepared
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ import typer
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.commands import app
-from stereogenbench_data.cli.outcome import OutcomeTold
+from stereogenbench_data.cli.outcome import ErrorsReported
 from stereogenbench_data.errors import ExtraError, SelectionError
 
 COMMAND = (sys.executable, "-m", "stereogenbench_data")
@@ -22,7 +22,7 @@ COMMAND = (sys.executable, "-m", "stereogenbench_data")
 
 def told(error, capsys):
     """Return how a command ends that raises an error, and the lines that it says."""
-    with pytest.raises(SystemExit) as ended, OutcomeTold():
+    with pytest.raises(SystemExit) as ended, ErrorsReported():
         raise error
     said = capsys.readouterr()
     assert said.out == ""
@@ -76,14 +76,14 @@ def test_an_error_ends_the_command_with_its_status_and_its_lines(error, status, 
 
 @pytest.mark.parametrize("error", [typer.Exit(1), typer.BadParameter("no"), SystemExit(3)])
 def test_what_says_itself_how_to_end_passes(error, capsys):
-    with pytest.raises(type(error)), OutcomeTold():
+    with pytest.raises(type(error)), ErrorsReported():
         raise error
     assert capsys.readouterr().err == ""
 
 
 def test_a_warning_is_one_line_and_afterwards_looks_as_before(capsys):
     before = warnings.formatwarning
-    with OutcomeTold(), warnings.catch_warnings():
+    with ErrorsReported(), warnings.catch_warnings():
         warnings.simplefilter("always")
         line = warnings.formatwarning("two scenes are odd", UserWarning, "file.py", 3)
 

@@ -127,7 +127,7 @@ def test_an_index_does_not_replace_a_device_or_a_pipe(small_release, tmp_path):
     shown = invoke("index", small_release, "-o", pipe)
 
     assert shown.exit_code == 2
-    assert "is no regular file" in " ".join(shown.stderr.replace("│", " ").split())
+    assert "is not a regular file" in " ".join(shown.stderr.replace("│", " ").split())
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
@@ -168,13 +168,13 @@ def test_a_descriptor_is_told_as_json(small_shards, tmp_path):
 
 
 def shown_progress(monkeypatch, *, width, every_s):
-    """Return what is printed of three steps where stderr is no terminal."""
+    """Return what is printed of three megabytes where stderr is no terminal."""
     console = Console(width=width, force_terminal=False, color_system=None)
     monkeypatch.setattr(progress, "Console", lambda **_: console)
     monkeypatch.setattr(progress, "_LOGGED_EVERY_S", every_s)
     with console.capture() as captured, progress.progress_bar("packing", unit="MB") as report:
         for done in (1, 2, 3):
-            report(done, 3)
+            report(done * 1_000_000, 3_000_000)
     return captured.get().splitlines()
 
 

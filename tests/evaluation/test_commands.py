@@ -64,10 +64,10 @@ def test_a_missing_prediction_ends_with_2_and_is_named(scenes, tmp_path):
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("--size", "832", "is no WIDTHxHEIGHT"),
+        ("--size", "832", "WIDTHxHEIGHT"),
         ("--frames", "some", "is not all, first, every:K"),
         ("--pairs", "0_1", "is not primary, adjacent, all or pairs"),
-        ("--by", "focal_mm:wide", "are no numbers"),
+        ("--by", "focal_mm:wide", "are not numbers"),
         ("--metrics", "mse", "there is no metric 'mse'"),
         ("--stereo-matcher", "eyes", "'eyes'"),
         ("--tier", "G9", "there is no tier 'G9'"),

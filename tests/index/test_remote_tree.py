@@ -69,7 +69,7 @@ def test_a_part_is_indexed_under_a_name_of_its_own(small_release):
     done = CliRunner().invoke(app, ["index", str(small_release), "--split", "eval"])
 
     assert done.exit_code == 2
-    assert "named by you: --out FILE" in done.output
+    assert "--out FILE" in done.output
     assert not (small_release / "index.parquet").exists()
 
 

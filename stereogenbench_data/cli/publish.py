@@ -1,13 +1,15 @@
-"""``stereogenbench croissant``: write a descriptor of some data, or check one."""
+"""``stereogenbench croissant``, ``card``, ``upload``: describe packed shards and publish them."""
 
 import json
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stereogenbench_data.cli.options import RootOption
+from stereogenbench_data.cli.options import DataOptions, JsonOption, RootOption, grouped
+from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.schema.problems import counted
 
 
@@ -64,7 +66,9 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         _check(data, mapping or [], as_json=as_json)
         return
     if out is None:
-        raise typer.BadParameter("name the descriptor to write: -o FILE", param_hint="--out")
+        raise typer.BadParameter(
+            "the descriptor needs a file: name it with -o FILE.", param_hint="--out"
+        )
     from stereogenbench_data.bridges import about
     from stereogenbench_data.bridges.croissant import Publication, write_descriptor
     from stereogenbench_data.index.table import SceneIndex
@@ -80,22 +84,25 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     descriptor = write_descriptor(index, out, publication=publication)
     files, records = len(descriptor["distribution"]), len(descriptor["recordSet"])
     if as_json:
-        told = {"descriptor": str(out), "distribution": files, "record_sets": records}
-        typer.echo(json.dumps(told, indent=2))
+        summary = {"descriptor": str(out), "distribution": files, "record_sets": records}
+        typer.echo(json.dumps(summary, indent=2))
     else:
         typer.echo(f"{out}: {files} files and sets of files, {counted(records, 'record set')}")
 
 
 def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
     if data is None:
-        raise typer.BadParameter("name the descriptor to check", param_hint="DATA")
+        raise typer.BadParameter("--check needs a descriptor: name its file.", param_hint="DATA")
     from stereogenbench_data.bridges.croissant_check import check_descriptor
 
     places = {}
     for each in mapping:
         name, equals, path = each.partition("=")
         if not equals:
-            raise typer.BadParameter(f"{each!r} is not ID=PATH", param_hint="--map-file")
+            raise typer.BadParameter(
+                f"{each!r} is not ID=PATH, such as shards.tar=data/shards.tar.",
+                param_hint="--map-file",
+            )
         places[name] = Path(path)
     problems = check_descriptor(Path(data), mapping=places)
     if as_json:
@@ -105,4 +112,46 @@ def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
             typer.echo(problem)
         typer.echo(f"{data}: {counted(len(problems), 'problem')}")
     if problems:
-        raise typer.Exit(1)
+        raise typer.Exit(FINDINGS)
+
+
+@grouped
+def card(
+    source: DataOptions,
+    *,
+    repository: Annotated[str, typer.Option("--repo", help="ORG/NAME on the Hub.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder to write README.md into [stdout].")
+    ] = None,
+) -> None:
+    """Write the dataset card of shards: what the Hub shows, and how `datasets` finds the shards."""
+    from stereogenbench_data.bridges.card import card as card_text
+    from stereogenbench_data.bridges.card import write_card
+    from stereogenbench_data.index.table import SceneIndex
+
+    index = SceneIndex.open(source.data, root=source.data_root)
+    if out is None:
+        typer.echo(card_text(index, repository=repository), nl=False)
+        return
+    typer.echo(f"{write_card(index, out, repository=repository)}")
+
+
+def upload(
+    shards: Annotated[Path, typer.Argument(help="Folder of shards, as pack made it.")],
+    repository: Annotated[str, typer.Argument(help="ORG/NAME of a dataset on the Hub.")],
+    *,
+    branch: Annotated[str, typer.Option(help="Branch to commit to.")] = "main",
+    as_json: JsonOption = False,
+) -> None:
+    """Upload shards with index, dataset card and Croissant descriptor (extra 'hub').
+
+    The card and the descriptor are written into the folder first. Log in with `hf auth login`.
+    A run that was stopped goes on if it is run again.
+    """
+    from stereogenbench_data.bridges.upload import upload as uploaded
+
+    report = uploaded(shards, repository, branch=branch)
+    if as_json:
+        typer.echo(json.dumps(asdict(report), indent=2))
+        return
+    typer.echo(f"{counted(report.files, 'file')}: StereoPairs({report.url!r})")

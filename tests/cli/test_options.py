@@ -1,0 +1,97 @@
+"""Options declared once: groups of them as parameters, and errors that name the option."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.cli.options import grouped
+from stereogenbench_data.samples.size import SwappedSizeWarning
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    where: Annotated[str, typer.Argument(help="Where.")]
+    floor: Annotated[int, typer.Option(help="Which floor.")] = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attic(Place):
+    floor: Annotated[int, typer.Option(help="Which floor.")] = 9
+
+
+def command_of(place):
+    @grouped
+    def look(here: place, what: Annotated[str, typer.Argument()], *, loud: bool = False) -> None:
+        typer.echo(f"{what} in {here.where} on {here.floor} {type(here).__name__} {loud}")
+
+    alone = typer.Typer()
+    alone.command()(look)
+    return alone
+
+
+@pytest.mark.parametrize(
+    ("place", "words", "said"),
+    [
+        (Place, ["house", "cat"], "cat in house on 0 Place False"),
+        (Place, ["house", "cat", "--floor", "3", "--loud"], "cat in house on 3 Place True"),
+        (Attic, ["house", "cat"], "cat in house on 9 Attic False"),
+    ],
+)
+def test_a_group_of_options_is_one_parameter_of_the_command(place, words, said):
+    shown = CliRunner().invoke(command_of(place), words)
+
+    assert (shown.exit_code, shown.stdout.strip()) == (0, said)
+
+
+def test_what_a_group_requires_is_required_of_the_command():
+    shown = CliRunner().invoke(command_of(Place), [])
+
+    assert shown.exit_code == 2
+    assert "Usage" in shown.stderr
+
+
+def refused(*words):
+    """Return what is said of a call that ends with exit status 2, as one line."""
+    shown = CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "300"})
+    assert shown.exit_code == 2, shown.output
+    return " ".join(shown.stderr.replace("│", " ").split())
+
+
+@pytest.mark.parametrize(
+    ("words", "option", "value", "cure"),
+    [
+        (["evaluate", "d", "p", "--tier", "G1"], "--size", "480,832", "WIDTHxHEIGHT"),
+        (["evaluate", "d", "p", "--tier", "G1"], "--size", "832x0", "1 to 16384"),
+        (["export-inputs", "d", "o", "--tier", "G1"], "--size", "480,832", "832x480"),
+        (["controls", "d"], "--size", "480", "WIDTHxHEIGHT"),
+        (["controls", "d"], "--pairs", "0:1", "0-1,0-5"),
+        (["controls", "d"], "--frames", "some", "every:K"),
+        (["evaluate", "d", "p", "--tier", "G1"], "--by", "focal_mm:wide", "18,35"),
+        (["audit", "d"], "--frames", "0", "'all'"),
+        (["show", "d"], "--pair", "left", "0-5"),
+        (["download", "d", "--dest", "o"], "--cameras", "6", "0 to 5"),
+        (["pack", "d", "o"], "--part", "first", "I/N"),
+    ],
+)
+def test_an_option_that_cannot_be_is_named_with_its_value_and_what_it_may_be(
+    words, option, value, cure
+):
+    said = refused(*words, option, value)
+
+    assert all(word in said for word in (option, value, cure)), said
+
+
+def test_synth_takes_one_number_for_width_and_height_and_names_the_option_of_another():
+    assert "'--size'" in refused("synth", "out", "--size", "64x48")
+
+
+def test_a_size_that_looks_exchanged_is_warned_of_by_name(small_shards, tmp_path):
+    words = ["export-inputs", small_shards, tmp_path / "in", "--tier", "G2", "--frames", "first"]
+    with pytest.warns(SwappedSizeWarning, match="--size 52x30"):
+        shown = CliRunner().invoke(app, [*map(str, words), "--size", "30x52", "--workers", "1"])
+
+    assert shown.exit_code == 0, shown.output
