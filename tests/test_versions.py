@@ -1,9 +1,10 @@
-"""The versions that the package is said to support are those that are tested, and paths exist."""
+"""What is told to whoever works on the package: versions that are tested, paths that exist."""
 
 import re
 import tomllib
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.version import Version
@@ -58,3 +59,17 @@ def test_every_python_that_is_named_is_tested_and_admitted():
 
     assert set(re.findall(r'python: "([\d.]+)"', workflow)) == named
     assert all(version in SpecifierSet(PROJECT["requires-python"]) for version in named)
+
+
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
+def test_every_path_and_name_on_a_page_for_developers_exists(page):
+    if not (HOME / page).exists():
+        pytest.skip(f"there is no {page}")
+    text = re.sub(r"```.*?```", "", (HOME / page).read_text(), flags=re.DOTALL)
+    words = set(re.findall(r"`([^`\n]+)`", text)) - {"shared/"}
+    is_path = re.compile(r"[\w.-]+(/[\w.-]+)*(/|\.(py|md|txt|toml))").fullmatch
+    is_name = re.compile(r"_?[A-Z][A-Za-z]+[a-z]|_?[A-Z_]{6,}").fullmatch
+    code = "\n".join(path.read_text() for path in (HOME / "stereogenbench_data").rglob("*.py"))
+
+    assert [word for word in words if is_path(word) and not (HOME / word).exists()] == []
+    assert [word for word in words if is_name(word) and not re.search(rf"\b{word}\b", code)] == []
