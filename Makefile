@@ -3,6 +3,7 @@
 PYTHON ?= python3
 VERSIONS ?= cpu
 VENV ?= .venv
+PYTEST_ARGS ?=
 CONSTRAINTS := constraints/$(VERSIONS).txt
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
@@ -17,7 +18,7 @@ demo: $(READY)
 	$(BIN)/python examples/train.py
 
 test: lint
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal
+	$(BIN)/python -m pytest $(PYTEST_ARGS) --numprocesses auto --maxprocesses 8 --dist worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .
