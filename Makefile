@@ -1,6 +1,10 @@
-# `make demo` and `make test` need python3 and make, nothing else.
+# `make demo` and `make test` need python3 and make, nothing else. With other versions:
+# `make test PYTHON=python3.14 VERSIONS=newest VENV=.venv-newest` (see constraints/).
 PYTHON ?= python3
-VENV := .venv
+VERSIONS ?= cpu
+VENV ?= .venv
+PYTEST_ARGS ?=
+CONSTRAINTS := constraints/$(VERSIONS).txt
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
@@ -14,7 +18,7 @@ demo: $(READY)
 	$(BIN)/python examples/train.py
 
 test: lint
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 8 --dist worksteal
+	$(BIN)/python -m pytest $(PYTEST_ARGS) --numprocesses auto --maxprocesses 8 --dist worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -28,7 +32,7 @@ docs: $(READY)
 # else run.
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
-		--constraint constraints/cpu.txt --editable ".[bench]"
+		--constraint $(CONSTRAINTS) --editable ".[bench]"
 	$(BIN)/stereogenbench bench
 
 # The scenes in shards/: videos are not drawn to the same bytes everywhere, packing is the same.
@@ -46,10 +50,10 @@ sample: $(READY)
 	cp -r $(SAMPLE)/shards/* shards/
 	$(BIN)/stereogenbench verify --deep shards
 
-$(READY): pyproject.toml constraints/cpu.txt
+$(READY): pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
-		--constraint constraints/cpu.txt --editable ".[dev]"
+		--constraint $(CONSTRAINTS) --editable ".[dev]"
 	touch $@
 
 clean:

@@ -1,0 +1,75 @@
+"""What is told to whoever works on the package: versions that are tested, paths that exist."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from packaging.version import Version
+
+HOME = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((HOME / "pyproject.toml").read_text())["project"]
+EXTRAS = PROJECT["optional-dependencies"]
+TOOLS = {"bench", "dev", "docs"}
+"""Extras of who works on the package: what they need is tested in its newest release alone."""
+
+
+def lower_bounds():
+    """Return the lowest version that is stated of each package that users install."""
+    lines = PROJECT["dependencies"] + [
+        line for extra, lines in EXTRAS.items() if extra not in TOOLS for line in lines
+    ]
+    bounds = {}
+    for requirement in map(Requirement, lines):
+        (lowest,) = (each for each in requirement.specifier if each.operator in (">=", "=="))
+        assert bounds.setdefault(requirement.name, lowest.version) == lowest.version
+    return bounds
+
+
+def pins(name):
+    lines = (HOME / "constraints" / f"{name}.txt").read_text().splitlines()
+    return [Requirement(line) for line in lines if line and not line.startswith("#")]
+
+
+def test_the_lowest_versions_that_are_tested_are_those_that_are_stated():
+    tested = {pin.name: str(pin.specifier).removeprefix("==") for pin in pins("lowest")}
+
+    for name, lowest in lower_bounds().items():
+        # Where no release has the very number, the first one after it is pinned.
+        assert Version(tested[name]) in SpecifierSet(f">={lowest},=={lowest}.*"), name
+
+
+def test_the_newest_versions_that_are_tested_are_admitted():
+    stated = {each.name: each.specifier for each in map(Requirement, PROJECT["dependencies"])}
+
+    for pin in pins("newest"):
+        (lowest,) = pin.specifier
+        assert stated[pin.name].contains(lowest.version), pin
+
+
+def test_every_python_that_is_named_is_tested_and_admitted():
+    named = {
+        line.rpartition(" ")[2]
+        for line in PROJECT["classifiers"]
+        if line.startswith("Programming Language :: Python :: ")
+    }
+    workflow = (HOME / ".github" / "workflows" / "test.yml").read_text()
+
+    assert set(re.findall(r'python: "([\d.]+)"', workflow)) == named
+    assert all(version in SpecifierSet(PROJECT["requires-python"]) for version in named)
+
+
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", "docs/architecture.md"])
+def test_every_path_and_name_on_a_page_for_developers_exists(page):
+    if not (HOME / page).exists():
+        pytest.skip(f"there is no {page}")
+    text = re.sub(r"```.*?```", "", (HOME / page).read_text(), flags=re.DOTALL)
+    words = set(re.findall(r"`([^`\n]+)`", text)) - {"shared/"}
+    is_path = re.compile(r"[\w.-]+(/[\w.-]+)*(/|\.(py|md|txt|toml))").fullmatch
+    is_name = re.compile(r"_?[A-Z][A-Za-z]+[a-z]|_?[A-Z_]{6,}").fullmatch
+    code = "\n".join(path.read_text() for path in (HOME / "stereogenbench_data").rglob("*.py"))
+
+    assert [word for word in words if is_path(word) and not (HOME / word).exists()] == []
+    assert [word for word in words if is_name(word) and not re.search(rf"\b{word}\b", code)] == []
