@@ -9,7 +9,7 @@ from typing import Final
 
 from stereogenbench_data.bridges import about
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
-from stereogenbench_data.bridges.croissant import Publication, write_descriptor
+from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
 from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
 from stereogenbench_data.schema.problems import counted

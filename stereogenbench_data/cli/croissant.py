@@ -66,7 +66,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     if out is None:
         raise typer.BadParameter("name the descriptor to write: -o FILE", param_hint="--out")
     from stereogenbench_data.bridges import about
-    from stereogenbench_data.bridges.croissant import Publication, write_descriptor
+    from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
     from stereogenbench_data.index.table import SceneIndex
 
     index = None if data is None else SceneIndex.open(data, root=data_root)
@@ -89,7 +89,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
 def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
     if data is None:
         raise typer.BadParameter("name the descriptor to check", param_hint="DATA")
-    from stereogenbench_data.bridges.croissant_check import check_descriptor
+    from stereogenbench_data.bridges.croissant.check import check_descriptor
 
     places = {}
     for each in mapping:

@@ -10,7 +10,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import MARK
-from stereogenbench_data.bridges.croissant_check import check_descriptor
+from stereogenbench_data.bridges.croissant.check import check_descriptor
 from tests.servers.fault import serving
 from tests.servers.hub import REPOSITORY
 from tests.servers.hub_upload import TOKEN, UploadHubHandler
