@@ -94,7 +94,7 @@ def test_a_refused_login_says_how_to_log_in(folder, upload_hub, tmp_path):
     done = uploaded(folder, upload_hub, tmp_path / "home", token="hf_other")
 
     assert done.returncode == 2
-    assert "the Hub did not take the upload (it answers 401)" in done.stderr
+    assert "the Hub refused the upload (it answers 401)" in done.stderr
     assert "hf auth login" in done.stderr
     assert "hf_other" not in done.stderr
 
@@ -103,7 +103,7 @@ def test_offline_mode_is_kept(folder, upload_hub, tmp_path):
     done = uploaded(folder, upload_hub, tmp_path / "home", HF_HUB_OFFLINE="1")
 
     assert done.returncode == 2
-    assert "the Hub did not take the upload" in done.stderr
+    assert "the Hub refused the upload" in done.stderr
     assert not (upload_hub.folder / ".commits").exists()
 
 
@@ -123,5 +123,5 @@ def test_a_missing_shard_is_named_before_anything_is_sent(folder, upload_hub, tm
     done = uploaded(folder, upload_hub, tmp_path / "home")
 
     assert done.returncode == 2
-    assert ".tar: is missing, and the index says" in done.stderr
+    assert ".tar: is missing, but the index says" in done.stderr
     assert upload_hub.asked == []
