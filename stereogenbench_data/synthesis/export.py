@@ -20,12 +20,12 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     TRAJECTORY_JSON,
 )
-from stereogenbench_data.synthesis.plan import ScenePlan
-from stereogenbench_data.synthesis.request import ExportContract
-from stereogenbench_data.synthesis.trajectory import (
+from stereogenbench_data.synthesis.cameras import (
     quaternion_from_rotator,
     rotation_from_rotator,
 )
+from stereogenbench_data.synthesis.plan import ScenePlan
+from stereogenbench_data.synthesis.request import ExportContract
 
 _REPRESENTATIONS: Final = {
     "rotator": "unreal_rotator_degrees",
@@ -166,10 +166,10 @@ def _rotation(
 
 
 def _description(plan: ScenePlan) -> dict[str, Any]:
-    stage = plan.stage
-    walls, things = stage.fixed[0].material.texture, len(stage.fixed)
+    scene = plan.scene
+    walls, things = scene.static_shapes[0].material.texture, len(scene.static_shapes)
     detailed = (
-        f"A figure walks across a slanted ground of {stage.ground.texture}, among crates, balls "
+        f"A figure walks across a slanted ground of {scene.ground.texture}, among crates, balls "
         f"and thin poles ({things} things in all), before walls of {walls} under a cloudy sky."
     )
     return {
@@ -178,7 +178,7 @@ def _description(plan: ScenePlan) -> dict[str, Any]:
         "primary_elements": ["walking figure", "crates", "balls", "poles", "walls"],
         "spatial_layout": "a figure in the middle, things scattered before and behind it",
         "lighting_materials": "sunlight, matte procedural textures",
-        "short_caption": f"A figure walks over {stage.ground.texture}.",
+        "short_caption": f"A figure walks over {scene.ground.texture}.",
         "detailed_caption": detailed,
-        "tags": ["outdoor", "figure", stage.ground.texture, walls],
+        "tags": ["outdoor", "figure", scene.ground.texture, walls],
     }

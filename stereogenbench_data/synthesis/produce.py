@@ -14,10 +14,10 @@ from typing import Final
 from stereogenbench_data.errors import SynthesisError, cure_of
 from stereogenbench_data.index.table import warn_if_stale
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
-from stereogenbench_data.synthesis.crew import Job, run_jobs
 from stereogenbench_data.synthesis.export import completion_text, metadata_texts
 from stereogenbench_data.synthesis.plan import ScenePlan, plan_scene
 from stereogenbench_data.synthesis.request import SynthRequest
+from stereogenbench_data.synthesis.workers import CameraJob, run_jobs
 
 Progress = Callable[[int, int], None]
 
@@ -93,7 +93,7 @@ def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
     return False
 
 
-def _jobs(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[Job]:
+def _jobs(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[CameraJob]:
     for index in missing:
         folder = out / _UNFINISHED / request.key(index)
         try:
@@ -105,7 +105,7 @@ def _jobs(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[J
                 + cure_of(error, "Choose one that you may write to.")
             ) from error
         for camera in range(CAMERA_COUNT):
-            yield Job(request=request, index=index, camera=camera, folder=folder)
+            yield CameraJob(request=request, index=index, camera=camera, folder=folder)
 
 
 def _finish(out: Path, plan: ScenePlan, *, drawn_in: Path) -> None:

@@ -15,7 +15,7 @@ from stereogenbench_data.schema.release import (
     Split,
     Subset,
 )
-from stereogenbench_data.synthesis.trajectory import OFFSET_RANGE_CM
+from stereogenbench_data.synthesis.cameras import OFFSET_RANGE_CM
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
 PairForm = Literal["names", "indices"]
@@ -88,7 +88,7 @@ class SynthRequest:
         split: ``train`` or ``eval``; ``subset`` (of maps) counts for eval alone.
         map_name: Folder of the scenes.
         focal_mm: The focal length, None to draw one of 18..85 mm for each scene.
-        world_offset_cm: How far from the world's origin a stage may lie, along each axis.
+        world_offset_cm: How far from the world's origin a scene may lie, along each axis.
         contract: How the files are written.
 
     Raises:

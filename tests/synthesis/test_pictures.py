@@ -70,8 +70,8 @@ def test_depth_has_near_far_and_sky(draw):
 
 
 def test_every_limb_of_the_subject_moves():
-    stage = plan_scene(SynthRequest(), index=0).stage
-    before, after = stage.walker(0.0), stage.walker(0.4)
+    scene = plan_scene(SynthRequest(), index=0).scene
+    before, after = scene.walker(0.0), scene.walker(0.4)
 
     moved_m = [np.linalg.norm(a.centre - b.centre) for a, b in zip(before, after, strict=True)]
     turned = [np.abs(a.axes - b.axes).max() for a, b in zip(before, after, strict=True)]

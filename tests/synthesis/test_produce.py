@@ -8,7 +8,7 @@ import pytest
 
 from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.synthesis import SynthRequest, synthesise
-from stereogenbench_data.synthesis.videos import VideoFile
+from stereogenbench_data.synthesis.camera_writer import VideoWriter
 
 SMALL = {"size_px": 32, "frames": 2, "seed": 9}
 
@@ -139,7 +139,7 @@ def test_a_full_disk_is_an_error_that_names_scene_camera_and_cure(tmp_path, monk
     def fail(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(VideoFile, "write", fail)
+    monkeypatch.setattr(VideoWriter, "write", fail)
 
     with pytest.raises(
         SynthesisError, match=r"scene_000000: camera 0 .* No space left .* Make room"

@@ -4,6 +4,8 @@ One thread encodes, and nothing but frames and options goes in, so that the same
 same bytes on any number of processors.
 """
 
+from collections.abc import Callable
+from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +17,14 @@ from av.video.stream import VideoStream
 from jaxtyping import Float64, Shaped, UInt8, UInt16
 
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_name
-from stereogenbench_data.synthesis.casting import View
+from stereogenbench_data.synthesis.plan import ScenePlan
+from stereogenbench_data.synthesis.ray_casting import View
+from stereogenbench_data.synthesis.render import (
+    SceneState,
+    render_depth,
+    render_frame,
+    static_light,
+)
 from stereogenbench_data.synthesis.request import ExportContract
 
 _LARGEST: Final = {"gray16le": 65535, "gray12le": 4095, "gray10le": 1023}
@@ -24,7 +33,36 @@ _X264_OPTIONS: Final = {"crf": "18", "x264-params": "cpu-independent=1"}
 _FFV1_OPTIONS: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
 
 
-class VideoFile:
+def write_camera(
+    plan: ScenePlan, *, camera: int, folder: Path, after_frame: Callable[[], None]
+) -> None:
+    """Write a camera's two videos into a folder.
+
+    ``after_frame`` is called after each frame; what it raises ends the work.
+    """
+    contract = plan.request.contract
+    light = static_light(plan.scene)
+    first = plan.view(camera=camera, frame=0)
+    with ExitStack() as files:
+        rgb = files.enter_context(open_rgb(folder, camera=camera, view=first))
+        depth = files.enter_context(
+            open_depth(folder, camera=camera, view=first, contract=contract)
+        )
+        for frame in range(plan.request.frames):
+            view = plan.view(camera=camera, frame=frame)
+            state = SceneState(plan.scene, moment_s=plan.moment_s(frame), static_light=light)
+            picture, depth_m = render_frame(state, view=view)
+            rgb.write(rgb_frame(picture))
+            if contract.frame_lag:
+                measured = frame - contract.frame_lag
+                view = plan.view(camera=camera, frame=measured)
+                state = SceneState(plan.scene, moment_s=plan.moment_s(measured), static_light=light)
+                depth_m = render_depth(state, view=view)
+            depth.write(depth_frame(depth_m, view=view, contract=contract))
+            after_frame()
+
+
+class VideoWriter:
     """A video that is being written; a context manager, whole when it was left without error."""
 
     def __init__(
@@ -53,7 +91,7 @@ class VideoFile:
         self._frames += 1
         self._container.mux(self._stream.encode(frame))
 
-    def __enter__(self) -> "VideoFile":
+    def __enter__(self) -> "VideoWriter":
         return self
 
     def __exit__(
@@ -69,9 +107,9 @@ class VideoFile:
             self._container.close()
 
 
-def open_rgb(folder: Path, *, camera: int, view: View) -> VideoFile:
+def open_rgb(folder: Path, *, camera: int, view: View) -> VideoWriter:
     """Start a camera's pictures: yuv420p, x264's defaults at constant rate factor 18."""
-    return VideoFile(
+    return VideoWriter(
         folder / rgb_name(camera),
         size_px=view.size_px,
         codec="libx264",
@@ -80,10 +118,10 @@ def open_rgb(folder: Path, *, camera: int, view: View) -> VideoFile:
     )
 
 
-def open_depth(folder: Path, *, camera: int, view: View, contract: ExportContract) -> VideoFile:
+def open_depth(folder: Path, *, camera: int, view: View, contract: ExportContract) -> VideoWriter:
     """Start a camera's depth, with the container's tag where the contract has one."""
     tag = contract.depth_tag
-    return VideoFile(
+    return VideoWriter(
         folder / depth_name(camera),
         size_px=view.size_px,
         codec="ffv1",

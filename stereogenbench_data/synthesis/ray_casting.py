@@ -1,6 +1,6 @@
 """Rays from a pinhole camera, and what they meet first.
 
-Pixel (u, v) is column, row; the centre of the top-left pixel is (0.5, 0.5). Stage axes are
+Pixel (u, v) is column, row; the centre of the top-left pixel is (0.5, 0.5). SceneModel axes are
 Unreal's (x forward, y right, z up), metres. A ray has a part of 1 along the optical axis, so the
 t where it meets a surface is its depth along that axis.
 """
@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.synthesis.shapes import Shape, entry
+from stereogenbench_data.synthesis.scene import Shape, entry_depth
 
 Array = Any
 
@@ -26,7 +26,7 @@ _STRIP_RAYS: Final = 1 << 17
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """One pinhole camera on the stage.
+    """One pinhole camera on the scene.
 
     Attributes:
         eye: (3,) its centre.
@@ -98,7 +98,7 @@ def pixel_rays(view: View) -> Iterator[tuple[slice, Rays]]:
         yield slice(top, top + len(rows)), Rays(right, view.below_axis(rows[:, None] + 0.5))
 
 
-def first_met(
+def first_hits(
     rays: Rays, *, view: View, shapes: Sequence[Shape], slope: Float64[np.ndarray, "2"]
 ) -> tuple[Array, Array]:
     """Return the depth in metres of what each ray meets first, and which solid that is.
@@ -113,7 +113,7 @@ def first_met(
         if inside.right.size == 0 or inside.below.size == 0:
             continue
         origin, axes = view.in_unit_solid(shape)
-        t = entry(shape, origin=list(origin), direction=inside.directions(axes))
+        t = entry_depth(shape, origin=list(origin), direction=inside.directions(axes))
         nearer = t < depth_m[index]
         depth_m[index] = np.where(nearer, t, depth_m[index])
         solid[index] = np.where(nearer, number, solid[index])

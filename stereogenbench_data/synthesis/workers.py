@@ -9,13 +9,13 @@ import torch
 
 from stereogenbench_data.engine.process_pool import run_tasks
 from stereogenbench_data.errors import StorageError, SynthesisError, cure_of
-from stereogenbench_data.synthesis.filming import film_camera
+from stereogenbench_data.synthesis.camera_writer import write_camera
 from stereogenbench_data.synthesis.plan import plan_scene
 from stereogenbench_data.synthesis.request import SynthRequest
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class CameraJob:
     """One camera of one scene, to be written into a folder."""
 
     request: SynthRequest
@@ -31,7 +31,7 @@ class Job:
         """
         plan = plan_scene(self.request, index=self.index)
         try:
-            film_camera(plan, camera=self.camera, folder=self.folder, after_frame=after_frame)
+            write_camera(plan, camera=self.camera, folder=self.folder, after_frame=after_frame)
         except OSError as error:
             raise SynthesisError(
                 f"{plan.key}: camera {self.camera} could not be written to {self.folder}: {error}. "
@@ -41,8 +41,8 @@ class Job:
 
 
 def run_jobs(
-    jobs: Sequence[Job], *, workers: int, after_frames: Callable[[int], None]
-) -> Generator[Job, None, None]:
+    jobs: Sequence[CameraJob], *, workers: int, after_frames: Callable[[int], None]
+) -> Generator[CameraJob, None, None]:
     """Do jobs in any order and yield each when it is done; close it to stop the rest.
 
     Args:
@@ -54,12 +54,12 @@ def run_jobs(
         SynthesisError: If a job fails or a worker dies; the others are stopped first.
     """
     try:
-        yield from run_tasks(_film, jobs, workers=workers, after_bytes=after_frames)
+        yield from run_tasks(_write_camera, jobs, workers=workers, after_bytes=after_frames)
     except StorageError as error:
         raise SynthesisError(str(error)) from error
 
 
-def _film(job: Job, after_frames: Callable[[int], None]) -> Job:
+def _write_camera(job: CameraJob, after_frames: Callable[[int], None]) -> CameraJob:
     with _one_thread():
         job.run(lambda: after_frames(1))
     return job

@@ -1,18 +1,20 @@
-"""What stands before the cameras: a slanted ground, a backdrop, boxes, balls, poles, a walker.
+"""A synthetic 3-D scene: a slanted ground, a backdrop, boxes, balls, poles and a walking figure.
 
-Stage axes are Unreal's (x forward, y right, z up), metres, the subject's walk around the origin
-and the cameras at negative x. Sizes follow the picture's width at the depth where a thing stands,
-so that a view is full at any focal length.
+Scene axes are Unreal's (x forward, y right, z up), in metres. The subject walks around the origin
+and the cameras are at negative x. Sizes follow the width of the picture at the depth of an object,
+so that a picture is full at any focal length.
+
+A ray is origin + t * direction. Where directions have a component of exactly 1 along the optical
+axis, t is the depth along that axis.
 """
 
 import colorsys
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float64
-
-from stereogenbench_data.synthesis.shapes import Material, Shape, limb
 
 Array = Any
 
@@ -22,11 +24,143 @@ _THINGS: Final = ("boards", "weave", "mosaic", "plaster", "soil", "bricks")
 _CLOTHES: Final = ("weave", "plaster", "mosaic")
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _STRIDE_S: Final = 1.1
+_PARALLEL: Final = 1e-300
+"""Stands for 0 where a ray runs along a face: it enters and leaves the slab at infinity."""
 
 
 @dataclass(frozen=True, slots=True)
-class Lens:
-    """How wide the picture is, as far as a stage must know.
+class Material:
+    """A texture, how many metres of surface one tile covers, and the colour it is multiplied by."""
+
+    texture: str
+    tile_m: float
+    tint: tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shape:
+    """A box or an ellipsoid.
+
+    Attributes:
+        centre: (3,) in the world, metres.
+        axes: (3, 3), whose rows are the solid's own unit axes in the world.
+        half_m: (3,) half the solid's extent along each of its axes.
+    """
+
+    kind: Literal["box", "ellipsoid"]
+    centre: Float64[np.ndarray, "3"]
+    axes: Float64[np.ndarray, "3 3"]
+    half_m: Float64[np.ndarray, "3"]
+    material: Material
+
+    def corners(self) -> Float64[np.ndarray, "8 3"]:
+        """Return the corners of the box that holds the solid."""
+        signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
+        corners: Float64[np.ndarray, "8 3"] = self.centre + (signs * self.half_m) @ self.axes
+        return corners
+
+
+def limb(
+    start: Float64[np.ndarray, "3"],
+    end: Float64[np.ndarray, "3"],
+    *,
+    radius_m: float,
+    material: Material,
+) -> Shape:
+    """Return an ellipsoid along the line between two joints, a little longer than the line."""
+    along = end - start
+    length = float(np.linalg.norm(along))
+    first = along / length
+    second = np.cross(first, [1.0, 0.0, 0.0])
+    second /= np.linalg.norm(second)
+    axes = np.stack([first, second, np.cross(first, second)])
+    half_m = np.array([length / 2 + 0.5 * radius_m, radius_m, radius_m])
+    return Shape("ellipsoid", (start + end) / 2, axes, half_m, material)
+
+
+def entry_depth(shape: Shape, *, origin: Sequence[Array], direction: Sequence[Array]) -> Array:
+    """Return t where rays enter a shape from outside, infinity where they do not.
+
+    ``origin`` and ``direction`` are three arrays each, that broadcast together: the rays in the
+    unit solid's coordinates.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if shape.kind == "box":
+            return _box_entry(origin, direction)
+        return _ellipsoid_entry(origin, direction)
+
+
+def _box_entry(origin: Sequence[Array], direction: Sequence[Array]) -> Array:
+    near, far = -np.inf, np.inf
+    for o, d in zip(origin, direction, strict=True):
+        inverse = 1 / np.where(d == 0, _PARALLEL, d)
+        middle = -o * inverse
+        reach = np.abs(inverse)
+        near = np.maximum(near, middle - reach)
+        far = np.minimum(far, middle + reach)
+    return np.where((near < far) & (near > 0), near, np.inf)
+
+
+def _ellipsoid_entry(origin: Sequence[Array], direction: Sequence[Array]) -> Array:
+    squared = sum(d * d for d in direction)
+    half_linear = sum(o * d for o, d in zip(origin, direction, strict=True))
+    constant = sum(o * o for o in origin) - 1
+    root = np.sqrt(half_linear * half_linear - squared * constant)
+    t = (-half_linear - root) / squared
+    return np.where(t > 0, t, np.inf)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """What rays meet on a shape: for each ray one number in each of these.
+
+    Attributes:
+        u_m: Place on the surface, in metres along the texture's width.
+        v_m: The same along its height.
+        facing: Cosine between the ray and the surface's normal, 0 where it is grazed.
+        sunward: Cosine between the normal and the direction to the sun, negative in shade.
+        upward: The same for straight up.
+    """
+
+    u_m: Array
+    v_m: Array
+    facing: Array
+    sunward: Array
+    upward: Array
+
+
+def surface(shape: Shape, *, point: Array, direction: Array, sun: Array) -> Surface:
+    """Describe the surface where rays meet it; a face's texture lies in the plane of the face.
+
+    An ellipsoid is textured as a box is: by the two axes that its normal points along least.
+
+    Args:
+        shape: What the rays meet.
+        point: (3, n) where they meet it, in the unit solid's coordinates.
+        direction: (3, n) their directions in the same coordinates.
+        sun: (3,) unit direction to the sun, in the world.
+    """
+    half_m = shape.half_m[:, None]
+    gradient = point if shape.kind == "box" else point / half_m
+    face = np.abs(gradient).argmax(axis=0)
+    if shape.kind == "box":
+        normal = np.where(face == np.arange(3)[:, None], np.sign(point), 0.0)
+    else:
+        normal = gradient / np.sqrt((gradient * gradient).sum(axis=0))
+    ray = direction * half_m
+    place_m = point * half_m + 7.3 * shape.centre.sum()
+    return Surface(
+        u_m=np.where(face == 0, place_m[1], place_m[0]) + 0.37 * face,
+        v_m=np.where(face == 2, place_m[1], place_m[2]),
+        facing=np.abs((normal * ray).sum(axis=0)) / np.sqrt((ray * ray).sum(axis=0)),
+        sunward=(shape.axes @ sun) @ normal,
+        upward=shape.axes[:, 2] @ normal,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Framing:
+    """How wide the picture is, as far as a scene must know.
 
     Attributes:
         distance_m: From the cameras to the subject.
@@ -41,31 +175,31 @@ class Lens:
     pixel_per_m: float
 
     def width_m(self, x_m: float) -> float:
-        """Return how wide the picture is at a place on the stage."""
+        """Return how wide the picture is at a place on the scene."""
         return (x_m + self.distance_m) * self.width_per_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stage:
-    """A drawn stage.
+class SceneModel:
+    """A drawn scene.
 
     Attributes:
         slope: (2,) rise of the ground a metre, along x and y.
         ground: The ground's material; the sky has its own.
-        fixed: What does not move.
+        static_shapes: What does not move.
         clothes: Three materials of the walker: skin, upper and lower clothes.
         walk_m_s: How fast the walker goes, to the right where positive.
         sun: (3,) unit direction to the sun.
-        reach_m: How far from the origin shadows are drawn.
+        shadow_range_m: How far from the origin shadows are drawn.
     """
 
     slope: Float64[np.ndarray, "2"]
     ground: Material
-    fixed: tuple[Shape, ...]
+    static_shapes: tuple[Shape, ...]
     clothes: tuple[Material, Material, Material]
     walk_m_s: float
     sun: Float64[np.ndarray, "3"]
-    reach_m: float
+    shadow_range_m: float
 
     def ground_m(self, x_m: float, y_m: float) -> float:
         """Return the ground's height at a place."""
@@ -79,23 +213,23 @@ class Stage:
         return _limbs(hips, swing=swing, heading=np.sign(self.walk_m_s), clothes=self.clothes)
 
 
-def draw_stage(rng: np.random.Generator, *, lens: Lens, walk_m_s: float) -> Stage:
-    """Draw a stage for a lens: everything but the cameras."""
+def random_scene(rng: np.random.Generator, *, lens: Framing, walk_m_s: float) -> SceneModel:
+    """Draw a scene for a lens: everything but the cameras."""
     slope = rng.uniform(-0.07, 0.07, 2)
     towards = rng.uniform(np.radians(-75), np.radians(75))
     height = rng.uniform(np.radians(32), np.radians(58))
     sun = np.array(
         [-np.cos(height) * np.cos(towards), np.cos(height) * np.sin(towards), np.sin(height)]
     )
-    fixed = [
+    static_shapes = [
         *_backdrop(rng, lens=lens),
-        *_things(rng, lens=lens),
+        *_objects(rng, lens=lens),
         *_poles(rng, lens=lens),
     ]
-    return Stage(
+    return SceneModel(
         slope=slope,
         ground=_material(rng, textures=_GROUNDS, tile_m=(2.0, 4.0)),
-        fixed=tuple(_placed(shape, slope=slope) for shape in fixed),
+        static_shapes=tuple(_placed(shape, slope=slope) for shape in static_shapes),
         clothes=(
             Material("plaster", 0.5, (1.5, 1.05, 0.8)),
             _material(rng, textures=_CLOTHES, tile_m=(0.3, 0.8)),
@@ -103,7 +237,7 @@ def draw_stage(rng: np.random.Generator, *, lens: Lens, walk_m_s: float) -> Stag
         ),
         walk_m_s=walk_m_s,
         sun=sun,
-        reach_m=3 * lens.distance_m + 4,
+        shadow_range_m=3 * lens.distance_m + 4,
     )
 
 
@@ -130,7 +264,7 @@ def _turned(*, yaw: float, tilt: float = 0.0) -> Array:
     return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]]) @ upright
 
 
-def _backdrop(rng: np.random.Generator, *, lens: Lens) -> list[Shape]:
+def _backdrop(rng: np.random.Generator, *, lens: Framing) -> list[Shape]:
     """Buildings and walls behind the subject, with gaps where the sky is seen."""
     shapes = []
     for x_m in lens.distance_m * rng.uniform(1.5, 3.5, 9) + 2:
@@ -149,7 +283,7 @@ def _backdrop(rng: np.random.Generator, *, lens: Lens) -> list[Shape]:
     return shapes
 
 
-def _things(rng: np.random.Generator, *, lens: Lens) -> list[Shape]:
+def _objects(rng: np.random.Generator, *, lens: Framing) -> list[Shape]:
     """Crates and balls before and behind the subject, from near to far."""
     shapes = []
     near, far = -0.55 * lens.distance_m, 1.6 * lens.distance_m
@@ -174,7 +308,7 @@ def _things(rng: np.random.Generator, *, lens: Lens) -> list[Shape]:
     return shapes
 
 
-def _poles(rng: np.random.Generator, *, lens: Lens) -> list[Shape]:
+def _poles(rng: np.random.Generator, *, lens: Framing) -> list[Shape]:
     """Thin upright posts, a few pixels wide, half of them nearer than the subject."""
     shapes = []
     for x_part in (*rng.uniform(-0.6, -0.25, 3), *rng.uniform(0.4, 1.6, 4)):
