@@ -1,6 +1,6 @@
-"""A camera's two videos: H.264 pictures and FFV1 depth.
+"""The two videos of a camera: H.264 pictures and FFV1 depth.
 
-One thread encodes, and nothing but frames and options goes in, so that the same frames make the
+One thread encodes, and the bytes depend only on frames and options, so the same frames give the
 same bytes on any number of processors.
 """
 
@@ -38,7 +38,7 @@ def write_camera(
 ) -> None:
     """Write a camera's two videos into a folder.
 
-    ``after_frame`` is called after each frame; what it raises ends the work.
+    ``after_frame`` is called after each frame; an exception from it ends the work.
     """
     contract = plan.request.contract
     light = static_light(plan.scene)
@@ -63,7 +63,7 @@ def write_camera(
 
 
 class VideoWriter:
-    """A video that is being written; a context manager, whole when it was left without error."""
+    """A video to write, as a context manager; the file is complete after an exit without error."""
 
     def __init__(
         self,
@@ -108,7 +108,7 @@ class VideoWriter:
 
 
 def open_rgb(folder: Path, *, camera: int, view: View) -> VideoWriter:
-    """Start a camera's pictures: yuv420p, x264's defaults at constant rate factor 18."""
+    """Open the video of a camera's pictures: yuv420p, x264's defaults, constant rate factor 18."""
     return VideoWriter(
         folder / rgb_name(camera),
         size_px=view.size_px,
@@ -119,7 +119,7 @@ def open_rgb(folder: Path, *, camera: int, view: View) -> VideoWriter:
 
 
 def open_depth(folder: Path, *, camera: int, view: View, contract: ExportContract) -> VideoWriter:
-    """Start a camera's depth, with the container's tag where the contract has one."""
+    """Open the video of a camera's depth, with the depth tag of the contract, if any."""
     tag = contract.depth_tag
     return VideoWriter(
         folder / depth_name(camera),
@@ -131,7 +131,7 @@ def open_depth(folder: Path, *, camera: int, view: View, contract: ExportContrac
 
 
 def rgb_frame(picture: UInt8[np.ndarray, "h w 3"]) -> av.VideoFrame:
-    """Return a picture as a frame that the encoder takes."""
+    """Return a picture as a frame for the encoder."""
     return av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p", threads=1)
 
 
@@ -148,7 +148,7 @@ def depth_frame(
 def depth_units(
     depth_m: Float64[np.ndarray, "h w"], *, view: View, contract: ExportContract
 ) -> UInt16[np.ndarray, "h w"]:
-    """Return depth as it is stored: rounded to the unit, the largest number where it is beyond."""
+    """Return depth in stored units: rounded, and limited to the largest number of the format."""
     if contract.depth_kind == "ray":
         width_px, height_px = view.size_px
         right = view.right_of_axis(np.arange(width_px) + 0.5)
@@ -159,7 +159,7 @@ def depth_units(
 
 
 def _fill_plane(plane: Any, rows: Shaped[np.ndarray, "h w"]) -> None:
-    """Copy an array into a plane, whose lines may be longer than the array's."""
+    """Copy an array into a plane, whose rows may be longer than the array's."""
     padded = np.zeros((rows.shape[0], plane.line_size // rows.itemsize), rows.dtype)
     padded[:, : rows.shape[1]] = rows
     plane.update(padded)

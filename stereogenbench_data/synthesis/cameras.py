@@ -1,9 +1,9 @@
-"""The six cameras of a synthetic scene: the gaps between them, the path of their rig, their poses.
+"""The six cameras of a synthetic scene: their gaps, the path of their rig, their poses.
 
 World axes are Unreal's: left-handed, x forward, y right, z up. A rotator (pitch, yaw, roll) in
 degrees turns camera axes (forward, right, up) into world axes by Rz(yaw) Ry(-pitch) Rx(-roll).
 Scene axes have their own origin and heading: the subject is at (0, 0) and the cameras are at
-negative x, in metres. World axes differ from them by an offset and a yaw, which only poses contain.
+negative x, in metres. World axes differ from them by an offset and a yaw, which affect only poses.
 """
 
 from dataclasses import dataclass
@@ -35,14 +35,14 @@ Vector = Float64[np.ndarray, "3"]
 
 
 def random_gaps_cm(family: str, *, rng: np.random.Generator) -> Gaps:
-    """Draw the five gaps between neighbouring cameras, from left to right.
+    """Return five random gaps between neighbouring cameras in cm, from left to right.
 
-    - ``IPD_Gaussian``: each from a normal (6.38, 0.5) cut to [4.5, 8.5] cm.
+    - ``IPD_Gaussian``: each from a normal (6.38, 0.5) truncated to [4.5, 8.5] cm.
     - ``Uniform``: each from U[1, 150] cm; the rig is then kept with probability
-      exp(-span / 77 cm), else drawn anew. It stands for the release's checks of collision,
-      visibility and framing, which a wide rig fails more often: median, mean and standard
-      deviation come out at 44, 53 and 39 cm, as in the release's train split (43, 53, 39).
-    - ``Pairwise_Uniform``: of 48 rigs the one whose 15 distances spread most evenly over
+      exp(-span / 77 cm), else sampled again. The rejection stands for the release's checks of
+      collision, visibility and framing, which wide rigs fail more often. Median, mean and standard
+      deviation are 44, 53 and 39 cm; in the release's train split they are 43, 53 and 39.
+    - ``Pairwise_Uniform``: the one of 48 rigs whose 15 distances are spread most evenly over
       [5, 200] cm.
 
     Raises:
@@ -57,7 +57,7 @@ def random_gaps_cm(family: str, *, rng: np.random.Generator) -> Gaps:
     if family == "Pairwise_Uniform":
         return _even_distances(rng)
     raise SynthesisError(
-        f"family {family!r} has no rig: ask for IPD_Gaussian, Uniform or Pairwise_Uniform."
+        f"family {family!r} is unknown: choose IPD_Gaussian, Uniform or Pairwise_Uniform."
     )
 
 
@@ -70,7 +70,7 @@ def pair_distances_cm(gaps_cm: Gaps) -> Float64[np.ndarray, "15"]:
 
 
 def lateral_places_cm(gaps_cm: Gaps) -> Float64[np.ndarray, "6"]:
-    """Return how far right of camera 0 each camera stands."""
+    """Return the distance in cm of each camera to the right of camera 0."""
     return np.concatenate([[0.0], np.cumsum(gaps_cm)])
 
 
@@ -91,7 +91,7 @@ def _uniform_with_rejection(rng: np.random.Generator) -> Gaps:
 
 
 def _even_distances(rng: np.random.Generator) -> Gaps:
-    """Keep the candidate whose sorted distances lie closest to evenly spaced ones."""
+    """Return the candidate whose sorted distances are closest to evenly spaced ones."""
     low, high = PAIRWISE_RANGE_CM
     even = low + (high - low) * (np.arange(len(CAMERA_PAIRS)) + 0.5) / len(CAMERA_PAIRS)
     best, least = np.empty(0), np.inf
@@ -107,16 +107,16 @@ def _even_distances(rng: np.random.Generator) -> Gaps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPath:
-    """Where the middle of the rig is at any moment, and where it looks.
+    """The position and the direction of the middle of the rig at any time.
 
     Attributes:
         distance_m: Distance between the rig and the middle of the subject's walk.
-        amplitudes: Largest swing of azimuth (deg), distance (part of it), height (m),
-            roll (deg), sideways look (m) and upward look (m).
-        periods_s: Period of each of the six.
-        phases: Phase of each of the six, in radians.
+        amplitudes: Amplitudes of six oscillations: azimuth (deg), distance (fraction of it),
+            height (m), roll (deg), and the look-at point to the side (m) and upwards (m).
+        periods_s: Period of each oscillation.
+        phases: Phase of each oscillation, in radians.
         height_m: Mean height above the subject's feet.
-        follow_m_s: How fast the look follows the subject to the right.
+        follow_m_s: Speed of the look-at point to the right, after the subject.
     """
 
     distance_m: float
@@ -128,14 +128,14 @@ class CameraPath:
 
     def rotator_deg(self, moment_s: float) -> Vector:
         """Return pitch, yaw and roll in scene axes."""
-        _, _, _, roll_deg, aside_m, up_m = self._swings(moment_s)
+        _, _, _, roll_deg, aside_m, up_m = self._oscillations(moment_s)
         target = np.array([0.0, aside_m + self.follow_m_s * moment_s, LOOK_HEIGHT_M + up_m])
         x, y, z = target - self.centre_m(moment_s)
         return np.array([*np.degrees([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)]), roll_deg])
 
     def centre_m(self, moment_s: float) -> Vector:
         """Return the middle of the rig in scene axes."""
-        azimuth_deg, stretch, up_m, *_ = self._swings(moment_s)
+        azimuth_deg, stretch, up_m, *_ = self._oscillations(moment_s)
         azimuth, distance_m = np.radians(azimuth_deg), self.distance_m * (1 + stretch)
         return np.array(
             [
@@ -145,14 +145,14 @@ class CameraPath:
             ]
         )
 
-    def _swings(self, moment_s: float) -> Float64[np.ndarray, "6"]:
+    def _oscillations(self, moment_s: float) -> Float64[np.ndarray, "6"]:
         angles = 2 * np.pi * moment_s / self.periods_s + self.phases
-        swings: Float64[np.ndarray, 6] = self.amplitudes * np.sin(angles)
-        return swings
+        values: Float64[np.ndarray, 6] = self.amplitudes * np.sin(angles)
+        return values
 
 
 def random_path(rng: np.random.Generator, *, distance_m: float, follow_m_s: float) -> CameraPath:
-    """Draw a path that turns in yaw, pitch and roll and keeps the subject in the picture."""
+    """Return a random path that varies yaw, pitch and roll and keeps the subject in the picture."""
     largest = np.array([9.0, 0.05, 0.035 * distance_m, 3.5, 0.03 * distance_m, 0.02 * distance_m])
     return CameraPath(
         distance_m=distance_m,
@@ -199,8 +199,8 @@ def rig_locations_cm(
 ) -> Float64[np.ndarray, "6 3"]:
     """Return the six camera centres, along the rig's right axis around its middle.
 
-    The world's offset is added last, so that the distances between the centres are wrong by
-    no more than the rounding of a coordinate that large (1.2e-10 cm at 1e6 cm).
+    The world's offset is added last, so the error of distances between centres is at most the
+    rounding of a coordinate of that size (1.2e-10 cm at 1e6 cm).
     """
     right = rotation_from_rotator(rotator_deg)[:, 1]
     lateral_cm = places_cm - places_cm[CAMERA_COUNT - 1] / 2

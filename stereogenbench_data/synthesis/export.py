@@ -1,6 +1,6 @@
-"""A scene's metadata files, in the release's layout.
+"""The metadata files of a synthetic scene, in the release's layout.
 
-Source: the StereoGenBench paper's appendix on the file schema; names that it does not spell are
+Source: the StereoGenBench paper's appendix on the file schema. Keys that it does not spell are
 those of a scene in this layout that was rendered elsewhere.
 """
 
@@ -36,7 +36,7 @@ _REPRESENTATIONS: Final = {
 
 
 def completion_text(plan: ScenePlan) -> str:
-    """Return the completion marker; what it says of the request tells whose scene this is."""
+    """Return the completion marker. It records the request, so that a later run can compare it."""
     request = plan.request
     map_name = request.map_name
     marker = {
@@ -56,7 +56,7 @@ def completion_text(plan: ScenePlan) -> str:
 
 
 def metadata_texts(plan: ScenePlan) -> dict[str, str]:
-    """Return the text of every metadata file by name, the completion marker last."""
+    """Return the text of every metadata file by name, with the completion marker last."""
     description = _description(plan)
     return {
         BASELINE_JSON: _json(_baseline(plan)),

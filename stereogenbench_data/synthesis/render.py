@@ -1,7 +1,7 @@
-"""Pictures of a scene: matte, textured, lit by one sun, the same from every camera.
+"""Pictures and depth of a scene: matte textured surfaces, lit by one sun.
 
-Colours depend on the place on the surface and on the size of a pixel there, not on the direction
-of view, so that a view warped into another by depth agrees with it.
+Colours depend on the place on the surface and on the size of a pixel there, but not on the viewing
+direction. So a view that is warped into another by its depth agrees with it.
 """
 
 from typing import Any, Final
@@ -64,12 +64,12 @@ class SceneState:
         ).T.copy()
 
     def first_hits(self, rays: Rays, *, view: View) -> tuple[Array, Array]:
-        """Return depth in metres and number of the solid that each ray meets first."""
+        """Return the depth in metres of each ray's first hit, and the number of the solid."""
         return first_hits(rays, view=view, shapes=self.shapes, slope=self.scene.slope)
 
 
 def static_light(scene: SceneModel) -> Float64[np.ndarray, "side side"]:
-    """Return the sunlight on the ground past all that does not move."""
+    """Return the map of sunlight on the ground, with the shadows of all static shapes."""
     light = full_light()
     for shape in scene.static_shapes:
         cast_shadow(light, shape=shape, scene=scene)
@@ -84,7 +84,7 @@ def render_depth(state: SceneState, *, view: View) -> Float64[np.ndarray, "h w"]
 def render_frame(
     state: SceneState, *, view: View
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Float64[np.ndarray, "h w"]]:
-    """Return a picture with smooth silhouettes, and its depth as `render_depth` returns it."""
+    """Return a picture with anti-aliased edges, and its depth as from `render_depth`."""
     width, height = view.size_px
     colour = np.empty((height, width, 3), np.float32)
     light = np.empty((height, width), np.float32)
@@ -128,7 +128,7 @@ def _smooth_edges(
     state: SceneState,
     view: View,
 ) -> None:
-    """Replace marked pixels, in place, by the mean of four rays through each."""
+    """Replace marked pixels, in place, by the mean of four rays per pixel."""
     rows, columns = np.nonzero(edges)
     for start in range(0, len(rows), _SUBPIXEL_BATCH):
         v, u = rows[start : start + _SUBPIXEL_BATCH], columns[start : start + _SUBPIXEL_BATCH]
@@ -144,7 +144,7 @@ def _smooth_edges(
 def _shaded(
     state: SceneState, *, view: View, rays: Rays, depth_m: Array, solid: Array
 ) -> tuple[Float32[np.ndarray, "3 n"], Float32[np.ndarray, " n"]]:
-    """Return colours in 0..1, and the light alone, which tells the faces of a box apart."""
+    """Return colours in 0..1, and the light alone, which differs between the faces of a box."""
     place_m = np.empty((2, solid.size), np.float32)
     footprint_m, slant, light = np.empty((3, solid.size), np.float32)
     for number in np.flatnonzero(np.bincount(solid)):
@@ -178,7 +178,7 @@ def _painted(
     footprint_m: Float32[np.ndarray, " n"],
     light: Float32[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "3 n"]:
-    """Multiply a material's texture by its tint, the light and a fine grain (but on the sky)."""
+    """Multiply a texture by its tint, the light and, except for the sky, a fine grain."""
     row, tiles_per_m, *tint = materials
     grain = sample_atlas(
         tiles=place_m / np.float32(_GRAIN_TILE_M),
@@ -199,7 +199,7 @@ def _lit(*, sunward: Array, upward: Array, sunlight: Array) -> Array:
 
 
 def _on_sky(rays: Rays, *, view: View) -> tuple[Array, Array, Array, Array]:
-    """Return place, facing and light on a ceiling of clouds, bent down to the horizon."""
+    """Return place, facing and light on a layer of clouds that curves down to the horizon."""
     x, y, z = rays.directions(view.axes)
     length = np.sqrt(x * x + y * y + z * z)
     height = np.abs(z) / length + 0.15
@@ -231,14 +231,14 @@ def _on_shape(
 
 
 def full_light() -> Float64[np.ndarray, "side side"]:
-    """Return the map of a ground that nothing stands on; rows are y, columns are x."""
+    """Return the map of sunlight on an empty ground; rows are y, columns are x."""
     return np.ones((_LIGHT_TEXELS, _LIGHT_TEXELS))
 
 
 def cast_shadow(
     light: Float64[np.ndarray, "side side"], *, shape: Shape, scene: SceneModel
 ) -> None:
-    """Darken the map, in place, where a shape stands between the ground and the sun."""
+    """Darken the map of sunlight, in place, where a shape is between the ground and the sun."""
     corners = shape.corners()
     drop = (corners[:, 2] - corners[:, :2] @ scene.slope) / (
         scene.sun[2] - scene.sun[:2] @ scene.slope
@@ -264,7 +264,7 @@ def cast_shadow(
 def sunlight_at(
     light: Float64[np.ndarray, "side side"], *, x_m: Array, y_m: Array, scene: SceneModel
 ) -> Array:
-    """Return the light at places on the ground, interpolated; beyond the map its rim goes on."""
+    """Return the interpolated light at places on the ground; beyond the map, that of its border."""
     place = np.clip(_texel_of(np.stack([x_m, y_m]).T, scene=scene), 0, _LIGHT_TEXELS - 1.001)
     corner = place.astype(int)
     (across, down), (column, row) = (place - corner).T, corner.T

@@ -25,12 +25,12 @@ _CLOTHES: Final = ("weave", "plaster", "mosaic")
 _UP: Final = np.array([0.0, 0.0, 1.0])
 _STRIDE_S: Final = 1.1
 _PARALLEL: Final = 1e-300
-"""Stands for 0 where a ray runs along a face: it enters and leaves the slab at infinity."""
+"""Replaces 0 for a ray parallel to a face: it enters and leaves the slab at infinity."""
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """A texture, how many metres of surface one tile covers, and the colour it is multiplied by."""
+    """A texture, the metres of surface that one tile covers, and a colour to multiply it by."""
 
     texture: str
     tile_m: float
@@ -43,8 +43,8 @@ class Shape:
 
     Attributes:
         centre: (3,) in the world, metres.
-        axes: (3, 3), whose rows are the solid's own unit axes in the world.
-        half_m: (3,) half the solid's extent along each of its axes.
+        axes: (3, 3), whose rows are the solid's unit axes in the world.
+        half_m: (3,) half the solid's size along each of its axes.
     """
 
     kind: Literal["box", "ellipsoid"]
@@ -54,7 +54,7 @@ class Shape:
     material: Material
 
     def corners(self) -> Float64[np.ndarray, "8 3"]:
-        """Return the corners of the box that holds the solid."""
+        """Return the corners of the solid's bounding box along its own axes."""
         signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
         corners: Float64[np.ndarray, "8 3"] = self.centre + (signs * self.half_m) @ self.axes
         return corners
@@ -79,9 +79,9 @@ def limb(
 
 
 def entry_depth(shape: Shape, *, origin: Sequence[Array], direction: Sequence[Array]) -> Array:
-    """Return t where rays enter a shape from outside, infinity where they do not.
+    """Return the t at which rays enter a shape from outside, infinity where they miss it.
 
-    ``origin`` and ``direction`` are three arrays each, that broadcast together: the rays in the
+    ``origin`` and ``direction`` are three arrays each, which broadcast together: the rays in the
     unit solid's coordinates.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -112,14 +112,14 @@ def _ellipsoid_entry(origin: Sequence[Array], direction: Sequence[Array]) -> Arr
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """What rays meet on a shape: for each ray one number in each of these.
+    """The surface of a shape where rays hit it, with one number per ray in each attribute.
 
     Attributes:
         u_m: Place on the surface, in metres along the texture's width.
         v_m: The same along its height.
-        facing: Cosine between the ray and the surface's normal, 0 where it is grazed.
+        facing: Cosine between the ray and the surface's normal, 0 for a grazing ray.
         sunward: Cosine between the normal and the direction to the sun, negative in shade.
-        upward: The same for straight up.
+        upward: Cosine between the normal and the vertical.
     """
 
     u_m: Array
@@ -130,14 +130,15 @@ class Surface:
 
 
 def surface(shape: Shape, *, point: Array, direction: Array, sun: Array) -> Surface:
-    """Describe the surface where rays meet it; a face's texture lies in the plane of the face.
+    """Describe the surface where rays hit it.
 
-    An ellipsoid is textured as a box is: by the two axes that its normal points along least.
+    The texture of a face lies in its plane. An ellipsoid is textured like a box: along the two axes
+    that are most perpendicular to its normal.
 
     Args:
-        shape: What the rays meet.
-        point: (3, n) where they meet it, in the unit solid's coordinates.
-        direction: (3, n) their directions in the same coordinates.
+        shape: The shape that the rays hit.
+        point: (3, n) the hits, in the unit solid's coordinates.
+        direction: (3, n) the rays' directions in the same coordinates.
         sun: (3,) unit direction to the sun, in the world.
     """
     half_m = shape.half_m[:, None]
@@ -160,12 +161,12 @@ def surface(shape: Shape, *, point: Array, direction: Array, sun: Array) -> Surf
 
 @dataclass(frozen=True, slots=True)
 class Framing:
-    """How wide the picture is, as far as a scene must know.
+    """The part of a scene that the cameras see.
 
     Attributes:
-        distance_m: From the cameras to the subject.
+        distance_m: Distance from the cameras to the subject.
         width_per_m: Width of the picture at one metre, in metres.
-        span_m: From the first camera to the last.
+        span_m: Distance from the first camera to the last.
         pixel_per_m: Width of a pixel at one metre, in metres.
     """
 
@@ -175,22 +176,22 @@ class Framing:
     pixel_per_m: float
 
     def width_m(self, x_m: float) -> float:
-        """Return how wide the picture is at a place on the scene."""
+        """Return the width of the picture at a place in the scene."""
         return (x_m + self.distance_m) * self.width_per_m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneModel:
-    """A drawn scene.
+    """The contents of a scene.
 
     Attributes:
-        slope: (2,) rise of the ground a metre, along x and y.
-        ground: The ground's material; the sky has its own.
-        static_shapes: What does not move.
+        slope: (2,) rise of the ground per metre along x and y.
+        ground: The ground's material.
+        static_shapes: The shapes that do not move.
         clothes: Three materials of the walker: skin, upper and lower clothes.
-        walk_m_s: How fast the walker goes, to the right where positive.
+        walk_m_s: Speed of the walker, positive to the right.
         sun: (3,) unit direction to the sun.
-        shadow_range_m: How far from the origin shadows are drawn.
+        shadow_range_m: Distance from the origin up to which there are shadows.
     """
 
     slope: Float64[np.ndarray, "2"]
@@ -206,15 +207,15 @@ class SceneModel:
         return float(self.slope @ (x_m, y_m))
 
     def walker(self, moment_s: float) -> list[Shape]:
-        """Return the walker's limbs at a moment."""
+        """Return the walker's limbs at a time."""
         y_m = self.walk_m_s * moment_s
         hips = np.array([0.0, y_m, self.ground_m(0.0, y_m) + 0.93])
         swing = 2 * np.pi * moment_s / _STRIDE_S
         return _limbs(hips, swing=swing, heading=np.sign(self.walk_m_s), clothes=self.clothes)
 
 
-def random_scene(rng: np.random.Generator, *, lens: Framing, walk_m_s: float) -> SceneModel:
-    """Draw a scene for a lens: everything but the cameras."""
+def random_scene(rng: np.random.Generator, *, framing: Framing, walk_m_s: float) -> SceneModel:
+    """Return a random scene for a framing, without its cameras."""
     slope = rng.uniform(-0.07, 0.07, 2)
     towards = rng.uniform(np.radians(-75), np.radians(75))
     height = rng.uniform(np.radians(32), np.radians(58))
@@ -222,14 +223,14 @@ def random_scene(rng: np.random.Generator, *, lens: Framing, walk_m_s: float) ->
         [-np.cos(height) * np.cos(towards), np.cos(height) * np.sin(towards), np.sin(height)]
     )
     static_shapes = [
-        *_backdrop(rng, lens=lens),
-        *_objects(rng, lens=lens),
-        *_poles(rng, lens=lens),
+        *_backdrop(rng, framing=framing),
+        *_objects(rng, framing=framing),
+        *_poles(rng, framing=framing),
     ]
     return SceneModel(
         slope=slope,
         ground=_material(rng, textures=_GROUNDS, tile_m=(2.0, 4.0)),
-        static_shapes=tuple(_placed(shape, slope=slope) for shape in static_shapes),
+        static_shapes=tuple(_on_slope(shape, slope=slope) for shape in static_shapes),
         clothes=(
             Material("plaster", 0.5, (1.5, 1.05, 0.8)),
             _material(rng, textures=_CLOTHES, tile_m=(0.3, 0.8)),
@@ -237,7 +238,7 @@ def random_scene(rng: np.random.Generator, *, lens: Framing, walk_m_s: float) ->
         ),
         walk_m_s=walk_m_s,
         sun=sun,
-        shadow_range_m=3 * lens.distance_m + 4,
+        shadow_range_m=3 * framing.distance_m + 4,
     )
 
 
@@ -250,32 +251,32 @@ def _material(
     return Material(texture, float(rng.uniform(*tile_m)), (red, green, blue))
 
 
-def _placed(shape: Shape, *, slope: Float64[np.ndarray, "2"]) -> Shape:
-    """Raise a shape that was made for a level ground at height 0 to the slanted one."""
+def _on_slope(shape: Shape, *, slope: Float64[np.ndarray, "2"]) -> Shape:
+    """Raise a shape from a level ground at height 0 to the slanted ground."""
     lifted = shape.centre + _UP * (slope @ shape.centre[:2])
     return Shape(shape.kind, lifted, shape.axes, shape.half_m, shape.material)
 
 
-def _turned(*, yaw: float, tilt: float = 0.0) -> Array:
-    """Return a solid's axes, turned around the vertical and then tilted."""
+def _rotated_axes(*, yaw: float, tilt: float = 0.0) -> Array:
+    """Return the axes of a solid that is turned around the vertical and then tilted."""
     c, s = np.cos(yaw), np.sin(yaw)
     upright = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     c, s = np.cos(tilt), np.sin(tilt)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]]) @ upright
 
 
-def _backdrop(rng: np.random.Generator, *, lens: Framing) -> list[Shape]:
-    """Buildings and walls behind the subject, with gaps where the sky is seen."""
+def _backdrop(rng: np.random.Generator, *, framing: Framing) -> list[Shape]:
+    """Return buildings and walls behind the subject, with gaps that show the sky."""
     shapes = []
-    for x_m in lens.distance_m * rng.uniform(1.5, 3.5, 9) + 2:
-        view_m = lens.width_m(x_m)
+    for x_m in framing.distance_m * rng.uniform(1.5, 3.5, 9) + 2:
+        view_m = framing.width_m(x_m)
         half_m = view_m * rng.uniform((0.05, 0.08, 0.08), (0.1, 0.22, 0.3))
-        y_m = rng.uniform(-0.6, 0.6) * (view_m + lens.span_m)
+        y_m = rng.uniform(-0.6, 0.6) * (view_m + framing.span_m)
         shapes.append(
             Shape(
                 "box",
                 np.array([x_m, y_m, half_m[2] * 0.98]),
-                _turned(yaw=rng.uniform(-0.5, 0.5)),
+                _rotated_axes(yaw=rng.uniform(-0.5, 0.5)),
                 half_m,
                 _material(rng, textures=_WALLS, tile_m=(2.0, 4.0)),
             )
@@ -283,15 +284,15 @@ def _backdrop(rng: np.random.Generator, *, lens: Framing) -> list[Shape]:
     return shapes
 
 
-def _objects(rng: np.random.Generator, *, lens: Framing) -> list[Shape]:
-    """Crates and balls before and behind the subject, from near to far."""
+def _objects(rng: np.random.Generator, *, framing: Framing) -> list[Shape]:
+    """Return crates and balls in front of and behind the subject, from near to far."""
     shapes = []
-    near, far = -0.55 * lens.distance_m, 1.6 * lens.distance_m
+    near, far = -0.55 * framing.distance_m, 1.6 * framing.distance_m
     for place in (np.arange(16) + rng.uniform(0, 1, 16)) / 16:
         x_m = near + place * (far - near)
-        view_m = lens.width_m(x_m)
+        view_m = framing.width_m(x_m)
         half_m = view_m * rng.uniform(0.025, 0.075) * rng.uniform(0.7, 1.4, 3)
-        y_m = rng.uniform(-0.5, 0.5) * (view_m + lens.span_m)
+        y_m = rng.uniform(-0.5, 0.5) * (view_m + framing.span_m)
         if abs(x_m) < 0.4 + half_m.max():
             x_m = 0.6 + 2 * half_m.max()
         is_box = rng.random() < 0.55
@@ -300,7 +301,7 @@ def _objects(rng: np.random.Generator, *, lens: Framing) -> list[Shape]:
             Shape(
                 "box" if is_box else "ellipsoid",
                 np.array([x_m, y_m, half_m[2] * rng.uniform(0.75, 0.98)]),
-                _turned(yaw=rng.uniform(0, np.pi), tilt=tilt),
+                _rotated_axes(yaw=rng.uniform(0, np.pi), tilt=tilt),
                 half_m,
                 _material(rng, textures=_THINGS, tile_m=(0.6, 2.0)),
             )
@@ -308,21 +309,21 @@ def _objects(rng: np.random.Generator, *, lens: Framing) -> list[Shape]:
     return shapes
 
 
-def _poles(rng: np.random.Generator, *, lens: Framing) -> list[Shape]:
-    """Thin upright posts, a few pixels wide, half of them nearer than the subject."""
+def _poles(rng: np.random.Generator, *, framing: Framing) -> list[Shape]:
+    """Return thin upright posts, a few pixels wide, some of them nearer than the subject."""
     shapes = []
     for x_part in (*rng.uniform(-0.6, -0.25, 3), *rng.uniform(0.4, 1.6, 4)):
-        x_m = x_part * lens.distance_m + (0.8 if x_part > 0 else 0.0)
-        depth_m = x_m + lens.distance_m
-        relative = rng.uniform(0.002, 0.006) * lens.width_per_m
-        width_m = depth_m * max(relative, 2.2 * lens.pixel_per_m)
-        height_m = lens.width_m(x_m) * rng.uniform(0.3, 0.8) + 0.5
-        y_m = rng.uniform(-0.45, 0.45) * (lens.width_m(x_m) + lens.span_m)
+        x_m = x_part * framing.distance_m + (0.8 if x_part > 0 else 0.0)
+        depth_m = x_m + framing.distance_m
+        relative = rng.uniform(0.002, 0.006) * framing.width_per_m
+        width_m = depth_m * max(relative, 2.2 * framing.pixel_per_m)
+        height_m = framing.width_m(x_m) * rng.uniform(0.3, 0.8) + 0.5
+        y_m = rng.uniform(-0.45, 0.45) * (framing.width_m(x_m) + framing.span_m)
         shapes.append(
             Shape(
                 "box",
                 np.array([x_m, y_m, 0.48 * height_m]),
-                _turned(yaw=rng.uniform(0, np.pi), tilt=rng.uniform(-0.12, 0.12)),
+                _rotated_axes(yaw=rng.uniform(0, np.pi), tilt=rng.uniform(-0.12, 0.12)),
                 np.array([width_m / 2, width_m / 2, height_m / 2]),
                 _material(rng, textures=_WALLS, tile_m=(0.3, 0.8)),
             )
@@ -337,7 +338,7 @@ def _limbs(
     heading: float,
     clothes: tuple[Material, Material, Material],
 ) -> list[Shape]:
-    """Put a walking figure together, about 1.75 m tall, that walks along y."""
+    """Return the limbs of a figure, about 1.75 m tall, that walks along y."""
     skin, upper, lower = clothes
     ahead, side = np.array([0.0, heading, 0.0]), np.array([1.0, 0.0, 0.0])
     hips = hips + _UP * 0.025 * np.cos(2 * swing)
@@ -351,11 +352,11 @@ def _limbs(
         phase = sign * np.sin(swing)
         lag = sign * np.sin(swing - 0.9)
         hip = hips + 0.1 * sign * side
-        knee = hip + 0.43 * _lean(0.5 * phase, ahead)
-        heel = knee + 0.42 * _lean(0.5 * phase - 0.35 - 0.35 * lag, ahead)
+        knee = hip + 0.43 * _limb_direction(0.5 * phase, ahead)
+        heel = knee + 0.42 * _limb_direction(0.5 * phase - 0.35 - 0.35 * lag, ahead)
         shoulder = neck + 0.2 * sign * side - 0.04 * _UP
-        elbow = shoulder + 0.29 * _lean(-0.5 * phase, ahead) + 0.04 * sign * side
-        hand = elbow + 0.27 * _lean(0.3 - 0.5 * phase, ahead)
+        elbow = shoulder + 0.29 * _limb_direction(-0.5 * phase, ahead) + 0.04 * sign * side
+        hand = elbow + 0.27 * _limb_direction(0.3 - 0.5 * phase, ahead)
         shapes += [
             limb(hip, knee, radius_m=0.09, material=lower),
             limb(knee, heel, radius_m=0.065, material=lower),
@@ -366,6 +367,6 @@ def _limbs(
     return shapes
 
 
-def _lean(angle: float, ahead: Array) -> Array:
-    """Return the direction of a limb that hangs down, swung ahead by an angle."""
+def _limb_direction(angle: float, ahead: Array) -> Array:
+    """Return the direction of a hanging limb that swings forward by an angle."""
     return np.sin(angle) * ahead - np.cos(angle) * _UP

@@ -1,4 +1,4 @@
-"""Cameras filmed by several processes: the job of one camera, and the jobs of many."""
+"""The videos of many cameras, written by several processes: one job per camera of a scene."""
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ from stereogenbench_data.synthesis.request import SynthRequest
 
 @dataclass(frozen=True, slots=True)
 class CameraJob:
-    """One camera of one scene, to be written into a folder."""
+    """One camera of one scene, and the folder for its videos."""
 
     request: SynthRequest
     index: int
@@ -24,7 +24,7 @@ class CameraJob:
     folder: Path
 
     def run(self, after_frame: Callable[[], None]) -> None:
-        """Do the work.
+        """Render the camera and write its videos.
 
         Raises:
             SynthesisError: If a file cannot be written; the message names the scene.
@@ -34,21 +34,21 @@ class CameraJob:
             write_camera(plan, camera=self.camera, folder=self.folder, after_frame=after_frame)
         except OSError as error:
             raise SynthesisError(
-                f"{plan.key}: camera {self.camera} could not be written to {self.folder}: {error}. "
-                + cure_of(error, "See that the disk has room and may be written to.")
-                + " Then run again: finished scenes are kept."
+                f"{plan.key}: camera {self.camera} cannot be written to {self.folder}: {error}. "
+                + cure_of(error, "Check that the disk has free space and may be written to.")
+                + " Then run the same request again: complete scenes are kept."
             ) from error
 
 
 def run_jobs(
     jobs: Sequence[CameraJob], *, workers: int, after_frames: Callable[[int], None]
 ) -> Generator[CameraJob, None, None]:
-    """Do jobs in any order and yield each when it is done; close it to stop the rest.
+    """Run jobs in any order and yield each when it is done; close the generator to stop the rest.
 
     Args:
-        jobs: The work.
-        workers: How many processes; 1 works in this one.
-        after_frames: Called now and then with how many frames were drawn since it was called.
+        jobs: The jobs.
+        workers: The number of processes; with 1, this process does the work.
+        after_frames: Called repeatedly with the number of frames rendered since the last call.
 
     Raises:
         SynthesisError: If a job fails or a worker dies; the others are stopped first.
@@ -67,7 +67,7 @@ def _write_camera(job: CameraJob, after_frames: Callable[[int], None]) -> Camera
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Draw with one thread: how torch rounds depends on how it shares work out."""
+    """Render with one thread: the rounding of torch depends on the number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

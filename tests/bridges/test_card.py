@@ -99,7 +99,7 @@ def write_card_over(folder):
     write_card(SceneIndex.open(folder), folder, repository=REPOSITORY)
 
 
-def test_a_card_is_written_again_but_no_other_text_is_replaced(tmp_path):
+def test_a_card_is_replaced_but_another_readme_is_not(tmp_path):
     index = SceneIndex.open(SAMPLE)
 
     write_card(index, tmp_path, repository="a/b")
@@ -114,7 +114,7 @@ def test_a_card_is_written_again_but_no_other_text_is_replaced(tmp_path):
         write_card(index, tmp_path, repository="a/b")
 
 
-def test_packed_depth_is_told_with_its_features(small_release, tmp_path):
+def test_the_card_states_the_features_of_packed_depth(small_release, tmp_path):
     require_module("blosc2")
     pack(small_release, tmp_path / "shards", workers=1, depth_codec="blosc2")
 

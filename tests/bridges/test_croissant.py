@@ -164,7 +164,7 @@ def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_p
 
 
 @pytest.mark.parametrize("stream", ["rgb", "depth"])
-def test_a_part_is_described_by_the_videos_that_it_has(small_shards, tmp_path, stream):
+def test_a_partial_download_is_described_by_its_videos(small_shards, tmp_path, stream):
     """Two cameras, one kind of video: as a tree and packed again."""
     whole = SceneIndex.open(small_shards)
     part = plan_download(whole, [0, 1], cameras=(2, 3), streams=(stream,))
@@ -205,7 +205,7 @@ def test_many_shards_are_listed_in_a_file(index, tmp_path, monkeypatch):
     assert loaded(path, tmp_path / "cache")["counts"]["shards"] == len(index.shards)
 
 
-def test_a_fifteen_baseline_row_stands_in_every_scene(index, tmp_path):
+def test_every_scene_has_its_fifteen_baselines(index, tmp_path):
     write_descriptor(index, tmp_path / "data.json", publication=DAY)
 
     rows = loaded(tmp_path / "data.json", tmp_path / "cache")["scenes"]
@@ -222,7 +222,7 @@ def test_shards_behind_a_url_need_an_address_to_name(small_release, web, tmp_pat
         write_descriptor(remote, tmp_path / "data.json", publication=DAY)
 
 
-def test_a_descriptor_that_cannot_be_written_says_where(index, tmp_path):
+def test_a_descriptor_that_cannot_be_written_names_the_place(index, tmp_path):
     (tmp_path / "file").write_text("")
 
     with pytest.raises(DescriptorError, match=r"file/data: tables cannot be written"):

@@ -33,7 +33,7 @@ def first_tar(document):
     )
 
 
-def test_what_is_written_has_no_problem(written):
+def test_a_written_descriptor_has_no_problem(written):
     assert check_descriptor(written) == []
 
 
@@ -155,7 +155,7 @@ MUTATIONS = {
 
 
 @pytest.mark.parametrize("name", MUTATIONS)
-def test_a_mutation_is_caught_by_name(written, name):
+def test_a_mutation_is_reported_by_name(written, name):
     change, message = MUTATIONS[name]
     document = json.loads(written.read_text())
     change(document)
@@ -166,7 +166,7 @@ def test_a_mutation_is_caught_by_name(written, name):
     assert any(re.search(message, problem) for problem in problems), problems
 
 
-def test_a_file_named_by_url_is_checked_where_it_is_at_hand(written, small_shards):
+def test_a_file_behind_a_url_is_checked_at_its_local_path(written, small_shards):
     document = json.loads(written.read_text())
     tar = first_tar(document)
     tar.update(contentUrl="https://example.org/data.tar", sha256="0" * 64)
@@ -177,13 +177,13 @@ def test_a_file_named_by_url_is_checked_where_it_is_at_hand(written, small_shard
     assert "was replaced or damaged" in " ".join(told)
 
 
-def test_a_place_for_no_file_is_named(written, tmp_path):
+def test_a_mapping_for_an_unknown_file_is_named(written, tmp_path):
     told = check_descriptor(written, mapping={"scene.parquet": tmp_path})
 
     assert told == ["scene.parquet: is mapped to a path, but the descriptor has no such file"]
 
 
-def test_what_is_no_json_is_refused(tmp_path):
+def test_a_file_that_is_not_json_is_refused(tmp_path):
     path = tmp_path / "data.json"
     path.write_text("{")
 
@@ -210,7 +210,7 @@ def test_the_command_writes_and_checks(small_shards, tmp_path):
 @pytest.mark.parametrize(
     "place", ["/etc/passwd", "/x.tar", "~/x.tar", "../secret", "a\\b.tar", "c:x.tar", "\0.tar"]
 )
-def test_a_path_that_is_none_of_a_data_file_is_not_read(written, place):
+def test_a_path_outside_the_data_is_not_read(written, place):
     document = json.loads(written.read_text())
     first_tar(document)["contentUrl"] = place
     written.write_text(json.dumps(document))

@@ -98,7 +98,7 @@ def test_torchdatas_loader_resumes_with_workers(small_shards, stream, expected):
     )
 
 
-def test_an_epoch_draws_frames_anew_and_orders_scenes_anew(small_shards):
+def test_an_epoch_has_new_random_frames_and_a_new_order(small_shards):
     stream = huggingface.iterable(
         small_shards, fields=("frame_index", "scene"), frames=("random", 3)
     )
@@ -205,7 +205,7 @@ DERIVED = {
 
 @pytest.mark.parametrize("workers", [None, 2])
 @pytest.mark.parametrize("name", DERIVED)
-def test_what_is_derived_draws_for_the_epoch_that_it_is_set_to(small_shards, name, workers):
+def test_derived_datasets_use_their_own_epoch(small_shards, name, workers):
     options = {"fields": ("frame_index", "__key__"), "frames": ("random", 3)}
     expected = StereoPairs(small_shards, **options)
     derived = DERIVED[name](huggingface.iterable(small_shards, **options))

@@ -107,7 +107,7 @@ def test_offline_mode_is_kept(folder, upload_hub, tmp_path):
     assert not (upload_hub.folder / ".commits").exists()
 
 
-def test_somebodys_own_readme_is_left_alone(folder, upload_hub, tmp_path):
+def test_a_readme_of_the_user_is_not_replaced(folder, upload_hub, tmp_path):
     (folder / "README.md").write_text("mine")
 
     done = uploaded(folder, upload_hub, tmp_path / "home")
@@ -117,7 +117,7 @@ def test_somebodys_own_readme_is_left_alone(folder, upload_hub, tmp_path):
     assert (folder / "README.md").read_text() == "mine"
 
 
-def test_a_missing_shard_is_named_before_anything_is_sent(folder, upload_hub, tmp_path):
+def test_a_missing_shard_is_named_before_the_upload(folder, upload_hub, tmp_path):
     next(folder.glob("*.tar")).unlink()
 
     done = uploaded(folder, upload_hub, tmp_path / "home")

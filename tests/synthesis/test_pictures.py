@@ -51,7 +51,7 @@ def test_a_wrong_scale_or_sign_is_far_worse(uniform_scene):
     assert true_db - wrong_db > 10
 
 
-def test_pictures_hold_detail_of_film(uniform_scene):
+def test_pictures_have_as_much_detail_as_real_ones(uniform_scene):
     """At constant rate factor 18, a detailed picture costs a codec a bit a pixel or so."""
     path = uniform_scene.folder / "cam_00_rgb.mp4"
     bits_a_pixel = 8 * path.stat().st_size / (2 * 384 * 384)

@@ -83,7 +83,7 @@ def test_a_shape_behind_the_camera_is_not_seen():
 
 
 @pytest.mark.parametrize("index", range(3))
-def test_every_depth_lies_on_the_surface_of_what_was_met(index):
+def test_every_hit_lies_on_the_surface_of_its_solid(index):
     """Independent of how it was found: the point at that depth fulfils the solid's equation."""
     plan = plan_scene(SynthRequest(family="Uniform", size_px=48), index=index)
     state = SceneState(plan.scene, moment_s=0.3, static_light=static_light(plan.scene))

@@ -57,6 +57,6 @@ def test_pair_distances_of_a_rig_worked_by_hand():
     ]
 
 
-def test_a_family_without_a_rig_is_refused_by_name():
-    with pytest.raises(SynthesisError, match="family 'Wide' has no rig: ask for IPD_Gaussian"):
+def test_an_unknown_family_is_refused():
+    with pytest.raises(SynthesisError, match="family 'Wide' is unknown: choose IPD_Gaussian"):
         random_gaps_cm("Wide", rng=np.random.default_rng(0))

@@ -40,8 +40,8 @@ def test_the_larger_a_pixel_the_less_detail_and_the_same_mean(name):
 
 
 def test_a_box_shades_the_ground_on_the_side_away_from_the_sun():
-    lens = Framing(distance_m=4.0, width_per_m=0.8, span_m=0.3, pixel_per_m=0.001)
-    scene = random_scene(np.random.default_rng(1), lens=lens, walk_m_s=0.6)
+    framing = Framing(distance_m=4.0, width_per_m=0.8, span_m=0.3, pixel_per_m=0.001)
+    scene = random_scene(np.random.default_rng(1), framing=framing, walk_m_s=0.6)
     stone = Material("plaster", 1.0, (1.0, 1.0, 1.0))
     box = Shape("box", np.array([0.0, 0.0, 1.0]), np.eye(3), np.full(3, 1.0), stone)
     light = full_light()
