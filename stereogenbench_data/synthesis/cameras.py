@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import CAMERA_COUNT, CAMERA_PAIRS
 
 IPD_MEAN_CM: Final = 6.38
@@ -164,20 +165,8 @@ def random_path(rng: np.random.Generator, *, distance_m: float, follow_m_s: floa
     )
 
 
-def rotation_from_rotator(rotator_deg: Vector) -> Float64[np.ndarray, "3 3"]:
-    """Return world-from-camera: its columns are the camera's forward, right and up axes."""
-    (sp, sy, sr), (cp, cy, cr) = np.sin(np.radians(rotator_deg)), np.cos(np.radians(rotator_deg))
-    return np.array(
-        [
-            [cp * cy, sr * sp * cy - cr * sy, -(cr * sp * cy + sr * sy)],
-            [cp * sy, sr * sp * sy + cr * cy, cy * sr - cr * sp * sy],
-            [sp, -sr * cp, cr * cp],
-        ]
-    )
-
-
 def quaternion_from_rotator(rotator_deg: Vector) -> Float64[np.ndarray, "4"]:
-    """Return the unit quaternion x, y, z, w of the same rotation."""
+    """Return the unit quaternion x, y, z, w of a rotator."""
     half = np.radians(rotator_deg) / 2
     (sp, sy, sr), (cp, cy, cr) = np.sin(half), np.cos(half)
     return np.array(
@@ -202,7 +191,7 @@ def rig_locations_cm(
     The world's offset is added last, so the error of distances between centres is at most the
     rounding of a coordinate of that size (1.2e-10 cm at 1e6 cm).
     """
-    right = rotation_from_rotator(rotator_deg)[:, 1]
+    right = rotation_from_rotator_deg(rotator_deg)[:, 1]
     lateral_cm = places_cm - places_cm[CAMERA_COUNT - 1] / 2
     near_cm = centre_cm + lateral_cm[:, None] * right
     centres_cm: Float64[np.ndarray, "6 3"] = near_cm + offset_cm

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float64
 
+from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     BASELINE_JSON,
@@ -22,7 +23,6 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.synthesis.cameras import (
     quaternion_from_rotator,
-    rotation_from_rotator,
 )
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.request import ExportContract
@@ -159,7 +159,7 @@ def _rotation(
     if contract.rotation == "rotator":
         return dict(zip(("pitch", "yaw", "roll"), rotator_deg.tolist(), strict=True))
     if contract.rotation == "matrix":
-        rows: list[list[float]] = rotation_from_rotator(rotator_deg).tolist()
+        rows: list[list[float]] = rotation_from_rotator_deg(rotator_deg).tolist()
         return rows
     x, y, z, w = quaternion_from_rotator(rotator_deg).tolist()
     return [x, y, z, w] if contract.rotation == "quaternion_xyzw" else [w, x, y, z]

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
+from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import FRAME_RATE_HZ
 from stereogenbench_data.synthesis.cameras import (
     FOCAL_RANGE_MM,
@@ -15,7 +16,6 @@ from stereogenbench_data.synthesis.cameras import (
     random_gaps_cm,
     random_path,
     rig_locations_cm,
-    rotation_from_rotator,
 )
 from stereogenbench_data.synthesis.ray_casting import View
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -73,7 +73,7 @@ class ScenePlan:
     def view(self, *, camera: int, frame: int) -> View:
         """Return a camera's view; the frame may lie before the first or after the last."""
         moment_s = self.moment_s(frame)
-        axes = rotation_from_rotator(self.path.rotator_deg(moment_s))
+        axes = rotation_from_rotator_deg(self.path.rotator_deg(moment_s))
         lateral_m = (self.places_cm[camera] - self.places_cm[-1] / 2) / 100
         width_px, height_px = self.request.picture_px
         return View(
@@ -95,7 +95,7 @@ class ScenePlan:
 
     def world_locations_cm(self, frame: int) -> Float64[np.ndarray, "6 3"]:
         """Return the six camera centres in world axes."""
-        heading = rotation_from_rotator(np.array([0.0, self.heading_deg, 0.0]))
+        heading = rotation_from_rotator_deg(np.array([0.0, self.heading_deg, 0.0]))
         return rig_locations_cm(
             centre_cm=100 * heading @ self.path.centre_m(self.moment_s(frame)),
             rotator_deg=self.world_rotator_deg(frame),
