@@ -7,7 +7,7 @@ from benchmarks.markdown import rate_text, spread_text, table, verdict
 from benchmarks.reencoded import DRAWN_CRF, OTHER_CRFS
 from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios, shares
 from benchmarks.workloads import RATED, WORKLOADS, Workload
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 
 def headlines(races: dict[str, Any]) -> str:

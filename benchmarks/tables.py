@@ -5,7 +5,7 @@ from typing import Any
 from benchmarks.markdown import table
 from benchmarks.race_tables import by_rate, headlines, race_table
 from benchmarks.workloads import RATES, WORKLOADS
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 
 def tables(sections: dict[str, Any]) -> str:

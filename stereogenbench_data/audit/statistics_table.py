@@ -11,7 +11,7 @@ from stereogenbench_data.audit.statistics import (
     Spread,
     Statistics,
 )
-from stereogenbench_data.schema.problems import markdown_text
+from stereogenbench_data.schema.text import markdown_text
 
 _BAR: Final = 40
 

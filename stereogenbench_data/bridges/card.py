@@ -15,7 +15,6 @@ import numpy as np
 from stereogenbench_data.bridges import about
 from stereogenbench_data.errors import DescriptorError, cure_of
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.problems import counted, markdown_text
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     CAMERA_COUNT,
@@ -23,6 +22,7 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     METADATA_FILES,
 )
+from stereogenbench_data.schema.text import counted, markdown_text
 from stereogenbench_data.sources.atomic_write import write_whole
 
 CARD_NAME: Final = "README.md"

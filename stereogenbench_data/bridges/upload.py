@@ -12,7 +12,7 @@ from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
 from stereogenbench_data.index.table import INDEX_NAME, SceneIndex
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.filesystems import network_errors
 from stereogenbench_data.sources.location import local_path
 from stereogenbench_data.sources.members import require_own_files

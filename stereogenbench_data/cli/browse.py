@@ -8,7 +8,7 @@ import typer
 
 from stereogenbench_data.cli.opening import open_data
 from stereogenbench_data.cli.options import DataArgument, DepthUnitOption, RootOption
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 
 def browse(

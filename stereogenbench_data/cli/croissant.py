@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stereogenbench_data.cli.options import RootOption
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 
 def croissant(  # noqa: PLR0913 - one parameter an option

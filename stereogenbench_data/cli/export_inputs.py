@@ -33,7 +33,7 @@ from stereogenbench_data.cli.options import (
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.stopping import STOPPED
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 
 def export_inputs(  # noqa: PLR0913 - one parameter an option

@@ -55,7 +55,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     """
     from stereogenbench_data.index.stale import StaleIndexWarning
     from stereogenbench_data.index.table import IncompleteSceneWarning, SceneIndex
-    from stereogenbench_data.schema.problems import counted, plain_line
+    from stereogenbench_data.schema.text import counted, plain_line
     from stereogenbench_data.shards.pack import pack as pack_locally
     from stereogenbench_data.shards.plan import parse_size
     from stereogenbench_data.shards.ray_pack import pack_on_ray

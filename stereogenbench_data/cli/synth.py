@@ -10,7 +10,6 @@ import typer
 from stereogenbench_data.cli.options import JsonOption, complete_from
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.stopping import STOPPED
-from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import (
     FAMILIES,
     FRAME_COUNT,
@@ -18,6 +17,7 @@ from stereogenbench_data.schema.release import (
     Split,
     Subset,
 )
+from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
     from stereogenbench_data.synthesis.request import SynthRequest

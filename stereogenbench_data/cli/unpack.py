@@ -27,7 +27,7 @@ def unpack(
     as FFV1 video again, with the same numbers, times and tags. Nothing is overwritten; scenes that
     are there are kept, so a run that was stopped goes on if it is run again.
     """
-    from stereogenbench_data.schema.problems import counted
+    from stereogenbench_data.schema.text import counted
     from stereogenbench_data.shards.unpack import unpack as unpacked
 
     try:

@@ -29,7 +29,7 @@ def verify(
 
     The exit status is 0 if nothing is wrong, 1 if something is, 2 if they cannot be verified.
     """
-    from stereogenbench_data.schema.problems import counted, plain_line
+    from stereogenbench_data.schema.text import counted, plain_line
     from stereogenbench_data.shards.verify import verify as verified
 
     mode: Literal["bytes", "decode"] = "decode" if deep else "bytes"

@@ -11,7 +11,7 @@ from stereogenbench_data.evaluation.aggregate import Cell
 from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
 from stereogenbench_data.evaluation.frechet import FrechetDistance
 from stereogenbench_data.evaluation.table_rows import Row, Table
-from stereogenbench_data.schema.problems import markdown_text
+from stereogenbench_data.schema.text import markdown_text
 
 ABSENT: Final = "-"
 _ARROWS: Final = {"higher": "↑", "lower": "↓", "neither": ""}

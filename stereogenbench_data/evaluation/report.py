@@ -16,7 +16,7 @@ from stereogenbench_data.evaluation.render import csv_text, latex, markdown, pla
 from stereogenbench_data.evaluation.results import CONTROL, Scores
 from stereogenbench_data.evaluation.table_rows import Table
 from stereogenbench_data.evaluation.tiers import TIERS
-from stereogenbench_data.schema.problems import counted, markdown_text
+from stereogenbench_data.schema.text import counted, markdown_text
 from stereogenbench_data.sources.atomic_write import write_whole
 
 Verdict = Mapping[bool | None, str]

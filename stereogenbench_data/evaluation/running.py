@@ -14,7 +14,7 @@ from stereogenbench_data.evaluation.predictions import Pair, PredictionFault, Wa
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.evaluation.scoring import SceneScores, SceneWork, score_scene
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.plan import Plan
 from stereogenbench_data.selection.windows import Random
 

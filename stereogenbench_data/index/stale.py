@@ -13,8 +13,8 @@ from typing import Final
 
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import COMPLETE_JSON, VIDEO_FILES
+from stereogenbench_data.schema.text import counted
 
 _LEVELS: Final = {"train": 3, "eval": 4}
 """Levels of folders from the split down to the scenes."""

@@ -5,7 +5,7 @@ from typing import Final
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import told_stale
 
 _SHOWN: Final = 6
