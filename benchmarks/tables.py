@@ -8,7 +8,7 @@ from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, NO_DEPTH, OURS, title
 from benchmarks.material import DRAWN_CRF, OTHER_CRFS
 from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios, sent_mb, shares
 from benchmarks.workloads import RATED, RATES, WORKLOADS, Workload
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 
 def tables(sections: dict[str, Any]) -> str:

@@ -23,8 +23,8 @@ from stereogenbench_data.audit.audit_records import (
 from stereogenbench_data.audit.paper_figures import AUDIT, AUDIT_TABLE, FRAMES_A_SCENE
 from stereogenbench_data.audit.reprojection import TOLERANCES
 from stereogenbench_data.audit.scene_audit import LONG_PAIR
-from stereogenbench_data.schema.problems import counted, markdown_text
 from stereogenbench_data.schema.release import ADJACENT_PAIRS
+from stereogenbench_data.schema.text import counted, markdown_text
 
 _LISTED: Final = 500
 _CHECKS: Final = (

@@ -37,7 +37,7 @@ from stereogenbench_data.audit.statistics import (
 )
 from stereogenbench_data.errors import ExtraError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.problems import markdown_text
+from stereogenbench_data.schema.text import markdown_text
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.sources.files import open_atomic
 

@@ -1,8 +1,9 @@
-"""What the dataset says of itself: title, authors, licences, citation, responsible use.
+"""Title, authors, licences, citation and responsible use of the dataset.
+
+The descriptor and the dataset card quote these texts.
 
 Source: the StereoGenBench paper, its sections on limitations, responsible use and release, and its
-appendices on hosting and on the generation environment. The descriptor and the dataset card are
-made from these texts.
+appendices on hosting and on the generation environment.
 """
 
 from typing import Any, Final
@@ -90,7 +91,7 @@ RESPONSIBLE_USE: Final[dict[str, str | list[str] | bool]] = {
     ),
     "rai:hasSyntheticData": True,
 }
-"""Responsible AI properties by the names of the RAI 1.0 specification (and hasSyntheticData)."""
+"""Responsible AI properties, with the names of the RAI 1.0 specification and hasSyntheticData."""
 
 PROVENANCE: Final[dict[str, Any]] = {
     "prov:wasGeneratedBy": [

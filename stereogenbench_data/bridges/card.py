@@ -1,7 +1,7 @@
-"""The dataset card of packed shards: the ``README.md`` that the Hub shows and ``datasets`` obeys.
+"""The dataset card of packed shards: a ``README.md`` for the Hub and for ``datasets``.
 
-Its YAML head tells ``load_dataset("ORG/NAME", "Uniform", split="train", streaming=True)`` which
-shards these are, and that their videos stay bytes; the rest is for people.
+``load_dataset("ORG/NAME", "Uniform", split="train", streaming=True)`` reads from its YAML head
+which shards to load, and that videos stay bytes. The rest is for people.
 """
 
 import fnmatch
@@ -15,7 +15,6 @@ import numpy as np
 from stereogenbench_data.bridges import about
 from stereogenbench_data.errors import DescriptorError, cure_of
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.problems import counted, markdown_text
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     CAMERA_COUNT,
@@ -23,27 +22,28 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     METADATA_FILES,
 )
+from stereogenbench_data.schema.text import counted, markdown_text
 from stereogenbench_data.sources.files import write_atomic
 
 CARD_NAME: Final = "README.md"
 MARK: Final = "<!-- made by stereogenbench card -->"
-"""What a card of ours holds, so that nobody's own text is overwritten."""
+"""Marks a card that this package wrote. A README.md without it is never overwritten."""
 _SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 _ADJACENT: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
 
 
 def card(index: SceneIndex, *, repository: str) -> str:
-    """Return the card of some shards.
+    """Return the card of shards.
 
     Args:
-        index: Of the shards.
+        index: The index of the shards.
         repository: "ORG/NAME" on the Hub.
 
     Raises:
-        DescriptorError: If the data are no shards.
+        DescriptorError: If the data are not shards.
     """
     if not index.shards:
-        raise DescriptorError(f"{index.where}: is no folder of shards: pack the data first.")
+        raise DescriptorError(f"{index.where}: not a folder of shards. Pack the data first.")
     return "\n".join([_head(index), MARK, "", *_body(index, repository)]) + "\n"
 
 
@@ -51,15 +51,15 @@ def write_card(index: SceneIndex, folder: Path, *, repository: str) -> Path:
     """Write the card beside the shards.
 
     Raises:
-        DescriptorError: If it cannot be written, or a README.md is there that is no such card.
+        DescriptorError: If it cannot be written, or the folder has another README.md.
     """
     path = folder / CARD_NAME
     text = card(index, repository=repository)
     try:
         if path.exists() and MARK.encode() not in path.read_bytes():
             raise DescriptorError(
-                f"{path}: is there and was not made by this package: move it away, or add "
-                f"{MARK!r} to it if it may be replaced."
+                f"{path}: exists and was not written by this package. Move it away, or add "
+                f"{MARK!r} to it to have it replaced."
             )
         write_atomic(path, text.encode())
     except OSError as error:
@@ -105,7 +105,7 @@ def _features(index: SceneIndex) -> dict[str, str]:
 
 
 def _configs(index: SceneIndex) -> dict[str, dict[str, list[str]]]:
-    """Return config name to split name to shards: one config a family, and one for all."""
+    """Return config to split to patterns of shards: a config per family, and one for all."""
     found: dict[str, dict[str, set[str]]] = {}
     for row in range(len(index)):
         scene = index.scene(row)
@@ -126,7 +126,7 @@ def _configs(index: SceneIndex) -> dict[str, dict[str, list[str]]]:
 
 
 def _patterns(paths: set[str], index: SceneIndex) -> list[str]:
-    """Return few patterns that match these shards and no other."""
+    """Return a few patterns that match these shards and no others."""
     patterns: set[str] = set()
     for path in paths:
         pattern = f"{path.rpartition('-')[0]}-*.tar"
@@ -247,19 +247,19 @@ def _depth(index: SceneIndex) -> list[str]:
     codecs = sorted(set(index.column("depth_codec").ravel().tolist()))
     formats = sorted(set(index.column("depth_pixel_format").ravel().tolist()))
     sources = set(np.asarray(index.column("depth_unit_source")).ravel().tolist())
-    told = "each file's own tag" if sources == {"tag"} else "each file's tag, else 0.1 m"
-    care = [
+    scale = "each file's own tag" if sources == {"tag"} else "each file's tag, else 0.1 m"
+    advice = [
         "Decode them in their own pixel format: a decoder that gives 8 bits destroys them.",
     ]
     if "blosc2" in codecs:
-        care = [
+        advice = [
             "They are blosc2 frames (`.b2frame`), which no decoder of videos reads: `StereoPairs`",
             "takes them as they are, and `stereogenbench unpack` turns them back into videos.",
         ]
     return [
         f"Depth files hold whole numbers ({', '.join(codecs)}, {', '.join(formats)}).",
-        f"Metres along the optical axis are the number times {told}",
+        f"Metres along the optical axis are the number times {scale}",
         f"({', '.join(f'{unit:g}' for unit in units)} m here); 0 and the largest number mean that",
         "nothing was measured.",
-        *care,
+        *advice,
     ]

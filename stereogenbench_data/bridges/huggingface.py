@@ -3,8 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final, Unpack
 
-from stereogenbench_data.bridges.arrays import to_arrays
-from stereogenbench_data.bridges.scene_bytes import SampleOptions, samples_of
+from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of, to_arrays
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.errors import ExtraError, SelectionError, StorageError
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
@@ -16,7 +15,7 @@ from stereogenbench_data.schema.release import (
 )
 
 _DEPTH_NAMES: Final[dict[str, Mapping[str, str]]] = {"mkv": {}, "b2frame": PACKED_DEPTH_NAMES}
-"""Suffix of depth members to their names by their released ones."""
+"""Suffix of depth members to their names in shards, by released name."""
 
 if TYPE_CHECKING:
     from datasets import Features
@@ -27,15 +26,16 @@ if TYPE_CHECKING:
 def iterable(data: Data, **options: Any) -> "SampleIterable":
     """Return the samples of `StereoPairs` as an iterable dataset of Hugging Face ``datasets``.
 
-    Every scene is one shard of it: ``split_dataset_by_node``, worker processes, ``shuffle`` and
-    ``state_dict`` deal with scenes. Samples are flat dicts of numpy arrays with the dtypes of the
-    fields' table. Leave the format as it is: ``with_format("numpy")`` and ``with_format("torch")``
-    turn uint8 into int64 and float64 into float32; torch's own collate makes tensors.
+    Every scene is one shard of the dataset. So ``split_dataset_by_node``, worker processes,
+    ``shuffle`` and ``state_dict`` work on scenes. Samples are flat dicts of numpy arrays with the
+    dtypes of the table of fields. Do not set a format: ``with_format("numpy")`` and
+    ``with_format("torch")`` turn uint8 into int64 and float64 into float32. torch's default
+    collate function makes tensors.
 
-    ``shuffle(seed=0, buffer_size=1)`` orders the scenes anew; a larger buffer holds whole samples
-    in memory. The loader of `StereoPairs` mixes scenes without one, and resumes without decoding
-    again what was seen. ``set_epoch``, also of what was derived, draws random frames and transforms
-    anew.
+    ``shuffle(seed=0, buffer_size=1)`` shuffles the scenes; a larger shuffle buffer holds whole
+    samples in memory. The loader of `StereoPairs` mixes scenes without a shuffle buffer, and
+    resumes without decoding samples a second time. ``set_epoch`` draws new random frames and
+    transforms, also on datasets derived from this one.
 
     Args:
         data: As for `StereoPairs`.
@@ -55,22 +55,22 @@ def iterable(data: Data, **options: Any) -> "SampleIterable":
 def features(*, depth_suffix: str = "mkv") -> "Features":
     """Return the features of raw shards, for ``load_dataset("webdataset", features=...)``.
 
-    Without them ``datasets`` infers them from the first scenes, decodes videos to 8 bits, which
-    destroys depth, and narrows numbers in JSON. With them a row holds every file of a scene as
-    bytes, JSON as parsed.
+    Without them, ``datasets`` infers features from the first scenes, decodes videos to 8 bits,
+    which destroys depth, and reduces the precision of numbers in JSON. With them, a row has every
+    file of a scene: JSON parsed, other files as bytes.
 
     Args:
-        depth_suffix: How the names of depth members end: "mkv" as released, "b2frame" in shards
-            that were packed with ``--depth-codec blosc2``.
+        depth_suffix: The suffix of depth members: "mkv" as released, "b2frame" in shards packed
+            with ``--depth-codec blosc2``.
 
     Raises:
-        SelectionError: If depth has no such suffix.
+        SelectionError: If ``depth_suffix`` is neither.
         ExtraError: If ``datasets`` is not installed.
     """
     names = _DEPTH_NAMES.get(depth_suffix)
     if names is None:
         raise SelectionError(
-            f"depth_suffix is {depth_suffix!r}; there are {', '.join(map(repr, _DEPTH_NAMES))}."
+            f"depth_suffix must be {' or '.join(map(repr, _DEPTH_NAMES))}, got {depth_suffix!r}."
         )
     try:
         from datasets import Features, Json, Value
@@ -89,14 +89,14 @@ def decode(
 ) -> Callable[[dict[str, Any]], dict[str, Any]]:
     """Return a function for ``map`` that turns rows of raw shards into samples.
 
-    Where every scene gives one sample, ``dataset.map(decode(...), remove_columns=...)``. Where it
-    gives several, ``map(..., batched=True, batch_size=1)``: they are all in memory at once, so
-    prefer `iterable` for many frames or pairs.
+    If every scene gives one sample, use ``dataset.map(decode(...), remove_columns=...)``. If a
+    scene gives several, use ``map(..., batched=True, batch_size=1)``. All samples of a scene are
+    then in memory at once, so prefer `iterable` for many frames or pairs.
 
     Args:
-        fields: Names of the fields wanted.
+        fields: Names of the fields to return.
         **options: pairs, frames, direction, baseline_cm, size, transform, depth, seed, as
-            `StereoPairs` takes them.
+            for `StereoPairs`.
     """
     return _RowDecoder(tuple(fields), options)
 
@@ -111,8 +111,8 @@ class _RowDecoder:
             samples = self._samples(row)
             if len(samples) != 1:
                 raise SelectionError(
-                    f"{row['__key__']}: gives {len(samples)} samples, and map takes one a row: "
-                    "pass batched=True, batch_size=1."
+                    f"{row['__key__']}: the scene gives {len(samples)} samples, but map takes "
+                    "one per row. Pass batched=True, batch_size=1."
                 )
             return samples[0]
         rows = [dict(zip(row, values, strict=True)) for values in zip(*row.values(), strict=True)]
@@ -123,8 +123,8 @@ class _RowDecoder:
         absent = [name for name in VIDEO_FILES if name in row and row[name] is None]
         if absent:
             raise StorageError(
-                f"{row['__key__']}: the shard has no {', '.join(absent)}. Shards that were packed "
-                'with --depth-codec blosc2 are read with features(depth_suffix="b2frame").'
+                f"{row['__key__']}: the shard has no {', '.join(absent)}. If it was packed with "
+                '--depth-codec blosc2, read it with features(depth_suffix="b2frame").'
             )
         found = samples_of(row["__key__"], row, fields=self._fields, epoch=0, options=self._options)
         return [to_arrays(sample) for sample in found]

@@ -1,4 +1,4 @@
-"""The classes behind `huggingface.iterable`; importing them imports Hugging Face ``datasets``."""
+"""The classes behind `huggingface.iterable`; this module imports Hugging Face ``datasets``."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -8,7 +8,7 @@ from datasets import IterableDataset
 from datasets.iterable_dataset import ExamplesIterable
 from torch.utils.data import get_worker_info
 
-from stereogenbench_data.bridges.arrays import to_arrays
+from stereogenbench_data.bridges.in_memory import to_arrays
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.samples.fields import Sample
 
@@ -17,42 +17,42 @@ class SampleIterable(IterableDataset):  # type: ignore[misc]  # datasets ships n
     """The samples of a `StereoPairs`, one scene after another; each scene is a shard.
 
     Attributes:
-        pairs: The dataset that makes the samples. Datasets that are derived from this one (by
-            ``shuffle``, ``map`` or ``split_dataset_by_node``) draw random frames and transforms for
-            the epoch that they are set to; in their epoch 0 for that of ``pairs``.
+        pairs: The dataset that makes the samples. Datasets derived from this one (by ``shuffle``,
+            ``map`` or ``split_dataset_by_node``) draw random frames and transforms for their own
+            epoch; if that is 0, for the epoch of ``pairs``.
     """
 
     pairs: StereoPairs
 
     @classmethod
     def of(cls, pairs: StereoPairs) -> "SampleIterable":
-        """Return the samples of a dataset."""
+        """Return the samples of a map-style dataset."""
         scenes = list(range(len(pairs.plan.scene_rows)))
         made = IterableDataset.from_generator(
             _samples, gen_kwargs={"pairs": pairs, "scenes": scenes}
         )
         plain = made._ex_iterable
-        told = _ScenesOfEpoch(plain.generate_examples_fn, plain.kwargs)
-        samples = cls(told, info=made.info, split=made.split)
+        scenes_of_epoch = _ScenesOfEpoch(plain.generate_examples_fn, plain.kwargs)
+        samples = cls(scenes_of_epoch, info=made.info, split=made.split)
         samples.pairs = pairs
         return samples
 
     def set_epoch(self, epoch: int) -> None:
-        """Order the scenes anew if they are shuffled, and draw for this epoch."""
+        """Set the epoch of the order of shuffled scenes, and of random frames and transforms."""
         super().set_epoch(epoch)
         self.pairs.set_epoch(epoch)
 
 
 class _ScenesOfEpoch(ExamplesIterable):  # type: ignore[misc]  # datasets ships no types
-    """The scenes, which ``datasets`` tells the epoch of whatever was derived from them.
+    """The scenes; ``datasets`` passes them the epoch of any dataset derived from them.
 
-    When it begins to iterate it calls ``shift_rngs`` with the epoch, unless that is 0; and in a
-    worker a second time, with the worker's number, on the share of the worker. That share is a
-    plain `ExamplesIterable`, which is not told.
+    At the start of an iteration, ``datasets`` calls ``shift_rngs`` with the epoch, unless it is 0.
+    A worker calls it a second time with the worker's number, on its share of the scenes. That
+    share is a plain `ExamplesIterable`, so the second call does not change the epoch.
     """
 
     def shift_rngs(self, value: int) -> "_ScenesOfEpoch":
-        """Return the same scenes, drawn for an epoch."""
+        """Return the same scenes for an epoch."""
         return _ScenesOfEpoch(self.generate_examples_fn, self.kwargs | {"epoch": value})
 
     def shuffle_data_sources(self, generator: np.random.Generator) -> "_ScenesOfEpoch":

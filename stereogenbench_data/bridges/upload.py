@@ -1,6 +1,6 @@
-"""Packed shards onto the Hub: with their index, card and descriptor, by the Hub's own client.
+"""Upload of packed shards to the Hub, with their index, card and descriptor.
 
-Logins, offline mode and retries are huggingface_hub's; nothing here sees a token.
+huggingface_hub handles logins, offline mode and retries; this module never sees a token.
 """
 
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ from typing import Final
 
 from stereogenbench_data.bridges import about
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
-from stereogenbench_data.bridges.croissant import Publication, write_descriptor
+from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.filesystems import network_errors
 from stereogenbench_data.sources.location import local_path
 from stereogenbench_data.sources.members import require_own_files
@@ -23,13 +23,13 @@ _COMPANIONS: Final = (INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "crois
 
 
 @dataclass(frozen=True, slots=True)
-class Uploaded:
-    """What an upload left on the Hub.
+class Upload:
+    """An upload to the Hub.
 
     Attributes:
-        url: ``hf://datasets/ORG/NAME@REVISION``, to be opened as data.
-        revision: The commit that holds the shards.
-        files: How many files belong to it.
+        url: ``hf://datasets/ORG/NAME@REVISION``, which opens as data.
+        revision: The commit with the shards.
+        files: The number of files.
     """
 
     url: str
@@ -37,22 +37,22 @@ class Uploaded:
     files: int
 
 
-def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uploaded:
+def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Upload:
     """Upload a folder of packed shards.
 
-    The card and the descriptor's tables are written into the folder first. The descriptor itself
-    names the files of the commit that holds them, so it comes in a commit of its own. A run that
-    was stopped goes on if it is run again.
+    The card and the descriptor's tables are written into the folder first. The descriptor names
+    the commit of the other files, so it has a commit of its own. To continue after an
+    interruption, call it again.
 
     Args:
-        shards: The folder, as ``pack`` made it.
-        repository: "ORG/NAME" of a dataset on the Hub; made if it is not there.
+        shards: The folder that ``pack`` wrote.
+        repository: "ORG/NAME" of a dataset on the Hub; created if it does not exist.
         branch: The branch to commit to.
 
     Raises:
         ExtraError: If huggingface_hub is not installed.
-        DescriptorError: If a README.md is there that this package did not make.
-        StorageError: If the folder holds no shards, lacks one of them, or the Hub refuses.
+        DescriptorError: If the folder has a README.md that this package did not write.
+        StorageError: If the folder has no shards or lacks one, or the Hub refuses the upload.
     """
     try:
         from huggingface_hub import HfApi
@@ -97,11 +97,11 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
         if isinstance(error, StorageError | DescriptorError):
             raise
         raise StorageError(
-            f"{repository}: the Hub did not take the upload ({_reason(error)}). Log in with "
-            "`hf auth login` if it asks for it, and run the same command again to go on."
+            f"{repository}: the Hub refused the upload ({_reason(error)}). Log in with "
+            "`hf auth login` if needed, and run the same command again to continue."
         ) from None
     files = _found(folder, patterns)
-    return Uploaded(f"hf://datasets/{repository}@{revision}", revision, len(files) + 1)
+    return Upload(f"hf://datasets/{repository}@{revision}", revision, len(files) + 1)
 
 
 def _found(folder: Path, patterns: list[str]) -> list[Path]:
@@ -109,22 +109,22 @@ def _found(folder: Path, patterns: list[str]) -> list[Path]:
 
 
 def _require_whole(index: SceneIndex, folder: Path) -> None:
-    """Refuse a folder that is no whole pack, by the sizes of its shards."""
+    """Refuse a folder that lacks a shard or has one of another size than the index says."""
     if not index.shards:
-        raise StorageError(f"{folder}: holds no shards: pack the data first.")
+        raise StorageError(f"{folder}: has no shards. Pack the data first.")
     for path, facts in sorted(index.shards.items()):
         place = folder / path
         found = place.stat().st_size if place.is_file() else None
         if found != facts.size:
-            says = "is missing" if found is None else f"has {found} bytes"
+            state = "is missing" if found is None else f"has {found} bytes"
             raise StorageError(
-                f"{place}: {says}, and the index says {facts.size}. Pack it again, and run "
-                "`stereogenbench verify` before an upload."
+                f"{place}: {state}, but the index says {facts.size} bytes. Pack the data again "
+                "and run `stereogenbench verify` before the upload."
             )
 
 
 def _reason(error: BaseException) -> str:
-    """Return what happened without an address, which may hold secrets."""
+    """Return what happened, without URLs, which may contain secrets."""
     status = getattr(getattr(error, "response", None), "status_code", None)
     if status is not None:
         return f"it answers {status}"

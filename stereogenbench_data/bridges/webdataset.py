@@ -1,4 +1,4 @@
-"""A stage for ``webdataset`` pipelines: from a scene's bytes to stereo samples.
+"""A stage for ``webdataset`` pipelines that turns scenes into stereo samples.
 
 >>> import webdataset  # doctest: +SKIP
 >>> from stereogenbench_data.bridges.webdataset import decode
@@ -9,35 +9,35 @@
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Unpack
 
-from stereogenbench_data.bridges.scene_bytes import SampleOptions, samples_of
+from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
 
 
 class SceneDecoder:
-    """Turns scenes as ``webdataset`` reads them into samples; see `decode`."""
+    """Turns the scenes that ``webdataset`` reads into samples; see `decode`."""
 
     def __init__(self, fields: tuple[str, ...], options: SampleOptions) -> None:
-        """Keep what the samples shall be."""
+        """Keep the fields and the options of the samples."""
         self._fields = fields
         self._options = options
         self._epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw random frames and transforms anew, in pipelines that start from now on.
+        """Draw new random frames and transforms in iterations that start after this call.
 
         Raises:
             SelectionError: If it is negative.
         """
         if epoch < 0:
-            raise SelectionError(f"an epoch is a whole number from 0, got {epoch!r}.")
+            raise SelectionError(f"epoch must be 0 or a positive whole number, got {epoch!r}.")
         self._epoch = epoch
 
     def __call__(self, scenes: Iterable[Mapping[str, Any]]) -> Iterator[Sample]:
         """Yield the samples of every scene.
 
         Raises:
-            StorageError: If a scene has no key, or lacks a file.
+            StorageError: If a scene has no key or lacks a file.
             SchemaError: If a metadata file does not follow the format.
             MediaError: If a video does not decode to what its header says.
         """
@@ -45,8 +45,8 @@ class SceneDecoder:
             key = scene.get("__key__")
             if not isinstance(key, str):
                 raise StorageError(
-                    f"a scene has no __key__ (it has {', '.join(map(str, scene))}): put the stage "
-                    "right after the reading of tars."
+                    f"a scene has no __key__ (its keys are {', '.join(map(str, scene))}). Put this "
+                    "stage directly after the WebDataset."
                 )
             for sample in samples_of(
                 key, scene, fields=self._fields, epoch=self._epoch, options=self._options
@@ -59,23 +59,23 @@ class SceneDecoder:
 def decode(
     fields: Iterable[str] = DEFAULT_PAIR_FIELDS, **options: Unpack[SampleOptions]
 ) -> SceneDecoder:
-    """Return a stage that turns scenes into samples as `StereoPairs` makes them.
+    """Return a stage that turns scenes into the samples of `StereoPairs`.
 
-    A whole scene passes through memory and a temporary folder, whatever is asked of it;
-    `StereoPairs` and `StereoPairStream` read only what samples need.
+    Every scene passes whole through memory and a temporary folder. `StereoPairs` and
+    `StereoPairStream` read only the bytes that the samples need.
 
     Args:
-        fields: Names of the fields wanted.
+        fields: Names of the fields to return.
         **options: pairs, frames, direction, baseline_cm, size, transform, depth, seed, as
-            `StereoPairs` takes them. Scenes without a pair of such a baseline give no sample.
+            for `StereoPairs`. A scene without a pair within ``baseline_cm`` gives no sample.
 
     Raises:
-        SelectionError: If there is no such option.
+        SelectionError: If an option is unknown.
     """
     unknown = sorted(set(options) - set(SampleOptions.__annotations__))
     if unknown:
         raise SelectionError(
-            f"there is no option {unknown[0]!r}; there are "
-            f"{', '.join(SampleOptions.__annotations__)}. Choose scenes before the stage."
+            f"unknown option {unknown[0]!r}; the options are "
+            f"{', '.join(SampleOptions.__annotations__)}. Select scenes before this stage."
         )
     return SceneDecoder(tuple(fields), options)

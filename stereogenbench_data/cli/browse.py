@@ -12,7 +12,7 @@ from stereogenbench_data.cli.options import (
     depth_of,
     grouped,
 )
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 
 @grouped

@@ -19,7 +19,7 @@ from stereogenbench_data.cli.options import (
 from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
     from stereogenbench_data.audit.contract.doctor import DoctorReport

@@ -14,7 +14,7 @@ from stereogenbench_data.cli.options import (
 )
 from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 
 @grouped

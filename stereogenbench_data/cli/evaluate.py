@@ -24,7 +24,7 @@ from stereogenbench_data.cli.options import (
 )
 from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
     from stereogenbench_data.evaluation.aggregate import Scores

@@ -19,7 +19,7 @@ from stereogenbench_data.cli.options import (
 from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
-from stereogenbench_data.schema.problems import counted, plain_line
+from stereogenbench_data.schema.text import counted, plain_line
 
 if TYPE_CHECKING:
     from stereogenbench_data.schema.records import SceneId

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.schema.problems import counted, plain_line
+from stereogenbench_data.schema.text import counted, plain_line
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.build import TreeReport

@@ -13,7 +13,7 @@ import typer
 
 from stereogenbench_data.cli.stopping import STOPPED
 from stereogenbench_data.errors import StereoGenBenchError, cure_of
-from stereogenbench_data.schema.problems import plain_line
+from stereogenbench_data.schema.text import plain_line
 
 FINDINGS: Final = 1
 """Exit status if something is wrong with the data."""

@@ -19,7 +19,7 @@ from stereogenbench_data.cli.options import (
 )
 from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.schema.problems import counted, plain_line
+from stereogenbench_data.schema.text import counted, plain_line
 
 
 @resumable()
@@ -58,6 +58,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     With --part, run the same command once for each I; whichever is finished last writes the index.
     """
     from stereogenbench_data.engine import engine_of
+    from stereogenbench_data.schema.text import counted
     from stereogenbench_data.shards.pack import pack as packed_by
     from stereogenbench_data.shards.plan import parse_size
 

@@ -10,7 +10,7 @@ import typer
 
 from stereogenbench_data.cli.options import DataOptions, JsonOption, RootOption, grouped
 from stereogenbench_data.cli.outcome import FINDINGS
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 
 def croissant(  # noqa: PLR0913 - one parameter an option
@@ -70,7 +70,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
             "the descriptor needs a file: name it with -o FILE.", param_hint="--out"
         )
     from stereogenbench_data.bridges import about
-    from stereogenbench_data.bridges.croissant import Publication, write_descriptor
+    from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
     from stereogenbench_data.index.table import SceneIndex
 
     index = None if data is None else SceneIndex.open(data, root=data_root)
@@ -93,7 +93,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
 def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
     if data is None:
         raise typer.BadParameter("--check needs a descriptor: name its file.", param_hint="DATA")
-    from stereogenbench_data.bridges.croissant_check import check_descriptor
+    from stereogenbench_data.bridges.croissant.check import check_descriptor
 
     places = {}
     for each in mapping:

@@ -14,7 +14,6 @@ from stereogenbench_data.cli.options import (
 )
 from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import (
     FAMILIES,
     FRAME_COUNT,
@@ -22,6 +21,7 @@ from stereogenbench_data.schema.release import (
     Split,
     Subset,
 )
+from stereogenbench_data.schema.text import counted
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
 """As in `synthesis.request`, which is imported when scenes are drawn, not for the help."""

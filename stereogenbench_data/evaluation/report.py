@@ -18,7 +18,7 @@ from stereogenbench_data.evaluation.predictions import pair_name
 from stereogenbench_data.evaluation.reference import DISCREPANCIES, PAPER
 from stereogenbench_data.evaluation.tables import Table, TableRow
 from stereogenbench_data.evaluation.tiers import TIERS
-from stereogenbench_data.schema.problems import counted, markdown_text
+from stereogenbench_data.schema.text import counted, markdown_text
 from stereogenbench_data.sources.files import write_atomic
 
 Verdict = Mapping[bool | None, str]

@@ -27,7 +27,7 @@ from stereogenbench_data.evaluation.predictions import (
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, models_of
 from stereogenbench_data.evaluation.scene_scores import SceneWork, score_scene
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.plan import Plan, Selection
 from stereogenbench_data.selection.windows import Random
 

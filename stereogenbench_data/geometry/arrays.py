@@ -1,7 +1,7 @@
-"""What numpy and torch do not spell alike: everything here takes and returns arrays of either.
+"""Array operations that numpy and torch spell differently.
 
-The rest of the layer is written once, against the array API standard. A function's arrays must
-be of one library and on one device.
+All functions take and return arrays of either library. The rest of the layer is written once,
+against the array API standard. The arrays of one call must be of one library and on one device.
 """
 
 import math
@@ -29,7 +29,7 @@ def as_float64(values: Array) -> Array:
 
 
 def quotient(number: float, divisor: Array) -> Array:
-    """Return number / divisor, rounded once: torch multiplies a plain number by the reciprocal."""
+    """Return number / divisor, rounded once; torch would multiply by the rounded reciprocal."""
     xp = array_namespace(divisor)
     return xp.asarray(number, dtype=divisor.dtype, device=device(divisor)) / divisor
 
@@ -37,7 +37,8 @@ def quotient(number: float, divisor: Array) -> Array:
 def whole_where(mask: Array, values: Array) -> Array:
     """Return values rounded towards 0 as int64, and 0 where the mask is False.
 
-    They are below 2 ** 31 where it is True: numpy converts to int32 and on faster than to int64.
+    Where it is True, values must be below 2 ** 31: with numpy, two conversions by way of int32 are
+    faster than one to int64.
     """
     xp = array_namespace(values)
     if not is_numpy_array(values):
@@ -49,9 +50,9 @@ def whole_where(mask: Array, values: Array) -> Array:
 
 
 def values_where(mask: Array, values: Array, *, otherwise: float) -> Array:
-    """Return ``xp.where(mask, values, otherwise)``; where all are kept, maybe ``values`` itself.
+    """Return ``xp.where(mask, values, otherwise)``; maybe ``values`` itself if all are kept.
 
-    numpy copies and then overwrites runs up to three times as fast as it chooses each number.
+    With numpy, copying and then overwriting runs is up to three times as fast as ``where``.
     """
     xp = array_namespace(values)
     if not is_numpy_array(values):
@@ -66,7 +67,7 @@ def values_where(mask: Array, values: Array, *, otherwise: float) -> Array:
 def take_flat(values: Array, index: Array) -> Array:
     """Return ``values`` (any shape, read in row-major order) at ``index``, in the index's shape.
 
-    The index must be in range: numpy's quickest way does not look.
+    The index must be in range: the fastest mode of numpy does not check it.
     """
     xp = array_namespace(values, index)
     if is_numpy_array(values):
@@ -78,7 +79,7 @@ def take_flat(values: Array, index: Array) -> Array:
 def take_pixels(image: Array, index: Array) -> Array:
     """Return (..., c, rows, columns) of an image (..., c, h, w) at an index (..., rows, columns).
 
-    The index is into maps (..., h, w) laid out flat: one pixel for all channels.
+    The index counts pixels of flattened maps (..., h, w), so it serves all channels.
     """
     xp = array_namespace(image, index)
     channels = image.shape[-3]
@@ -88,9 +89,10 @@ def take_pixels(image: Array, index: Array) -> Array:
 
 
 def scatter_max(values: Array, index: Array, *, size: int, empty: int) -> Array:
-    """Return ``size`` cells, each the largest of ``values`` sent to it by ``index``, or ``empty``.
+    """Return ``size`` cells with the largest of the ``values`` that ``index`` sends to each.
 
-    Both arrays are flat. The outcome does not depend on the order in which cells are written.
+    Cells without a value are ``empty``. Both arrays are flat. The result does not depend on the
+    order in which cells are written.
     """
     xp = array_namespace(values, index)
     cells = xp.full((size,), empty, dtype=values.dtype, device=device(values))
@@ -101,7 +103,7 @@ def scatter_max(values: Array, index: Array, *, size: int, empty: int) -> Array:
 
 
 def scatter_min(values: Array, index: Array, *, shape: tuple[int, ...]) -> Array:
-    """Return cells of a shape, each the least of the floats sent to its flat index, or inf."""
+    """Return cells with the smallest of the values that ``index`` sends to each, or inf."""
     xp = array_namespace(values, index)
     cells = xp.full((math.prod(shape),), math.inf, dtype=values.dtype, device=device(values))
     values, index = xp.reshape(values, (-1,)), xp.reshape(index, (-1,))

@@ -31,12 +31,12 @@ class Intrinsics:
     height_px: int
 
     def __post_init__(self) -> None:
-        """Refuse a camera that sees nothing."""
+        """Refuse values out of range."""
         for name in ("width_px", "height_px"):
             if getattr(self, name) < 1:
                 raise GeometryError(
                     f"{name} must be at least 1, got {getattr(self, name)!r}: "
-                    "ask for an image of one pixel or more."
+                    "choose a size of one pixel or more."
                 )
         for name in ("fx_px", "fy_px"):
             require_positive(getattr(self, name), name=name)
@@ -56,11 +56,11 @@ class Intrinsics:
         size_px: tuple[int, int],
         principal_point_px: tuple[float, float] | None = None,
     ) -> "Intrinsics":
-        """Return the intrinsics of a lens in front of a film.
+        """Return the intrinsics of a lens in front of a sensor.
 
         Args:
             focal_mm: Focal length in mm.
-            sensor_mm: (width, height) of the film in mm.
+            sensor_mm: (width, height) of the sensor in mm.
             size_px: (width, height) of the image in pixels.
             principal_point_px: (x, y) in pixels of the image; None is the image's centre.
 
@@ -89,8 +89,8 @@ class Intrinsics:
     def resized(self, *, width_px: int, height_px: int) -> "Intrinsics":
         """Return the intrinsics of the image stretched to exactly this size.
 
-        Disparity in the resized image is the old one times ``width_px / self.width_px``,
-        whatever the height does.
+        Disparity in the resized image is the old one times ``width_px / self.width_px``, for any
+        height.
         """
         sx, sy = width_px / self.width_px, height_px / self.height_px
         return replace(
@@ -119,7 +119,7 @@ class Intrinsics:
     def flipped(self) -> "Intrinsics":
         """Return the intrinsics of the image mirrored left to right: cx becomes width - cx.
 
-        Of a stereo pair the views swap too: the mirrored right view is the new left one.
+        The views of a stereo pair swap too: the mirrored right view becomes the left one.
         """
         return replace(self, cx_px=self.width_px - self.cx_px)
 
@@ -131,7 +131,7 @@ class Intrinsics:
 
 
 def rig_intrinsics(rig: Rig) -> Intrinsics:
-    """Return the intrinsics that all six cameras of a rig share, at the recorded image size."""
+    """Return the intrinsics of all six cameras of a rig, at the recorded image size."""
     return Intrinsics.from_mm(
         focal_mm=rig.focal_mm,
         sensor_mm=(rig.sensor_width_mm, rig.sensor_height_mm),
@@ -145,12 +145,12 @@ def require_positive(value: float, *, name: str) -> None:
     if not (math.isfinite(value) and value > 0):
         raise GeometryError(
             f"{name} must be a positive finite number, got {value!r}: "
-            "correct it where the camera is recorded or given."
+            "correct it in the metadata or in the call."
         )
 
 
 def require_size(shape: tuple[int, ...], intrinsics: Intrinsics, *, name: str) -> None:
-    """Raise GeometryError unless a map (..., h, w) has the size that the intrinsics are for."""
+    """Raise GeometryError unless a map (..., h, w) has the image size of the intrinsics."""
     height_px, width_px = shape[-2:]
     if (height_px, width_px) != (intrinsics.height_px, intrinsics.width_px):
         raise GeometryError(

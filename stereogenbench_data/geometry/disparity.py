@@ -1,10 +1,10 @@
-"""Depth to disparity and back, and what the rounding of stored depth does to disparity.
+"""Depth to disparity and back, and the error of disparity due to the rounding of stored depth.
 
 A point at depth z along the optical axis moves by d = u_source - u_target = B fx / z pixels
 between two rectified cameras. B, the baseline in metres, is positive for a target to the right
 of the source and negative for one to the left; d takes its sign. Pixels are those of the image
-that focal_px is for. In a depth map inf is sky and 0 is "not measured" (so are nan and negative
-values); the disparity of all of these is 0, so a map goes with the mask of what was measured.
+that focal_px is for. In a depth map inf is sky; 0, nan and negative values are "not measured". The
+disparity of all of these is 0, so a disparity map needs the mask of measured pixels beside it.
 """
 
 import math
@@ -20,11 +20,11 @@ from stereogenbench_data.geometry.camera import Intrinsics, require_positive, re
 from stereogenbench_data.schema.records import DepthForm
 
 _EXACT_FACTORS: Final = np.arange(128.0, 256.0)
-"""Whole numbers whose product with a 16-bit number is exact in float32's 24 bits. Smaller ones
-are these over a power of two, which rounds alike."""
+"""Whole numbers whose product with a 16-bit number is exact in the 24 bits of float32. Smaller ones
+are these divided by a power of two, and round in the same way."""
 
 _BLOCK_PIXELS: Final = 64 * 1280
-"""Pixels of which the numbers of one step stay in a processor's cache for the next."""
+"""The number of pixels whose values stay in a processor's cache from one step to the next."""
 
 _NEARLY_EXACT: Final = 2.0**-29
 """A relative error that is at most 1/32 ulp of a float32."""
@@ -64,8 +64,8 @@ def depth_from_disparity(
 ) -> Float[Any, "*batch h w"]:
     """Return depth along the optical axis in metres, in the disparity's dtype.
 
-    0 ("not measured") where disparity is 0, nan, or of the sign that the baseline rules out:
-    disparity 0 does not tell sky from what was not measured.
+    Depth is 0 ("not measured") where disparity is 0, nan, or of the sign opposite to the
+    baseline's. Disparity 0 does not distinguish sky from pixels that were not measured.
 
     Raises:
         GeometryError: If focal_px is not positive and finite, or baseline_m is 0 or not finite.
@@ -88,17 +88,17 @@ def disparity_from_units(
     unit_m: float,
     form: DepthForm = "depth",
 ) -> Float32[Any, "*batch h w"]:
-    """Return the disparity in pixels of stored 16-bit depth, without a depth map in between.
+    """Return the disparity in pixels of stored 16-bit depth, without an intermediate depth map.
 
     The result is within 0.55 ulp of the float64 one, at float32's speed: B fx / unit_m is
-    multiplied by the j of 128 to 255 that brings the product nearest to a float32, and units * j
-    is exact. For the few numbers that no j brings near enough it is computed in float64.
+    multiplied by the j in 128..255 that brings the product nearest to a float32, and units * j
+    is exact. If no j brings it near enough, the result is computed in float64.
 
     Args:
         units: Stored numbers below 2 ** 16, as decoded.
         focal_px: Horizontal focal length in pixels of this image.
         baseline_m: Signed baseline in metres, positive for a target to the right.
-        unit_m: Metres in one stored unit; with ``form="inverse"``, the depth that 1 stands for.
+        unit_m: Metres in one stored unit; with ``form="inverse"``, the depth of the number 1.
         form: Whether a stored number is proportional to depth or to its inverse.
 
     Returns:
@@ -134,42 +134,43 @@ def write_disparity(
     shift_units: float,
     form: DepthForm = "depth",
 ) -> None:
-    """Write what `disparity_from_units` returns, and 0 where depth was not measured, into an array.
+    """Write the result of `disparity_from_units` into an array, and 0 where depth was not measured.
 
-    A few rows at a time, which stay in the processor's cache from the first step to the last, so
-    that no step makes a map of its own.
+    It works on a few rows at a time, which stay in the processor's cache through all steps, so that
+    no step allocates a map.
 
     Args:
-        out: Where to write, in pixels.
+        out: The array to write disparity in pixels to.
         units: Stored numbers.
-        measured: Where depth was measured: nowhere where the stored number is 0, if ``form`` is
-            "depth".
-        shift_units: Focal length in pixels times signed baseline, by metres in a stored unit.
+        measured: Where depth was measured; with ``form="depth"`` it must be False where the stored
+            number is 0.
+        shift_units: Focal length in pixels times signed baseline, divided by metres in a stored
+            unit.
         form: Whether a stored number is proportional to depth or to its inverse.
     """
     product, factor, dtype = _exact_quotient(shift_units)
     dtype = "float64" if form == "inverse" else dtype
     rows = max(1, _BLOCK_PIXELS // max(1, out.shape[-1]))
-    room = np.empty((rows, out.shape[-1]), dtype=np.float64) if dtype == "float64" else None
+    scratch = np.empty((rows, out.shape[-1]), dtype=np.float64) if dtype == "float64" else None
     blocks = [slice(top, top + rows) for top in range(0, out.shape[-2], rows)]
     with np.errstate(divide="ignore"):
         for here in ((*place, block) for place in np.ndindex(out.shape[:-2]) for block in blocks):
             found, known = out[here], measured[here]
-            work = found if room is None else room[: len(found)]
+            work = found if scratch is None else scratch[: len(found)]
             np.copyto(work, units[here])
             if form == "inverse":
                 np.multiply(work, shift_units, out=work)
             else:
                 np.multiply(work, work.dtype.type(factor), out=work)
                 np.divide(work.dtype.type(product), work, out=work)
-            if room is not None:
+            if scratch is not None:
                 np.copyto(found, work, casting="same_kind")
             if not known.all():
                 np.copyto(found, 0, where=~known)
 
 
 def _exact_quotient(shift_units: float) -> tuple[float, float, Literal["float32", "float64"]]:
-    """Return product, factor and dtype: shift / units is product / (units * factor) in it."""
+    """Return product, factor and dtype with shift / units = product / (units * factor)."""
     products = shift_units * _EXACT_FACTORS
     misses = np.abs(products.astype(np.float32) / products - 1.0)
     best = misses.argmin()
@@ -181,11 +182,11 @@ def _exact_quotient(shift_units: float) -> tuple[float, float, Literal["float32"
 def disparity_error_px(
     depth_m: Float[Any, "*batch h w"], *, focal_px: float, baseline_m: float, quantum_m: float
 ) -> Float[Any, "*batch h w"]:
-    """Return how far disparity can be from the truth because depth was stored in steps.
+    """Return the largest error of disparity due to the steps in which depth is stored.
 
     True depth lies within half a step of the stored one, so disparity is off by at most
     |d| (q / 2) / (z - q / 2). The bound also covers the rounding of depth and disparity to
-    the map's dtype (2 eps of |d|), which shows where steps are fine and things far.
+    the map's dtype (2 eps of |d|), which matters where steps are fine and depth is large.
 
     Args:
         depth_m: Stored depth along the optical axis, in metres.
@@ -195,11 +196,11 @@ def disparity_error_px(
 
     Returns:
         The bound in pixels, never negative, in the depth's dtype: inf where depth is half a
-        step or less (the truth may be arbitrarily near), 0 where disparity is 0 because of sky
-        or because nothing was measured.
+        step or less (the true depth may be arbitrarily small), 0 for sky and where depth was
+        not measured.
 
     Raises:
-        GeometryError: If a number is out of its range.
+        GeometryError: If a number is out of range.
 
     >>> depth_m = np.array([[10.0, np.inf, 0.0]])
     >>> error_px = disparity_error_px(depth_m, focal_px=800.0, baseline_m=0.1, quantum_m=0.1)
@@ -225,10 +226,10 @@ def disparity_error_px(
 def planar_from_ray(
     ray_m: Float[Any, "*batch h w"], intrinsics: Intrinsics
 ) -> Float[Any, "*batch h w"]:
-    """Return depth along the optical axis of distances from the camera's centre, both in metres.
+    """Return depth along the optical axis from distances to the camera's centre, both in metres.
 
     Raises:
-        GeometryError: If the map is not of the size that the intrinsics are for.
+        GeometryError: If the map does not have the image size of the intrinsics.
 
     Source: Roberts et al., Hypersim, 2021, whose depth_meters is the length of the ray.
     """
@@ -238,10 +239,10 @@ def planar_from_ray(
 def ray_from_planar(
     depth_m: Float[Any, "*batch h w"], intrinsics: Intrinsics
 ) -> Float[Any, "*batch h w"]:
-    """Return distances from the camera's centre of depth along the optical axis, in metres.
+    """Return distances to the camera's centre from depth along the optical axis, both in metres.
 
     Raises:
-        GeometryError: If the map is not of the size that the intrinsics are for.
+        GeometryError: If the map does not have the image size of the intrinsics.
     """
     return depth_m * _ray_per_planar(depth_m, intrinsics)
 

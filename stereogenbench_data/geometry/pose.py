@@ -2,8 +2,8 @@
 
 Unreal axes (as recorded): x forward, y right, z up, left-handed. OpenCV axes (everywhere else):
 x right, y down, z forward, right-handed. A matrix ``a_from_b`` takes points in b's axes to a's.
-All is float64, and centres are subtracted before they are scaled or rotated: at 1e6 cm from the
-world's origin a float32 centre is off by 0.06 cm.
+Everything is float64, and centres are subtracted before they are scaled or rotated: at 1e6 cm from
+the world's origin, a float32 centre is off by 0.06 cm.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.schema.records import Trajectory
 
 OPENCV_FROM_UNREAL: Final = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-"""A mirror (determinant -1), so a rotation must be changed on both sides: S R S^T."""
+"""A mirror (determinant -1), so a rotation R becomes S R S^T."""
 
 
 def rotation_from_rotator_deg(
@@ -26,7 +26,7 @@ def rotation_from_rotator_deg(
 
     The columns are the camera's forward, right and up axes in the world. Positive yaw turns
     right, positive pitch looks up, positive roll tilts clockwise: Rz(yaw) Ry(-pitch) Rx(-roll).
-    The map is exact at pitch +-90 degrees too, where only its inverse is not unique.
+    The result is exact at pitch +-90 degrees too; only the inverse is not unique there.
 
     Source: Unreal Engine, FRotationMatrix.
     """
@@ -49,9 +49,9 @@ def rotation_from_rotator_deg(
 def rotation_from_quaternion_xyzw(
     quaternion_xyzw: Float64[np.ndarray, "*batch 4"],
 ) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Return the rotations of quaternions x, y, z, w, in the axes that the quaternions are in.
+    """Return the rotations of quaternions x, y, z, w, in the same axes.
 
-    Quaternions are normalised: a length that is off by 1e-3 would bend angles by as much.
+    Quaternions are normalised: a length that is off by 1e-3 would distort angles by as much.
 
     Raises:
         GeometryError: If a quaternion has no direction (length 0 or not finite).
@@ -77,10 +77,10 @@ def rotation_from_quaternion_xyzw(
 def nearest_rotation(
     matrices: Float64[np.ndarray, "*batch 3 3"],
 ) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Return the rotations nearest to recorded matrices, which rounding has bent a little.
+    """Return the rotations nearest to recorded matrices, which are not exact due to rounding.
 
     Raises:
-        GeometryError: If a matrix is nearest to a reflection.
+        GeometryError: If the nearest orthogonal matrix is a reflection.
 
     Source: Kabsch; the orthogonal Procrustes problem, solved by the SVD.
     """
@@ -104,14 +104,14 @@ def invert_rigid(a_from_b: Float64[np.ndarray, "*batch 4 4"]) -> Float64[np.ndar
 def rotation_angle_rad(
     first: Float64[np.ndarray, "*batch 3 3"], second: Float64[np.ndarray, "*batch 3 3"]
 ) -> Float64[np.ndarray, "*batch"]:
-    """Return the angle between rotations in radians, exact for the smallest ones too."""
+    """Return the angle between rotations in radians, accurate for very small angles too."""
     chord = np.linalg.norm(first - second, axis=(-2, -1)) / np.sqrt(8.0)
     return np.asarray(2 * np.arcsin(np.minimum(chord, 1.0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPoses:
-    """Where six cameras stand over the frames of a scene.
+    """The poses of six cameras over the frames of a scene.
 
     Attributes:
         centres: (frames, 6, 3) float64, in the recorded unit and Unreal world axes.
@@ -126,10 +126,10 @@ class CameraPoses:
 
     @classmethod
     def from_trajectory(cls, trajectory: Trajectory) -> "CameraPoses":
-        """Return the poses that a trajectory records, in any of its rotation representations.
+        """Return the poses of a trajectory in any of its rotation representations.
 
         Raises:
-            GeometryError: If a recorded rotation is a reflection or a quaternion of no length.
+            GeometryError: If a recorded rotation is a reflection or a quaternion of length 0.
         """
         convert = {
             "rotator_deg": rotation_from_rotator_deg,
@@ -149,7 +149,7 @@ class CameraPoses:
         return len(self.centres)
 
     def cam_from_cam(self, frame: int, *, target: int, source: int) -> Float64[np.ndarray, "4 4"]:
-        """Return the motion from one camera's axes to another's in the same frame, in metres."""
+        """Return the transform from one camera's axes to another's in one frame, in metres."""
         target_from_world = self.world_from_cam_rotations[frame, target].T
         step = OPENCV_FROM_UNREAL @ (self.centres[frame, source] - self.centres[frame, target])
         return _rigid(

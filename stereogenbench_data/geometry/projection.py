@@ -24,10 +24,10 @@ from stereogenbench_data.geometry.camera import Intrinsics, require_size
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Projection:
-    """Where each source pixel's point lands in the target image, and how deep it is there.
+    """The position in the target image, and the depth there, of each source pixel's point.
 
     Attributes:
-        u_px: Column coordinate in the target image; nan where the point has none.
+        u_px: Column coordinate in the target image; nan where the point does not project.
         v_px: Row coordinate, or None where rows do not change (a rectified pair).
         depth_m: Depth along the target's optical axis, in metres.
     """
@@ -38,14 +38,14 @@ class Projection:
 
 
 _BLOCK_PIXELS: Final = 64 * 1280
-"""Pixels, of all images of a batch, whose maps stay in a processor's cache between steps."""
+"""The number of pixels of a batch whose maps stay in a processor's cache between steps."""
 
 
 def row_blocks(projection: Projection, *, height_px: int) -> list[slice]:
-    """Return the rows of a projection in blocks that can be worked on one after another.
+    """Return the rows of a projection in blocks that can be processed one after another.
 
-    Several where rows do not change, the target has as many, and the maps are numpy's; else one.
-    What is worked out of each block for itself is the same, and up to twice as fast.
+    There are several blocks if rows do not change, the target has as many rows, and the maps are
+    numpy arrays; else there is one. Results are the same, and up to twice as fast.
     """
     *images, rows, columns = projection.u_px.shape
     apart = is_numpy_array(projection.u_px) and projection.v_px is None and rows == height_px
@@ -77,17 +77,17 @@ def project_through_poses(
 ) -> Projection:
     """Return the projection into any target: K_t (R K_s^-1 (u, v, 1) z + t).
 
-    Computed in float64 and returned in the depth's dtype. u and v are nan where the point is on
-    or behind the target's plane, or where depth is nan or inf.
+    The result is computed in float64 and has the depth's dtype. u and v are nan where the point is
+    on or behind the target's plane, or where depth is nan or inf.
 
     Args:
         depth_m: Source depth along the optical axis, in metres.
-        intrinsics: Of the source image, whose size the map has.
-        target_intrinsics: Of the target image.
+        intrinsics: Intrinsics of the source image, which has the size of the map.
+        target_intrinsics: Intrinsics of the target image.
         target_from_source: Rigid motion from source to target camera axes, in metres.
 
     Raises:
-        GeometryError: If the map is not of the size that the intrinsics are for.
+        GeometryError: If the map does not have the image size of the intrinsics.
 
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., ch. 6.
     """
@@ -137,8 +137,8 @@ def landing_pixels(
 ) -> tuple[Bool[Any, "*batch h w"], Int64[Any, "*batch h w"]]:
     """Return which source pixels land inside a target image, and on which of its pixels.
 
-    The pixel is an index into target maps (..., height_px, width_px) laid out flat; of a
-    source pixel that lands outside it is some pixel that means nothing.
+    The pixel is an index into flattened target maps (..., height_px, width_px). For a source pixel
+    that lands outside, it is an arbitrary valid index.
 
     Raises:
         GeometryError: If rows do not change but the two images differ in height.
@@ -156,7 +156,7 @@ def landing_pixels(
 def image_starts(
     projection: Projection, *, height_px: int, width_px: int
 ) -> Int64[Any, "*batch 1 1"]:
-    """Return where each target map of a batch starts in the flat layout."""
+    """Return the flat index of the first pixel of each target map of a batch."""
     batch = projection.u_px.shape[:-2]
     return leading_offsets((*batch, 1, 1), step=height_px * width_px, like=projection.u_px)
 
@@ -164,6 +164,6 @@ def image_starts(
 def row_starts(
     projection: Projection, *, height_px: int, width_px: int
 ) -> Int64[Any, "*batch h 1"]:
-    """Return where each row of each target map of a batch starts in the flat layout."""
+    """Return the flat index of the first pixel of each row of each target map of a batch."""
     batch = projection.u_px.shape[:-2]
     return leading_offsets((*batch, height_px, 1), step=width_px, like=projection.u_px)

@@ -1,8 +1,8 @@
-"""How far a lateral rig's recorded poses are from the rectified rig that the closed form assumes.
+"""The deviation of a lateral rig's recorded poses from the rectified rig of the closed form.
 
 Camera axes are x right, y down, z forward, in metres; pixels as in `camera`. In a rectified rig
-all cameras look the same way and stand on camera 0's x axis, so that a point at depth z moves
-from u to u - B fx / z, and no row changes.
+all cameras have the same orientation and lie on camera 0's x axis. So a point at depth z moves from
+u to u - B fx / z, and no row changes.
 """
 
 import itertools
@@ -19,9 +19,9 @@ _LEFT, _RIGHT = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
 
 
 def lateral_offsets_m(poses: CameraPoses) -> Float64[np.ndarray, "6"]:
-    """Return how far each camera stands to the right of camera 0 in frame 0, in metres.
+    """Return the distance of each camera to the right of camera 0 in frame 0, in metres.
 
-    The signed baseline of a pair is the target's offset less the source's.
+    The signed baseline of a pair is the target's offset minus the source's.
     """
     right_axis = poses.world_from_cam_rotations[0, 0, :, 0]
     steps = (poses.centres[0] - poses.centres[0, 0]) @ OPENCV_FROM_UNREAL.T
@@ -31,7 +31,7 @@ def lateral_offsets_m(poses: CameraPoses) -> Float64[np.ndarray, "6"]:
 def baseline_deviation_cm(poses: CameraPoses, rig: Rig) -> float:
     """Return the largest difference between a recorded baseline and the poses' distance, in cm.
 
-    Over all 15 pairs and all frames.
+    The maximum is over all 15 pairs and all frames.
     """
     steps = poses.centres[:, _RIGHT] - poses.centres[:, _LEFT]
     distances_cm = np.linalg.norm(steps, axis=-1) * (poses.unit_m * 100)
@@ -41,12 +41,12 @@ def baseline_deviation_cm(poses: CameraPoses, rig: Rig) -> float:
 def rectification_residual_px(poses: CameraPoses, intrinsics: Intrinsics) -> float:
     """Return the largest distance in pixels between the closed form and the pose chain.
 
-    Both take points of the left camera's image to the right camera's, for all frames and all 15
-    pairs: the image's four corners and its centre, each infinitely far and as near as matters,
-    which is 1 m or, for a wide pair, where disparity is the image's width. Wrong rotations show
-    at every depth, wrong places most at the nearest. The closed form is (u - B fx / z, v), with
-    B the difference of `lateral_offsets_m`: one number a pair, for all frames. The result is inf
-    where a point falls on or behind the right camera's plane.
+    Both map points of the left camera's image to the right camera's image, for all frames and all
+    15 pairs. The points are the image's four corners and its centre, each at infinity and at the
+    nearest relevant depth: 1 m or, for a wide pair, the depth where disparity is the image's width.
+    Rotation errors show at every depth, position errors mostly at the nearest. The closed form is
+    (u - B fx / z, v), where B is the difference of `lateral_offsets_m`, one number per pair for all
+    frames. The result is inf where a point lies on or behind the right camera's plane.
     """
     width_px, height_px = float(intrinsics.width_px), float(intrinsics.height_px)
     corners = itertools.product((0.0, width_px), (0.0, height_px))

@@ -1,8 +1,8 @@
-"""Which source pixels a target camera sees: inside its image, and not behind something else.
+"""Which source pixels a target camera sees: those inside its image that nothing occludes.
 
 Depth is along the optical axis in metres. Two depths agree where they differ by no more than
-``tolerance`` of the projected depth plus two quanta (the steps in which depth is stored), on
-either side: a point in front of what the target sees is as wrong as one behind it.
+``tolerance`` of the projected depth plus two quanta (the steps in which depth is stored), in
+either direction: a point in front of the target's depth is as inconsistent as one behind it.
 """
 
 import math
@@ -29,11 +29,11 @@ def visible_in_target(
     quantum_m: float | Float[Any, "*batch h w"],
     tolerance: float = 0.02,
 ) -> Bool[Any, "*batch h w"]:
-    """Return the source pixels that the target camera sees, judged by its own depth.
+    """Return the source pixels that the target camera sees, decided by the target's depth.
 
-    A pixel is visible if it was measured, lands inside the target image, and the depth that the
-    target measured at the pixel where it lands (the one that holds the point, not an average of
-    neighbours) agrees with its own.
+    A pixel is visible if it was measured, lands inside the target image, and its depth there agrees
+    with the depth that the target measured at the pixel that contains the point (not an average of
+    neighbours).
 
     Args:
         projection: Where source pixels land in the target.
@@ -41,8 +41,8 @@ def visible_in_target(
         target_depth_m: The target camera's depth in metres.
         target_measured: Where target depth was measured.
         quantum_m: The step in which depth is stored, in metres (the coarser of the two views);
-            one number, or a map of the source's pixels where the step varies with depth.
-        tolerance: Share of the depth by which the two may differ beside two quanta.
+            one number, or a map over source pixels if the step varies with depth.
+        tolerance: Fraction of the depth by which the two may differ, in addition to two quanta.
 
     Returns:
         True where visible.
@@ -51,7 +51,7 @@ def visible_in_target(
         GeometryError: If a rectified projection's rows are not the target's.
 
     Source: the StereoGenBench paper, appendix on the geometry audit, which compares projected
-    points with the target's depth buffer; the tolerance is ours.
+    points with the target's depth buffer; the tolerance is our choice.
     """
     blocks = row_blocks(projection, height_px=target_depth_m.shape[-2])
     if len(blocks) > 1:
@@ -82,20 +82,20 @@ def visible_from_source(
     quantum_m: float | Float[Any, "*batch h w"],
     tolerance: float = 0.02,
 ) -> Bool[Any, "*batch h w"]:
-    """Return the source pixels that nothing else in the source view hides from the target.
+    """Return the source pixels that nothing in the source view occludes from the target.
 
-    The same test as `visible_in_target` against a z-buffer of the source's own points, for where
-    the target's depth is not at hand. It does not know what stands outside the source view or
-    behind what the source sees, so it calls visible what the target may not see.
+    This is the test of `visible_in_target` with a z-buffer of the source's own points, for use
+    without the target's depth. It does not know about occluders outside the source view or behind
+    its surfaces, so some pixels that it calls visible are occluded.
 
     Args:
         projection: Where source pixels land in a target image of the same size.
         measured: Where source depth was measured.
         quantum_m: The step in which depth is stored, in metres.
-        tolerance: Share of the depth by which a point may be behind the nearest one.
+        tolerance: Fraction of the depth by which a point may be behind the nearest one.
 
     Returns:
-        True where nothing in the source view hides the pixel and it lands inside the image.
+        True where the pixel lands inside the image and nothing in the source view occludes it.
     """
     blocks = row_blocks(projection, height_px=projection.u_px.shape[-2])
     if len(blocks) > 1:
@@ -118,5 +118,5 @@ def visible_from_source(
 
 
 def _rows_of_step(quantum_m: Any, rows: slice) -> Any:
-    """Return the depth step of some rows, where it is a map."""
+    """Return the depth steps of some rows if they are a map, else the one step."""
     return quantum_m if isinstance(quantum_m, float) else quantum_m[..., rows, :]

@@ -1,4 +1,4 @@
-"""Warping: a source image splatted into the target view, or the target sampled from the source.
+"""Forward warping (splatting a source image into the target view) and backward warping.
 
 Pixel (u, v) is column, row; the centre of the top-left pixel is (0.5, 0.5). Images are
 channel-first, (..., c, h, w).
@@ -31,10 +31,10 @@ def front_pixels(
 ) -> tuple[Int64[Any, "*batch h w"], Bool[Any, "*batch h w"]]:
     """Return which source pixel is in front at each target pixel, and where none landed.
 
-    The target image has the source's size. The nearest point wins; of equally near ones that
-    with the larger index, so the result is the same on every device. One pass does both: the
-    bits of positive floats are ordered as the floats are, so (-bits, index) in one integer is
-    largest for the pixel in front.
+    The target image has the source's size. The nearest point wins, and among equally near points
+    the larger index, so the result is the same on every device. One pass does both: the bits of
+    positive floats have the order of the floats, so the integer (-bits, index) is largest for the
+    pixel in front.
 
     Returns:
         Flat indices into source maps (..., h, w), 0 where nothing landed; and the holes.
@@ -60,9 +60,10 @@ def splat(
     *,
     measured: Bool[Any, "*batch h w"],
 ) -> tuple[Shaped[Any, "*batch c h w"], Bool[Any, "*batch h w"]]:
-    """Return a source image as the target would see it, and where it has holes.
+    """Return a source image warped into the target view, and its holes.
 
-    Each measured source pixel paints the target pixel that holds its point; the nearest wins.
+    Each measured source pixel is written to the target pixel that contains its point; the nearest
+    point wins.
 
     Args:
         image: The source image, of any dtype.
@@ -89,10 +90,10 @@ def splat(
 def backward_warp(
     image: Shaped[Any, "*batch c target_h target_w"], projection: Projection
 ) -> tuple[Float[Any, "*batch c h w"], Bool[Any, "*batch h w"]]:
-    """Return the target image sampled where each source pixel lands, and what lands inside it.
+    """Return the target image sampled where each source pixel lands, and which pixels land inside.
 
-    Bilinear between pixel centres; in the outer half pixel of the border the outermost pixel.
-    What the sampled image shows at an occluded pixel is the occluder: mask with visibility.
+    Sampling is bilinear between pixel centres; in the outer half pixel of the border it takes the
+    outermost pixel. At an occluded pixel the result shows the occluder: mask it by visibility.
 
     Args:
         image: The target image, of any real dtype.
@@ -139,7 +140,7 @@ def backward_warp(
 def _neighbours(
     position_px: Float[Any, "*batch h w"], inside: Bool[Any, "*batch h w"], *, size_px: int
 ) -> tuple[Int64[Any, "*batch h w"], Int64[Any, "*batch h w"], Float[Any, "*batch 1 h w"]]:
-    """Return the pixels whose centres lie around a position, and how far it is to the second."""
+    """Return the two pixels around a position, and its distance from the first one's centre."""
     xp = array_namespace(position_px)
     position = xp.clip(xp.where(inside, position_px, 0.5) - 0.5, 0.0, size_px - 1.0)
     low = xp.floor(position)

@@ -32,9 +32,9 @@ from stereogenbench_data.index.scene_folder import (
 from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes, find_scene_folders
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.schema.release import TRAIN_MAPS, depth_name
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
 
 Progress = Callable[[int, int], None]

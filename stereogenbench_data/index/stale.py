@@ -15,8 +15,8 @@ from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.index.parquet import IndexHead
 from stereogenbench_data.index.tree import ListedTree
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import COMPLETE_JSON, VIDEO_FILES
+from stereogenbench_data.schema.text import counted
 
 _SHOWN: Final = 3
 _MOST: Final = 1000

@@ -1,8 +1,8 @@
-"""The typed, frozen records that the rest of the package works on.
+"""The typed, frozen records that the rest of the package uses.
 
-A record holds what a file says, with units in the names and nothing derived: poses stay in the
-world axes and the rotation representation in which they were recorded, so that relative poses
-can be formed before anything is rounded.
+A record contains the values of a file, with units in the names and nothing derived. Poses stay in
+the recorded world axes and rotation representation, so that relative poses can be computed before
+anything is rounded.
 """
 
 import math
@@ -31,9 +31,9 @@ DepthUnitSource = Literal["tag", "default", "unreadable"]
 
 @dataclass(frozen=True, slots=True)
 class SceneId:
-    """Where a scene stands in the release; ``key`` is its whole path, unique and stable.
+    """The identity of a scene. ``key`` is its whole path in the release, unique and stable.
 
-    ``subset`` is None for train, and for an eval folder whose name tells no subset.
+    ``subset`` is None for train, and for an eval folder whose name does not tell the subset.
     """
 
     key: str
@@ -45,11 +45,11 @@ class SceneId:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """Six equal pinhole cameras on a lateral rig, from ``baseline.json``.
+    """Six identical pinhole cameras on a lateral rig, from ``baseline.json``.
 
     ``principal_point_px`` is (x, y) in pixels of the recorded image, None for the image centre.
-    ``baselines_cm`` has one entry for each pair of `CAMERA_PAIRS`, in that order.
-    ``image_size_source`` is "default" where the file records no image size.
+    ``baselines_cm`` has one entry per pair of `CAMERA_PAIRS`, in that order.
+    ``image_size_source`` is "default" if the file records no image size.
     """
 
     focal_mm: float
@@ -70,7 +70,7 @@ class Rig:
 
 @dataclass(frozen=True, slots=True)
 class SceneLabels:
-    """The identifiers that ``baseline.json`` and ``_scene_complete.json`` record, where present."""
+    """The identifiers in ``baseline.json`` and ``_scene_complete.json``; None where absent."""
 
     scene_label: str | None = None
     scene_index: int | None = None
@@ -83,7 +83,7 @@ class SceneLabels:
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """A scene's machine-written description (not verified by people); absent texts are empty."""
+    """A scene's machine-written description, not verified by people; absent texts are empty."""
 
     short_caption: str = ""
     detailed_caption: str = ""
@@ -94,7 +94,7 @@ class Description:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
-    """The poses of six cameras over the frames of a scene, as ``trajectory.json`` records them.
+    """The poses of six cameras over the frames of a scene, as recorded in ``trajectory.json``.
 
     World axes are Unreal's: left-handed, x forward, y right, z up. A rotation takes camera axes
     (x forward, y right, z up) to world axes.
@@ -105,7 +105,7 @@ class Trajectory:
         rotations: (frames, 6, 3) pitch, yaw, roll in degrees; or (frames, 6, 4) unit
             quaternions x, y, z, w; or (frames, 6, 3, 3) matrices whose columns are the
             camera's forward, right and up axes in the world.
-        rotation_kind: Which of the three ``rotations`` is.
+        rotation_kind: Which of these three ``rotations`` has.
     """
 
     locations: Float64[np.ndarray, "frames 6 3"]
@@ -124,24 +124,24 @@ class DepthEncoding:
     """The depth contract: how a number stored in a depth video becomes metres.
 
     Attributes:
-        unit_m: Metres in one stored unit; None for what the file's own tag says, and where it
-            has none the release's default of 0.1 m. With ``form="inverse"``, the depth in metres
-            that the stored number 1 stands for: depth = unit_m / stored.
+        unit_m: Metres in one stored unit. None means the file's own tag, or the release's default
+            of 0.1 m if it has no tag. With ``form="inverse"``, the depth in metres of the stored
+            number 1: depth = unit_m / stored.
         kind: "planar" is depth along the optical axis (z); "ray" is the distance from the
             camera's centre, turned into z by the intrinsics.
         form: "depth" or "inverse".
-        frame_lag: A whole number: RGB frame t shows what depth frame t + frame_lag measured.
-            Where that frame does not exist, depth counts as not measured.
+        frame_lag: A whole number: depth frame t + frame_lag belongs to RGB frame t. Where that
+            frame does not exist, depth counts as not measured.
         no_depth: Stored numbers that mean "not measured"; "max" is the pixel format's largest.
-        accept: Streams that are refused unless named here: of fewer than 16 bits ("8-bit",
-            "9-bit", "10-bit", "12-bit", "14-bit"), "lossy" (a codec that does not return what it
-            was given) or "chroma" (only the luma plane is read).
-        source: Where ``unit_m`` comes from: a tag of the file, the release's default, the user.
+        accept: Kinds of streams that are refused unless listed here: fewer than 16 bits ("8-bit",
+            "9-bit", "10-bit", "12-bit", "14-bit"), "lossy" (a lossy codec) or "chroma" (only the
+            luma plane is read).
+        source: The origin of ``unit_m``: a tag of the file, the release's default, or the user.
 
     Raises:
-        SchemaError: If a value is out of its range.
+        SchemaError: If a value is out of range.
 
-    Source: the paper's appendix on the file schema; a missing tag means 0.1 m a unit.
+    Source: the paper's appendix on the file schema; without a tag, a unit is 0.1 m.
     """
 
     unit_m: float | None = None
@@ -153,7 +153,7 @@ class DepthEncoding:
     source: Literal["tag", "default", "user"] = "user"
 
     def __post_init__(self) -> None:
-        """Refuse a contract that no stream can follow."""
+        """Refuse values out of range."""
         if self.unit_m is not None and not _is_positive(self.unit_m):
             raise SchemaError(f"unit_m must be a positive number of metres, got {self.unit_m!r}.")
         for name, numbers in (
@@ -161,7 +161,9 @@ class DepthEncoding:
             ("no_depth", [number for number in self.no_depth if number != "max"]),
         ):
             if not all(type(number) is int for number in numbers):
-                raise SchemaError(f"{name} must be of whole numbers, got {getattr(self, name)!r}.")
+                raise SchemaError(
+                    f"{name} must contain whole numbers, got {getattr(self, name)!r}."
+                )
         for name, value, choices in (
             ("kind", self.kind, ("planar", "ray")),
             ("form", self.form, ("depth", "inverse")),
@@ -177,19 +179,19 @@ class DepthEncoding:
         """Metres in one stored unit.
 
         Raises:
-            SchemaError: If that waits for the file's tag.
+            SchemaError: If ``unit_m`` is None, so that the file's tag decides.
         """
         if self.unit_m is None:
             raise SchemaError(
-                "a depth contract without unit_m means the file's own: resolve it with "
-                "`resolve_encoding`, or give unit_m."
+                "unit_m is None, so the unit depends on the file: resolve it with "
+                "`resolve_encoding`, or set unit_m."
             )
         return self.unit_m
 
     def with_file_unit(
         self, unit_m: float, *, source: Literal["tag", "default"]
     ) -> "DepthEncoding":
-        """Return the contract with the file's unit, unless it states its own."""
+        """Return the encoding with the file's unit, unless it has its own."""
         return self if self.unit_m is not None else replace(self, unit_m=unit_m, source=source)
 
 
@@ -199,11 +201,11 @@ def _is_positive(number: object) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """Where the bytes of one of a scene's files lie: ``size`` bytes from ``offset`` of ``path``.
+    """The place of one of a scene's files: ``size`` bytes from ``offset`` of ``path``.
 
-    ``path`` is relative to the data's root, with forward slashes. Of a released folder each file
-    is its own path at offset 0; of a shard all members share the path. ``crc32`` is zlib's of the
-    bytes, known for what was packed; None for released folders.
+    ``path`` is relative to the data's root, with forward slashes. In a released folder each file
+    has its own path and offset 0; in a shard all members have the shard's path. ``crc32`` is zlib's
+    checksum of the bytes, known for packed files; None for released folders.
     """
 
     path: str
@@ -214,7 +216,7 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class ShardFacts:
-    """What an index knows of a shard: its size in bytes, sha256 in hex, and number of members."""
+    """A shard in an index: its size in bytes, its sha256 in hex, its number of members."""
 
     size: int
     sha256: str
@@ -223,22 +225,22 @@ class ShardFacts:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """One row of the index: all that a sample needs to know before a video is opened.
+    """One row of the index: everything that is needed before a video is opened.
 
     Attributes:
-        lateral_m: How far each camera stands to the right of camera 0, in metres along camera
-            0's x axis, from the poses; None where the index was made without them.
+        lateral_m: The distance of each camera to the right of camera 0, in metres along camera
+            0's x axis, from the poses.
         rig_residual_px: The largest distance between the closed form of a rectified rig and
             the pose chain, in pixels of the recorded image.
-        depth_unit_m: Metres in a stored unit for each camera's depth, as tagged or by default.
-        depth_unit_source: "tag", "default", or "unreadable" (contradictory tags, unit nan), for
-            each camera.
-        depth_codec: FFmpeg's name of the codec of each camera's depth, or "blosc2" for depth that
-            was packed so.
+        depth_unit_m: Metres in a stored unit of each camera's depth, from its tag or the default.
+        depth_unit_source: "tag", "default", or "unreadable" (contradictory tags, unit nan), per
+            camera.
+        depth_codec: FFmpeg's name of the codec of each camera's depth, or "blosc2" for depth
+            packed by blosc2.
         depth_pixel_format: FFmpeg's name of the pixel format of each camera's depth.
-        frames: Frames that every video and the trajectory have.
-        members: File name to the place of its bytes; depth that was packed by blosc2 stands under
-            its own name, which `held_name` tells.
+        frames: The number of frames in every video and in the trajectory.
+        members: File name to the place of its bytes. Depth packed by blosc2 has a name of its own,
+            which `held_name` returns.
     """
 
     id: SceneId
@@ -257,25 +259,25 @@ class Scene:
     members: Mapping[str, Member] = field(hash=False)
 
     def held_name(self, name: str) -> str:
-        """Return by what name ``members`` has one of the release's files: depth may be packed."""
+        """Return the name in ``members`` of one of the release's files: depth may be packed."""
         return name if name in self.members else PACKED_DEPTH_NAMES.get(name, name)
 
     def member(self, name: str) -> Member:
-        """Return where one of the release's files lies.
+        """Return the place of one of the release's files.
 
         Raises:
-            StorageError: If the index does not have it: a download may hold some cameras alone.
+            StorageError: If the index lacks it: a download may contain only some cameras.
         """
         found = self.members.get(self.held_name(name))
         if found is None:
             there = ", ".join(self.held_videos) or "no video"
             raise StorageError(
-                f"{self.id.key}: {name} is not among its files; there are {there}. Ask for these, "
+                f"{self.id.key}: {name} is not in the data; the scene has {there}. Select these "
                 "or download the others too."
             )
         return found
 
     @property
     def held_videos(self) -> tuple[str, ...]:
-        """The names in ``members`` of the files of colour and depth that there are."""
+        """The names in ``members`` of the videos and packed depth files that the data have."""
         return tuple(name for name in map(self.held_name, VIDEO_FILES) if name in self.members)

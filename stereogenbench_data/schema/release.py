@@ -1,4 +1,4 @@
-"""What the release fixes by name: cameras, files, folders, families, maps, baseline bins.
+"""The fixed names and numbers of the release: cameras, files, folders, families, maps, bins.
 
 Source: the StereoGenBench paper, section 3 and its appendices on the file schema, the per-map
 counts and the baseline bins.
@@ -15,7 +15,7 @@ CAMERA_COUNT: Final = 6
 CAMERA_PAIRS: Final[tuple[tuple[int, int], ...]] = tuple(
     itertools.combinations(range(CAMERA_COUNT), 2)
 )
-"""The 15 pairs (left, right), left < right, in the order in which baselines are kept."""
+"""The 15 pairs (left, right) with left < right, in the order of all lists of baselines."""
 
 ADJACENT_PAIRS: Final = tuple((left, left + 1) for left in range(CAMERA_COUNT - 1))
 
@@ -81,9 +81,9 @@ BASELINE_BINS: Final[dict[str, tuple[float, float]]] = {
     "[100,150]": (100.0, 150.0),
     "(150,inf)": (150.0, INFINITY),
 }
-"""Baseline bins in cm. The five in the middle are the paper's; the outer two hold what it leaves
-out (all pairs of a Pairwise_Uniform rig reach 200 cm, of a Uniform rig 750 cm). Half-open, but for
-150 cm itself, which is the last value of the paper's last bin."""
+"""Baseline bins in cm. The five in the middle are the paper's. The outer two are for the baselines
+beyond them: all pairs of a Pairwise_Uniform rig reach 200 cm, those of a Uniform rig 750 cm. Bins
+are half-open, except that 150 cm belongs to the paper's last bin."""
 
 
 def rgb_name(camera: int) -> str:
@@ -102,11 +102,11 @@ VIDEO_FILES: Final = tuple(
 PACKED_DEPTH_NAMES: Final = {
     depth_name(camera): f"cam_{camera:02d}_depth.b2frame" for camera in range(CAMERA_COUNT)
 }
-"""What a camera's depth is called in shards where blosc2 packed it, by its released name."""
+"""Released name of a camera's depth to its name in shards where blosc2 packed it."""
 
 
 def baseline_bin(baseline_cm: float) -> str:
-    """Return the name of the bin that holds a baseline in cm.
+    """Return the name of the bin of a baseline in cm.
 
     >>> baseline_bin(9.99), baseline_bin(10.0), baseline_bin(150.0), baseline_bin(150.1)
     ('[1,10)', '[10,30)', '[100,150]', '(150,inf)')
@@ -117,7 +117,7 @@ def baseline_bin(baseline_cm: float) -> str:
 
 
 def subset_of_folder(folder: str) -> Subset | None:
-    """Return the subset that a folder under ``eval/`` names, None where it names none."""
+    """Return the subset of a folder under ``eval/``, None if its name does not tell."""
     if folder == SEEN_MAP_FOLDER:
         return "seen_map"
     return "unseen_map" if _UNSEEN_MAP_FOLDER.search(folder) else None

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int64
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 
 Range = tuple[float, float]
 

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float64, Int8, Int64
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     BASELINE_BINS,
@@ -18,6 +17,7 @@ from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
     baseline_bin,
 )
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import Range, require_range
 
 PairsSpec = Literal["primary", "adjacent", "all", "sweep"] | Sequence[tuple[int, int]]

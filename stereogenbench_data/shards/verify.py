@@ -14,7 +14,7 @@ from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.stale import StaleIndexWarning
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.problems import counted
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.companion_files import foreign_indexes
 from stereogenbench_data.shards.verify_decode import (
     Problem,

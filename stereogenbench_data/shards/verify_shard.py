@@ -10,9 +10,9 @@ from typing import Final
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.index.scene_folder import metadata_differences
-from stereogenbench_data.schema.problems import counted
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import METADATA_FILES
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.tar import TarMember, read_checksums, read_members
 from stereogenbench_data.shards.verify_decode import Problem
 

@@ -1,4 +1,4 @@
-"""Scenes in the released layout, drawn without Unreal."""
+"""Synthetic scenes in the released layout, rendered without Unreal."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ __all__ = ["ExportContract", "SynthRequest", "synthesise"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import what draws, and torch with it, when it is first used."""
+    """Import the renderer, and torch with it, on first use."""
     if name != "synthesise":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from stereogenbench_data.synthesis.produce import synthesise

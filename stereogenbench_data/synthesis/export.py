@@ -1,6 +1,6 @@
-"""A scene's metadata files, in the release's layout.
+"""The metadata files of a synthetic scene, in the release's layout.
 
-Source: the StereoGenBench paper's appendix on the file schema; names that it does not spell are
+Source: the StereoGenBench paper's appendix on the file schema. Keys that it does not spell are
 those of a scene in this layout that was rendered elsewhere.
 """
 
@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float64
 
+from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     BASELINE_JSON,
@@ -20,12 +21,11 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     TRAJECTORY_JSON,
 )
+from stereogenbench_data.synthesis.cameras import (
+    quaternion_from_rotator,
+)
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.request import ExportContract
-from stereogenbench_data.synthesis.trajectory import (
-    quaternion_from_rotator,
-    rotation_from_rotator,
-)
 
 _REPRESENTATIONS: Final = {
     "rotator": "unreal_rotator_degrees",
@@ -36,7 +36,7 @@ _REPRESENTATIONS: Final = {
 
 
 def completion_text(plan: ScenePlan) -> str:
-    """Return the completion marker; what it says of the request tells whose scene this is."""
+    """Return the completion marker. It records the request, so that a later run can compare it."""
     request = plan.request
     map_name = request.map_name
     marker = {
@@ -56,7 +56,7 @@ def completion_text(plan: ScenePlan) -> str:
 
 
 def metadata_texts(plan: ScenePlan) -> dict[str, str]:
-    """Return the text of every metadata file by name, the completion marker last."""
+    """Return the text of every metadata file by name, with the completion marker last."""
     description = _description(plan)
     return {
         BASELINE_JSON: _json(_baseline(plan)),
@@ -159,17 +159,17 @@ def _rotation(
     if contract.rotation == "rotator":
         return dict(zip(("pitch", "yaw", "roll"), rotator_deg.tolist(), strict=True))
     if contract.rotation == "matrix":
-        rows: list[list[float]] = rotation_from_rotator(rotator_deg).tolist()
+        rows: list[list[float]] = rotation_from_rotator_deg(rotator_deg).tolist()
         return rows
     x, y, z, w = quaternion_from_rotator(rotator_deg).tolist()
     return [x, y, z, w] if contract.rotation == "quaternion_xyzw" else [w, x, y, z]
 
 
 def _description(plan: ScenePlan) -> dict[str, Any]:
-    stage = plan.stage
-    walls, things = stage.fixed[0].material.texture, len(stage.fixed)
+    scene = plan.scene
+    walls, things = scene.static_shapes[0].material.texture, len(scene.static_shapes)
     detailed = (
-        f"A figure walks across a slanted ground of {stage.ground.texture}, among crates, balls "
+        f"A figure walks across a slanted ground of {scene.ground.texture}, among crates, balls "
         f"and thin poles ({things} things in all), before walls of {walls} under a cloudy sky."
     )
     return {
@@ -178,7 +178,7 @@ def _description(plan: ScenePlan) -> dict[str, Any]:
         "primary_elements": ["walking figure", "crates", "balls", "poles", "walls"],
         "spatial_layout": "a figure in the middle, things scattered before and behind it",
         "lighting_materials": "sunlight, matte procedural textures",
-        "short_caption": f"A figure walks over {stage.ground.texture}.",
+        "short_caption": f"A figure walks over {scene.ground.texture}.",
         "detailed_caption": detailed,
-        "tags": ["outdoor", "figure", stage.ground.texture, walls],
+        "tags": ["outdoor", "figure", scene.ground.texture, walls],
     }

@@ -1,4 +1,4 @@
-"""All that chance decides about a scene, and the cameras that follow from it."""
+"""The plan of a synthetic scene: all its random choices, and the cameras that follow from them."""
 
 import zlib
 from dataclasses import dataclass
@@ -7,21 +7,19 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
+from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import FRAME_RATE_HZ
-from stereogenbench_data.synthesis.casting import View
-from stereogenbench_data.synthesis.request import SynthRequest
-from stereogenbench_data.synthesis.rigs import (
+from stereogenbench_data.synthesis.cameras import (
     FOCAL_RANGE_MM,
-    draw_gaps_cm,
-    lateral_places_cm,
-)
-from stereogenbench_data.synthesis.stage import Lens, Stage, draw_stage
-from stereogenbench_data.synthesis.trajectory import (
     CameraPath,
-    draw_path,
+    lateral_places_cm,
+    random_gaps_cm,
+    random_path,
     rig_locations_cm,
-    rotation_from_rotator,
 )
+from stereogenbench_data.synthesis.ray_casting import View
+from stereogenbench_data.synthesis.request import SynthRequest
+from stereogenbench_data.synthesis.scene import Framing, SceneModel, random_scene
 
 _SUBJECT_M: Final = 1.75
 _SUBJECT_PART: Final = 0.62
@@ -31,12 +29,12 @@ _MIDDLE_S: Final = 2.6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScenePlan:
-    """One scene before it is drawn.
+    """One scene before it is rendered.
 
     Attributes:
-        places_cm: How far right of camera 0 each camera stands.
-        heading_deg: The stage's heading in the world.
-        offset_cm: The stage's origin in the world.
+        places_cm: The distance of each camera to the right of camera 0.
+        heading_deg: The scene's heading in the world.
+        offset_cm: The scene's origin in the world.
         character: Name of the subject.
     """
 
@@ -45,7 +43,7 @@ class ScenePlan:
     places_cm: Float64[np.ndarray, "6"]
     focal_mm: float
     path: CameraPath
-    stage: Stage
+    scene: SceneModel
     heading_deg: float
     offset_cm: Float64[np.ndarray, "3"]
     character: str
@@ -57,7 +55,7 @@ class ScenePlan:
 
     @property
     def label_number(self) -> int:
-        """The number in the scene's label, which is not that of its folder."""
+        """The number in the scene's label, which differs from that of its folder."""
         return _FIRST_LABEL + self.index
 
     @property
@@ -67,15 +65,15 @@ class ScenePlan:
 
     @property
     def focal_px(self) -> tuple[float, float]:
-        """Focal length along the picture's width and height."""
+        """Focal lengths along the picture's width and height."""
         width_px, height_px = self.request.picture_px
         sensor_mm = self.request.contract.sensor_mm
         return self.focal_mm / sensor_mm[0] * width_px, self.focal_mm / sensor_mm[1] * height_px
 
     def view(self, *, camera: int, frame: int) -> View:
-        """Return a camera on the stage; a frame may lie before the first or after the last."""
+        """Return a camera's view; the frame may lie before the first or after the last."""
         moment_s = self.moment_s(frame)
-        axes = rotation_from_rotator(self.path.rotator_deg(moment_s))
+        axes = rotation_from_rotator_deg(self.path.rotator_deg(moment_s))
         lateral_m = (self.places_cm[camera] - self.places_cm[-1] / 2) / 100
         width_px, height_px = self.request.picture_px
         return View(
@@ -87,7 +85,7 @@ class ScenePlan:
         )
 
     def moment_s(self, frame: int) -> float:
-        """Return when a frame is shown; the subject passes the stage's origin at 0."""
+        """Return the time of a frame; the subject passes the scene's origin at 0."""
         return frame / FRAME_RATE_HZ - _MIDDLE_S
 
     def world_rotator_deg(self, frame: int) -> Float64[np.ndarray, "3"]:
@@ -97,7 +95,7 @@ class ScenePlan:
 
     def world_locations_cm(self, frame: int) -> Float64[np.ndarray, "6 3"]:
         """Return the six camera centres in world axes."""
-        heading = rotation_from_rotator(np.array([0.0, self.heading_deg, 0.0]))
+        heading = rotation_from_rotator_deg(np.array([0.0, self.heading_deg, 0.0]))
         return rig_locations_cm(
             centre_cm=100 * heading @ self.path.centre_m(self.moment_s(frame)),
             rotator_deg=self.world_rotator_deg(frame),
@@ -107,13 +105,13 @@ class ScenePlan:
 
 
 def plan_scene(request: SynthRequest, *, index: int) -> ScenePlan:
-    """Draw a scene's rig, lens, path and stage from the request's seed, its folder and number."""
+    """Return the plan of a scene: random, from the request's seed and folder and the number."""
     seed = np.random.SeedSequence((request.seed, index, zlib.crc32(request.folder.encode())))
-    rig_rng, path_rng, stage_rng = (np.random.default_rng(child) for child in seed.spawn(3))
-    places_cm = lateral_places_cm(draw_gaps_cm(request.family, rng=rig_rng))
+    rig_rng, path_rng, scene_rng = (np.random.default_rng(child) for child in seed.spawn(3))
+    places_cm = lateral_places_cm(random_gaps_cm(request.family, rng=rig_rng))
     drawn_mm = float(rig_rng.uniform(*FOCAL_RANGE_MM))
     focal_mm = drawn_mm if request.focal_mm is None else request.focal_mm
-    lens = _lens(request, focal_mm=focal_mm, span_m=places_cm[-1] / 100)
+    framing = _framing(request, focal_mm=focal_mm, span_m=places_cm[-1] / 100)
     walk_m_s = float(path_rng.choice([-1.0, 1.0]) * path_rng.uniform(0.5, 0.8))
     offset_cm = path_rng.uniform(-1, 1, 3) * request.world_offset_cm
     heading_deg = float(path_rng.uniform(-180, 180))
@@ -122,20 +120,20 @@ def plan_scene(request: SynthRequest, *, index: int) -> ScenePlan:
         index=index,
         places_cm=places_cm,
         focal_mm=focal_mm,
-        path=draw_path(path_rng, distance_m=lens.distance_m, follow_m_s=0.6 * walk_m_s),
-        stage=draw_stage(stage_rng, lens=lens, walk_m_s=walk_m_s),
+        path=random_path(path_rng, distance_m=framing.distance_m, follow_m_s=0.6 * walk_m_s),
+        scene=random_scene(scene_rng, framing=framing, walk_m_s=walk_m_s),
         heading_deg=heading_deg,
         offset_cm=offset_cm,
         character=f"SK_Synth{int(path_rng.integers(1, 20)):02d}",
     )
 
 
-def _lens(request: SynthRequest, *, focal_mm: float, span_m: float) -> Lens:
-    """Choose a distance at which the subject fills part of the picture, and none too near."""
+def _framing(request: SynthRequest, *, focal_mm: float, span_m: float) -> Framing:
+    """Choose a distance at which the subject fills part of the picture, but not too close."""
     width_mm, height_mm = request.contract.sensor_mm
-    framing_m = _SUBJECT_M / _SUBJECT_PART * focal_mm / height_mm
-    return Lens(
-        distance_m=max(framing_m, span_m, 1.5),
+    distance_m = _SUBJECT_M / _SUBJECT_PART * focal_mm / height_mm
+    return Framing(
+        distance_m=max(distance_m, span_m, 1.5),
         width_per_m=width_mm / focal_mm,
         span_m=span_m,
         pixel_per_m=width_mm / focal_mm / request.size_px,

@@ -1,8 +1,8 @@
-"""Scenes on disk: what `stereogenbench synth` does.
+"""Synthetic scenes on disk, for `stereogenbench synth`.
 
-A scene is drawn in a hidden folder beside the splits and moved under its name when all of it is
-there, the completion marker written last. A run that was stopped leaves nothing that looks like
-a scene, and the next run of the same request goes on with the scenes that are missing.
+A scene is rendered into a hidden folder beside the splits and moved to its place when it is
+complete; its completion marker is written last. An interrupted run leaves no incomplete scenes, and
+the next run of the same request renders only the missing ones.
 """
 
 import shutil
@@ -15,15 +15,15 @@ from stereogenbench_data.engine import LOCAL, Engine
 from stereogenbench_data.errors import SynthesisError, cure_of
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
-from stereogenbench_data.synthesis.crew import Job, run_jobs
 from stereogenbench_data.synthesis.export import completion_text, metadata_texts
 from stereogenbench_data.synthesis.plan import ScenePlan, plan_scene
 from stereogenbench_data.synthesis.request import SynthRequest
+from stereogenbench_data.synthesis.workers import CameraJob, run_jobs
 
 Progress = Callable[[int, int], None]
 
 _UNFINISHED: Final = ".unfinished"
-_LOOK: Final = "See that the disk has room and may be written to."
+_CURE: Final = "Check that the disk has free space and may be written to."
 
 
 def synthesise(
@@ -34,22 +34,22 @@ def synthesise(
     engine: Engine = LOCAL,
     progress: Progress | None = None,
 ) -> list[str]:
-    """Write scenes in the released layout, and keep those that the same request wrote before.
+    """Write scenes in the released layout; keep scenes that the same request wrote before.
 
     Args:
-        out: Root of the tree, made if need be.
-        request: Which scenes; scene i does not depend on their number or on ``workers``.
-        workers: Processes to draw with, one camera of one scene each. 1 draws in this process;
-            more are spawned, so a script must start them below ``if __name__ == "__main__"``;
-            None is one a core.
-        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
-        progress: Called now and then with the camera frames drawn so far, and all there are.
+        out: Root of the tree; created if it does not exist.
+        request: The scenes. Scene i does not depend on the number of scenes or on ``workers``.
+        workers: The number of processes; each renders one camera of one scene at a time. With 1,
+            this process renders; None is one a core. More are spawned, so a script must call
+            this function below ``if __name__ == "__main__"``.
+        engine: Where the processes run: `engine.LOCAL`, or an `engine.RayCluster`.
+        progress: Called repeatedly with the numbers of camera frames rendered so far and in total.
 
     Returns:
         The scenes' keys, from scene 0 on.
 
     Raises:
-        SynthesisError: If ``workers`` is below 1, a scene's folder holds something else, a file
+        SynthesisError: If ``workers`` is below 1, a scene's folder has other content, a file
             cannot be written, or a worker process dies.
     """
     if workers is not None and workers < 1:
@@ -83,7 +83,7 @@ def synthesise(
 
 
 def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
-    """Tell whether a scene is to be drawn, and refuse a folder that another request wrote."""
+    """Return whether a scene must be rendered; refuse a folder that another request wrote."""
     folder = out / request.key(index)
     try:
         if not folder.exists():
@@ -91,18 +91,18 @@ def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
         found = (folder / COMPLETE_JSON).read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise SynthesisError(
-            f"{folder}: stands where a scene is to be written, and its {COMPLETE_JSON} could not "
-            f"be read ({error}). Move it away or choose another folder."
+            f"{folder}: a scene belongs here, but the {COMPLETE_JSON} of this folder cannot be "
+            f"read ({error}). Move the folder away or choose another output."
         ) from error
     if found != completion_text(plan_scene(request, index=index)):
         raise SynthesisError(
-            f"{folder}: is a scene that another request wrote (its {COMPLETE_JSON} differs). "
-            f"Choose another folder or map_name, or move that one away."
+            f"{folder}: another request wrote this scene (its {COMPLETE_JSON} differs). Choose "
+            f"another output or map_name, or move the folder away."
         )
     return False
 
 
-def _jobs(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[Job]:
+def _jobs(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[CameraJob]:
     for index in missing:
         folder = out / _UNFINISHED / request.key(index)
         try:
@@ -110,15 +110,15 @@ def _jobs(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[J
             folder.mkdir(parents=True)
         except OSError as error:
             raise SynthesisError(
-                f"{out}: no folder could be made in it ({error}). "
-                + cure_of(error, "Choose one that you may write to.")
+                f"{out}: cannot create a folder there ({error}). "
+                + cure_of(error, "Choose an output that you may write to.")
             ) from error
         for camera in range(CAMERA_COUNT):
-            yield Job(request=request, index=index, camera=camera, folder=folder)
+            yield CameraJob(request=request, index=index, camera=camera, folder=folder)
 
 
 def _finish(out: Path, plan: ScenePlan, *, drawn_in: Path) -> None:
-    """Write the metadata, the completion marker last, and move the scene under its name."""
+    """Write the metadata, with the completion marker last, and move the scene to its place."""
     folder = out / plan.key
     try:
         for name, text in metadata_texts(plan).items():
@@ -127,13 +127,13 @@ def _finish(out: Path, plan: ScenePlan, *, drawn_in: Path) -> None:
         drawn_in.rename(folder)
     except OSError as error:
         raise SynthesisError(
-            f"{plan.key}: could not be finished in {out}: {error}. {cure_of(error, _LOOK)} Then "
-            f"run again: finished scenes are kept."
+            f"{plan.key}: cannot be completed in {out}: {error}. {cure_of(error, _CURE)} Then "
+            f"run the same request again: complete scenes are kept."
         ) from error
 
 
 def _clear(out: Path, request: SynthRequest, *, missing: list[int]) -> None:
-    """Remove what was drawn of scenes that are not whole, and folders that are empty then."""
+    """Remove incomplete scenes, and the folders that are then empty."""
     for index in missing:
         shutil.rmtree(out / _UNFINISHED / request.key(index), ignore_errors=True)
     folder = out / _UNFINISHED / request.folder

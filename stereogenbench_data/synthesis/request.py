@@ -1,4 +1,4 @@
-"""What is asked for: which scenes, and how their files are written."""
+"""A request for synthetic scenes: which scenes, and how their files are written."""
 
 import math
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from stereogenbench_data.schema.release import (
     Split,
     Subset,
 )
-from stereogenbench_data.synthesis.trajectory import OFFSET_RANGE_CM
+from stereogenbench_data.synthesis.cameras import OFFSET_RANGE_CM
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
 PairForm = Literal["names", "indices"]
@@ -28,24 +28,24 @@ _LARGEST_PX: Final = 8192
 
 @dataclass(frozen=True, slots=True)
 class ExportContract:
-    """How scenes are written; the defaults are the spelling of the scene that stands beside us.
+    """How the files of scenes are written. The defaults are as in a scene rendered elsewhere.
 
     Attributes:
         rotation: How ``trajectory.json`` records rotations.
-        pair_form: The primary pair as camera names, or in the older form as two integers.
+        pair_form: "names" writes the primary pair as camera names, "indices" as two integers.
         primary_pair: Left and right camera of that pair.
         depth_unit_m: Metres in one stored unit of depth.
-        depth_tag: Container tag that tells the unit; None writes no tag.
+        depth_tag: Container tag for the unit; None writes no tag.
         depth_kind: Depth along the optical axis, or along the ray.
-        depth_format: FFV1's pixel format. Depth beyond its largest number is stored as that
-            number, which means "no depth", as it is for the sky. Fewer than 16 bits are read
-            back only by who accepts them, such as ``DepthEncoding(accept={"10-bit"})``.
-        frame_lag: Depth frame t + frame_lag is of the moment that RGB frame t shows.
+        depth_format: FFV1's pixel format. Depth above its largest number, and the sky, are stored
+            as that number, which means "no depth". Reading fewer than 16 bits needs an encoding
+            that accepts them, such as ``DepthEncoding(accept={"10-bit"})``.
+        frame_lag: Depth frame t + frame_lag belongs to RGB frame t.
         sensor_mm: Width and height of the sensor.
-        principal_point_px: Where the optical axis meets the picture, None for its centre.
+        principal_point_px: Principal point (x, y), None for the picture's centre.
 
     Raises:
-        SynthesisError: If a value is not one of those, or out of its range.
+        SynthesisError: If a value is unknown or out of range.
     """
 
     rotation: RotationForm = "rotator"
@@ -60,7 +60,7 @@ class ExportContract:
     principal_point_px: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be written."""
+        """Refuse values that cannot be written."""
         _require_choice("rotation", self.rotation, choices=get_args(RotationForm))
         _require_choice("pair_form", self.pair_form, choices=get_args(PairForm))
         _require_choice("depth_kind", self.depth_kind, choices=get_args(DepthKind))
@@ -77,22 +77,22 @@ class ExportContract:
 
 @dataclass(frozen=True, slots=True)
 class SynthRequest:
-    """Scenes to draw. Scene i is the same whatever ``scenes`` is.
+    """The scenes to render. Scene i does not depend on the number of scenes.
 
     Attributes:
         family: ``IPD_Gaussian``, ``Uniform`` or ``Pairwise_Uniform`` (in train only).
-        scenes: How many, numbered from 0.
+        scenes: The number of scenes, which are numbered from 0.
         size_px: Width of the pictures, even; ``height_px`` is the same where it is None.
-        frames: Frames at 15 Hz.
-        seed: With the scene's number and folder, all that chance decides follows from it.
-        split: ``train`` or ``eval``; ``subset`` (of maps) counts for eval alone.
-        map_name: Folder of the scenes.
-        focal_mm: The focal length, None to draw one of 18..85 mm for each scene.
-        world_offset_cm: How far from the world's origin a stage may lie, along each axis.
+        frames: The number of frames, at 15 Hz.
+        seed: Determines all random choices, together with a scene's number and folder.
+        split: ``train`` or ``eval``; ``subset`` (of maps) applies only to eval.
+        map_name: The folder of the scenes.
+        focal_mm: The focal length; None for a random one in 18..85 mm per scene.
+        world_offset_cm: The largest distance of a scene from the world's origin, along each axis.
         contract: How the files are written.
 
     Raises:
-        SynthesisError: If no scene can be drawn so; the message says which value and why.
+        SynthesisError: If a value is unknown or out of range.
     """
 
     family: str = "IPD_Gaussian"
@@ -109,14 +109,14 @@ class SynthRequest:
     contract: ExportContract = field(default_factory=ExportContract)
 
     def __post_init__(self) -> None:
-        """Refuse a request that no scene can meet."""
+        """Refuse values that no scene can have."""
         _require_choice("family", self.family, choices=FAMILIES)
         _require_choice("split", self.split, choices=get_args(Split))
         _require_choice("subset", self.subset, choices=get_args(Subset))
         if self.split == "eval" and self.family == "Pairwise_Uniform":
             raise SynthesisError(
-                "family Pairwise_Uniform is in the train split only: ask for split train, "
-                "or for IPD_Gaussian or Uniform."
+                "family Pairwise_Uniform exists only in train: choose split train, or family "
+                "IPD_Gaussian or Uniform."
             )
         for name, value in (("scenes", self.scenes), ("frames", self.frames)):
             if value < 1:

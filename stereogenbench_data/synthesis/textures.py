@@ -1,9 +1,9 @@
 """Procedural textures that tile, stored with their mip levels in one atlas.
 
 A texture has (u, v) in tiles: (0, 0) is a corner of the tile and (1, 1) the same corner again.
-Each is red, green and blue in 0..1 around 0.5, with detail at every scale, so that a codec works
-as hard on a drawn surface as on a filmed one. Mip levels keep a drawn texture below what the
-pixels of the picture can hold, so that two views of a surface agree.
+Each is red, green and blue in 0..1 around 0.5, with detail at every scale, so that it is as hard
+for a codec as a real surface. Mip levels keep the detail of a texture below the resolution of the
+picture, so that two views of a surface agree.
 """
 
 from collections.abc import Callable
@@ -38,8 +38,8 @@ def sample_atlas(
 
     Args:
         tiles: (u, v) in tiles; the texture repeats.
-        rows: Which texture: its place in `TEXTURES`.
-        footprint_tiles: How much of a tile one pixel covers; what is finer is averaged.
+        rows: The texture, by its index in `TEXTURES`.
+        footprint_tiles: The part of a tile that one pixel covers; finer detail is averaged.
 
     Returns:
         Red, green, blue in 0..1.
@@ -60,7 +60,7 @@ def _sample_level(
     rows: Float32[np.ndarray, " n"],
     level: Float32[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "3 n"]:
-    """Interpolate bilinearly at whole mip levels; level l begins at 2 side (1 - 2^-l) + 2 l."""
+    """Interpolate bilinearly at whole mip levels; level l starts at 2 side (1 - 2^-l) + 2 l."""
     atlas = _atlas()
     height, width = atlas.shape[2:]
     scale = np.exp2(-level)
@@ -76,7 +76,7 @@ def _sample_level(
 
 @cache
 def _atlas() -> torch.Tensor:
-    """Draw every texture with all its mip levels side by side, each in a border that wraps."""
+    """Return all textures with their mip levels side by side, each with a border that wraps."""
     rows = []
     for seed, draw in enumerate(TEXTURES.values()):
         tile = np.clip(draw(np.random.default_rng(seed)), 0, 1)
@@ -92,7 +92,7 @@ def _atlas() -> torch.Tensor:
 
 
 def _halved(tile: Tile, *, axis: int) -> Tile:
-    """Halve a side with the filter (1, 3, 3, 1) / 8, around the tile's edge."""
+    """Halve a side with the filter (1, 3, 3, 1) / 8, which wraps at the tile's edge."""
     if tile.shape[axis] == 1:
         return tile
     wide = np.roll(tile, 1, axis) + 3 * tile + 3 * np.roll(tile, -1, axis) + np.roll(tile, -2, axis)
@@ -100,7 +100,7 @@ def _halved(tile: Tile, *, axis: int) -> Tile:
 
 
 def _noise(rng: np.random.Generator, *, slope: float, low: float = 1.0) -> Tile:
-    """Noise whose amplitude falls as frequency^-slope from ``low`` cycles a tile; sd 1, mean 0."""
+    """Return noise with amplitude frequency^-slope above ``low`` cycles per tile; sd 1, mean 0."""
     frequency = np.hypot(*np.meshgrid(*[np.fft.fftfreq(SIDE_TEXELS, 1 / SIDE_TEXELS)] * 2))
     amplitude = np.where(frequency >= low, np.maximum(frequency, 1.0) ** -slope, 0.0)
     white = rng.standard_normal((SIDE_TEXELS, SIDE_TEXELS))
@@ -109,13 +109,13 @@ def _noise(rng: np.random.Generator, *, slope: float, low: float = 1.0) -> Tile:
 
 
 def _colour_noise(rng: np.random.Generator, *, slope: float, spread: float) -> Tile:
-    """Noise that moves lightness, and a third as much each colour alone."""
+    """Return noise in lightness, with about a third as much in each colour channel."""
     channels = [_noise(rng, slope=slope) for _ in range(3)]
     return spread * (_noise(rng, slope=slope) + 0.35 * np.concatenate(channels, axis=2))
 
 
 def _cells(rng: np.random.Generator, *, count: int) -> tuple[Tile, Tile]:
-    """Return random cells of a tile: each texel's tone, and 1 inside, 0 on the rims."""
+    """Return random cells of a tile: each texel's tone, and 1 inside cells, 0 on their borders."""
     sites = rng.uniform(0.1, 0.9, (count, count, 2))
     tones = rng.uniform(-1, 1, (count, count, 1)) + rng.uniform(-0.3, 0.3, (count, count, 3))
     place = (np.arange(SIDE_TEXELS) + 0.5) * count / SIDE_TEXELS
@@ -138,7 +138,7 @@ def _cells(rng: np.random.Generator, *, count: int) -> tuple[Tile, Tile]:
 def _blocks(
     rng: np.random.Generator, *, rows: int, columns: int, joint: float
 ) -> tuple[Tile, Tile]:
-    """Return courses of bricks or boards: each texel's tone, and 1 inside, 0 in the joints."""
+    """Return rows of bricks or boards: each texel's tone, and 1 inside them, 0 in the joints."""
     place = (np.arange(SIDE_TEXELS) + 0.5) / SIDE_TEXELS
     across, down = np.meshgrid(place * columns, place * rows)
     course = down.astype(int)
@@ -209,9 +209,9 @@ TEXTURES: Final[dict[str, Draw]] = {
     "boards": _boards,
     "weave": _weave,
 }
-"""The textures by name, in the order of the atlas. "grain" is what others are multiplied with."""
+"""The textures by name, in the order of the atlas. The others are multiplied by "grain"."""
 
 
 def texture_row(name: str) -> int:
-    """Return the place of a texture in the atlas."""
+    """Return the index of a texture in the atlas."""
     return list(TEXTURES).index(name)

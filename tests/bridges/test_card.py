@@ -99,7 +99,7 @@ def write_card_over(folder):
     write_card(SceneIndex.open(folder), folder, repository=REPOSITORY)
 
 
-def test_a_card_is_written_again_but_no_other_text_is_replaced(tmp_path):
+def test_a_card_is_replaced_but_another_readme_is_not(tmp_path):
     index = SceneIndex.open(SAMPLE)
 
     write_card(index, tmp_path, repository="a/b")
@@ -108,11 +108,13 @@ def test_a_card_is_written_again_but_no_other_text_is_replaced(tmp_path):
     assert MARK in (tmp_path / "README.md").read_text()
     assert "a/c" in (tmp_path / "README.md").read_text()
     (tmp_path / "README.md").write_text("mine")
-    with pytest.raises(DescriptorError, match="was not made by this package"):
+    with pytest.raises(
+        DescriptorError, match=r"README\.md: exists and was not written by this package"
+    ):
         write_card(index, tmp_path, repository="a/b")
 
 
-def test_packed_depth_is_told_with_its_features(small_release, tmp_path):
+def test_the_card_states_the_features_of_packed_depth(small_release, tmp_path):
     require_module("blosc2")
     pack(small_release, tmp_path / "shards", workers=1, depth_codec="blosc2")
 
@@ -126,5 +128,5 @@ def test_packed_depth_is_told_with_its_features(small_release, tmp_path):
 
 
 def test_a_tree_of_folders_has_no_card(small_release):
-    with pytest.raises(DescriptorError, match="is no folder of shards: pack the data first"):
+    with pytest.raises(DescriptorError, match="not a folder of shards"):
         card(SceneIndex.open(small_release), repository="a/b")

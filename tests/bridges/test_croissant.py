@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from stereogenbench_data import SceneIndex
-from stereogenbench_data.bridges.croissant import Publication, write_descriptor
-from stereogenbench_data.bridges.croissant_check import check_descriptor
+from stereogenbench_data.bridges.croissant.check import check_descriptor
+from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
@@ -164,7 +164,7 @@ def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_p
 
 
 @pytest.mark.parametrize("stream", ["rgb", "depth"])
-def test_a_part_is_described_by_the_videos_that_it_has(small_shards, tmp_path, stream):
+def test_a_partial_download_is_described_by_its_videos(small_shards, tmp_path, stream):
     """Two cameras, one kind of video: as a tree and packed again."""
     whole = SceneIndex.open(small_shards)
     part = plan_download(whole, [0, 1], cameras=(2, 3), streams=(stream,))
@@ -193,9 +193,8 @@ def test_shards_of_any_folder_are_named_relative_to_the_descriptor(index, tmp_pa
 
 
 def test_many_shards_are_listed_in_a_file(index, tmp_path, monkeypatch):
-    for module in ("croissant_tables", "croissant_packed"):
-        monkeypatch.setattr(f"stereogenbench_data.bridges.{module}.MOST_SHARD_FILES", 1)
-    monkeypatch.setattr("stereogenbench_data.bridges.croissant_packed.MOST_MEDIA_BYTES", 1)
+    for limit in ("MOST_SHARD_FILES", "MOST_MEDIA_BYTES"):
+        monkeypatch.setattr(f"stereogenbench_data.bridges.croissant.shards.{limit}", 1)
     path = tmp_path / "many.json"
 
     written = write_descriptor(index, path, publication=DAY)
@@ -206,7 +205,7 @@ def test_many_shards_are_listed_in_a_file(index, tmp_path, monkeypatch):
     assert loaded(path, tmp_path / "cache")["counts"]["shards"] == len(index.shards)
 
 
-def test_a_fifteen_baseline_row_stands_in_every_scene(index, tmp_path):
+def test_every_scene_has_its_fifteen_baselines(index, tmp_path):
     write_descriptor(index, tmp_path / "data.json", publication=DAY)
 
     rows = loaded(tmp_path / "data.json", tmp_path / "cache")["scenes"]
@@ -219,11 +218,11 @@ def test_shards_behind_a_url_need_an_address_to_name(small_release, web, tmp_pat
     pack(small_release, web.folder / "shards", workers=1)
     remote = SceneIndex.open(f"{web.url}/shards")
 
-    with pytest.raises(DescriptorError, match=r"lie behind a URL: give the URL .*--base-url"):
+    with pytest.raises(DescriptorError, match=r"are behind a URL.*--base-url"):
         write_descriptor(remote, tmp_path / "data.json", publication=DAY)
 
 
-def test_a_descriptor_that_cannot_be_written_says_where(index, tmp_path):
+def test_a_descriptor_that_cannot_be_written_names_the_place(index, tmp_path):
     (tmp_path / "file").write_text("")
 
     with pytest.raises(DescriptorError, match=r"file/data: tables cannot be written"):
@@ -235,7 +234,7 @@ def test_no_login_is_published(small_shards, tmp_path, name):
     publication = Publication(**{name: "https://me:word@host/data?key=word"})
 
     with pytest.raises(
-        DescriptorError, match=r"^https://host/data: the URL has a login or a query"
+        DescriptorError, match=r"^https://host/data: the URL contains a login or a query"
     ):
         write_descriptor(
             SceneIndex.open(small_shards), tmp_path / "a.json", publication=publication

@@ -98,7 +98,7 @@ def test_torchdatas_loader_resumes_with_workers(small_shards, stream, expected):
     )
 
 
-def test_an_epoch_draws_frames_anew_and_orders_scenes_anew(small_shards):
+def test_an_epoch_has_new_random_frames_and_a_new_order(small_shards):
     stream = huggingface.iterable(
         small_shards, fields=("frame_index", "scene"), frames=("random", 3)
     )
@@ -159,7 +159,7 @@ def test_a_scene_of_many_samples_is_mapped_in_batches_of_one(urls):
     mapped = rows.map(decoder, remove_columns=rows.column_names, batched=True, batch_size=1)
 
     assert len(set(keys(mapped))) == 4 * 15 * 2
-    with pytest.raises(SelectionError, match=r"gives 30 samples, and map takes one a row"):
+    with pytest.raises(SelectionError, match=r"gives 30 samples, but map takes one per row"):
         next(iter(rows.map(decoder)))
 
 
@@ -174,7 +174,7 @@ def test_raw_bytes_are_the_released_ones(urls, small_release):
 def test_videos_that_datasets_decoded_are_refused(urls):
     row = next(iter(raw(urls))) | {"cam_00_depth.mkv": object()}
 
-    with pytest.raises(StorageError, match=r"is a object and not bytes"):
+    with pytest.raises(StorageError, match=r"cam_00_depth\.mkv must be bytes, found object"):
         huggingface.decode(FIELDS)(row)
 
 
@@ -205,7 +205,7 @@ DERIVED = {
 
 @pytest.mark.parametrize("workers", [None, 2])
 @pytest.mark.parametrize("name", DERIVED)
-def test_what_is_derived_draws_for_the_epoch_that_it_is_set_to(small_shards, name, workers):
+def test_derived_datasets_use_their_own_epoch(small_shards, name, workers):
     options = {"fields": ("frame_index", "__key__"), "frames": ("random", 3)}
     expected = StereoPairs(small_shards, **options)
     derived = DERIVED[name](huggingface.iterable(small_shards, **options))
@@ -250,5 +250,7 @@ def test_the_wrong_suffix_of_depth_is_named(packed_depth_urls):
 
     with pytest.raises(StorageError, match=r'no cam_00_depth\.mkv.*features\(depth_suffix="b2f'):
         huggingface.decode(FIELDS)(row)
-    with pytest.raises(SelectionError, match=r"depth_suffix is 'b2nd'; there are 'mkv', 'b2frame'"):
+    with pytest.raises(
+        SelectionError, match=r"depth_suffix must be 'mkv' or 'b2frame', got 'b2nd'"
+    ):
         huggingface.features(depth_suffix="b2nd")

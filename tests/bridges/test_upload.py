@@ -10,7 +10,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import MARK
-from stereogenbench_data.bridges.croissant_check import check_descriptor
+from stereogenbench_data.bridges.croissant.check import check_descriptor
 from tests.servers.fault import serving
 from tests.servers.hub import REPOSITORY
 from tests.servers.hub_upload import TOKEN, UploadHubHandler
@@ -94,7 +94,7 @@ def test_a_refused_login_says_how_to_log_in(folder, upload_hub, tmp_path):
     done = uploaded(folder, upload_hub, tmp_path / "home", token="hf_other")
 
     assert done.returncode == 2
-    assert "the Hub did not take the upload (it answers 401)" in done.stderr
+    assert "the Hub refused the upload (it answers 401)" in done.stderr
     assert "hf auth login" in done.stderr
     assert "hf_other" not in done.stderr
 
@@ -103,11 +103,11 @@ def test_offline_mode_is_kept(folder, upload_hub, tmp_path):
     done = uploaded(folder, upload_hub, tmp_path / "home", HF_HUB_OFFLINE="1")
 
     assert done.returncode == 2
-    assert "the Hub did not take the upload" in done.stderr
+    assert "the Hub refused the upload" in done.stderr
     assert not (upload_hub.folder / ".commits").exists()
 
 
-def test_somebodys_own_readme_is_left_alone(folder, upload_hub, tmp_path):
+def test_a_readme_of_the_user_is_not_replaced(folder, upload_hub, tmp_path):
     (folder / "README.md").write_text("mine")
 
     done = uploaded(folder, upload_hub, tmp_path / "home")
@@ -117,11 +117,11 @@ def test_somebodys_own_readme_is_left_alone(folder, upload_hub, tmp_path):
     assert (folder / "README.md").read_text() == "mine"
 
 
-def test_a_missing_shard_is_named_before_anything_is_sent(folder, upload_hub, tmp_path):
+def test_a_missing_shard_is_named_before_the_upload(folder, upload_hub, tmp_path):
     next(folder.glob("*.tar")).unlink()
 
     done = uploaded(folder, upload_hub, tmp_path / "home")
 
     assert done.returncode == 2
-    assert ".tar: is missing, and the index says" in done.stderr
+    assert ".tar: is missing, but the index says" in done.stderr
     assert upload_hub.asked == []

@@ -95,17 +95,17 @@ def test_a_damaged_video_is_named(scenes):
 
 
 @pytest.mark.parametrize("key", ["../../etc/scene", "/train/A/B/c", "train/a.b/c/d", "scene"])
-def test_a_key_that_is_no_scenes_path_is_refused(scenes, key):
+def test_a_key_that_is_not_a_scene_path_is_refused(scenes, key):
     scenes[0]["__key__"] = key
 
     with pytest.raises(SchemaError, match="scene"):
         list(decode(("left",))(scenes[:1]))
 
 
-def test_a_video_that_was_decoded_before_is_refused(scenes):
+def test_a_decoded_video_is_refused(scenes):
     scenes[0]["cam_00_depth.mkv"] = np.zeros((7, 64, 64), dtype=np.uint8)
 
-    with pytest.raises(StorageError, match=r"is a ndarray and not bytes: a decoder took it before"):
+    with pytest.raises(StorageError, match=r"cam_00_depth\.mkv must be bytes, found ndarray"):
         list(decode(("left",))(scenes[:1]))
 
 
@@ -116,12 +116,12 @@ def test_a_sample_without_a_key_is_refused():
 
 def test_an_unknown_option_is_named():
     with pytest.raises(
-        SelectionError, match=r"there is no option 'split'; there are pairs, frames"
+        SelectionError, match=r"unknown option 'split'; the options are pairs, frames"
     ):
         decode(("left",), split="train")
 
 
-def test_json_that_webdataset_parsed_on_the_way_is_taken(urls, small_shards, equal_samples):
+def test_parsed_json_is_accepted(urls, small_shards, equal_samples):
     expected = StereoPairs(small_shards, fields=FIELDS)
     pipeline = webdataset.WebDataset(urls, shardshuffle=False).decode(
         webdataset.handle_extension("json", json.loads)

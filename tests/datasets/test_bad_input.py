@@ -302,7 +302,9 @@ def test_a_camera_that_looks_back_is_refused(scene):
 def test_a_principal_point_outside_the_picture_is_refused(scene, point):
     rewrite(
         scene / "baseline.json",
-        lambda doc: doc["camera_intrinsics"].update(principal_point_px=point),
+        lambda doc: doc["camera_intrinsics"].update(
+            principal_point_px=dict(zip("xy", point, strict=True))
+        ),
     )
 
     with pytest.raises(StorageError, match=r"principal_point_px.*inside a picture of 64 pixels"):

@@ -83,14 +83,14 @@ def test_no_map_grows_to_float64(inputs):
     assert grown == {}
 
 
-def test_maps_stay_on_the_device_that_they_are_given(inputs):
+def test_results_stay_on_the_device_of_the_input(inputs):
     """The meta device takes no array of another one, as a GPU does not."""
     made = maps(*(torch.from_numpy(values).to("meta") for values in inputs))
 
     assert {str(values.device) for values in made.values()} == {"meta"}
 
 
-def test_what_is_no_whole_number_does_not_matter_where_the_mask_is_false(library):
+def test_values_outside_the_mask_may_be_anything(library):
     values = np.array([[2.9, -2.9, 0.0, np.nan, np.inf, -1e30]], dtype=np.float32)
     mask = np.array([[True, True, True, False, False, False]])
 
@@ -101,7 +101,7 @@ def test_what_is_no_whole_number_does_not_matter_where_the_mask_is_false(library
 
 
 @pytest.mark.parametrize("mask", [[True, True], [True, False], [False, False]])
-def test_choosing_values_changes_nothing_in_the_array_that_they_come_from(library, mask):
+def test_values_where_does_not_change_its_input(library, mask):
     values = library.array(np.array([1.5, 2.5], dtype=np.float32))
 
     chosen = values_where(library.array(np.array(mask)), values, otherwise=-np.inf)
@@ -111,7 +111,7 @@ def test_choosing_values_changes_nothing_in_the_array_that_they_come_from(librar
     assert library.numpy(values).tolist() == [1.5, 2.5]
 
 
-def test_values_are_taken_in_row_major_order_of_any_part_of_an_array(library):
+def test_take_flat_reads_views_in_row_major_order(library):
     values = library.array(np.arange(12.0).reshape(3, 4)[:, 1:3])
 
     taken = take_flat(values, library.array(np.array([[0, 5], [3, 0]])))
@@ -119,7 +119,7 @@ def test_values_are_taken_in_row_major_order_of_any_part_of_an_array(library):
     assert library.numpy(taken).tolist() == [[1.0, 10.0], [6.0, 1.0]]
 
 
-def test_of_all_values_sent_to_a_cell_the_least_stays(library):
+def test_scatter_min_keeps_the_smallest_value_of_a_cell(library):
     values = library.array(np.array([[3.0, 2.0, 4.0], [np.inf, 7.0, 6.0]], dtype=np.float32))
     index = library.array(np.array([[1, 1, 1], [3, 0, 0]]))
 

@@ -9,7 +9,7 @@ from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 sizes_px = st.integers(1, 4000)
 
 
-def test_the_focal_length_of_a_real_scene_is_its_share_of_the_film():
+def test_the_focal_length_in_pixels_of_a_real_scene():
     intrinsics = Intrinsics.from_mm(
         focal_mm=32.599998, sensor_mm=(23.76, 23.76), size_px=(1280, 1280)
     )
@@ -18,7 +18,7 @@ def test_the_focal_length_of_a_real_scene_is_its_share_of_the_film():
     assert (intrinsics.cx_px, intrinsics.cy_px) == (640.0, 640.0)
 
 
-def test_a_film_that_is_not_square_gives_each_axis_its_own_focal_length():
+def test_a_sensor_that_is_not_square_gives_each_axis_its_own_focal_length():
     intrinsics = Intrinsics.from_mm(
         focal_mm=50.0, sensor_mm=(36.0, 24.0), size_px=(720, 720), principal_point_px=(300.0, 400.0)
     )
@@ -73,7 +73,7 @@ def test_a_flip_mirrors_the_principal_point_about_the_images_middle(intrinsics):
 
 
 @given(width_px=sizes_px, height_px=sizes_px, x=st.floats(-1, 1), y=st.floats(-1, 1))
-def test_a_ray_lands_on_the_same_share_of_the_image_at_every_size(width_px, height_px, x, y):
+def test_a_ray_lands_on_the_same_fraction_of_the_image_at_every_size(width_px, height_px, x, y):
     intrinsics = Intrinsics(70.0, 66.0, 21.5, 14.0, 40, 30)
     resized = intrinsics.resized(width_px=width_px, height_px=height_px)
 
@@ -94,7 +94,7 @@ def test_a_ray_lands_on_the_same_share_of_the_image_at_every_size(width_px, heig
         ({"cx_px": float("inf")}, r"cx_px must be finite, got inf"),
     ],
 )
-def test_a_camera_that_sees_nothing_is_refused(changes, message):
+def test_intrinsics_out_of_range_are_refused(changes, message):
     numbers = {
         "fx_px": 70.0,
         "fy_px": 66.0,
@@ -113,6 +113,6 @@ def test_a_resize_to_nothing_is_refused(intrinsics):
         intrinsics.resized(width_px=0, height_px=10)
 
 
-def test_a_film_without_width_is_refused():
+def test_a_sensor_without_width_is_refused():
     with pytest.raises(GeometryError, match=r"sensor width in mm must be .* got 0\.0"):
         Intrinsics.from_mm(focal_mm=50.0, sensor_mm=(0.0, 24.0), size_px=(720, 720))

@@ -211,7 +211,7 @@ def test_the_ray_to_the_corner_is_longer_than_its_depth(library):
 
 
 @pytest.mark.parametrize("value_m", [0.0, np.inf])
-def test_what_was_not_measured_and_sky_have_no_other_depth_along_the_axis(library, value_m):
+def test_unmeasured_pixels_and_sky_keep_their_values_along_the_axis(library, value_m):
     intrinsics = Intrinsics(1.0, 1.0, 3.0, 1.0, 6, 2)
     ray_m = library.array(np.full((1, 2, 6), value_m, dtype=np.float32))
 
@@ -240,7 +240,7 @@ def test_a_pair_without_a_focal_length_or_a_baseline_is_refused(formula, changes
         formula(np.ones((1, 1)), **({"focal_px": 800.0, "baseline_m": 0.1} | changes))
 
 
-def test_a_unit_of_no_length_is_refused():
+def test_a_unit_of_zero_length_is_refused():
     with pytest.raises(GeometryError, match=r"unit_m must be a positive finite number, got 0\.0"):
         disparity_from_units(np.ones((1, 1), int), focal_px=1.0, baseline_m=1.0, unit_m=0.0)
 
@@ -257,7 +257,7 @@ def test_a_negative_quantum_is_refused():
     sign=st.sampled_from([1, -1]),
     form=st.sampled_from(["depth", "inverse"]),
 )
-def test_what_is_written_is_what_is_returned_and_0_where_not_measured(
+def test_written_disparity_equals_the_returned_one_and_is_0_where_not_measured(
     stored, measured, shift, sign, form
 ):
     units = np.array(stored, dtype=np.uint16).reshape(1, 3, 2)

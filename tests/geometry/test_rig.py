@@ -43,7 +43,7 @@ def test_a_lateral_rig_is_rectified_wherever_it_stands(make_rig, recorded_rig, o
     assert baseline_deviation_cm(poses, recorded_rig(LATERAL_CM)) < 1e-9
 
 
-def test_a_camera_that_nods_in_one_frame_is_seen_in_pixels(make_rig):
+def test_one_frame_with_a_pitch_error_shows_in_the_residual(make_rig):
     """0.01 degrees of pitch move the image's middle by f tan(0.01 deg) and its corners by more."""
     nod = Rotation.from_euler("x", 0.01, degrees=True)
     poses = with_camera_turned(make_rig(LATERAL_CM, frames=4), 3, nod)
@@ -53,14 +53,14 @@ def test_a_camera_that_nods_in_one_frame_is_seen_in_pixels(make_rig):
     assert middle_px < rectification_residual_px(poses, INTRINSICS) < 1.2 * middle_px
 
 
-def test_a_camera_out_of_line_is_seen_at_the_nearest_depth(make_rig):
+def test_a_camera_beside_the_line_shows_at_the_nearest_depth(make_rig):
     """1 mm up, in a rig so narrow that the nearest depth looked at is 1 m, is f / 1000."""
     poses = with_camera_moved(make_rig(LATERAL_CM / 10, frames=2), 5, (0.0, 0.0, 0.1))
 
     assert rectification_residual_px(poses, INTRINSICS) == pytest.approx(2.694, rel=1e-6)
 
 
-def test_a_wide_pair_is_looked_at_only_as_near_as_its_images_can_overlap(make_rig):
+def test_a_wide_pair_is_tested_only_at_depths_where_its_images_overlap(make_rig):
     """Camera 5's disparity against camera 0 is the image's width at 1.63 * 2694 / 1280 m."""
     centred = np.array([0.0, 0.01, 0.02, 0.03, 0.04, 163.0])
     poses = with_camera_moved(make_rig(centred, frames=2), 5, (0.0, 0.0, 0.1))

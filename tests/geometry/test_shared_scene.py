@@ -156,7 +156,9 @@ def test_the_right_view_warped_by_disparity_is_the_left_one(
 
 @pytest.mark.parametrize(("left", "right", "loss_db"), [(0, 1, 0.9), (1, 3, 3.5), (0, 5, 9.0)])
 @pytest.mark.parametrize("scale", [0.97, 1.03])
-def test_a_depth_scale_that_is_wrong_by_3_percent_is_seen(warp_pair, left, right, loss_db, scale):
+def test_a_depth_scale_that_is_wrong_by_3_percent_is_detected(
+    warp_pair, left, right, loss_db, scale
+):
     wrong = warp_pair(left, right, scale=scale)
 
     assert wrong.psnr_db < warp_pair(left, right).psnr_db - loss_db
@@ -169,7 +171,7 @@ def test_the_wrong_sign_is_far_worse(warp_pair, left, right):
     assert wrong.psnr_db < warp_pair(left, right).psnr_db - 10
 
 
-def test_the_source_view_alone_does_not_know_what_stands_outside_it(warp_pair):
+def test_the_source_view_does_not_know_occluders_outside_it(warp_pair):
     by_source = warp_pair(0, 5, judge="source")
 
     assert by_source.psnr_db < 16

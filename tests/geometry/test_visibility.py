@@ -34,7 +34,7 @@ def pair(library, depth_m, *, shift_px_m):
         pytest.param(0.0, 10.0, False, id="an unmeasured source"),
     ],
 )
-def test_whether_a_target_that_measured_this_sees_that(library, source_m, target_m, expected):
+def test_a_target_sees_points_that_agree_with_its_own_depth(library, source_m, target_m, expected):
     projection, measured = pair(library, [source_m], shift_px_m=1e-3)
     target = row(library, target_m)
 
@@ -64,7 +64,7 @@ def test_a_pixel_that_leaves_the_image_is_not_visible(library):
     assert library.numpy(visible).tolist() == [[False, False, True, True]]
 
 
-def test_an_occluder_outside_the_source_view_is_known_to_the_target_alone(library):
+def test_only_the_target_depth_shows_an_occluder_outside_the_source_view(library):
     """A wall at 2 m moves by one column; the target sees a pole at 0.5 m that the source cannot.
 
     The pole stands in the target's column 2, to which it moved by four columns: from column 6

@@ -68,7 +68,7 @@ def test_a_near_pixel_covers_the_far_one_and_leaves_a_hole_where_it_stood(librar
     assert library.numpy(hole).tolist() == [[False, False, False, True, False]]
 
 
-def test_depths_that_differ_in_the_last_bit_are_told_apart(library):
+def test_depths_that_differ_in_the_last_bit_are_ordered(library):
     near = np.float32(123.456)
     depth_m = np.array([[np.nextafter(near, np.float32(0)), near]], dtype=np.float32)
     disparity_px = library.array(np.array([[0.0, 1.0]], dtype=np.float32))
@@ -133,7 +133,7 @@ def test_a_warp_by_disparity_samples_to_the_left_by_as_much(library):
     assert library.numpy(inside).tolist() == [[True, True, True, False]]
 
 
-def test_what_is_painted_can_be_sampled_back_where_nothing_hides_it(library):
+def test_a_splat_can_be_sampled_back_where_nothing_occludes_it(library):
     """A slanted plane: whole-pixel disparities, so that both warps are exact."""
     rng = np.random.default_rng(1)
     disparity = np.broadcast_to(np.array([3, 3, 2, 2, 1, 1, 0, 0], np.float32), (4, 8)).copy()
@@ -158,7 +158,7 @@ def test_a_rectified_warp_of_an_image_with_other_rows_is_refused():
 
 
 @pytest.mark.parametrize("quantum", ["a number", "a map"])
-def test_rows_are_worked_on_in_blocks_as_in_one(monkeypatch, quantum):
+def test_blocks_of_rows_give_the_result_of_one_block(monkeypatch, quantum):
     rng = np.random.default_rng(3)
     shape = (2, 9, 16)
     depth_m, target_m = rng.uniform(1, 4, (2, *shape)).astype(np.float32)

@@ -173,7 +173,12 @@ def test_a_baseline_may_differ_by_a_millimetre_and_a_thousandth(make_scene, root
 
 
 def test_a_wrong_unit_shows_as_a_contradiction(make_scene, root, rewrite):
-    rewrite(make_scene() / "trajectory.json", lambda document: document.update(unit="m"))
+    def in_another_unit(document):
+        for frame in document["frames"]:
+            for pose in frame["cameras"]:
+                pose["location"] = {axis: 100 * cm for axis, cm in pose["location"].items()}
+
+    rewrite(make_scene() / "trajectory.json", in_another_unit)
 
     with pytest.raises(StorageError, match=r"10 cm apart, and by the poses.*1000 cm apart"):
         describe_scene(root, KEY)
@@ -182,7 +187,7 @@ def test_a_wrong_unit_shows_as_a_contradiction(make_scene, root, rewrite):
 @pytest.mark.parametrize(
     ("name", "content", "error", "match"),
     [
-        ("baseline.json", b"{", SchemaError, f"{KEY}/baseline.json: not JSON"),
+        ("baseline.json", b"{", SchemaError, f"{KEY}/baseline.json: not valid JSON"),
         ("trajectory.json", b"[]", SchemaError, f"{KEY}/trajectory.json: .* must be an object"),
         ("_scene_complete.json", b"", SchemaError, f"{KEY}/_scene_complete.json: .* empty"),
         ("cam_00_rgb.mp4", b"", MediaError, f"{KEY}/cam_00_rgb.mp4: is empty"),

@@ -24,7 +24,7 @@ from stereogenbench_data.schema.document import parse_object, require_text_size
         pytest.param(b'{"a":' * 100_000, "nested hundreds of levels deep", id="nested objects"),
     ],
 )
-def test_a_text_that_is_no_json_object_is_refused_by_name(text, match):
+def test_a_text_that_is_not_a_json_object_is_refused(text, match):
     with pytest.raises(SchemaError, match=match):
         parse_object(text, where="a.json")
 
@@ -48,5 +48,5 @@ def test_a_size_is_refused_without_the_text():
         require_text_size(200_000_000, where="a.json")
 
 
-def test_a_byte_order_mark_is_let_through():
+def test_a_byte_order_mark_is_accepted():
     assert parse_object(b"\xef\xbb\xbf" + json.dumps({"a": 1}).encode(), where="a") == {"a": 1}

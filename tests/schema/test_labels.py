@@ -52,7 +52,7 @@ def test_any_text_is_a_key_or_refused(key):
         assert parse_scene_key(key).key == key
 
 
-def test_the_mark_of_a_finished_scene_is_read():
+def test_the_completion_marker_is_read():
     text = json.dumps(
         {"scene_label": "A_1", "scene_index": 1.0, "map_name": "A", "map_path": "/Game/A"}
     )
@@ -62,7 +62,7 @@ def test_the_mark_of_a_finished_scene_is_read():
     assert labels == SceneLabels(scene_label="A_1", scene_index=1, map_name="A", map_path="/Game/A")
 
 
-def test_every_identifier_of_a_wrong_type_is_told():
+def test_every_identifier_of_a_wrong_type_is_reported():
     text = b'{"scene_label": 3, "scene_index": "4", "map_name": ["A"]}'
 
     with pytest.raises(SchemaError, match=r"m\.json: 3 problems") as caught:

@@ -46,7 +46,7 @@ def test_the_scene_rendered_elsewhere_is_read(shared_scenes):
     assert (labels.character, labels.animation) == ("SK_Ch13_nonPBR", "AN_Pontera")
 
 
-def test_without_an_image_size_the_rig_is_for_the_releases(rig_document, dumped):
+def test_without_an_image_size_the_releases_size_is_assumed(rig_document, dumped):
     del rig_document["image_width"], rig_document["image_height"]
 
     rig, _ = parse_rig(dumped(rig_document), where="baseline.json")
@@ -172,7 +172,7 @@ def test_an_unknown_key_that_may_hold_a_quantity_is_refused(
         (-6.5, "must be a number above zero, found -6.5"),
     ],
 )
-def test_a_baseline_that_is_no_length_is_named_with_its_path(rig_document, dumped, value, found):
+def test_a_baseline_that_is_not_a_length_is_named_with_its_path(rig_document, dumped, value, found):
     rig_document["pairwise_pairs"][3]["baseline_cm"] = value
 
     problems = problems_of(rig_document, dumped)
@@ -195,7 +195,7 @@ def test_a_pair_given_twice_names_both_places_and_the_pair_that_is_missing(rig_d
     ]
 
 
-def test_a_camera_that_is_not_there_is_named(rig_document, dumped):
+def test_a_camera_outside_the_rig_is_named(rig_document, dumped):
     rig_document["pairwise_pairs"][4]["camera_index_b"] = 7
 
     assert problems_of(rig_document, dumped) == [
@@ -218,7 +218,7 @@ def test_a_pair_of_one_camera_is_refused(rig_document, dumped):
         ([], "$.pairwise_pairs: must have each of the 15 camera pairs once, and lacks 0-1"),
     ],
 )
-def test_pairs_that_are_no_list_of_objects_are_refused(rig_document, dumped, pairs, problem):
+def test_pairs_must_be_a_list_of_objects(rig_document, dumped, pairs, problem):
     rig_document["pairwise_pairs"] = pairs
 
     assert problems_of(rig_document, dumped)[0].startswith(problem)
@@ -270,7 +270,7 @@ def test_missing_intrinsics_are_named_with_the_keys_of_the_file(rig_document, du
     assert "image_width, intrinsics, map_name" in problems[0]
 
 
-def test_all_problems_of_a_file_are_told_at_once(rig_document, dumped):
+def test_all_problems_of_a_file_are_reported_at_once(rig_document, dumped):
     rig_document["camera_intrinsics"]["focal_length_mm"] = "32"
     rig_document["camera_intrinsics"]["sensor_width_mm"] = 0
     rig_document |= {"unit": "inch", "camera_count": 5, "image_width": 0.5, "image_height": -1}

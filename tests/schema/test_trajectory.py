@@ -349,9 +349,7 @@ def change(path, value):
         ),
     ],
 )
-def test_what_does_not_follow_the_format_is_named_with_its_path(
-    trajectory_document, changes, problem
-):
+def test_a_violation_of_the_format_is_named_with_its_path(trajectory_document, changes, problem):
     changes(trajectory_document)
 
     assert any(found.startswith(problem) for found in problems_of(trajectory_document))

@@ -158,7 +158,7 @@ def test_commands_that_need_all_cameras_name_what_a_part_lacks(shards_on_the_web
     shown = CliRunner().invoke(app, ["show", str(dest), "--out", str(tmp_path / "sheet.png")])
 
     assert shown.exit_code == 2
-    assert "cam_02_rgb.mp4 is not among its files; there are cam_00_rgb.mp4" in shown.stderr
+    assert "cam_02_rgb.mp4 is not in the data; the scene has cam_00_rgb.mp4" in shown.stderr
 
 
 def test_a_killed_download_goes_on_and_leaves_no_file_that_is_not_whole(

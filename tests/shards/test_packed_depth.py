@@ -14,7 +14,7 @@ import torch
 from typer.testing import CliRunner
 
 from stereogenbench_data import PAIR_FIELDS, SceneViews, StereoPairs, StereoPairStream
-from stereogenbench_data.bridges.scene_bytes import samples_of
+from stereogenbench_data.bridges.in_memory import samples_of
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import ExtraError, MediaError, ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex

@@ -32,8 +32,8 @@ def test_the_command_passes_the_contract_on(tmp_path):
     assert "depth_unit_m=0.1, depth_tag=None" in marker.read_text()
 
 
-def test_a_request_that_no_scene_can_meet_ends_the_command(tmp_path):
-    with pytest.raises(SynthesisError, match="in the train split only"):
+def test_an_impossible_request_ends_the_command(tmp_path):
+    with pytest.raises(SynthesisError, match="Pairwise_Uniform exists only in train"):
         CliRunner().invoke(
             app,
             [str(tmp_path), *SMALL, "--family", "Pairwise_Uniform", "--split", "eval"],

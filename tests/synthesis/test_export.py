@@ -93,7 +93,7 @@ def test_recorded_baselines_are_the_distances_of_the_recorded_poses(draw, family
         np.testing.assert_allclose(distances_cm, recorded_cm, rtol=0, atol=1e-9)
 
 
-def test_every_rotation_form_says_the_same(draw):
+def test_every_rotation_form_records_the_same_poses(draw):
     poses = {}
     for form in ("rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"):
         scene = draw(contract=ExportContract(rotation=form), **small())
@@ -163,7 +163,7 @@ def test_the_release_reader_takes_a_scene_as_rectified(draw):
     assert described.labels.character.startswith("SK_Synth")
 
 
-def test_the_depth_tag_tells_the_unit_or_is_left_out(draw):
+def test_the_depth_tag_states_the_unit_or_is_absent(draw):
     tagged = draw(contract=ExportContract(depth_unit_m=0.01, depth_tag="scale"), **small())
     bare = draw(contract=ExportContract(depth_unit_m=0.1, depth_tag=None), **small())
 
@@ -259,13 +259,13 @@ def test_the_primary_pair_is_written_in_either_form(draw):
         ({"scenes": -1}, "scenes must be at least 1, got -1"),
         ({"seed": -1}, "seed must be 0 or more, got -1"),
         ({"family": "Wide"}, "family must be one of IPD_Gaussian, .* got 'Wide'"),
-        ({"family": "Pairwise_Uniform", "split": "eval"}, "in the train split only"),
+        ({"family": "Pairwise_Uniform", "split": "eval"}, "Pairwise_Uniform exists only in train"),
         ({"map_name": "a.b"}, "map_name must be letters.* got 'a.b'"),
         ({"focal_mm": float("nan")}, "focal_mm must be a positive number, got nan"),
         ({"world_offset_cm": 2e6}, "world_offset_cm must be in 0..1e[+]06, got 2000000.0"),
     ],
 )
-def test_a_request_that_no_scene_can_meet_is_refused(changes, message):
+def test_an_impossible_request_is_refused(changes, message):
     with pytest.raises(SynthesisError, match=message):
         SynthRequest(**changes)
 

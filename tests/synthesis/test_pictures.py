@@ -51,7 +51,7 @@ def test_a_wrong_scale_or_sign_is_far_worse(uniform_scene):
     assert true_db - wrong_db > 10
 
 
-def test_pictures_hold_detail_of_film(uniform_scene):
+def test_pictures_have_as_much_detail_as_real_ones(uniform_scene):
     """At constant rate factor 18, a detailed picture costs a codec a bit a pixel or so."""
     path = uniform_scene.folder / "cam_00_rgb.mp4"
     bits_a_pixel = 8 * path.stat().st_size / (2 * 384 * 384)
@@ -70,8 +70,8 @@ def test_depth_has_near_far_and_sky(draw):
 
 
 def test_every_limb_of_the_subject_moves():
-    stage = plan_scene(SynthRequest(), index=0).stage
-    before, after = stage.walker(0.0), stage.walker(0.4)
+    scene = plan_scene(SynthRequest(), index=0).scene
+    before, after = scene.walker(0.0), scene.walker(0.4)
 
     moved_m = [np.linalg.norm(a.centre - b.centre) for a, b in zip(before, after, strict=True)]
     turned = [np.abs(a.axes - b.axes).max() for a, b in zip(before, after, strict=True)]

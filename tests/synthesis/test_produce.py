@@ -7,9 +7,8 @@ import os
 import pytest
 
 from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.synthesis import synthesise
-from stereogenbench_data.synthesis.request import SynthRequest
-from stereogenbench_data.synthesis.videos import VideoFile
+from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis.camera_writer import VideoWriter
 
 SMALL = {"size_px": 32, "frames": 2, "seed": 9}
 
@@ -35,7 +34,7 @@ def contents(folder):
         ),
     ],
 )
-def test_scenes_stand_where_the_release_has_them(tmp_path, request_, key):
+def test_scenes_are_written_to_the_folders_of_the_release(tmp_path, request_, key):
     assert synthesise(tmp_path, request_) == [key]
     assert {path.name for path in tmp_path.iterdir()} == {key.split("/")[0]}
     assert len(contents(tmp_path / key)) == 17
@@ -50,7 +49,7 @@ def test_a_scene_is_the_same_whatever_the_number_of_scenes_and_workers(tmp_path)
 
 
 @pytest.mark.parametrize("other", [{"seed": 10}, {"split": "eval"}, {"map_name": "Elsewhere"}])
-def test_another_seed_or_folder_draws_another_scene(tmp_path, other):
+def test_another_seed_or_folder_gives_another_scene(tmp_path, other):
     (first,) = synthesise(tmp_path / "first", SynthRequest(**SMALL))
     (second,) = synthesise(tmp_path / "second", SynthRequest(**(SMALL | other)))
 
@@ -73,7 +72,7 @@ def test_progress_counts_camera_frames_up_to_all(tmp_path):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_run_that_was_stopped_leaves_whole_scenes_only_and_goes_on(tmp_path, workers):
+def test_an_interrupted_run_leaves_only_complete_scenes_and_can_continue(tmp_path, workers):
     request = SynthRequest(scenes=2, **(SMALL | {"frames": 6}))
 
     def stop(done, total):
@@ -97,7 +96,7 @@ def test_a_run_that_was_stopped_leaves_whole_scenes_only_and_goes_on(tmp_path, w
     assert {folder: folder.stat().st_mtime_ns for folder in finished} == before
 
 
-def test_what_a_killed_run_left_is_drawn_anew(tmp_path):
+def test_incomplete_scenes_of_a_killed_run_are_rendered_again(tmp_path):
     request = SynthRequest(**SMALL)
     stale = tmp_path / ".unfinished" / request.key(0)
     stale.mkdir(parents=True)
@@ -114,25 +113,28 @@ def test_a_scene_that_another_request_wrote_is_neither_kept_nor_overwritten(tmp_
     (key,) = synthesise(tmp_path, SynthRequest(**SMALL))
     before = contents(tmp_path / key)
 
-    with pytest.raises(SynthesisError, match="scene_000000: is a scene that another request wrote"):
+    with pytest.raises(SynthesisError, match="scene_000000: another request wrote this scene"):
         synthesise(tmp_path, SynthRequest(**(SMALL | {"frames": 3})))
 
     assert contents(tmp_path / key) == before
 
 
-def test_a_folder_that_is_no_finished_scene_is_not_touched(tmp_path):
+def test_a_folder_that_is_not_a_complete_scene_is_not_touched(tmp_path):
     request = SynthRequest(**SMALL)
     (tmp_path / request.key(0)).mkdir(parents=True)
 
-    with pytest.raises(SynthesisError, match="scene_000000: stands where a scene is to be written"):
+    with pytest.raises(
+        SynthesisError,
+        match=r"scene_000000: .* _scene_complete\.json of this folder cannot be read",
+    ):
         synthesise(tmp_path, request)
 
 
-def test_an_output_that_is_no_folder_is_named(tmp_path):
+def test_an_output_that_is_not_a_folder_is_named(tmp_path):
     taken = tmp_path / "file"
     taken.write_text("")
 
-    with pytest.raises(SynthesisError, match="file: no folder could be made in it"):
+    with pytest.raises(SynthesisError, match="file: cannot create a folder there"):
         synthesise(taken, SynthRequest(**SMALL))
 
 
@@ -140,7 +142,7 @@ def test_a_full_disk_is_an_error_that_names_scene_camera_and_cure(tmp_path, monk
     def fail(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(VideoFile, "write", fail)
+    monkeypatch.setattr(VideoWriter, "write", fail)
 
     with pytest.raises(
         SynthesisError, match=r"scene_000000: camera 0 .* No space left .* Make room"
@@ -149,7 +151,7 @@ def test_a_full_disk_is_an_error_that_names_scene_camera_and_cure(tmp_path, monk
     assert not list(tmp_path.iterdir())
 
 
-def test_a_worker_that_dies_is_an_error_and_not_a_hang(tmp_path):
+def test_a_dead_worker_is_an_error_and_not_a_hang(tmp_path):
     def kill(done, total):
         if done:
             multiprocessing.active_children()[0].kill()

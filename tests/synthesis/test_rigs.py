@@ -3,12 +3,16 @@ import pytest
 from scipy import stats
 
 from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.synthesis.rigs import draw_gaps_cm, lateral_places_cm, pair_distances_cm
+from stereogenbench_data.synthesis.cameras import (
+    lateral_places_cm,
+    pair_distances_cm,
+    random_gaps_cm,
+)
 
 
 def gaps_cm(family, *, rigs=800):
     rng = np.random.default_rng(5)
-    return np.array([draw_gaps_cm(family, rng=rng) for _ in range(rigs)])
+    return np.array([random_gaps_cm(family, rng=rng) for _ in range(rigs)])
 
 
 def test_ipd_gaussian_gaps_follow_the_truncated_normal_of_the_paper():
@@ -53,6 +57,6 @@ def test_pair_distances_of_a_rig_worked_by_hand():
     ]
 
 
-def test_a_family_without_a_rig_is_refused_by_name():
-    with pytest.raises(SynthesisError, match="family 'Wide' has no rig: ask for IPD_Gaussian"):
-        draw_gaps_cm("Wide", rng=np.random.default_rng(0))
+def test_an_unknown_family_is_refused():
+    with pytest.raises(SynthesisError, match="family 'Wide' is unknown: choose IPD_Gaussian"):
+        random_gaps_cm("Wide", rng=np.random.default_rng(0))

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis.shapes import Material, Shape
-from stereogenbench_data.synthesis.stage import Lens, draw_stage
-from stereogenbench_data.synthesis.sunlight import cast_shadow, full_light, sunlight_at
+from stereogenbench_data.synthesis.render import cast_shadow, full_light, sunlight_at
+from stereogenbench_data.synthesis.scene import Framing, Material, Shape, random_scene
 from stereogenbench_data.synthesis.textures import TEXTURES, sample_atlas, texture_row
 
 
@@ -41,17 +40,17 @@ def test_the_larger_a_pixel_the_less_detail_and_the_same_mean(name):
 
 
 def test_a_box_shades_the_ground_on_the_side_away_from_the_sun():
-    lens = Lens(distance_m=4.0, width_per_m=0.8, span_m=0.3, pixel_per_m=0.001)
-    stage = draw_stage(np.random.default_rng(1), lens=lens, walk_m_s=0.6)
+    framing = Framing(distance_m=4.0, width_per_m=0.8, span_m=0.3, pixel_per_m=0.001)
+    scene = random_scene(np.random.default_rng(1), framing=framing, walk_m_s=0.6)
     stone = Material("plaster", 1.0, (1.0, 1.0, 1.0))
     box = Shape("box", np.array([0.0, 0.0, 1.0]), np.eye(3), np.full(3, 1.0), stone)
     light = full_light()
 
-    cast_shadow(light, shape=box, stage=stage)
+    cast_shadow(light, shape=box, scene=scene)
 
-    away = 1.6 * -stage.sun[:2] / np.linalg.norm(stage.sun[:2])
+    away = 1.6 * -scene.sun[:2] / np.linalg.norm(scene.sun[:2])
     behind, before = (
-        sunlight_at(light, x_m=np.array([x]), y_m=np.array([y]), stage=stage)[0]
+        sunlight_at(light, x_m=np.array([x]), y_m=np.array([y]), scene=scene)[0]
         for x, y in (away, -away)
     )
     assert behind < 0.5

@@ -1,29 +1,28 @@
-"""The files and record sets of the release as it stands in a repository: folders of scenes.
+"""The files and record sets of a repository with the release's folders of scenes.
 
-Loose JSON files can be parsed, so scenes and pairs are read from each scene's ``baseline.json``;
-nothing depends on how many scenes there are.
+JSON files outside tars can be parsed, so scenes and pairs are read from each ``baseline.json``, and
+the descriptor does not depend on the number of scenes.
 """
 
 from typing import Any, Final
 
-from stereogenbench_data.bridges.croissant_enumerations import enumerations
-from stereogenbench_data.bridges.croissant_media import (
+from stereogenbench_data.bridges.croissant.nodes import (
     ENCODINGS,
-    UNKNOWN_ENCODING,
-    suffixes_of,
-    text_records,
-    video_records,
-)
-from stereogenbench_data.bridges.croissant_terms import (
     GIT,
     GIT_CHECKSUM,
     TEXT,
+    UNKNOWN_ENCODING,
+    VIDEO_TEXTS,
     Node,
+    enumerations,
     field,
     file_object,
     file_set,
     of_file,
     record_set,
+    suffixes_of,
+    text_records,
+    video_records,
 )
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
@@ -35,17 +34,15 @@ from stereogenbench_data.schema.release import (
 
 REPOSITORY: Final = "repository"
 _KEY: Final = r"^.*?((?:train|eval)/.+?/[^/.]+?)(?:/[^/]*\.[^/]*)?$"
-"""The scene of a file in a folder: it leaves a key as it is, so that a join may apply it twice."""
-
-_VIDEOS: Final = {"rgb": "RGB videos.", "depth": "Depth videos."}
+"""The scene of a file in a folder. It does not change a key: a join applies the regex twice."""
 
 
 def folder_nodes(index: SceneIndex | None, *, repository_url: str) -> tuple[list[Node], list[Node]]:
     """Return the files and the record sets of a tree in the released layout.
 
     Args:
-        index: Of such a tree, for the names of families, maps and files; None for those of the
-            paper.
+        index: The index of the tree, for the names of families, maps and files; None for the
+            names in the paper.
         repository_url: URL of the git repository that holds it.
     """
     suffixes = suffixes_of(index)
@@ -74,15 +71,15 @@ def folder_nodes(index: SceneIndex | None, *, repository_url: str) -> tuple[list
 
 
 def _file_sets(suffixes: dict[str, str]) -> dict[str, tuple[str | list[str], str, str]]:
-    """Return id to encodings, name and meaning.
+    """Return, for each id, the encodings, the file name and the meaning.
 
-    mlcroissant has no reader of videos: as text they are bytes.
+    mlcroissant has no reader for videos. It reads them as bytes if they are also called text.
     """
     videos = {
         f"{kind}-files": (
             [ENCODINGS.get(suffix, UNKNOWN_ENCODING), TEXT],
             f"cam_??_{kind}.{suffix}",
-            _VIDEOS[kind],
+            VIDEO_TEXTS[kind],
         )
         for kind, suffix in suffixes.items()
     }

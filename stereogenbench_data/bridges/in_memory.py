@@ -1,7 +1,7 @@
-"""A scene that another library has read into memory, as the samples of `StereoPairs`.
+"""Samples from a scene whose files another library holds in memory, and samples as numpy arrays.
 
-The files are laid out in a temporary folder as they were released, and read as any scene is: with
-the same checks, the same errors and the same samples.
+The files are written to a temporary folder in the released layout and read from there. So checks,
+errors and samples are those of `StereoPairs`.
 """
 
 import json
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final, TypedDict
 
 from stereogenbench_data.datasets.mapped import StereoPairs
-from stereogenbench_data.errors import SelectionError, StorageError
+from stereogenbench_data.errors import FieldError, SelectionError, StorageError
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
@@ -22,12 +22,12 @@ from stereogenbench_data.schema.release import METADATA_FILES, PACKED_DEPTH_NAME
 from stereogenbench_data.selection.pairs import PairsSpec
 from stereogenbench_data.selection.windows import FramesSpec
 
-VIDEOS: Final = (*VIDEO_FILES, *PACKED_DEPTH_NAMES.values())
-FILES: Final = (*METADATA_FILES, *VIDEOS)
+_VIDEOS: Final = (*VIDEO_FILES, *PACKED_DEPTH_NAMES.values())
+_FILES: Final = (*METADATA_FILES, *_VIDEOS)
 
 
 class SampleOptions(TypedDict, total=False):
-    """What `StereoPairs` takes beside data and fields, but for the filters on scenes."""
+    """The options of `StereoPairs`, except data, fields and the filters on scenes."""
 
     pairs: PairsSpec
     frames: FramesSpec
@@ -47,15 +47,15 @@ def samples_of(
     epoch: int,
     options: SampleOptions,
 ) -> Iterator[Sample]:
-    """Yield the samples of one scene; none where no pair of it has a baseline asked for.
+    """Yield the samples of one scene; none if no pair has a baseline within ``baseline_cm``.
 
     Args:
         key: The scene's key: its path.
-        files: Name to content, as bytes; other names are ignored. JSON that was parsed and text
-            that was decoded on the way are taken too.
-        fields: Names of the fields wanted.
-        epoch: For what is drawn at random.
-        options: What the samples shall be.
+        files: File name to content in bytes; parsed JSON and decoded text are accepted too.
+            Unknown names are ignored.
+        fields: Names of the fields to return.
+        epoch: Seeds random frames and transforms, with the seed.
+        options: As for `StereoPairs`.
 
     Raises:
         StorageError: If a file is missing, or the content of a video is not bytes.
@@ -67,11 +67,11 @@ def samples_of(
     with tempfile.TemporaryDirectory(prefix="stereogenbench-") as root:
         folder = Path(root, key)
         folder.mkdir(parents=True)
-        _lay_out(key, files, folder)
+        _write_files(key, files, folder)
         index = SceneIndex.from_scenes([describe_scene(root, key)], root)
-        drawn: dict[str, Any] = dict(options) | {"seed": _seed(options.get("seed", 0), key)}
+        seeded: dict[str, Any] = dict(options) | {"seed": _seed(options.get("seed", 0), key)}
         try:
-            pairs = StereoPairs(index, fields=fields, **drawn)
+            pairs = StereoPairs(index, fields=fields, **seeded)
         except SelectionError:
             if options.get("baseline_cm") is None:
                 raise
@@ -85,22 +85,22 @@ def samples_of(
 
 
 def _seed(seed: int, key: str) -> int:
-    """Return a seed of the scene's own, so that scenes do not all draw the same numbers."""
+    """Return a seed for one scene, so that scenes draw different random numbers."""
     return (seed << 32 | zlib.crc32(key.encode())) % 2**63
 
 
-def _lay_out(key: str, files: Mapping[str, Any], folder: Path) -> None:
-    needed = shutil.disk_usage(folder)
+def _write_files(key: str, files: Mapping[str, Any], folder: Path) -> None:
+    free_bytes = shutil.disk_usage(folder).free
     total = 0
-    for name in FILES:
+    for name in _FILES:
         if files.get(name) is None:
             continue
         content = _bytes(key, name, files[name])
         total += len(content)
-        if total > needed.free:
+        if total > free_bytes:
             raise StorageError(
-                f"{folder}: has room for {needed.free} bytes, and the files of {key} need more. "
-                "Set TMPDIR to a larger place."
+                f"{folder}: {free_bytes} bytes are free, and the files of {key} need more. "
+                "Set TMPDIR to a folder on a larger disk."
             )
         (folder / name).write_bytes(content)
 
@@ -110,14 +110,35 @@ def _bytes(key: str, name: str, content: Any) -> bytes:
         return content
     if isinstance(content, str):
         return content.encode()
-    if name in VIDEOS:
+    if name in _VIDEOS:
         inner = content.get("bytes") if isinstance(content, dict) else None
         if isinstance(inner, bytes):
             return inner
         raise StorageError(
-            f"{key}: {name} is a {type(content).__name__} and not bytes: a decoder took it before. "
+            f"{key}: {name} must be bytes, found {type(content).__name__}: it is already decoded. "
             "Read the shards without decoding (webdataset: no .decode(); datasets: features())."
         )
     if isinstance(content, dict):
         return json.dumps(content).encode()
-    raise StorageError(f"{key}: {name} is a {type(content).__name__}, and must be bytes.")
+    raise StorageError(
+        f"{key}: {name} must be bytes, found {type(content).__name__}. Read the shards without "
+        "decoding."
+    )
+
+
+def to_arrays(sample: Sample) -> Sample:
+    """Return a sample with numpy arrays of the same dtypes instead of tensors; texts stay.
+
+    Raises:
+        FieldError: If a tensor's dtype has no numpy counterpart.
+    """
+    try:
+        return {
+            name: value if isinstance(value, str) else value.numpy()
+            for name, value in sample.items()
+        }
+    except TypeError as error:
+        raise FieldError(
+            f"a field cannot be converted to a numpy array ({error}). Leave it out of fields, or "
+            "convert its dtype in transform."
+        ) from error

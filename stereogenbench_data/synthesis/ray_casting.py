@@ -1,8 +1,8 @@
-"""Rays from a pinhole camera, and what they meet first.
+"""Rays from a pinhole camera, and their first hits.
 
-Pixel (u, v) is column, row; the centre of the top-left pixel is (0.5, 0.5). Stage axes are
-Unreal's (x forward, y right, z up), metres. A ray has a part of 1 along the optical axis, so the
-t where it meets a surface is its depth along that axis.
+Pixel (u, v) is column, row; the centre of the top-left pixel is (0.5, 0.5). Scene axes are Unreal's
+(x forward, y right, z up), in metres. The direction of a ray has a component of 1 along the optical
+axis, so the t of a hit is its depth along that axis.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.synthesis.shapes import Shape, entry
+from stereogenbench_data.synthesis.scene import Shape, entry_depth
 
 Array = Any
 
@@ -26,11 +26,11 @@ _STRIP_RAYS: Final = 1 << 17
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """One pinhole camera on the stage.
+    """The view of one pinhole camera in a scene.
 
     Attributes:
-        eye: (3,) its centre.
-        axes: (3, 3) whose columns are its forward, right and up axes.
+        eye: (3,) the camera's centre.
+        axes: (3, 3) whose columns are the camera's forward, right and up axes.
         focal_px: Focal lengths along the picture's width and height.
         centre_px: Principal point.
         size_px: Width and height of the picture.
@@ -43,11 +43,11 @@ class View:
     size_px: tuple[int, int]
 
     def right_of_axis(self, u_px: Array) -> Array:
-        """Return how far right of the optical axis a column looks, at depth 1."""
+        """Return the distance of a column to the right of the optical axis, at depth 1."""
         return (u_px - self.centre_px[0]) / self.focal_px[0]
 
     def below_axis(self, v_px: Array) -> Array:
-        """Return how far below the optical axis a row looks, at depth 1."""
+        """Return the distance of a row below the optical axis, at depth 1."""
         return (v_px - self.centre_px[1]) / self.focal_px[1]
 
     def in_unit_solid(self, shape: Shape) -> tuple[Array, Array]:
@@ -58,16 +58,16 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rays:
-    """Rays by where they cross the plane at depth 1: right of and below the optical axis.
+    """Rays by their place in the plane at depth 1: right of and below the optical axis.
 
-    Either a grid, ``right`` (1, w) and ``below`` (h, 1), or a list, both (n,).
+    They are either a grid, with ``right`` (1, w) and ``below`` (h, 1), or a list, with both (n,).
     """
 
     right: Array
     below: Array
 
     def within(self, bounds: tuple[float, float, float, float]) -> tuple[Any, "Rays"]:
-        """Return those between left, right, top and bottom bounds, and their index in an array."""
+        """Return the index of the rays within left, right, top and bottom bounds, and the rays."""
         left, right, top, bottom = bounds
         if self.right.ndim == 2:
             columns = slice(*np.searchsorted(self.right[0], (left, right)))
@@ -84,12 +84,12 @@ class Rays:
         return Rays(right.ravel(), below.ravel())
 
     def directions(self, axes: Array) -> list[Array]:
-        """Return the three parts of each ray's direction, given the camera's axes as columns."""
+        """Return the three components of the directions, given the camera's axes as columns."""
         return [ahead + (right * self.right - up * self.below) for ahead, right, up in axes]
 
 
 def pixel_rays(view: View) -> Iterator[tuple[slice, Rays]]:
-    """Yield rays through pixel centres, in strips of rows that fit the processor's cache."""
+    """Yield the rays through pixel centres, in strips of rows that fit the processor's cache."""
     width, height = view.size_px
     step = max(1, _STRIP_RAYS // width)
     right = view.right_of_axis(np.arange(width)[None] + 0.5)
@@ -98,13 +98,13 @@ def pixel_rays(view: View) -> Iterator[tuple[slice, Rays]]:
         yield slice(top, top + len(rows)), Rays(right, view.below_axis(rows[:, None] + 0.5))
 
 
-def first_met(
+def first_hits(
     rays: Rays, *, view: View, shapes: Sequence[Shape], slope: Float64[np.ndarray, "2"]
 ) -> tuple[Array, Array]:
-    """Return the depth in metres of what each ray meets first, and which solid that is.
+    """Return the depth in metres of each ray's first hit, and the number of the solid.
 
     The ground is the plane z = slope . (x, y). A solid is `SKY` (at infinite depth), `GROUND`,
-    or `FIRST_SHAPE` plus the place of a shape in ``shapes``.
+    or `FIRST_SHAPE` plus the index of a shape in ``shapes``.
     """
     depth_m = _ground_depth(rays, view=view, slope=slope)
     solid = np.where(np.isfinite(depth_m), GROUND, SKY)
@@ -113,7 +113,7 @@ def first_met(
         if inside.right.size == 0 or inside.below.size == 0:
             continue
         origin, axes = view.in_unit_solid(shape)
-        t = entry(shape, origin=list(origin), direction=inside.directions(axes))
+        t = entry_depth(shape, origin=list(origin), direction=inside.directions(axes))
         nearer = t < depth_m[index]
         depth_m[index] = np.where(nearer, t, depth_m[index])
         solid[index] = np.where(nearer, number, solid[index])
@@ -128,7 +128,7 @@ def _ground_depth(rays: Rays, *, view: View, slope: Float64[np.ndarray, "2"]) ->
 
 
 def _bounds(shape: Shape, *, view: View) -> tuple[float, float, float, float]:
-    """Return left, right, top and bottom of what a shape can cover at depth 1."""
+    """Return left, right, top and bottom bounds of a shape in the plane at depth 1."""
     forward, right, up = ((shape.corners() - view.eye) @ view.axes).T
     if forward.max() <= 0:
         return np.inf, -np.inf, np.inf, -np.inf

@@ -4,13 +4,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stereogenbench_data.synthesis.plan import plan_scene
-from stereogenbench_data.synthesis.request import SynthRequest
-from stereogenbench_data.synthesis.trajectory import (
+from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
+from stereogenbench_data.synthesis.cameras import (
     quaternion_from_rotator,
     rig_locations_cm,
-    rotation_from_rotator,
 )
+from stereogenbench_data.synthesis.plan import plan_scene
+from stereogenbench_data.synthesis.request import SynthRequest
 
 angles = st.floats(-180, 180)
 rotators = st.tuples(st.floats(-90, 90), angles, angles).map(np.array)
@@ -18,13 +18,13 @@ rotators = st.tuples(st.floats(-90, 90), angles, angles).map(np.array)
 
 def test_a_rotator_turns_the_camera_as_unreal_does():
     """Yaw turns right, pitch up; a positive roll lowers the right hand."""
-    forward, right, up = rotation_from_rotator(np.array([0.0, 90.0, 0.0])).T
+    forward, right, up = rotation_from_rotator_deg(np.array([0.0, 90.0, 0.0])).T
     np.testing.assert_allclose([forward, right, up], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], atol=1e-15)
 
-    forward, right, up = rotation_from_rotator(np.array([90.0, 0.0, 0.0])).T
+    forward, right, up = rotation_from_rotator_deg(np.array([90.0, 0.0, 0.0])).T
     np.testing.assert_allclose([forward, right, up], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], atol=1e-15)
 
-    forward, right, up = rotation_from_rotator(np.array([0.0, 0.0, 90.0])).T
+    forward, right, up = rotation_from_rotator_deg(np.array([0.0, 0.0, 90.0])).T
     np.testing.assert_allclose([forward, right, up], [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-15)
 
 
@@ -34,7 +34,7 @@ def test_the_quaternion_is_the_same_rotation_as_the_matrix(rotator_deg):
     pitch, yaw, roll = rotator_deg
     composed = Rotation.from_euler("ZYX", [yaw, -pitch, -roll], degrees=True).as_matrix()
 
-    matrix = rotation_from_rotator(rotator_deg)
+    matrix = rotation_from_rotator_deg(rotator_deg)
     quaternion = quaternion_from_rotator(rotator_deg)
 
     np.testing.assert_allclose(matrix, composed, atol=1e-12)
@@ -79,12 +79,12 @@ def test_the_rig_looks_at_the_subject_from_above_the_ground(index):
         view = plan.view(camera=0, frame=frame)
         other = plan.view(camera=5, frame=frame)
         middle = (view.eye + other.eye) / 2
-        hips = plan.stage.walker(plan.moment_s(frame))[0].centre
+        hips = plan.scene.walker(plan.moment_s(frame))[0].centre
         forward, right, up = view.axes.T @ (hips - middle)
         assert abs(right) < 0.35 * forward * 23.76 / plan.focal_mm + 0.4
         assert abs(up) < 0.5 * forward * 23.76 / plan.focal_mm
         for eye in (view.eye, other.eye):
-            assert eye[2] > plan.stage.ground_m(*eye[:2]) + 0.15
+            assert eye[2] > plan.scene.ground_m(*eye[:2]) + 0.15
 
 
 def test_focal_lengths_fill_the_range_of_the_release():

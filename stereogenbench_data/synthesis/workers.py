@@ -1,4 +1,4 @@
-"""Cameras filmed by several processes: the job of one camera, and the jobs of many."""
+"""The videos of many cameras, written by several processes: one job per camera of a scene."""
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,14 +9,14 @@ import torch
 
 from stereogenbench_data.engine import LOCAL, Engine
 from stereogenbench_data.errors import StorageError, SynthesisError, cure_of
-from stereogenbench_data.synthesis.filming import film_camera
+from stereogenbench_data.synthesis.camera_writer import write_camera
 from stereogenbench_data.synthesis.plan import plan_scene
 from stereogenbench_data.synthesis.request import SynthRequest
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
-    """One camera of one scene, to be written into a folder."""
+class CameraJob:
+    """One camera of one scene, and the folder for its videos."""
 
     request: SynthRequest
     index: int
@@ -24,43 +24,43 @@ class Job:
     folder: Path
 
     def run(self, after_frame: Callable[[], None]) -> None:
-        """Do the work.
+        """Render the camera and write its videos.
 
         Raises:
             SynthesisError: If a file cannot be written; the message names the scene.
         """
         plan = plan_scene(self.request, index=self.index)
         try:
-            film_camera(plan, camera=self.camera, folder=self.folder, after_frame=after_frame)
+            write_camera(plan, camera=self.camera, folder=self.folder, after_frame=after_frame)
         except OSError as error:
             raise SynthesisError(
-                f"{plan.key}: camera {self.camera} could not be written to {self.folder}: {error}. "
-                + cure_of(error, "See that the disk has room and may be written to.")
-                + " Then run again: finished scenes are kept."
+                f"{plan.key}: camera {self.camera} cannot be written to {self.folder}: {error}. "
+                + cure_of(error, "Check that the disk has free space and may be written to.")
+                + " Then run the same request again: complete scenes are kept."
             ) from error
 
 
 def run_jobs(
-    jobs: Sequence[Job],
+    jobs: Sequence[CameraJob],
     *,
     workers: int | None,
     engine: Engine = LOCAL,
     after_frames: Callable[[int], None],
-) -> Generator[Job, None, None]:
-    """Do jobs in any order and yield each when it is done; close it to stop the rest.
+) -> Generator[CameraJob, None, None]:
+    """Run jobs in any order and yield each when it is done; close the generator to stop the rest.
 
     Args:
-        jobs: The work.
-        workers: How many processes, None for one a core; 1 works in this one.
-        engine: Where they are.
-        after_frames: Called now and then with how many frames were drawn since it was called.
+        jobs: The jobs.
+        workers: The number of processes, None for one a core; with 1, this process does the work.
+        engine: Where the processes run.
+        after_frames: Called repeatedly with the number of frames rendered since the last call.
 
     Raises:
         SynthesisError: If a job fails or a worker dies; the others are stopped first.
     """
     try:
         yield from engine.map(
-            _film,
+            _write_camera,
             jobs,
             name=lambda job: f"{job.request.key(job.index)}, camera {job.camera}",
             workers=workers,
@@ -70,7 +70,7 @@ def run_jobs(
         raise SynthesisError(str(error)) from error
 
 
-def _film(job: Job, after_frames: Callable[[int], None]) -> Job:
+def _write_camera(job: CameraJob, after_frames: Callable[[int], None]) -> CameraJob:
     with _one_thread():
         job.run(lambda: after_frames(1))
     return job
@@ -78,7 +78,7 @@ def _film(job: Job, after_frames: Callable[[int], None]) -> Job:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Draw with one thread: how torch rounds depends on how it shares work out."""
+    """Render with one thread: the rounding of torch depends on the number of threads."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -3,18 +3,23 @@
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis.casting import GROUND, SKY, View, first_met, pixel_rays
+from stereogenbench_data.synthesis import SynthRequest
 from stereogenbench_data.synthesis.plan import plan_scene
-from stereogenbench_data.synthesis.render import Scenery, draw_depth, draw_frame, still_light
-from stereogenbench_data.synthesis.request import SynthRequest
-from stereogenbench_data.synthesis.shapes import Material, Shape
+from stereogenbench_data.synthesis.ray_casting import GROUND, SKY, View, first_hits, pixel_rays
+from stereogenbench_data.synthesis.render import (
+    SceneState,
+    render_depth,
+    render_frame,
+    static_light,
+)
+from stereogenbench_data.synthesis.scene import Material, Shape
 
 LEVEL = np.zeros(2)
 STONE = Material("plaster", 1.0, (1.0, 1.0, 1.0))
 
 
 def view_from(eye, *, size_px=(5, 5), focal_px=5.0):
-    """A camera that looks along the stage's x axis, its principal point in the middle."""
+    """A camera that looks along the scene's x axis, its principal point in the middle."""
     width, height = size_px
     return View(
         eye=np.array(eye),
@@ -27,7 +32,7 @@ def view_from(eye, *, size_px=(5, 5), focal_px=5.0):
 
 def depth_of(shapes, view):
     ((_, rays),) = pixel_rays(view)
-    return first_met(rays, view=view, shapes=shapes, slope=LEVEL)
+    return first_hits(rays, view=view, shapes=shapes, slope=LEVEL)
 
 
 def test_the_ground_is_at_height_over_descent_and_the_sky_has_no_depth():
@@ -78,13 +83,13 @@ def test_a_shape_behind_the_camera_is_not_seen():
 
 
 @pytest.mark.parametrize("index", range(3))
-def test_every_depth_lies_on_the_surface_of_what_was_met(index):
+def test_every_hit_lies_on_the_surface_of_its_solid(index):
     """Independent of how it was found: the point at that depth fulfils the solid's equation."""
     plan = plan_scene(SynthRequest(family="Uniform", size_px=48), index=index)
-    scenery = Scenery(plan.stage, moment_s=0.3, still_light=still_light(plan.stage))
+    state = SceneState(plan.scene, moment_s=0.3, static_light=static_light(plan.scene))
     view = plan.view(camera=2, frame=40)
     ((_, rays),) = pixel_rays(view)
-    depth_m, solid = scenery.first_met(rays, view=view)
+    depth_m, solid = state.first_hits(rays, view=view)
 
     v, u = np.nonzero(np.isfinite(depth_m))
     camera = np.stack(
@@ -94,9 +99,9 @@ def test_every_depth_lies_on_the_surface_of_what_was_met(index):
     checked = 0
     for point, met in zip(points.T, solid[v, u], strict=True):
         if met == GROUND:
-            level = point[2] - plan.stage.slope @ point[:2]
+            level = point[2] - plan.scene.slope @ point[:2]
         else:
-            shape = scenery.shapes[met - 2]
+            shape = state.shapes[met - 2]
             place = shape.axes @ (point - shape.centre) / shape.half_m
             level = np.abs(place).max() - 1 if shape.kind == "box" else np.linalg.norm(place) - 1
         assert abs(level) < 1e-9
@@ -107,13 +112,13 @@ def test_every_depth_lies_on_the_surface_of_what_was_met(index):
 def test_strips_of_a_large_picture_join_without_a_seam():
     """A 1280 px picture is cast in strips; its rows are those of rays cast one row at a time."""
     plan = plan_scene(SynthRequest(size_px=1280, height_px=112), index=0)
-    scenery = Scenery(plan.stage, moment_s=0.0, still_light=still_light(plan.stage))
+    state = SceneState(plan.scene, moment_s=0.0, static_light=static_light(plan.scene))
     view = plan.view(camera=0, frame=0)
 
-    picture, depth_m = draw_frame(scenery, view=view)
+    picture, depth_m = render_frame(state, view=view)
 
     assert picture.shape == (112, 1280, 3)
-    np.testing.assert_array_equal(depth_m, draw_depth(scenery, view=view))
+    np.testing.assert_array_equal(depth_m, render_depth(state, view=view))
     for row in (0, 101, 102, 111):
         alone = View(
             eye=view.eye,
@@ -123,5 +128,5 @@ def test_strips_of_a_large_picture_join_without_a_seam():
             size_px=(1280, 1),
         )
         np.testing.assert_allclose(
-            depth_m[row : row + 1], draw_depth(scenery, view=alone), rtol=1e-9
+            depth_m[row : row + 1], render_depth(state, view=alone), rtol=1e-9
         )

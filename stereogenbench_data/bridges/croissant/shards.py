@@ -1,50 +1,78 @@
 """The files and record sets of shards: tables for scenes and pairs, tars for videos and JSON files.
 
-mlcroissant parses no JSON inside a tar, follows one reference from a record set, and unpacks every
-tar that a record set touches. So scenes and pairs come from tables, and the record sets of files
-are bound to a few shards where there are many.
+mlcroissant does not parse JSON inside a tar, follows only one reference from a record set, and
+unpacks every tar that a record set uses. So the contents of the scenes' JSON files are written once
+as Parquet, from the index; where there are many shards, the record sets of files use only a few.
+The same index gives the same bytes.
 """
 
+import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.bridges.croissant_enumerations import enumerations
-from stereogenbench_data.bridges.croissant_media import (
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from stereogenbench_data.bridges.croissant.nodes import (
     ENCODINGS,
-    UNKNOWN_ENCODING,
-    suffixes_of,
-    text_records,
-    video_records,
-)
-from stereogenbench_data.bridges.croissant_tables import (
-    MOST_SHARD_FILES,
-    PAIRS,
-    SCENES,
-    SHARD_LIST,
-    SHARDS,
-    WrittenTable,
-)
-from stereogenbench_data.bridges.croissant_terms import (
     PARQUET,
     TAR,
     TEXT,
+    UNKNOWN_ENCODING,
+    VIDEO_TEXTS,
     Node,
     column,
+    enumerations,
     field,
     file_object,
     file_set,
     of_file,
     record_set,
     refers_to,
+    suffixes_of,
+    text_records,
+    video_records,
 )
+from stereogenbench_data.errors import DescriptorError, cure_of
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.release import BASELINE_JSON, COMPLETE_JSON, TRAJECTORY_JSON
+from stereogenbench_data.schema.release import (
+    BASELINE_JSON,
+    CAMERA_PAIRS,
+    COMPLETE_JSON,
+    TRAJECTORY_JSON,
+    baseline_bin,
+)
+from stereogenbench_data.sources.files import open_atomic, write_atomic
 
+SCENES: Final = "scenes.parquet"
+PAIRS: Final = "pairs.parquet"
+SHARDS: Final = "shards.parquet"
+SHARD_LIST: Final = "shards.txt"
+MOST_SHARD_FILES: Final = 3000
+"""Above this number, shards are named in a list, with their checksums in a table."""
 MOST_MEDIA_BYTES: Final = 1_000_000_000
-"""Beyond so many bytes of shards, record sets of files are bound to the smallest of each family."""
+"""Above this size of all shards, record sets of files use the smallest shard of each family."""
 
 _KEY: Final = r"^(.+?)(?:\.cam_\d{{2}}_{kind}\.{suffix})?$"
-"""The scene of a video in a shard. A key is left as it is: a join may apply the regex twice."""
+"""The scene of a video in a shard. It does not change a key: a join applies the regex twice."""
+_TABLES: Final = {
+    SCENES: "One row a scene.",
+    PAIRS: "One row a camera pair, 15 a scene.",
+    SHARDS: "One row a shard, with its checksum.",
+    SHARD_LIST: "The paths of all shards, one a line.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenTable:
+    """A table on disk: its file name, its size in bytes and its checksum in hex."""
+
+    name: str
+    size: int
+    sha256: str
 
 
 def packed_nodes(
@@ -53,8 +81,8 @@ def packed_nodes(
     """Return the files and the record sets of shards.
 
     Args:
-        index: Of the shards.
-        tables: The tables as written.
+        index: The index of the shards.
+        tables: The tables that `write_tables` wrote.
         data_url: URL or relative path of the folder of shards.
         tables_url: URL or relative path of the folder of tables.
     """
@@ -96,16 +124,8 @@ def packed_nodes(
     return files, records
 
 
-_TABLES: Final = {
-    SCENES: "One row a scene.",
-    PAIRS: "One row a camera pair, 15 a scene.",
-    SHARDS: "One row a shard, with its checksum.",
-    SHARD_LIST: "The paths of all shards, one a line.",
-}
-
-
 def _bound_shards(index: SceneIndex) -> list[str]:
-    """Return the shards whose files are records: all, or the smallest of each family if large."""
+    """Return the shards that record sets of files use: all, or the smallest of each family."""
     paths = sorted(index.shards)
     if sum(index.shards[path].size for path in paths) <= MOST_MEDIA_BYTES:
         return paths
@@ -120,7 +140,7 @@ def _bound_shards(index: SceneIndex) -> list[str]:
 def _file_sets(shards: list[str], suffixes: dict[str, str]) -> list[Node]:
     kinds = {kind: ENCODINGS.get(suffix, UNKNOWN_ENCODING) for kind, suffix in suffixes.items()}
     sets: dict[str, tuple[str | list[str], str, str]] = {
-        f"{kind}-files": (kinds[kind], f"**/*.cam_??_{kind}.{suffix}", _VIDEOS[kind])
+        f"{kind}-files": (kinds[kind], f"**/*.cam_??_{kind}.{suffix}", VIDEO_TEXTS[kind])
         for kind, suffix in suffixes.items()
     }
     sets |= {
@@ -133,9 +153,6 @@ def _file_sets(shards: list[str], suffixes: dict[str, str]) -> list[Node]:
         file_set(name, within=shards, encoding=encoding, includes=includes, about=text)
         for name, (encoding, includes, text) in sets.items()
     ]
-
-
-_VIDEOS: Final = {"rgb": "RGB videos.", "depth": "Depth videos."}
 
 
 def _listed_shards() -> Node:
@@ -284,3 +301,115 @@ def _media(suffixes: dict[str, str]) -> list[Node]:
     ]
     texts = text_records(scene_of=r"^(.+)\.{file}$")
     return [names, *videos, *texts]
+
+
+def write_tables(index: SceneIndex, folder: Path) -> list[WrittenTable]:
+    """Write the tables of an index into a folder.
+
+    Args:
+        index: The scenes. ``shards.parquet`` is written if they are in shards, and ``shards.txt``
+            if there are too many shards for a descriptor.
+        folder: Where to write; created if it does not exist.
+
+    Raises:
+        DescriptorError: If the folder cannot be written.
+    """
+    tables = {SCENES: scenes_table(index), PAIRS: pairs_table(index)}
+    if index.shards:
+        tables[SHARDS] = shards_table(index)
+    names = [*tables]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, table in tables.items():
+            with open_atomic(folder / name) as file:
+                pq.write_table(table, file, compression="zstd")
+        if len(index.shards) > MOST_SHARD_FILES:
+            listed = "".join(f"{path}\n" for path in sorted(index.shards))
+            write_atomic(folder / SHARD_LIST, listed.encode())
+            names.append(SHARD_LIST)
+    except OSError as error:
+        raise DescriptorError(
+            f"{folder}: tables cannot be written ({error.strerror or error}). "
+            + cure_of(error, "Choose another place with --out.")
+        ) from error
+    return [_written(folder / name) for name in names]
+
+
+def scenes_table(index: SceneIndex) -> pa.Table:
+    """Return one row per scene: identity, camera, 15 baselines, description."""
+    keys = index.column("key")
+    baselines_cm = index.column("baselines_cm")
+    columns: dict[str, pa.Array] = {
+        "scene_id": pa.array(keys, pa.string()),
+        "split": pa.array(index.column("split"), pa.string()),
+        "eval_subset": pa.array(index.column("subset"), pa.string()),
+        "family": pa.array(index.column("family"), pa.string()),
+        "map": pa.array(index.column("map_name"), pa.string()),
+        "scene_label": pa.array(index.column("scene_label"), pa.string()),
+        "character": pa.array(index.column("character"), pa.string()),
+        "animation": pa.array(index.column("animation"), pa.string()),
+        "frames": pa.array(index.column("frames"), pa.int64()),
+        "frame_rate_hz": pa.array(index.column("frame_rate_hz"), pa.float64()),
+        "image_width_px": pa.array(index.column("image_width_px"), pa.int64()),
+        "image_height_px": pa.array(index.column("image_height_px"), pa.int64()),
+        "focal_mm": pa.array(index.column("focal_mm"), pa.float64()),
+        "sensor_width_mm": pa.array(index.column("sensor_width_mm"), pa.float64()),
+        "sensor_height_mm": pa.array(index.column("sensor_height_mm"), pa.float64()),
+        "primary_left": pa.array(index.column("primary_left"), pa.int64()),
+        "primary_right": pa.array(index.column("primary_right"), pa.int64()),
+        "pairwise_baselines_cm": pa.array(baselines_cm.tolist(), pa.list_(pa.float64())),
+        "depth_unit_m": pa.array(index.column("depth_unit_m").tolist(), pa.list_(pa.float64())),
+        "description": pa.array(index.column("caption"), pa.string()),
+    }
+    if index.shards:
+        columns["shard"] = pa.array([_shard_of(index, row) for row in range(len(index))])
+    return pa.table(columns)
+
+
+def pairs_table(index: SceneIndex) -> pa.Table:
+    """Return one row per camera pair, 15 per scene, in the order of `CAMERA_PAIRS`."""
+    scenes, count = len(index), len(CAMERA_PAIRS)
+    left, right = np.array(CAMERA_PAIRS, dtype=np.int64).T
+    baselines_cm = index.column("baselines_cm").reshape(-1)
+    primary = np.stack([index.column("primary_left"), index.column("primary_right")], axis=-1)
+    is_primary = (np.array(CAMERA_PAIRS)[None] == np.sort(primary, axis=-1)[:, None]).all(axis=-1)
+    keys = np.repeat(index.column("key"), count)
+    lefts, rights = np.tile(left, scenes), np.tile(right, scenes)
+    return pa.table(
+        {
+            "pair_id": [f"{key}:{a}-{b}" for key, a, b in zip(keys, lefts, rights, strict=True)],
+            "scene_id": pa.array(keys, pa.string()),
+            "camera_left": lefts,
+            "camera_right": rights,
+            "baseline_cm": baselines_cm,
+            "baseline_bin": [baseline_bin(float(each)) for each in baselines_cm],
+            "is_adjacent": rights - lefts == 1,
+            "is_primary": is_primary.reshape(-1),
+        }
+    )
+
+
+def shards_table(index: SceneIndex) -> pa.Table:
+    """Return one row per shard: path, size, checksum, and the number of scenes and members."""
+    paths = sorted(index.shards)
+    scenes = dict.fromkeys(paths, 0)
+    for row in range(len(index)):
+        scenes[_shard_of(index, row)] += 1
+    return pa.table(
+        {
+            "shard": paths,
+            "size_bytes": [index.shards[path].size for path in paths],
+            "sha256": [index.shards[path].sha256 for path in paths],
+            "scenes": [scenes[path] for path in paths],
+            "members": [index.shards[path].members for path in paths],
+        }
+    )
+
+
+def _shard_of(index: SceneIndex, row: int) -> str:
+    return next(iter(index.scene(row).members.values())).path
+
+
+def _written(path: Path) -> WrittenTable:
+    content = path.read_bytes()
+    return WrittenTable(path.name, len(content), hashlib.sha256(content).hexdigest())

@@ -1,9 +1,11 @@
-"""A camera's two videos: H.264 pictures and FFV1 depth.
+"""The two videos of a camera: H.264 pictures and FFV1 depth.
 
-One thread encodes, and nothing but frames and options goes in, so that the same frames make the
+One thread encodes, and the bytes depend only on frames and options, so the same frames give the
 same bytes on any number of processors.
 """
 
+from collections.abc import Callable
+from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +17,14 @@ from av.video.stream import VideoStream
 from jaxtyping import Float64, Shaped, UInt8, UInt16
 
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_name
-from stereogenbench_data.synthesis.casting import View
+from stereogenbench_data.synthesis.plan import ScenePlan
+from stereogenbench_data.synthesis.ray_casting import View
+from stereogenbench_data.synthesis.render import (
+    SceneState,
+    render_depth,
+    render_frame,
+    static_light,
+)
 from stereogenbench_data.synthesis.request import ExportContract
 
 _LARGEST: Final = {"gray16le": 65535, "gray12le": 4095, "gray10le": 1023}
@@ -24,8 +33,37 @@ _X264_OPTIONS: Final = {"crf": "18", "x264-params": "cpu-independent=1"}
 _FFV1_OPTIONS: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
 
 
-class VideoFile:
-    """A video that is being written; a context manager, whole when it was left without error."""
+def write_camera(
+    plan: ScenePlan, *, camera: int, folder: Path, after_frame: Callable[[], None]
+) -> None:
+    """Write a camera's two videos into a folder.
+
+    ``after_frame`` is called after each frame; an exception from it ends the work.
+    """
+    contract = plan.request.contract
+    light = static_light(plan.scene)
+    first = plan.view(camera=camera, frame=0)
+    with ExitStack() as files:
+        rgb = files.enter_context(open_rgb(folder, camera=camera, view=first))
+        depth = files.enter_context(
+            open_depth(folder, camera=camera, view=first, contract=contract)
+        )
+        for frame in range(plan.request.frames):
+            view = plan.view(camera=camera, frame=frame)
+            state = SceneState(plan.scene, moment_s=plan.moment_s(frame), static_light=light)
+            picture, depth_m = render_frame(state, view=view)
+            rgb.write(rgb_frame(picture))
+            if contract.frame_lag:
+                measured = frame - contract.frame_lag
+                view = plan.view(camera=camera, frame=measured)
+                state = SceneState(plan.scene, moment_s=plan.moment_s(measured), static_light=light)
+                depth_m = render_depth(state, view=view)
+            depth.write(depth_frame(depth_m, view=view, contract=contract))
+            after_frame()
+
+
+class VideoWriter:
+    """A video to write, as a context manager; the file is complete after an exit without error."""
 
     def __init__(
         self,
@@ -53,7 +91,7 @@ class VideoFile:
         self._frames += 1
         self._container.mux(self._stream.encode(frame))
 
-    def __enter__(self) -> "VideoFile":
+    def __enter__(self) -> "VideoWriter":
         return self
 
     def __exit__(
@@ -69,9 +107,9 @@ class VideoFile:
             self._container.close()
 
 
-def open_rgb(folder: Path, *, camera: int, view: View) -> VideoFile:
-    """Start a camera's pictures: yuv420p, x264's defaults at constant rate factor 18."""
-    return VideoFile(
+def open_rgb(folder: Path, *, camera: int, view: View) -> VideoWriter:
+    """Open the video of a camera's pictures: yuv420p, x264's defaults, constant rate factor 18."""
+    return VideoWriter(
         folder / rgb_name(camera),
         size_px=view.size_px,
         codec="libx264",
@@ -80,10 +118,10 @@ def open_rgb(folder: Path, *, camera: int, view: View) -> VideoFile:
     )
 
 
-def open_depth(folder: Path, *, camera: int, view: View, contract: ExportContract) -> VideoFile:
-    """Start a camera's depth, with the container's tag where the contract has one."""
+def open_depth(folder: Path, *, camera: int, view: View, contract: ExportContract) -> VideoWriter:
+    """Open the video of a camera's depth, with the depth tag of the contract, if any."""
     tag = contract.depth_tag
-    return VideoFile(
+    return VideoWriter(
         folder / depth_name(camera),
         size_px=view.size_px,
         codec="ffv1",
@@ -93,7 +131,7 @@ def open_depth(folder: Path, *, camera: int, view: View, contract: ExportContrac
 
 
 def rgb_frame(picture: UInt8[np.ndarray, "h w 3"]) -> av.VideoFrame:
-    """Return a picture as a frame that the encoder takes."""
+    """Return a picture as a frame for the encoder."""
     return av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p", threads=1)
 
 
@@ -110,7 +148,7 @@ def depth_frame(
 def depth_units(
     depth_m: Float64[np.ndarray, "h w"], *, view: View, contract: ExportContract
 ) -> UInt16[np.ndarray, "h w"]:
-    """Return depth as it is stored: rounded to the unit, the largest number where it is beyond."""
+    """Return depth in stored units: rounded, and limited to the largest number of the format."""
     if contract.depth_kind == "ray":
         width_px, height_px = view.size_px
         right = view.right_of_axis(np.arange(width_px) + 0.5)
@@ -121,7 +159,7 @@ def depth_units(
 
 
 def _fill_plane(plane: Any, rows: Shaped[np.ndarray, "h w"]) -> None:
-    """Copy an array into a plane, whose lines may be longer than the array's."""
+    """Copy an array into a plane, whose rows may be longer than the array's."""
     padded = np.zeros((rows.shape[0], plane.line_size // rows.itemsize), rows.dtype)
     padded[:, : rows.shape[1]] = rows
     plane.update(padded)

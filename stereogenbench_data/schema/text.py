@@ -1,4 +1,4 @@
-"""Text for messages and for Markdown."""
+"""Text for messages, terminals and Markdown."""
 
 
 def counted(count: int, noun: str) -> str:
@@ -11,9 +11,9 @@ def counted(count: int, noun: str) -> str:
 
 
 def markdown_text(text: str) -> str:
-    r"""Return text that came with data as Markdown that shows it, in a table's cell too.
+    r"""Return text from the data as Markdown that shows it literally, also in a table cell.
 
-    Nothing in it is taken for a tag, a link, a picture, code or the end of a cell.
+    No part of it becomes a tag, a link, a picture, code or the end of a cell.
 
     >>> print(markdown_text("<img src=x onerror=alert(1)>|[a](b)"))
     &lt;img src=x onerror=alert(1)&gt;\|[a]\(b)
@@ -26,7 +26,7 @@ def markdown_text(text: str) -> str:
 
 
 def plain_line(text: str) -> str:
-    r"""Return text on one line, without what steers a terminal: such characters are spelled out.
+    r"""Return text on one line, with control characters escaped, so that terminals ignore them.
 
     >>> print(plain_line("a" + chr(27) + "[31mb" + chr(10) + "c"))
     a\x1b[31mb\nc

@@ -1,8 +1,8 @@
-"""A Croissant 1.1 descriptor with RAI 1.0 properties, made from an index.
+"""A Croissant 1.1 descriptor with RAI 1.0 properties, written from an index.
 
-Shards are files with their checksums, and their scenes and pairs are read from small tables beside
-the descriptor. A tree in the released layout is a repository, whose scenes and pairs are read from
-its JSON files.
+It describes either shards or a tree in the released layout. Shards are files with checksums, and
+small tables beside the descriptor hold their scenes and pairs (`shards`). A tree is a repository,
+and its JSON files hold its scenes and pairs (`folders`).
 
 Source: the Croissant 1.1 and RAI 1.0 specifications.
 """
@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from stereogenbench_data.bridges import about
-from stereogenbench_data.bridges.croissant_folders import folder_nodes
-from stereogenbench_data.bridges.croissant_packed import packed_nodes
-from stereogenbench_data.bridges.croissant_tables import write_tables
-from stereogenbench_data.bridges.croissant_terms import CONTEXT, CROISSANT, RAI, Node
+from stereogenbench_data.bridges.croissant.folders import folder_nodes
+from stereogenbench_data.bridges.croissant.nodes import CONTEXT, CROISSANT, RAI, Node
+from stereogenbench_data.bridges.croissant.shards import packed_nodes, write_tables
 from stereogenbench_data.errors import DescriptorError, cure_of
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.files import write_atomic
@@ -27,17 +26,17 @@ from stereogenbench_data.sources.location import shown
 
 @dataclass(frozen=True, slots=True)
 class Publication:
-    """Where a descriptor's files will be found, and what it says of its release.
+    """The name, version and URLs that a descriptor states.
 
     Attributes:
         name: The dataset's name.
         version: MAJOR.MINOR.PATCH.
         published: The day of publication; None for today.
-        data_url: URL of the folder of shards, pinned to a revision, or of the repository of
-            folders. None for the paths of shards relative to the descriptor, or for the release's
-            own repository.
-        tables_url: URL of the tables' folder; None for ``data_url``'s folder named as the
-            descriptor, or for paths relative to it.
+        data_url: URL of the folder of shards, pinned to a revision, or of the repository of a
+            tree. With None, shards have paths relative to the descriptor, and a tree has the URL
+            of the release's own repository.
+        tables_url: URL of the folder of tables. None for the folder in ``data_url`` with the name
+            of the descriptor, or for paths relative to the descriptor.
     """
 
     name: str = about.TITLE
@@ -50,42 +49,44 @@ class Publication:
 def write_descriptor(
     index: SceneIndex | None, path: Path, *, publication: Publication | None = None
 ) -> dict[str, Any]:
-    """Write the descriptor of an index's data, and the tables that it reads beside it.
+    """Write the descriptor of an index's data, and its tables beside it.
 
     Args:
-        index: Of shards, or of a tree in the released layout; None for the release as it stands in
+        index: The index of shards, or of a tree in the released layout; None for the release in
             its own repository.
         path: The descriptor to write, such as ``croissant/sample.json``; the tables of shards are
             written into the folder of the same name without its suffix.
-        publication: Where its files will be found.
+        publication: What it states about name, version and URLs.
 
     Returns:
         The descriptor as written.
 
     Raises:
-        DescriptorError: If something cannot be written, shards lie behind a URL while no
-            ``data_url`` is given, or such a URL holds a login or a query.
+        DescriptorError: If a file cannot be written, the shards are behind a URL and ``data_url``
+            is None, or a URL contains a login or a query.
     """
-    told = publication or Publication()
-    for url in (told.data_url, told.tables_url):
+    publication = publication or Publication()
+    for url in (publication.data_url, publication.tables_url):
         if url is not None and shown(url) != url:
             raise DescriptorError(
-                f"{shown(url)}: the URL has a login or a query, which no descriptor shall publish: "
-                f"give the plain URL."
+                f"{shown(url)}: the URL contains a login or a query, which must not be published. "
+                f"Give the URL without them."
             )
     if index is not None and index.shards:
-        data_url = told.data_url or _relative(index.root, to=path.parent)
-        beside = path.stem if told.data_url is None else f"{told.data_url}/{path.stem}"
+        data_url = publication.data_url or _relative(index.root, to=path.parent)
+        beside = (
+            path.stem if publication.data_url is None else f"{publication.data_url}/{path.stem}"
+        )
         files, records = packed_nodes(
             index,
             write_tables(index, path.with_suffix("")),
             data_url=data_url,
-            tables_url=told.tables_url or beside,
+            tables_url=publication.tables_url or beside,
         )
     else:
-        data_url = told.data_url or about.HOME
+        data_url = publication.data_url or about.HOME
         files, records = folder_nodes(index, repository_url=data_url)
-    descriptor = _head(told, url=data_url) | {"distribution": files, "recordSet": records}
+    descriptor = _head(publication, url=data_url) | {"distribution": files, "recordSet": records}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(descriptor, indent=1, ensure_ascii=False) + "\n"
@@ -101,14 +102,14 @@ def write_descriptor(
 def _relative(root: str, *, to: Path) -> str:
     if "://" in root:
         raise DescriptorError(
-            f"{shown(root)}: the shards lie behind a URL: give the URL that the descriptor shall "
-            "name, pinned to a revision (--base-url)."
+            f"{shown(root)}: the shards are behind a URL, so paths cannot be relative. Give their "
+            "URL for the descriptor, pinned to a revision (--base-url)."
         )
     return Path(os.path.relpath(root, to)).as_posix()
 
 
 def _head(publication: Publication, *, url: str) -> Node:
-    """Return what a descriptor says of the dataset as a whole."""
+    """Return the properties of the dataset as a whole."""
     published = publication.published or datetime.now(UTC).date()
     organisation = {"@type": "sc:Organization", "name": about.AFFILIATION}
     return {
