@@ -299,6 +299,23 @@ def test_torchdatas_loader_saves_and_loads_its_position(keyed, workers, stop):
 
 
 @pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")
+def test_a_state_of_torchdatas_loader_that_holds_the_position_twice_is_resumed(keyed):
+    """Passes over the batches had a state of their own before, the same as the sampler's."""
+
+    def loader():
+        batches = EpochBatches(keyed, 16, tail="uneven")
+        return StatefulDataLoader(keyed, batch_sampler=batches)
+
+    unbroken, broken, resumed = keys_of(loader()), loader(), loader()
+    before = keys_of(itertools.islice(broken, 4))
+    state = broken.state_dict()
+    assert state["_sampler_iter_state"] is None
+    resumed.load_state_dict(state | {"_sampler_iter_state": state["_index_sampler_state"]})
+
+    assert before + keys_of(resumed) == unbroken
+
+
+@pytest.mark.filterwarnings("ignore:'set_vital' is deprecated")
 @pytest.mark.parametrize("workers", [0, 1])
 def test_torchdatas_loader_begins_a_whole_epoch_after_a_finished_one(keyed, workers):
     def loader():

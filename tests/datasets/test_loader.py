@@ -17,6 +17,7 @@ from stereogenbench_data import (
     SelectionError,
     StateError,
     StereoPairs,
+    StereoPairStream,
 )
 from stereogenbench_data.datasets.open_videos import (
     OpenVideosWarning,
@@ -361,6 +362,9 @@ def test_public_objects_say_what_they_are(keyed):
     assert "not begun" in repr(batches)
     next(batches)
     assert "1 of 15 batches of epoch 0" in repr(batches)
+    stream = StereoPairStream(keyed.index, 4, fields=("__key__",), frames="all")
+    assert "28 samples of 4 scenes" in repr(stream)
+    assert "4 of 28 samples a batch" in repr(stream)
 
 
 def test_a_killed_worker_ends_the_loop_with_an_error_that_says_so(keyed):
