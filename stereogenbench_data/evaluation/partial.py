@@ -1,4 +1,4 @@
-"""Partial results on disk: one file a scene, so that an evaluation that was killed goes on.
+"""Partial results on disk, one file a scene, from which a killed evaluation resumes.
 
 A folder belongs to one evaluation: its settings, its data and its right views. Anything else is
 refused by the name of what differs.
@@ -32,7 +32,7 @@ class PartialResults:
     """The scenes of one evaluation that are scored so far."""
 
     def __init__(self, folder: Path, *, settings: Mapping[str, Any]) -> None:
-        """Begin in a folder, or go on where an evaluation of the same settings stopped.
+        """Start in a folder, or resume an evaluation of the same settings.
 
         Args:
             folder: Where partial results are kept; it is made where it is missing.

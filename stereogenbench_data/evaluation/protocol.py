@@ -79,7 +79,7 @@ class EvaluationProtocol:
     batch_frames: int = 8
 
     def __post_init__(self) -> None:
-        """Put metrics in order, and refuse what cannot be."""
+        """Put the metrics in order and check the values."""
         object.__setattr__(self, "metrics", require_metrics(self.metrics))
         require_fit(self.fit)
         if self.batch_frames < 1:

@@ -182,7 +182,7 @@ def _stored_right(loader: SampleLoader, row: int, pair: Pair, sample: Sample) ->
 
 @dataclass(frozen=True, slots=True)
 class _CachedKeypoints:
-    """A keypoint matcher that keeps what it found in each picture, by the picture's identity."""
+    """A keypoint matcher that caches the keypoints of each picture, by the picture's identity."""
 
     matcher: KeypointMatcher
     found: dict[int, tuple[Any, Keypoints]] = field(default_factory=dict)
@@ -226,7 +226,7 @@ def one_thread() -> Iterator[None]:
 
 
 class TargetFrame:
-    """One frame of one pair, with what of its scores does not depend on the prediction."""
+    """One frame of one pair, with the parts of its scores that do not depend on the prediction."""
 
     def __init__(
         self,
