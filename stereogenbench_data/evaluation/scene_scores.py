@@ -369,9 +369,9 @@ class PairScorer:
             self._clip.extend(zip(pictures, rendered_views, strict=True))
 
     def _merge(self, name: str, predicted: Any, target: Any) -> None:
-        for spreads, features in ((self._predicted, predicted), (self._target, target)):
+        for statistics, features in ((self._predicted, predicted), (self._target, target)):
             new = FeatureStatistics.of(features)
-            spreads[name] = spreads[name].merged(new) if name in spreads else new
+            statistics[name] = statistics[name].merged(new) if name in statistics else new
 
     def scores(self) -> PairScores:
         """Return what was gathered."""
