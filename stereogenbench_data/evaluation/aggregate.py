@@ -151,7 +151,7 @@ def half_interval(means: Sequence[float]) -> float | None:
 def grouped(
     pairs: Iterable[PairMeans], group_of: Callable[[PairMeans], Group]
 ) -> dict[Group, list[PairMeans]]:
-    """Return pairs by group, in the order in which groups first come."""
+    """Return pairs by group, in order of first appearance."""
     groups: dict[Group, list[PairMeans]] = {}
     for each in pairs:
         groups.setdefault(group_of(each), []).append(each)
@@ -159,7 +159,7 @@ def grouped(
 
 
 def strata(values: Sequence[Any], *, name: str, edges: Sequence[float] = ()) -> list[str]:
-    """Return for each value of a column the stratum that it falls into.
+    """Return the stratum of each value of a column.
 
     Texts and up to 6 different numbers are strata themselves. Other numbers fall between the
     edges, half-open but for the last, or where none are given into quarters of the scenes.
@@ -234,7 +234,7 @@ class Scores:
 
 
 def require_comparable(results: Sequence[Scores]) -> None:
-    """Refuse to put methods into one table that answer different questions.
+    """Raise unless the methods may stand in one table: same tier, protocol and data.
 
     Raises:
         EvaluationError: Naming the first two that differ, and in what.

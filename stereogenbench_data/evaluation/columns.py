@@ -39,7 +39,7 @@ _SD_FITS: Final = {
 
 
 def _fit_columns(fit: str) -> dict[str, Column]:
-    """Return what explains SD by one fit."""
+    """Return the columns that explain SD by one fit."""
     explained: dict[str, tuple[str, int, str]] = {
         "slope": ("a", 4, "slope of true on found disparity"),
         "offset_px": ("b", 2, "px; offset of the fit"),

@@ -1,4 +1,4 @@
-"""Calibration controls: right views whose scores are known in kind, which give the metrics a scale.
+"""Calibration controls: right views with predictable scores, which give the metrics a scale.
 
 The rendered target, the left view itself, the same scene from the wrong camera, and the right view
 of another scene. They are not methods. All are scored together: each view is decoded once.
@@ -62,7 +62,7 @@ class SameFrame:
         return f"its {self.view} view"
 
     def open(self, index: SceneIndex) -> "SameFrame":
-        """Begin with a scene."""
+        """Open a scene."""
         return self
 
     def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
@@ -101,7 +101,7 @@ class OtherView:
         return f"camera {camera:02d} of {scene}"
 
     def open(self, index: SceneIndex) -> "_OtherViewReader":
-        """Begin with a scene."""
+        """Open a scene."""
         return _OtherViewReader(self, index)
 
 
@@ -141,7 +141,7 @@ def wrong_camera(left: int, right: int) -> int:
 
 
 def derangement(keys: Sequence[str], *, seed: int) -> dict[str, str]:
-    """Return for each scene another one, each taken once: a permutation without a fixed point.
+    """Map each scene to another one, each taken once: a permutation without a fixed point.
 
     Sattolo's algorithm: all scenes in one cycle, drawn by the seed.
 
@@ -220,7 +220,7 @@ class Relation:
 
 
 def relations(results: Sequence[Scores]) -> list[Relation]:
-    """Return the relations between the four controls that their metrics allow to judge.
+    """Judge the relations between the four controls, as far as their metrics allow.
 
     Args:
         results: The scores of all of `CONTROLS`.

@@ -1,4 +1,4 @@
-"""Scoring a method by the paper's protocol: what it wrote, or what it returns when it is called."""
+"""Score a method by the paper's protocol, from the views it wrote or by calling it."""
 
 from pathlib import Path
 from typing import Unpack
@@ -32,7 +32,7 @@ def evaluate(
     protocol: EvaluationProtocol | None = None,
     **options: Unpack[EvaluationOptions],
 ) -> Scores:
-    """Return a method's scores.
+    """Score a method and return its scores.
 
     Args:
         data: What `StereoPairs` takes: a folder of scenes or shards, its URL, an index.

@@ -1,4 +1,4 @@
-"""What a tier's methods are given, written to disk: the inputs and nothing that they must not know.
+"""Export the inputs of a tier to disk, without anything that its methods must not know.
 
     OUT/inputs.json                 the tier, the size, the frames, a digest of the data's index
     OUT/<item>/left/000.png         8-bit RGB, one a frame

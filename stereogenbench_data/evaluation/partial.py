@@ -1,4 +1,4 @@
-"""Partial results on disk: one file a scene, so that an evaluation that was killed goes on.
+"""Partial results on disk, one file a scene, from which a killed evaluation resumes.
 
 A folder belongs to one evaluation: its settings, its data and its right views. Anything else is
 refused by the name of what differs.
@@ -32,7 +32,7 @@ class PartialResults:
     """The scenes of one evaluation that are scored so far."""
 
     def __init__(self, folder: Path, *, settings: Mapping[str, Any]) -> None:
-        """Begin in a folder, or go on where an evaluation of the same settings stopped.
+        """Start in a folder, or resume an evaluation of the same settings.
 
         Args:
             folder: Where partial results are kept; it is made where it is missing.
@@ -78,7 +78,7 @@ class PartialResults:
 
         Args:
             scene: The scene's key.
-            scores: Its scores by candidate and pair.
+            scores: Its scores by source and pair.
             stamps: What identified the right views when they were scored.
 
         Raises:
@@ -101,10 +101,10 @@ class PartialResults:
             },
         }
         arrays = {
-            f"{_place_name(place)}/{whose}/{name}/{part}": getattr(spread, part)
+            f"{_place_name(place)}/{whose}/{name}/{part}": getattr(each, part)
             for place, found in scores.items()
-            for whose, spreads in (("predicted", found.predicted), ("target", found.target))
-            for name, spread in spreads.items()
+            for whose, statistics in (("predicted", found.predicted), ("target", found.target))
+            for name, each in statistics.items()
             for part in ("count", "mean", "root")
         }
         path = self._path(scene)
@@ -207,7 +207,7 @@ def _pair_scores(entry: Mapping[str, Any], arrays: Mapping[str, Any], place: str
         },
         fault=entry["fault"],
     )
-    for whose, spreads in (("predicted", scores.predicted), ("target", scores.target)):
+    for whose, statistics in (("predicted", scores.predicted), ("target", scores.target)):
         start = f"{place}/{whose}/"
         for name in {
             key.removeprefix(start).rpartition("/")[0] for key in arrays if key.startswith(start)
@@ -215,7 +215,7 @@ def _pair_scores(entry: Mapping[str, Any], arrays: Mapping[str, Any], place: str
             count, mean, root = (
                 arrays[f"{start}{name}/{part}"] for part in ("count", "mean", "root")
             )
-            spreads[name] = FeatureStatistics(int(count), mean, root)
+            statistics[name] = FeatureStatistics(int(count), mean, root)
     return scores
 
 

@@ -98,7 +98,7 @@ def pair_name(pair: Pair) -> str:
 
 
 def item_name(scene: str, pair: Pair) -> str:
-    """Return the name of a scene's pair that tells nothing of either: no family, no map, no camera.
+    """Return an opaque name of a scene's pair, which reveals no family, map or camera.
 
     >>> item_name("eval/MapSeenInTrain/Uniform/Town/scene_000001", (0, 1))
     '0b5ca3b34645553c'
@@ -235,7 +235,7 @@ class _VideoFileReader:
             self._reader = VideoReader(path, name=str(path), frames=facts.frames)
 
     def _numbers(self, count: int) -> dict[int, int]:
-        """Return the place of each evaluated frame in the video."""
+        """Return the position of each evaluated frame in the video."""
         if count == self._wanted.scene_frames:
             return {frame: frame for frame in self._wanted.frames}
         if count == len(self._wanted.frames):
@@ -346,7 +346,7 @@ class PredictionSource(Protocol):
         ...
 
     def open(self, index: SceneIndex) -> PredictionReader:
-        """Begin with a scene; the index holds it, and scenes that are read beside it."""
+        """Open a scene; the index holds it, and other scenes that are read for it."""
         ...
 
 
@@ -418,7 +418,7 @@ class CalledMethod:
         return f"called {self.name}"
 
     def open(self, index: SceneIndex) -> "CalledMethod":
-        """Begin with a scene."""
+        """Open a scene."""
         return self
 
     def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> Sequence[Any]:

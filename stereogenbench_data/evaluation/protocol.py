@@ -80,7 +80,7 @@ class EvaluationProtocol:
     batch_frames: int = 8
 
     def __post_init__(self) -> None:
-        """Put metrics in order, and refuse what cannot be."""
+        """Put the metrics in order and check the values."""
         object.__setattr__(self, "metrics", require_metrics(self.metrics))
         object.__setattr__(self, "size", require_size(self.size))
         require_fit(self.fit)

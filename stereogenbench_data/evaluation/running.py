@@ -1,4 +1,4 @@
-"""Running an evaluation: scenes in parallel processes, each kept on disk as it is done."""
+"""Run an evaluation: scenes in parallel processes, each kept on disk as soon as it is scored."""
 
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -102,7 +102,7 @@ def select_workload(
     inputs: Sequence[str],
     options: Mapping[str, Any],
 ) -> Workload:
-    """Return what is to be scored, once it is known that its data can be read.
+    """Return the workload of a selection, after checking that its data can be read.
 
     Args:
         data: What `StereoPairs` takes.
@@ -172,7 +172,7 @@ def _pairs_of_scene(
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a workload is scored by, and what its results are kept under.
+    """How a workload is scored, and what identifies its results.
 
     Attributes:
         protocol: The choices that scores depend on.
@@ -298,7 +298,7 @@ def no_progress(done: int, total: int) -> None:
 
 
 def frame_counter(progress: Progress, *, done: int, total: int) -> Callable[[int], None]:
-    """Return what is called with how many frames were done since, and reports how many are."""
+    """Return a callback that takes newly scored frames and reports the total to ``progress``."""
 
     def after_frames(count: int) -> None:
         nonlocal done

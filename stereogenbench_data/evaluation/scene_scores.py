@@ -183,7 +183,7 @@ def _stored_right(loader: SampleLoader, row: int, pair: Pair, sample: Sample) ->
 
 @dataclass(frozen=True, slots=True)
 class _CachedKeypoints:
-    """A keypoint matcher that keeps what it found in each picture, by the picture's identity."""
+    """A keypoint matcher that caches the keypoints of each picture, by the picture's identity."""
 
     matcher: KeypointMatcher
     found: dict[int, tuple[Any, Keypoints]] = field(default_factory=dict)
@@ -227,7 +227,7 @@ def one_thread() -> Iterator[None]:
 
 
 class TargetFrame:
-    """One frame of one pair, with what of its scores does not depend on the prediction."""
+    """One frame of one pair, with the parts of its scores that do not depend on the prediction."""
 
     def __init__(
         self,
@@ -370,9 +370,9 @@ class PairScorer:
             self._clip.extend(zip(pictures, rendered_views, strict=True))
 
     def _merge(self, name: str, predicted: Any, target: Any) -> None:
-        for spreads, features in ((self._predicted, predicted), (self._target, target)):
+        for statistics, features in ((self._predicted, predicted), (self._target, target)):
             new = FeatureStatistics.of(features)
-            spreads[name] = spreads[name].merged(new) if name in spreads else new
+            statistics[name] = statistics[name].merged(new) if name in statistics else new
 
     def scores(self) -> PairScores:
         """Return what was gathered."""

@@ -112,7 +112,7 @@ def paper_row(row: Mapping[str, str], labels: Labels) -> TableRow:
 def notes_of(
     results: Sequence[Scores], rows: Sequence[TableRow], *, name: str, columns: Sequence[str]
 ) -> list[str]:
-    """Return what to know when reading a table: sources, and what is not comparable."""
+    """Return the notes of a table: its sources, and what is not comparable."""
     protocol = results[0].protocol
     notes = []
     if any(COLUMNS[column].fit for column in columns if column in COLUMNS):

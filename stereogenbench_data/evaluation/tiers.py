@@ -1,4 +1,4 @@
-"""The paper's inference tiers: what a method of each is given of a sample, and nothing else.
+"""The paper's inference tiers: what a method of each tier is given, and nothing else.
 
 Scores of different tiers answer different questions, so they are never ranked together.
 
@@ -30,7 +30,7 @@ class Tier:
     inputs: tuple[str, ...]
 
     def inputs_of(self, sample: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what of a sample a method of this tier may see."""
+        """Return the fields of a sample that a method of this tier may see."""
         return {name: sample[name] for name in self.inputs}
 
 

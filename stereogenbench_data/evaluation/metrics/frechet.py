@@ -1,4 +1,4 @@
-"""The Fréchet distance of two sets of features, gathered bit by bit and by many processes.
+"""The Fréchet distance of two sets of features, accumulated in parts and across processes.
 
 No covariance matrix is formed, and no root of one is taken. Of a set is kept its mean and a root
 R of its scatter, with R'R the sum over samples of (x - mean)(x - mean)'. The trace of the root of
@@ -18,7 +18,7 @@ from stereogenbench_data.errors import EvaluationError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureStatistics:
-    """How many samples a set of features has, where they lie and how they spread, in float64.
+    """Count, mean and scatter of a set of features, in float64.
 
     Its arrays may be stored and given back. Sets are merged in any grouping with the same result
     up to rounding; merged in the same order, to the last digit.
@@ -35,12 +35,12 @@ class FeatureStatistics:
 
     @classmethod
     def empty(cls, dim: int) -> "FeatureStatistics":
-        """Return the spread of no samples."""
+        """Return the statistics of an empty set."""
         return cls(count=0, mean=np.zeros(dim), root=np.zeros((0, dim)))
 
     @classmethod
     def of(cls, features: Float[np.ndarray, "n dim"]) -> "FeatureStatistics":
-        """Return the spread of samples.
+        """Return the statistics of samples.
 
         Raises:
             EvaluationError: If they are not a table of finite numbers.
@@ -66,7 +66,7 @@ class FeatureStatistics:
         return len(self.mean)
 
     def merged(self, other: "FeatureStatistics") -> "FeatureStatistics":
-        """Return the spread of the samples of both.
+        """Return the statistics of the union of both sets.
 
         Raises:
             EvaluationError: If their samples have different numbers of features.
@@ -86,7 +86,7 @@ class FeatureStatistics:
 
 @dataclass(frozen=True, slots=True)
 class FrechetDistance:
-    """A Fréchet distance, and what one needs to know to read it.
+    """A Fréchet distance, with the sample sizes needed to interpret it.
 
     Attributes:
         value: The distance (squared, as FID and FVD are); nan below two samples on a side.

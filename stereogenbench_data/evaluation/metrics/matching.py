@@ -1,4 +1,4 @@
-"""E_match: how the set of left keypoints that are found again to the right changes."""
+"""E_match: how much the set of left keypoints matched in the right picture changes."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -121,7 +121,7 @@ def match_settings(matcher: KeypointMatcher, *, epipolar_px: float = EPIPOLAR_PX
 def mutual_matches(
     left: Keypoints, right: Keypoints, *, ratio: float = RATIO
 ) -> Int64[np.ndarray, "m 2"]:
-    """Return indices of keypoints that are each other's nearest, clearly in both directions.
+    """Return mutual nearest neighbours that pass the ratio test in both directions.
 
     Clearly: the distance of descriptors to the nearest is at most ``ratio`` times that to the
     second nearest. As kornia's match_smnn, in float64.

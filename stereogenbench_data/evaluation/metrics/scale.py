@@ -1,4 +1,4 @@
-"""SD: by which factor the disparity of a predicted pair misses the true one."""
+"""SD: the factor by which a predicted pair's disparity misses the true one."""
 
 from dataclasses import dataclass
 from typing import Final, Literal

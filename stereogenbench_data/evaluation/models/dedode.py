@@ -92,7 +92,7 @@ class DeDoDeMatcher:
         }
 
     def detect(self, picture: Picture) -> Keypoints:
-        """Return the keypoints of a picture that the detector is surest of.
+        """Return the keypoints with the highest detector confidence.
 
         Raises:
             EvaluationError: If it is not a picture.

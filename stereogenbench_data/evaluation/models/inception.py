@@ -218,7 +218,7 @@ _LAYERS_7: Final[_Layers] = {
 
 
 class _Mixed(nn.Module):
-    """A block of branches side by side; what no layer takes up is joined, in the layers' order."""
+    """A block of parallel branches; outputs that no other layer uses are concatenated in order."""
 
     def __init__(
         self, inputs: int, layers: _Layers, *, pool: Literal["mean", "max", "halve"]

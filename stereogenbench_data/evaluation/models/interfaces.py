@@ -1,7 +1,7 @@
-"""What the protocol asks of the systems it measures with: any object with these members will do.
+"""The interfaces of the models that metrics use; any object with these members will do.
 
-Pictures are uint8 RGB, channel first. Each system says in ``settings`` every choice that its
-answers depend on, so that a score can be told apart from one that was measured otherwise.
+Pictures are uint8 RGB, channel first. Each model states in ``settings`` every choice that its
+answers depend on, so that scores measured in different ways can be distinguished.
 """
 
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ class Keypoints:
 
 
 class Measured(Protocol):
-    """What every measuring system has.
+    """What every model has.
 
     Attributes:
         name: What tables call it, with its version.
@@ -91,7 +91,7 @@ class PairMetric(Measured, Protocol):
 
 
 class Features(Measured, Protocol):
-    """What an extractor of features for a Fréchet distance has."""
+    """What a feature extractor for a Fréchet distance has."""
 
     @property
     def distance(self) -> str:
@@ -128,7 +128,7 @@ class VideoFeatures(Features, Protocol):
 
 
 def require_pictures(*pictures: Picture) -> None:
-    """Return if all are (3, h, w) uint8 pictures of one size.
+    """Raise unless all are (3, h, w) uint8 pictures of one size.
 
     Raises:
         EvaluationError: Else; it says what was found.
@@ -145,7 +145,7 @@ def require_pictures(*pictures: Picture) -> None:
 
 
 def require_batch(pictures: Pictures) -> None:
-    """Return if these are (n, 3, h, w) uint8 pictures.
+    """Raise unless these are (n, 3, h, w) uint8 pictures.
 
     Raises:
         EvaluationError: Else; it says what was found.
@@ -158,7 +158,7 @@ def require_batch(pictures: Pictures) -> None:
 
 
 def require_clips(clips: Clips) -> None:
-    """Return if these are (n, t, 3, h, w) uint8 clips.
+    """Raise unless these are (n, t, 3, h, w) uint8 clips.
 
     Raises:
         EvaluationError: Else; it says what was found.

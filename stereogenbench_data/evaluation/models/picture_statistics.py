@@ -1,4 +1,4 @@
-"""Features without learned weights, for Fréchet distances where Inception and I3D are not at hand.
+"""Features without learned weights: stand-ins where Inception and I3D are not available.
 
 They see colour, contrast and change, not content: distances of them tell nothing about realism,
 have other units than FID and FVD, and are never called so.

@@ -92,7 +92,7 @@ def fingerprint(path: Path) -> str:
 
 
 def read_weights(path: Path, *, what: str) -> Mapping[str, Any]:
-    """Return the tensors of a file of weights, on the CPU; what else it holds is refused.
+    """Return the tensors of a file of weights, on the CPU; anything else in it is refused.
 
     Raises:
         EvaluationError: If it holds more than tensors and plain values, or is damaged.
