@@ -2,8 +2,8 @@
 
 accelerate launch examples/accelerate_loop.py [SHARDS]
 
-Prepare the loader like the rest: it shares batches among the ranks by itself, gives them on the
-accelerator's device, and its position is part of the saved state.
+Prepare the loader like the rest. It gives each rank its share of the batches, moves them to the
+accelerator's device, and adds its position to the saved state.
 """
 
 import sys

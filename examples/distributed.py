@@ -1,9 +1,9 @@
-"""DistributedDataParallel, saved and resumed: run it by torchrun.
+"""DistributedDataParallel with saving and resuming, run by torchrun.
 
 torchrun --nproc-per-node 2 examples/distributed.py [SHARDS]
 
-Every rank takes its own batches of one global order. A state that was saved after any batch resumes
-there, also under another number of ranks or workers.
+Every rank takes its own batches of one global order. Training resumes after the batch at which the
+state was saved, also with another number of ranks or workers.
 """
 
 import sys

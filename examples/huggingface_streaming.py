@@ -16,7 +16,9 @@ SHARDS = Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parents[1] / 
 
 def main() -> None:
     samples = huggingface.iterable(SHARDS, split="train", pairs="adjacent", frames=("every", 40))
-    shuffled = samples.shuffle(seed=0, buffer_size=1)  # whole scenes: nothing waits in memory
+    shuffled = samples.shuffle(
+        seed=0, buffer_size=1
+    )  # shuffles whole scenes, so no samples are buffered
     for number, batch in enumerate(DataLoader(shuffled, batch_size=4, num_workers=2)):
         if number == 0:
             print(f"samples: left {tuple(batch['left'].shape)} {batch['left'].dtype}")

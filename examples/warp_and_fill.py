@@ -1,7 +1,7 @@
-"""The simplest G0 method: splat the left view by the true disparity, fill the holes, be scored.
+"""The simplest G0 method: splat the left view by the true disparity, and fill the holes.
 
-It is scored twice on the sample in shards/: called on batches, and from pictures that it wrote.
-Both ways give the same numbers.
+The script scores it twice on the sample in shards/: as a function called on batches, and from the
+pictures that it wrote. Both ways give the same numbers.
 """
 
 from pathlib import Path

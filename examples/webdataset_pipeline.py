@@ -1,4 +1,4 @@
-"""webdataset: a pipeline with our stage as its decoder (extra 'webdataset').
+"""webdataset: a pipeline whose decoder is this package's stage (extra 'webdataset').
 
 python examples/webdataset_pipeline.py [SHARDS]
 """

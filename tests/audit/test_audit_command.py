@@ -110,9 +110,12 @@ def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(
 
 @pytest.mark.parametrize(
     ("words", "told"),
-    [(("--frames", "some"), "'some' is no number of frames"), (("--frames", "0"), "no number of"),
-     (("-o", "."), "is a folder: name a file")],
-)  # fmt: skip
+    [
+        (("--frames", "some"), "--frames: 'some' is"),
+        (("--frames", "0"), "--frames: '0' is"),
+        (("-o", "."), "is a folder: name a file"),
+    ],
+)
 def test_an_option_that_is_off_is_a_usage_error(small_shards, run, words, told):
     result = run(small_shards, *words)
 
