@@ -75,6 +75,10 @@ class ShardCache:
         with _named_errors(self.folder):
             self._make()
 
+    def __repr__(self) -> str:
+        """Return the folder and the limit."""
+        return f"ShardCache({str(self.folder.parent)!r}, limit_bytes={self.limit_bytes})"
+
     def open(self, member: Member, *, remote: RemoteObject, revision: str) -> FileSlice:
         """Return a member, fetched if it is not here; it is the caller's to close.
 

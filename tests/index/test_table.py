@@ -641,3 +641,9 @@ def test_as_many_scenes_as_the_release_has_come_back(tmp_path):
     assert len(index) == 8493
     assert index.scene(8492).id == scenes[8492].id
     assert index.column("baselines_cm").shape == (8493, 15)
+
+
+def test_an_index_shows_its_root_and_how_many_scenes_it_holds(small_release):
+    index = SceneIndex.open(small_release)
+
+    assert repr(index) == f"<SceneIndex of {str(small_release)!r}: {len(index)} scenes>"

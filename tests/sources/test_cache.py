@@ -72,6 +72,10 @@ def test_a_member_is_fetched_once(cache, shelf):
     assert cache.used_bytes() == 2000
 
 
+def test_a_cache_shows_its_folder_and_limit(cache, tmp_path):
+    assert repr(cache) == f"ShardCache({str(tmp_path)!r}, limit_bytes=10000)"
+
+
 def test_another_cache_in_the_folder_finds_it(cache, shelf, tmp_path):
     read(cache, member(1000, 2000), shelf)
     read(ShardCache(tmp_path, limit_bytes=5000), member(1000, 2000), shelf)

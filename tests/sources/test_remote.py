@@ -1,6 +1,5 @@
 """Bytes from a server that fails: had all the same, each once, or an error that says why not."""
 
-import pickle
 import threading
 
 import pytest
@@ -285,12 +284,6 @@ def test_connections_can_be_closed_and_are_opened_anew(served):
     web_transport.close_connections()
 
     assert read_range(f"{served.url}/x.tar", 0, 9) == DATA[:9]
-
-
-def test_a_remote_object_can_be_sent_to_another_process(served):
-    remote = pickle.loads(pickle.dumps(RemoteObject(f"{served.url}/x.tar")))
-
-    assert remote.read(5, 9) == DATA[5:9]
 
 
 MONDAY, TUESDAY = "Mon, 02 Feb 2026 07:28:00 GMT", "Tue, 03 Feb 2026 07:28:00 GMT"

@@ -117,14 +117,6 @@ def test_a_hub_that_sends_too_much_is_refused(hub, small_shards):
         read_range(url, 0, 9)
 
 
-def test_s3_sends_the_range_asked_for(s3, small_shards):
-    shard = shard_of(small_shards)
-
-    assert size_of(f"{s3}/{shard.name}") == shard.stat().st_size
-    assert read_range(f"{s3}/{shard.name}", 1000, 3000) == shard.read_bytes()[1000:3000]
-    assert same_index(s3, small_shards)
-
-
 def test_what_s3_does_not_have_is_told_at_once(s3):
     with pytest.raises(StorageError, match=rf"{s3}/none.tar: does not exist, or is private"):
         read_range(f"{s3}/none.tar", 0, 9)
@@ -143,13 +135,6 @@ def test_s3_without_a_login_is_told_at_once(s3, monkeypatch):
 
     with pytest.raises(StorageError, match=r"may not be read \(NoCredentialsError\). Log in to"):
         read_range(f"{s3}/x.tar", 0, 9)
-
-
-def test_a_shard_of_another_size_in_a_store_is_told(s3, small_shards):
-    url = f"{s3}/{shard_of(small_shards).name}"
-
-    with pytest.raises(ShardError, match=r"tar: has \d+ bytes, and the index says 5. The index"):
-        RemoteObject(url, expected_size=5).read(0, 3)
 
 
 def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_told(s3):

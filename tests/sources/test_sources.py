@@ -1,0 +1,120 @@
+"""Every kind of place that bytes are read from, held to the one contract of `SourceTests`."""
+
+import fsspec
+import pytest
+
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.members import read_range
+from tests.servers.fault import Answer, serving
+from tests.servers.hub import COMMIT, REPOSITORY
+from tests.sources.source_kit import BASELINE_JSON, SourceTests
+
+
+class TestReleasedFolder(SourceTests):
+    @pytest.fixture
+    def root(self, small_release):
+        return small_release
+
+    @pytest.fixture
+    def index(self, small_release):
+        return SceneIndex.open(small_release)
+
+    def test_bytes_that_are_not_those_of_the_index_are_an_error(self):
+        """The files of a released folder have no checksums in its index."""
+
+
+class TestShards(SourceTests):
+    @pytest.fixture
+    def root(self, small_shards):
+        return small_shards
+
+
+class TestHttp(SourceTests):
+    @pytest.fixture
+    def server(self, small_shards):
+        with serving(small_shards) as server:
+            yield server
+
+    @pytest.fixture
+    def root(self, server):
+        return server.url
+
+    def test_no_byte_is_sent_but_those_asked_for(self, server, index, make_source, scene):
+        member = scene.members[BASELINE_JSON]
+        make_source().read(scene, BASELINE_JSON)
+
+        assert server.sent == 1 + member.size
+
+
+class TestReleasedFolderOverHttp(TestReleasedFolder):
+    @pytest.fixture
+    def root(self, small_release, tmp_path):
+        with serving(small_release) as server:
+            yield server.url
+
+    def test_the_index_can_be_opened_where_the_data_are(self):
+        """A web server does not list its folders: the index comes from elsewhere."""
+
+
+class TestHttpWithLogin(TestHttp):
+    @pytest.fixture
+    def root(self, server):
+        return server.url.replace("http://", "http://me:word@")
+
+
+class TestNginx(SourceTests):
+    @pytest.fixture
+    def root(self, nginx):
+        return nginx.url
+
+
+class TestHub(SourceTests):
+    @pytest.fixture(params=["", f"@{COMMIT}"])
+    def root(self, hub, request):
+        return f"hf://datasets/{REPOSITORY}{request.param}"
+
+
+class TestS3(SourceTests):
+    @pytest.fixture
+    def root(self, s3):
+        return s3
+
+
+class TestOtherFileSystem(SourceTests):
+    """Whatever fsspec opens; here its file system in memory."""
+
+    @pytest.fixture
+    def root(self, small_shards):
+        files = fsspec.filesystem("memory")
+        for path in small_shards.iterdir():
+            if path.is_file():
+                files.pipe_file(f"/data/{path.name}", path.read_bytes())
+        yield "memory://data"
+        files.rm("/data", recursive=True)
+
+
+class TestCached(TestHttp):
+    @pytest.fixture
+    def cache(self, tmp_path):
+        return ShardCache(tmp_path / "cache", limit_bytes=10**8)
+
+    def test_a_file_is_fetched_once_by_all_copies(self, server, make_source, scene, released):
+        for _ in range(3):
+            assert make_source().read(scene, BASELINE_JSON) == released(BASELINE_JSON)
+
+        assert len([asked for asked in server.asked if asked.stop - asked.start > 1]) == 1
+
+    def test_bytes_that_came_wrong_once_are_fetched_again(
+        self, server, make_source, scene, released
+    ):
+        server.answers = [Answer(), Answer(change=lambda data: data[::-1])]
+
+        assert make_source().read(scene, BASELINE_JSON) == released(BASELINE_JSON)
+
+
+def test_a_login_is_sent(small_shards):
+    with serving(small_shards) as server:
+        read_range(f"{server.url.replace('http://', 'http://me:word@')}/index.parquet", 0, 4)
+
+        assert "authorization" in server.asked[0].headers
