@@ -31,12 +31,27 @@ Result = TypeVar("Result")
 Advance = Callable[[int], None]
 """Called with how many bytes, frames or scenes were done since the last call."""
 
+Progress = Callable[[int, int], None]
+"""Called with how much is done by now, and how much there is."""
+
 _POLL_S: Final = 0.2
 _SHOWN: Final = 3
 
 
 def no_advance(count: int) -> None:
     """Take no note of what is done."""
+
+
+def advance_of(progress: Progress | None, *, done: int = 0, total: int) -> Advance:
+    """Return an `Advance` that adds up what is done, and reports it along with the total."""
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        if progress is not None:
+            progress(min(done, total), total)
+
+    return advance
 
 
 @runtime_checkable

@@ -20,7 +20,7 @@ _Placed = tuple[int, int, str]
 """Offset, size and whole name of a member."""
 
 
-def foreign_indexes(index: SceneIndex) -> dict[str, bytes]:
+def companion_files(index: SceneIndex) -> dict[str, bytes]:
     """Return ``shards.json`` for wids and ``dali/<shard>.idx`` for DALI: path to content.
 
     DALI's format divides by spaces: a shard with a space in a name has no such file.
@@ -42,14 +42,14 @@ def foreign_indexes(index: SceneIndex) -> dict[str, bytes]:
     return {WIDS_NAME: json.dumps(wids, indent=2).encode() + b"\n"} | files
 
 
-def write_foreign_indexes(index: SceneIndex, *, out: Path) -> None:
-    """Write the files of `foreign_indexes` beside the shards.
+def write_companion_files(index: SceneIndex, *, out: Path) -> None:
+    """Write the files of `companion_files` beside the shards.
 
     Raises:
         ShardError: If a file cannot be written.
     """
     try:
-        for path, content in foreign_indexes(index).items():
+        for path, content in companion_files(index).items():
             (out / path).parent.mkdir(exist_ok=True)
             write_atomic(out / path, content)
     except OSError as error:

@@ -6,13 +6,14 @@ names those that are there. A run that was stopped goes on: files that are whole
 
 import shutil
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event
 from typing import Final
 
+from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import StorageError, cure_of
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
@@ -24,13 +25,11 @@ from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.members import open_local, require_own_files
 from stereogenbench_data.sources.remote import RemoteObject
 
-Progress = Callable[[int, int], None]
-
 _CHUNK: Final = 1024 * 1024
 _SPARE_BYTES: Final = 16 * 1024 * 1024
 
 
-class _Stopped(Exception):
+class _Cancelled(Exception):
     """Another file failed, so this one is not fetched to its end."""
 
 
@@ -210,7 +209,7 @@ def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> No
                     f"{wanted.key}/{wanted.name}: came with crc32 {crc32:08x}, and the index says "
                     f"{member.crc32:08x}. The source is damaged, or not the one that was indexed."
                 )
-    except _Stopped:
+    except _Cancelled:
         return
     except OSError as error:
         if isinstance(error, StorageError):
@@ -221,7 +220,7 @@ def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> No
 def _until(stop: Event, chunks: Iterator[bytes]) -> Iterator[bytes]:
     for data in chunks:
         if stop.is_set():
-            raise _Stopped
+            raise _Cancelled
         yield data
 
 

@@ -1,6 +1,6 @@
-"""What is noted of a finished shard in ``OUT/.parts/<shard>.json``, just before it gets its name.
+"""The manifest of a finished shard, ``OUT/.parts/<shard>.json``, written just before its rename.
 
-A shard that has its note and is as it was then is finished: a later run keeps it.
+A shard with a manifest that still fits it is finished: a later run keeps it.
 """
 
 import hashlib
@@ -30,8 +30,8 @@ class ShardTask:
         return Path(self.out, self.shard.name)
 
     @property
-    def note(self) -> Path:
-        """Where it is noted that it is finished."""
+    def manifest(self) -> Path:
+        """Where its manifest is written."""
         return self.target.parent / PARTS / f"{self.target.stem}.json"
 
 
@@ -48,7 +48,7 @@ class PackedShard:
 
 
 @dataclass(frozen=True, slots=True)
-class SeenFile:
+class SourceStamp:
     """A source as it was when it was packed: size, time of change, and crc32 of all its bytes."""
 
     size: int
@@ -57,8 +57,8 @@ class SeenFile:
 
 
 @dataclass(frozen=True, slots=True)
-class ShardNote:
-    """What is noted: the shard, when it was last written, and what it was made from.
+class ShardManifest:
+    """A finished shard: its places and checksums, when it was written, and what it was made from.
 
     Attributes:
         packed: The shard.
@@ -69,10 +69,10 @@ class ShardNote:
 
     packed: PackedShard
     modified_ns: int
-    sources: tuple[SeenFile, ...]
+    sources: tuple[SourceStamp, ...]
     rows: dict[str, str]
 
-    def members(self, task: ShardTask) -> Iterator[tuple[PlannedMember, SeenFile, int]]:
+    def members(self, task: ShardTask) -> Iterator[tuple[PlannedMember, SourceStamp, int]]:
         """Yield each planned member with its source and with its place in the shard."""
         yield from zip(task.shard.members, self.sources, self.packed.offsets, strict=True)
 
@@ -84,54 +84,57 @@ def row_digest(scene: Scene) -> str:
     return hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()
 
 
-def read_note(task: ShardTask) -> ShardNote | None:
-    """Return what a run of this plan noted of a shard, None if nothing that can be used."""
+def read_manifest(task: ShardTask) -> ShardManifest | None:
+    """Return the manifest that this plan wrote of a shard, None if none can be used."""
     try:
-        noted = json.loads(task.note.read_bytes())
-        note = ShardNote(
+        found = json.loads(task.manifest.read_bytes())
+        manifest = ShardManifest(
             PackedShard(
-                noted["name"], noted["size"], noted["sha256"], tuple(noted["offsets"]),
-                tuple(noted["sizes"]), tuple(noted["crc32s"]),
+                found["name"], found["size"], found["sha256"], tuple(found["offsets"]),
+                tuple(found["sizes"]), tuple(found["crc32s"]),
             ),
-            noted["modified_ns"],
-            tuple(SeenFile(*seen) for seen in noted["sources"]),
-            dict(noted["rows"]),
+            found["modified_ns"],
+            tuple(SourceStamp(*seen) for seen in found["sources"]),
+            dict(found["rows"]),
         )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    is_ours = noted.get("plan") == task.plan_digest and note.packed.name == task.shard.name
-    packed = note.packed
-    listed = (packed.offsets, packed.sizes, packed.crc32s, note.sources)
+    is_ours = found.get("plan") == task.plan_digest and manifest.packed.name == task.shard.name
+    packed = manifest.packed
+    listed = (packed.offsets, packed.sizes, packed.crc32s, manifest.sources)
     counts = set(map(len, listed))
-    return note if is_ours and counts == {len(task.shard.members)} else None
+    return manifest if is_ours and counts == {len(task.shard.members)} else None
 
 
-def write_note(task: ShardTask, note: ShardNote) -> None:
-    """Note a finished shard, whole or not at all.
+def write_manifest(task: ShardTask, manifest: ShardManifest) -> None:
+    """Write the manifest of a finished shard, whole or not at all.
 
     Raises:
-        OSError: If the note cannot be written.
+        OSError: If the manifest cannot be written.
     """
-    told = asdict(note.packed) | {
+    content = asdict(manifest.packed) | {
         "plan": task.plan_digest,
-        "modified_ns": note.modified_ns,
+        "modified_ns": manifest.modified_ns,
         "members": [member.name for member in task.shard.members],
-        "sources": [[seen.size, seen.modified_ns, seen.crc32] for seen in note.sources],
-        "rows": note.rows,
+        "sources": [[seen.size, seen.modified_ns, seen.crc32] for seen in manifest.sources],
+        "rows": manifest.rows,
     }
-    write_atomic(task.note, json.dumps(told).encode())
+    write_atomic(task.manifest, json.dumps(content).encode())
 
 
 def find_packed(task: ShardTask) -> PackedShard | None:
     """Return a shard that this plan has packed before, None if it is to be packed or looked at.
 
-    A shard whose size or time of change is not the noted one may be another.
+    A shard whose size or time of change is not that of its manifest may be another.
     """
-    note = read_note(task)
+    manifest = read_manifest(task)
     try:
         status = task.target.stat()
     except OSError:
         return None
-    if note is None or (note.packed.size, note.modified_ns) != (status.st_size, status.st_mtime_ns):
+    if manifest is None or (manifest.packed.size, manifest.modified_ns) != (
+        status.st_size,
+        status.st_mtime_ns,
+    ):
         return None
-    return note.packed
+    return manifest.packed

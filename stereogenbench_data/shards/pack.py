@@ -1,31 +1,35 @@
-"""Packing a release: the plan, this part's shards, and the index once all shards are there.
+"""Pack a release into shards: the plan, this part's shards, and the index once all are there.
 
 Any number of processes on any number of machines may pack parts of one plan into one folder: they
 need to agree on nothing but the plan, and that is a function of the release and the target size.
 """
 
+import json
 import warnings
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Final
 
-from stereogenbench_data.engine import LOCAL, Engine
+from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of, no_advance
 from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frame_file import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
-from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES
-from stereogenbench_data.shards.companion_files import write_foreign_indexes
+from stereogenbench_data.schema.release import CAMERA_COUNT, METADATA_FILES, PACKED_DEPTH_NAMES
+from stereogenbench_data.shards.companion_files import write_companion_files
 from stereogenbench_data.shards.manifest import (
     PackedShard,
-    ShardNote,
+    ShardManifest,
     ShardTask,
+    SourceStamp,
     find_packed,
-    read_note,
+    read_manifest,
+    row_digest,
 )
-from stereogenbench_data.shards.pack_folder import take_folder
 from stereogenbench_data.shards.plan import (
     DEFAULT_SHARD_BYTES,
     DepthCodec,
@@ -33,11 +37,18 @@ from stereogenbench_data.shards.plan import (
     ShardPlan,
     plan_shards,
 )
-from stereogenbench_data.shards.repack_check import require_same_rows, require_same_sources
-from stereogenbench_data.shards.writer import found_whole, pack_task
+from stereogenbench_data.shards.tar import read_members
+from stereogenbench_data.shards.writer import (
+    UNFINISHED,
+    found_whole,
+    pack_task,
+    require_indexed_metadata,
+)
+from stereogenbench_data.sources.files import PARTS, write_atomic
 from stereogenbench_data.sources.members import require_own_files
 
-Progress = Callable[[int, int], None]
+_PLAN_FILE: Final = "plan.json"
+_CHUNK_BYTES: Final = 4 * 1024 * 1024
 
 
 class OversizedSceneWarning(UserWarning):
@@ -125,15 +136,18 @@ def pack(  # noqa: PLR0913 - each is an option of the command
     """
     job = prepare(data, out, target_bytes=target_bytes, depth_codec=depth_codec, part=part)
     tasks = job.unfinished()
-    after_bytes = packed_counter(job, tasks, progress)
+    total = sum(shard.source_bytes for shard in job.shards)
+    left = sum(task.shard.source_bytes for task in tasks)
+    advance = advance_of(progress, done=total - left, total=total)
+    advance(0)
     outcomes = engine.map(
         pack_task,
         tasks,
         name=lambda task: str(task.target),
         workers=workers,
-        advance=after_bytes,
+        advance=advance,
     )
-    return finish(job, packed=[each.shard.name for each in outcomes if each.work == "packed"])
+    return _finish(job, packed=[each.shard.name for each in outcomes if each.work == "packed"])
 
 
 def prepare(
@@ -166,10 +180,10 @@ def prepare(
     job = PackJob(index, plan, Path(out), part)
     _require_fitting(job.plan)
     try:
-        take_folder(job.plan, job.out)
-        for task, note in _noted(job):
-            require_same_sources(task, note)
-            require_same_rows(task, note)
+        _claim_folder(job.plan, job.out)
+        for task, manifest in _finished(job):
+            _require_same_sources(task, manifest)
+            _require_same_rows(task, manifest)
     except OSError as error:
         if isinstance(error, ShardError):
             raise
@@ -200,33 +214,33 @@ def _require_fitting(plan: ShardPlan) -> None:
     )
 
 
-def finish(job: PackJob, *, packed: list[str]) -> PackReport:
+def _finish(job: PackJob, *, packed: list[str]) -> PackReport:
     """Write the index, if all shards of the plan are there by now.
 
     Raises:
         StorageError: If the index cannot be written.
-        ShardError: If it would tell scenes otherwise than their shards do.
+        ShardError: If it would contradict the metadata in the shards.
     """
     done = {
-        task.shard.name: find_packed(task) or found_whole(task, lambda count: None)
+        task.shard.name: find_packed(task) or found_whole(task, no_advance)
         for task in map(job.task, job.plan.shards)
     }
     missing = tuple(name for name, found in done.items() if found is None)
     target = None if missing else job.out / INDEX_NAME
     if target is not None:
-        for task, note in _noted(job):
-            require_same_rows(task, note)
+        for task, manifest in _finished(job):
+            _require_same_rows(task, manifest)
         shards = {name: found for name, found in done.items() if found is not None}
-        index = packed_index(job, shards)
+        index = _packed_index(job, shards)
         # The index comes last: where there is one, everything is.
-        write_foreign_indexes(index, out=job.out)
+        write_companion_files(index, out=job.out)
         index.write(target)
         warn_if_stale(job.out)
     part = tuple(shard.name for shard in job.shards)
     return PackReport(part, tuple(name for name in part if name in packed), missing, target)
 
 
-def packed_index(job: PackJob, shards: dict[str, PackedShard]) -> SceneIndex:
+def _packed_index(job: PackJob, shards: dict[str, PackedShard]) -> SceneIndex:
     """Return the index of finished shards: the scenes of the release, at their new places."""
     facts = {
         shard.name: ShardFacts(
@@ -253,27 +267,171 @@ def _moved(shard: PlannedShard, packed: PackedShard) -> Iterator[Scene]:
         yield replace(scene, members=members, depth_codec=codec)
 
 
-def _noted(job: PackJob) -> Iterator[tuple[ShardTask, ShardNote]]:
-    """Yield every shard of the plan that is finished, of whatever part."""
+def _finished(job: PackJob) -> Iterator[tuple[ShardTask, ShardManifest]]:
+    """Yield every finished shard of the plan, of whatever part, with its manifest."""
     for task in map(job.task, job.plan.shards):
-        note = read_note(task)
-        if note is not None and task.target.is_file():
-            yield task, note
+        manifest = read_manifest(task)
+        if manifest is not None and task.target.is_file():
+            yield task, manifest
 
 
-def packed_counter(
-    job: PackJob, tasks: list[ShardTask], progress: Progress | None
-) -> Callable[[int], None]:
-    """Return what counts bytes of members, beginning with those that were packed before."""
-    sizes = {shard.name: sum(member.size for member in shard.members) for shard in job.shards}
-    total = sum(sizes.values())
-    done = total - sum(sizes[task.shard.name] for task in tasks)
+# The folder that shards are packed into: which plan it is for, and that nothing else is in it.
 
-    def after_bytes(count: int) -> None:
-        nonlocal done
-        done += count
-        if progress is not None:
-            progress(min(done, total), total)
 
-    after_bytes(0)
-    return after_bytes
+def _claim_folder(plan: ShardPlan, out: Path) -> None:
+    """Write the plan into the folder, unless it is there; refuse before anything is written.
+
+    Raises:
+        ShardError: If the folder lies in the release, or holds what other plans left.
+        OSError: If it cannot be written to.
+    """
+    place = out / PARTS / _PLAN_FILE
+    expected = {
+        "plan": plan.digest,
+        "target_bytes": plan.target_bytes,
+        "shards": len(plan.shards),
+    } | ({} if plan.depth_codec == "released" else {"depth": plan.depth_codec})
+    _require_beside_release(plan, out)
+    if not place.exists():
+        _require_own_shards(plan, out)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(place, json.dumps(expected).encode())
+    try:
+        found = json.loads(place.read_bytes())
+    except ValueError:
+        found = None
+    if found != expected:
+        raise ShardError(
+            f"{place}: this folder was begun with another plan ({_brief(found)}, and this one is "
+            f"{_brief(expected)}): the release, the size of the shards or the depth codec was "
+            f"another. Pack into an empty folder, or remove what is in {out}."
+        )
+    _require_no_others(plan, out)
+
+
+def _brief(content: object) -> str:
+    if not isinstance(content, dict):
+        return "unreadable"
+    plan, size = str(content.get("plan"))[:12], content.get("target_bytes")
+    depth = content.get("depth", "released")
+    return f"{content.get('shards')} shards of {size} bytes, depth {depth}, {plan}"
+
+
+def _require_beside_release(plan: ShardPlan, out: Path) -> None:
+    root, place = Path(plan.root).resolve(), out.resolve()
+    if place == root:
+        raise ShardError(f"{out}: is the release itself. Pack into another folder.")
+    for split in ("train", "eval"):
+        if any(place.is_relative_to(each) for each in (root / split, (root / split).resolve())):
+            raise ShardError(
+                f"{out}: lies in {plan.root}/{split}, among the scenes of the release. "
+                f"Pack into a folder outside it."
+            )
+
+
+def _require_own_shards(plan: ShardPlan, out: Path) -> None:
+    """Refuse a folder without a plan that holds anything else than the plan's shards.
+
+    Shards that hold the plan's files by name may be finished ones without their manifests: they
+    are compared byte for byte when their turn comes.
+    """
+    _require_no_others(plan, out)
+    ours = [shard for shard in plan.shards if (out / shard.name).exists()]
+    for shard in ours:
+        path = out / shard.name
+        try:
+            with path.open("rb") as file:
+                found = read_members(file, path.stat().st_size, where=str(path))
+            is_ours = [each.name for each in found] == [each.name for each in shard.members]
+        except ShardError:
+            is_ours = False
+        if not is_ours:
+            raise _not_ours(path)
+    if not ours and (out / INDEX_NAME).exists():
+        raise _not_ours(out / INDEX_NAME)
+
+
+def _not_ours(path: Path) -> ShardError:
+    return ShardError(
+        f"{path}: is there, and was not packed here by this plan. Move it away, or pack into an "
+        f"empty folder."
+    )
+
+
+def _require_no_others(plan: ShardPlan, out: Path) -> None:
+    """Refuse a folder with a shard that is none of the plan's."""
+    known = {shard.name for shard in plan.shards}
+    for path in sorted(out.iterdir()) if out.exists() else []:
+        name = path.name.removesuffix(UNFINISHED)
+        if name.endswith(".tar") and name not in known:
+            raise ShardError(
+                f"{path}: is there, and is no shard of this plan. Move it away, or pack into an "
+                f"empty folder."
+            )
+
+
+# Whether a finished shard is still what packing it now would give. Files that have gone since do
+# not contradict it.
+
+
+def _require_same_sources(task: ShardTask, manifest: ShardManifest) -> None:
+    """Refuse to keep a finished shard if the files that it was made from are others now.
+
+    Metadata files are read, of videos the size and the time of change are looked at; where these
+    differ they are read too.
+
+    Raises:
+        ShardError: Naming the first such file, and what to do.
+    """
+    for member, seen, _ in manifest.members(task):
+        key, _, name = member.name.partition(".")
+        found = _stamp_now(Path(task.root, member.source), seen, is_text=name in METADATA_FILES)
+        if found is not None and found != (seen.size, seen.crc32):
+            raise ShardError(
+                f"{key}: its {member.source.rpartition('/')[2]} is not the one that "
+                f"{task.target} was packed from: it has {found[0]} bytes with crc32 "
+                f"{found[1]:08x}, and had {seen.size} with {seen.crc32:08x}. Remove that shard to "
+                f"have it packed anew and run the same command again, or put the file back, or "
+                f"pack into an empty folder."
+            )
+
+
+def _require_same_rows(task: ShardTask, manifest: ShardManifest) -> None:
+    """Refuse to keep a finished shard if the index contradicts its metadata.
+
+    Raises:
+        ShardError: Naming the first such scene, and what to do.
+    """
+    for scene in task.shard.scenes:
+        key = scene.id.key
+        if manifest.rows.get(key) == row_digest(scene):
+            continue
+        texts = {}
+        with task.target.open("rb") as file:
+            for member, seen, offset in manifest.members(task):
+                of_scene, _, name = member.name.partition(".")
+                if of_scene == key and name in METADATA_FILES:
+                    file.seek(offset)
+                    texts[name] = file.read(seen.size)
+        require_indexed_metadata(scene, texts, root=task.root)
+
+
+def _stamp_now(source: Path, seen: SourceStamp, *, is_text: bool) -> tuple[int, int] | None:
+    """Return a source's size and crc32, of the manifest if it was not touched; None if gone."""
+    try:
+        status = source.stat()
+        is_untouched = (status.st_size, status.st_mtime_ns) == (seen.size, seen.modified_ns)
+        if is_untouched and not is_text:
+            return seen.size, seen.crc32
+        crc32 = 0
+        with source.open("rb", buffering=0) as file:
+            while chunk := file.read(_CHUNK_BYTES):
+                crc32 = zlib.crc32(chunk, crc32)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise ShardError(
+            f"{source}: cannot be read ({error.strerror}). "
+            + cure_of(error, "Check the disk, then run the same command again.")
+        ) from error
+    return status.st_size, crc32

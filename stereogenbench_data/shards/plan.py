@@ -66,6 +66,11 @@ class PlannedShard:
         """The keys of its scenes, in order."""
         return tuple(scene.id.key for scene in self.scenes)
 
+    @property
+    def source_bytes(self) -> int:
+        """The size of all files that it is made from."""
+        return sum(member.size for member in self.members)
+
 
 @dataclass(frozen=True, slots=True)
 class ShardPlan:
@@ -118,8 +123,8 @@ def plan_shards(
         [shard.name, shard.size, [[member.name, member.size] for member in shard.members]]
         for shard in shards
     ]
-    told = json.dumps([target_bytes, content], separators=(",", ":"))
-    digest = hashlib.sha256(told.encode()).hexdigest()
+    content_text = json.dumps([target_bytes, content], separators=(",", ":"))
+    digest = hashlib.sha256(content_text.encode()).hexdigest()
     return ShardPlan(index.root, target_bytes, shards, digest, depth_codec)
 
 

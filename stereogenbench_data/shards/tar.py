@@ -181,9 +181,9 @@ def _require_end(file: BinaryFile, left: int, *, place: str) -> None:
 
 def _parse_header(block: bytes, *, place: str) -> tuple[str, int]:
     """Return name and size of the regular file that a header announces."""
-    told = _OCTAL.fullmatch(block[_CHECKSUM])
+    stated = _OCTAL.fullmatch(block[_CHECKSUM])
     real = sum(block) - sum(block[_CHECKSUM]) + 8 * ord(" ")
-    if told is None or int(told[1], 8) != real:
+    if stated is None or int(stated[1], 8) != real:
         raise ShardError(
             f"{place} the header is damaged: its checksum is {block[_CHECKSUM]!r}, and its bytes "
             f"sum up to {real:06o}. {_AGAIN}"

@@ -8,12 +8,11 @@ import errno
 import io
 import shutil
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.engine import LOCAL, Advance
+from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.table import SceneIndex
@@ -26,8 +25,6 @@ from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.members import open_local
 from stereogenbench_data.sources.ranged_file import MemberFile
-
-Progress = Callable[[int, int], None]
 
 _RELEASED_NAMES: Final = {packed: name for name, packed in PACKED_DEPTH_NAMES.items()}
 _LOCK: Final = ".unpacking"
@@ -44,7 +41,7 @@ class UnpackReport:
 
 
 @dataclass(frozen=True, slots=True)
-class _Task:
+class _UnpackTask:
     """A scene to be unpacked."""
 
     root: str
@@ -95,7 +92,7 @@ def unpack(
     if out.resolve() == Path(index.root).resolve():
         raise ShardError(f"{out}: holds the shards themselves. Unpack into another folder.")
     tasks = [
-        _Task(
+        _UnpackTask(
             index.root,
             str(out),
             scene,
@@ -104,14 +101,6 @@ def unpack(
         for scene in scenes
     ]
     total = sum(member.size for scene in scenes for member in scene.members.values())
-    done = 0
-
-    def after_bytes(count: int) -> None:
-        nonlocal done
-        done += count
-        if progress is not None:
-            progress(min(done, total), total)
-
     found: dict[str, str] = {}
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -127,7 +116,7 @@ def unpack(
                     tasks,
                     name=lambda task: task.scene.id.key,
                     workers=workers,
-                    advance=after_bytes,
+                    advance=advance_of(progress, total=total),
                 )
                 found.update(outcomes)
             finally:
@@ -160,7 +149,9 @@ def _why_not_written(out: Path, error: OSError) -> str:
     return f"{error.filename or out}: cannot be written ({error.strerror or error}). {cure}"
 
 
-def unpack_scene(task: _Task, after_bytes: Advance) -> tuple[str, Literal["unpacked", "kept"]]:
+def unpack_scene(
+    task: _UnpackTask, after_bytes: Advance
+) -> tuple[str, Literal["unpacked", "kept"]]:
     """Unpack one scene, unless it is there; a worker process calls this.
 
     Raises:
@@ -189,7 +180,7 @@ def unpack_scene(task: _Task, after_bytes: Advance) -> tuple[str, Literal["unpac
     return scene.id.key, "unpacked"
 
 
-def _member_of(task: _Task, member: Member) -> MemberFile:
+def _member_of(task: _UnpackTask, member: Member) -> MemberFile:
     opened = open_local(task.root, member, shard=task.shards[member.path])
     if isinstance(opened, Path):
         raise ShardError(f"{opened}: is no member of a shard. Use a folder of shards.")
@@ -228,7 +219,7 @@ def _require_crc32(crc32: int, member: Member, *, where: str) -> None:
         )
 
 
-def _require_unpacked(task: _Task) -> None:
+def _require_unpacked(task: _UnpackTask) -> None:
     """Refuse a scene's folder that does not hold what unpacking would write, as far as sizes tell.
 
     Of a depth video that was written anew, the header tells.

@@ -1,40 +1,98 @@
-"""Verifying shards against their index: every byte, and with "decode" every picture.
+"""Compare shards with their index: every byte, and with "decode" every picture.
 
-A shard that is wrong does not stop the rest: all that is wrong is gathered, each with its cure.
+A wrong shard does not stop the rest: all problems are gathered, each with its cure.
 """
 
+import io
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.engine import LOCAL, Engine
-from stereogenbench_data.errors import ShardError, cure_of
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
+from stereogenbench_data.errors import MediaError, ShardError, cure_of
 from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.index.stale import StaleIndexWarning
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.container import StreamFacts
+from stereogenbench_data.media.depth import require_depth_stream, resolve_encoding
+from stereogenbench_data.media.depth_frames import DepthFrames
+from stereogenbench_data.media.video import VideoReader, probe, require_pixel_aspect
+from stereogenbench_data.schema.records import Member, Scene, ShardFacts
+from stereogenbench_data.schema.release import (
+    CAMERA_COUNT,
+    METADATA_FILES,
+    PACKED_DEPTH_NAMES,
+    depth_name,
+)
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.shards.companion_files import foreign_indexes
-from stereogenbench_data.shards.verify_decode import (
-    Problem,
-    decode_scene,
-    decode_tasks,
-    video_bytes,
-)
-from stereogenbench_data.shards.verify_shard import (
-    FETCH,
-    WRONG_INDEX,
-    ExpectedShard,
-    check_shard,
-)
+from stereogenbench_data.shards.companion_files import companion_files
+from stereogenbench_data.shards.tar import TarMember, read_checksums, read_members
 from stereogenbench_data.shards.writer import UNFINISHED
 from stereogenbench_data.sources.files import PARTS
 from stereogenbench_data.sources.location import shown
 
-Progress = Callable[[int, int], None]
+_FETCH: Final = "Fetch the shard again, or pack it again."
+
+_WRONG_INDEX: Final = "Put the index beside the shards that it was packed with."
+
+_FETCH_BOTH: Final = "Fetch the shard and its index again, or pack them again."
+
+_SHOWN: Final = 3
 
 _WRITE_AGAIN: Final = "Fetch it again, or write it anew: run `stereogenbench pack` again."
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What is wrong, and what to do; texts that do not apply are empty."""
+
+    shard: str
+    scene: str
+    member: str
+    found: str
+    cure: str
+
+    def __str__(self) -> str:
+        """Return it as one line."""
+        where = ": ".join(part for part in (self.shard, self.scene, self.member) if part)
+        return f"{where}: {self.found}. {self.cure}".replace("\n", " ")
+
+
+@dataclass(frozen=True, slots=True)
+class _ExpectedShard:
+    """What the index says of one shard: facts, scenes, and members by their whole name."""
+
+    root: str
+    shard: str
+    facts: ShardFacts
+    scenes: list[Scene] = field(default_factory=list)
+    members: dict[str, Member] = field(default_factory=dict)
+
+    def problem(self, name: str, found: str, cure: str = _FETCH) -> Problem:
+        """Return a problem of the member of that name, or of the shard for an empty one."""
+        scene, _, member = name.partition(".")
+        return Problem(self.shard, scene, member, found, cure)
+
+
+@dataclass(slots=True)
+class _CheckedShard:
+    """What was found out about a shard; ``sound`` names the members that are as they were."""
+
+    problems: list[Problem] = field(default_factory=list)
+    sound: set[str] = field(default_factory=set)
+
+
+@dataclass(frozen=True, slots=True)
+class _DecodeTask:
+    """Videos of one scene that are to be decoded."""
+
+    root: str
+    scene: Scene
+    names: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,28 +138,21 @@ def verify(
     problems = list(_folder_problems(index, expected))
     checks = [each for each in expected.values() if Path(each.root, each.shard).is_file()]
     scenes = [index.scene(row) for row in range(len(index))] if mode == "decode" else []
-    total = sum(each.facts.size for each in checks) + sum(map(video_bytes, scenes))
-    done = 0
-
-    def after_bytes(count: int) -> None:
-        nonlocal done
-        done += count
-        if progress is not None:
-            progress(min(done, total), total)
-
+    total = sum(each.facts.size for each in checks) + sum(map(_video_bytes, scenes))
+    advance = advance_of(progress, total=total)
     sound: set[str] = set()
     for checked in engine.map(
-        check_shard, checks, name=lambda each: each.shard, workers=workers, advance=after_bytes
+        _check_shard, checks, name=lambda each: each.shard, workers=workers, advance=advance
     ):
         problems += checked.problems
         sound |= checked.sound
-    tasks = decode_tasks(scenes, index.root, sound)
+    tasks = _decode_tasks(scenes, index.root, sound)
     for found in engine.map(
-        decode_scene,
+        _decode_scene,
         tasks,
         name=lambda task: task.scene.id.key,
         workers=workers,
-        advance=after_bytes,
+        advance=advance,
     ):
         problems += found
     return VerifyReport(
@@ -127,7 +178,7 @@ def _opened(data: str | Path, root: str | Path | None) -> SceneIndex:
                "Point at a folder that `stereogenbench pack` made.")
         )  # fmt: skip
     with warnings.catch_warnings():
-        # What does not fit the index is a problem, told with the others.
+        # What does not fit the index is a problem, reported with the others.
         warnings.simplefilter("ignore", StaleIndexWarning)
         index = SceneIndex.open(path, root=root)
     if not index.shards:
@@ -138,9 +189,10 @@ def _opened(data: str | Path, root: str | Path | None) -> SceneIndex:
     return index
 
 
-def _expected_of(index: SceneIndex) -> dict[str, ExpectedShard]:
+def _expected_of(index: SceneIndex) -> dict[str, _ExpectedShard]:
     expected = {
-        name: ExpectedShard(index.root, name, facts) for name, facts in sorted(index.shards.items())
+        name: _ExpectedShard(index.root, name, facts)
+        for name, facts in sorted(index.shards.items())
     }
     for scene in map(index.scene, range(len(index))):
         for name, member in scene.members.items():
@@ -155,16 +207,16 @@ def _expected_of(index: SceneIndex) -> dict[str, ExpectedShard]:
     return expected
 
 
-def _folder_problems(index: SceneIndex, expected: dict[str, ExpectedShard]) -> Iterator[Problem]:
+def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> Iterator[Problem]:
     there = {path.name for path in Path(index.root).iterdir()}
     for each in expected.values():
         if not Path(each.root, each.shard).is_file():
             scenes = len({name.partition(".")[0] for name in each.members})
             what = "is no file" if each.shard in there else "is missing"
-            yield each.problem("", f"{what}, with {counted(scenes, 'scene')}", FETCH)
+            yield each.problem("", f"{what}, with {counted(scenes, 'scene')}", _FETCH)
     for name in sorted(there - expected.keys()):
         if name.endswith(".tar"):
-            yield Problem(name, "", "", "is there, and the index does not know it", WRONG_INDEX)
+            yield Problem(name, "", "", "is there, and the index does not know it", _WRONG_INDEX)
         elif name.endswith(f".tar{UNFINISHED}"):
             cure = "Run `stereogenbench pack` again, or remove it."
             yield Problem(name, "", "", "is an unfinished shard", cure)
@@ -173,7 +225,7 @@ def _folder_problems(index: SceneIndex, expected: dict[str, ExpectedShard]) -> I
 
 def _companion_problems(index: SceneIndex) -> Iterator[Problem]:
     """Yield what is wrong with the files that pack writes for other readers."""
-    for name, content in foreign_indexes(index).items():
+    for name, content in companion_files(index).items():
         try:
             found = Path(index.root, name).read_bytes()
         except FileNotFoundError:
@@ -184,3 +236,218 @@ def _companion_problems(index: SceneIndex) -> Iterator[Problem]:
         else:
             if found != content:
                 yield Problem(name, "", "", "contradicts the index", _WRITE_AGAIN)
+
+
+# One shard: its structure, every byte, and its metadata.
+
+
+def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> _CheckedShard:
+    """Read a shard through and return what is wrong with it; a worker process calls this."""
+    path = Path(expected.root, expected.shard)
+    try:
+        with path.open("rb", buffering=0) as file:
+            return _checked(expected, file, path.stat().st_size, after_bytes)
+    except OSError as error:
+        found = f"cannot be read ({error.strerror or error})"
+        return _CheckedShard([expected.problem("", found, cure_of(error, _FETCH))])
+
+
+def _checked(
+    expected: _ExpectedShard, file: io.FileIO, size: int, after_bytes: Advance
+) -> _CheckedShard:
+    checked = _CheckedShard()
+    try:
+        found = {each.name: each for each in read_members(file, size, where=expected.shard)}
+    except ShardError as error:
+        reason = str(error).removeprefix(f"{expected.shard}: ").removesuffix(f" {_FETCH}")
+        checked.problems.append(expected.problem("", reason.rstrip(".")))
+        checked.problems += _cut_off(expected, size)
+        placed = {
+            name: each for name, each in expected.members.items() if each.offset + each.size <= size
+        }
+    else:
+        checked.problems += _differing(expected, found)
+        placed = {
+            name: each
+            for name, each in expected.members.items()
+            if found.get(name) == TarMember(name, each.offset, each.size)
+        }
+    parts = _apart(placed)
+    checksums = read_checksums(
+        file,
+        size,
+        parts=[(each.offset, each.size) for each in parts.values()],
+        after_bytes=after_bytes,
+    )
+    for (name, member), crc32 in zip(parts.items(), checksums.crc32s, strict=True):
+        if crc32 == member.crc32:
+            checked.sound.add(name)
+            continue
+        indexed = "none is" if member.crc32 is None else f"{member.crc32:08x} is"
+        found_crc = f"its bytes have crc32 {crc32:08x}, and by the index {indexed} right"
+        checked.problems.append(expected.problem(name, found_crc))
+    checked.problems += _misindexed(expected, file, checked.sound)
+    facts = expected.facts
+    if not checked.problems and (size, checksums.sha256) != (facts.size, facts.sha256):
+        differing = (
+            f"all members are whole, and yet the file has {size} bytes with sha256 "
+            f"{checksums.sha256[:16]}..., and by the index {facts.size} with {facts.sha256[:16]}..."
+        )
+        checked.problems.append(expected.problem("", differing))
+    return checked
+
+
+def _cut_off(expected: _ExpectedShard, size: int) -> Iterator[Problem]:
+    """Yield a problem for each scene of which members lie beyond the end of the file."""
+    of_scene = defaultdict(list)
+    for name, member in expected.members.items():
+        if member.offset + member.size > size:
+            of_scene[name.partition(".")[0]].append(name.partition(".")[2])
+    for scene, names in of_scene.items():
+        yield expected.problem(scene, f"{len(names)} of its files are cut off ({_few(names)})")
+
+
+def _misindexed(expected: _ExpectedShard, file: io.FileIO, sound: set[str]) -> Iterator[Problem]:
+    """Yield where the index contradicts the metadata in the shard."""
+    for scene in expected.scenes:
+        texts = {}
+        for name in METADATA_FILES:
+            member = scene.members.get(name)
+            if member is not None and f"{scene.id.key}.{name}" in sound:
+                file.seek(member.offset)
+                texts[name] = file.read(member.size)
+        for name, difference in metadata_differences(scene, texts):
+            yield Problem(expected.shard, scene.id.key, name, difference, _FETCH_BOTH)
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join([*names[:_SHOWN], "..."] if len(names) > _SHOWN else names)
+
+
+def _differing(expected: _ExpectedShard, found: dict[str, TarMember]) -> Iterator[Problem]:
+    """Yield what differs between the members that are there and those of the index."""
+    scenes, indexed = (
+        {name.partition(".")[0] for name in names} for names in (found, expected.members)
+    )
+    if indexed < scenes:
+        added = sorted(name for name in found if name not in expected.members)
+        text = (
+            f"holds {counted(len(added), 'member')} that the index does not place in it "
+            f"({_few(added)}): something was appended, or the index is of another pack"
+        )
+        yield expected.problem("", text, _FETCH_BOTH)
+        return
+    if scenes != indexed:
+        text = (
+            f"holds other scenes than the index says: {len(scenes - indexed)} unknown, "
+            f"{len(indexed - scenes)} not there ({_few(sorted(scenes ^ indexed))}); shard and "
+            f"index are of different packs"
+        )
+        yield expected.problem("", text, _WRONG_INDEX)
+        return
+    for name in sorted(found.keys() | expected.members.keys()):
+        here, member = found.get(name), expected.members.get(name)
+        if here is None:
+            yield expected.problem(name, "is missing")
+        elif member is None:
+            yield expected.problem(name, "is there, and the index does not know it")
+        elif (here.offset, here.size) != (member.offset, member.size):
+            yield expected.problem(
+                name,
+                f"has {here.size} bytes from byte {here.offset} on, and by the index "
+                f"{member.size} from {member.offset} on",
+            )
+
+
+def _apart(members: dict[str, Member]) -> dict[str, Member]:
+    """Return members in the order of their bytes, without any that begins inside another.
+
+    Only an altered index has such, and only beside a tar that cannot be read: that is reported.
+    """
+    apart: dict[str, Member] = {}
+    end = 0
+    for name, member in sorted(members.items(), key=lambda item: item[1].offset):
+        if member.offset >= end:
+            apart[name] = member
+            end = member.offset + member.size
+    return apart
+
+
+# The videos of one scene: every frame is decoded.
+
+
+def _video_bytes(scene: Scene) -> int:
+    """Return how many bytes a scene's videos have."""
+    return sum(scene.members[name].size for name in scene.held_videos)
+
+
+def _decode_tasks(scenes: list[Scene], root: str, sound: set[str]) -> list[_DecodeTask]:
+    """Return what to decode: all videos whose bytes are those that were packed."""
+    tasks = []
+    for scene in scenes:
+        names = tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound)
+        if names:
+            tasks.append(_DecodeTask(root, scene, names))
+    return tasks
+
+
+def _decode_scene(task: _DecodeTask, after_bytes: Advance) -> list[Problem]:
+    """Decode all frames of a scene's videos; return what is wrong with any."""
+    problems = []
+    for name in task.names:
+        member = task.scene.members[name]
+        try:
+            _decode(task, name)
+        except (MediaError, OSError) as error:
+            reason = str(error).removeprefix(f"{name}: ").rstrip(".")
+            cure = "Pack the scene again from a video that is whole."
+            if isinstance(error, OSError):
+                cure = cure_of(error, cure)
+            problems.append(Problem(member.path, task.scene.id.key, name, reason, cure))
+        after_bytes(member.size)
+    return problems
+
+
+def _decode(task: _DecodeTask, name: str) -> None:
+    """Decode all frames of a video from its place in the shard, and hold it against the index."""
+    scene, member = task.scene, task.scene.members[name]
+    with Path(task.root, member.path).open("rb") as shard:
+        shard.seek(member.offset)
+        file = io.BytesIO(shard.read(member.size))
+    if name in PACKED_DEPTH_NAMES.values():
+        with DepthFrames(file, name=name, frames=scene.frames) as depth:
+            _require_indexed(scene, name, depth.facts)
+            for index in range(scene.frames):
+                depth.units(index)
+        return
+    _require_indexed(scene, name, probe(file, name=name))
+    with VideoReader(file, name=name, frames=scene.frames) as reader:
+        for index in range(scene.frames):
+            _ = reader.colour_frame(index) if name.endswith("_rgb.mp4") else reader.frame(index)
+
+
+def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
+    """Hold a video's header against the index."""
+    size = (scene.rig.image_width_px, scene.rig.image_height_px)
+    if (facts.frames, (facts.width_px, facts.height_px)) != (scene.frames, size):
+        raise MediaError(
+            f"{name}: has {facts.frames} frames of {facts.width_px}x{facts.height_px} pixels, and "
+            f"by the index {scene.frames} of {size[0]}x{size[1]}."
+        )
+    require_pixel_aspect(facts.pixel_aspect, scene.rig, name=name)
+    depth_names = [scene.held_name(depth_name(camera)) for camera in range(CAMERA_COUNT)]
+    if name not in depth_names:
+        return
+    camera = depth_names.index(name)
+    encoding = resolve_encoding(facts, name=name)
+    found = (facts.codec, facts.pixel_format, encoding.known_unit_m)
+    indexed = (
+        scene.depth_codec[camera],
+        scene.depth_pixel_format[camera],
+        scene.depth_unit_m[camera],
+    )
+    if found != indexed:
+        raise MediaError(f"{name}: is stored as {found}, and by the index as {indexed}.")
+    require_depth_stream(
+        codec=facts.codec, pixel_format=facts.pixel_format, encoding=encoding, name=name
+    )

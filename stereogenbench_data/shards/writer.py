@@ -1,10 +1,16 @@
-"""One shard on disk, whole or not there: written beside its place, read back, then renamed."""
+"""One shard on disk, whole or not there: written beside its place, read back, then renamed.
+
+Its members are made from files of the release that are as they were planned and do not change
+meanwhile.
+"""
 
 import errno
 import hashlib
+import io
 import os
+import stat
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from io import FileIO
@@ -12,23 +18,23 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.engine import Advance
-from stereogenbench_data.errors import ShardError, cure_of
+from stereogenbench_data.engine import Advance, no_advance
+from stereogenbench_data.errors import MediaError, ShardError, cure_of
+from stereogenbench_data.index.scene_folder import metadata_differences
+from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import METADATA_FILES
 from stereogenbench_data.shards.manifest import (
     PackedShard,
-    SeenFile,
-    ShardNote,
+    ShardManifest,
     ShardTask,
+    SourceStamp,
     find_packed,
-    read_note,
+    read_manifest,
     row_digest,
-    write_note,
+    write_manifest,
 )
-from stereogenbench_data.shards.plan import PlannedMember, ShardPlan
-from stereogenbench_data.shards.released_file import read_packed_depth, read_released
-from stereogenbench_data.shards.repack_check import require_indexed_metadata
+from stereogenbench_data.shards.plan import PlannedMember
 from stereogenbench_data.shards.tar import (
     END_OF_ARCHIVE,
     Checksums,
@@ -42,6 +48,7 @@ from stereogenbench_data.sources.files import open_exclusive
 
 UNFINISHED: Final = ".tmp"
 
+_CHUNK_BYTES: Final = 4 * 1024 * 1024
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
@@ -53,20 +60,14 @@ class ShardOutcome:
     work: Literal["packed", "kept"]
 
 
-def pack_shard(plan: ShardPlan, number: int, out: str | Path) -> PackedShard:
-    """Pack one shard of a plan into a folder, unless it is there already.
+def pack_task(task: ShardTask, after_bytes: Advance) -> ShardOutcome:
+    """Pack one shard into its folder, unless it is there already; a worker calls this.
 
     Raises:
-        ShardError: If a source is missing, unreadable, changes meanwhile or tells otherwise than
-            the index; the disk is full; the shard does not read back as written; a file that was
-            not packed here has its name; or another process is packing it.
+        ShardError: If a source is missing, unreadable, changes meanwhile or contradicts the index;
+            the disk is full; the shard does not read back as written; a file that was not packed
+            here has its name; or another process is packing it.
     """
-    task = ShardTask(plan.shards[number], plan.root, str(out), plan.digest)
-    return pack_task(task, lambda count: None).shard
-
-
-def pack_task(task: ShardTask, after_bytes: Advance) -> ShardOutcome:
-    """Pack one shard, as `pack_shard` does; a worker process calls this."""
     done = find_packed(task)
     if done is not None:
         return ShardOutcome(done, "kept")
@@ -83,26 +84,26 @@ def pack_task(task: ShardTask, after_bytes: Advance) -> ShardOutcome:
 
 
 def found_whole(task: ShardTask, after_bytes: Advance) -> PackedShard | None:
-    """Return a finished shard that was touched and holds the bytes that were noted all the same.
+    """Return a finished shard that was touched and still holds the bytes of its manifest.
 
     Raises:
         OSError: If it cannot be read.
     """
-    note = read_note(task)
-    if note is None or not task.target.is_file():
+    manifest = read_manifest(task)
+    if manifest is None or not task.target.is_file():
         return None
     with task.target.open("rb", buffering=0) as file:
         status = os.fstat(file.fileno())
-        if status.st_size != note.packed.size:
+        if status.st_size != manifest.packed.size:
             return None
         found = read_checksums(
             file, status.st_size, parts=[], after_bytes=lambda count: after_bytes(0)
         )
-    if found.sha256 != note.packed.sha256:
+    if found.sha256 != manifest.packed.sha256:
         return None
-    write_note(task, replace(note, modified_ns=status.st_mtime_ns))
-    after_bytes(sum(member.size for member in task.shard.members))
-    return note.packed
+    write_manifest(task, replace(manifest, modified_ns=status.st_mtime_ns))
+    after_bytes(task.shard.source_bytes)
+    return manifest.packed
 
 
 def _unfinished_of(task: ShardTask) -> Path:
@@ -129,7 +130,7 @@ class _Output:
         self.offsets: list[int] = []
         self.sizes: list[int] = []
         self.crc32s: list[int] = []
-        self.sources: list[SeenFile] = []
+        self.sources: list[SourceStamp] = []
 
     @property
     def sha256(self) -> str:
@@ -152,37 +153,37 @@ class _Output:
         self.write(content)
         self.crc32s[-1] = zlib.crc32(content, self.crc32s[-1])
 
-    def end_member(self, source: SeenFile) -> None:
+    def end_member(self, source: SourceStamp) -> None:
         self.write(bytes(padded(self.sizes[-1]) - self.sizes[-1]))
         self.sources.append(source)
 
 
 def _pack(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardOutcome:
-    # A shard without a note is kept if it is what packing gives: its notes were removed.
-    is_unknown = read_note(task) is None and task.target.exists()
-    note = _written(task, file, after_bytes)
-    _require_read_back(task, file, note.packed)
+    # A shard whose manifest was removed is kept if it is what packing gives.
+    is_unknown = read_manifest(task) is None and task.target.exists()
+    manifest = _written(task, file, after_bytes)
+    _require_read_back(task, file, manifest.packed)
     if is_unknown:
-        note = _require_same_shard(task, note)
-    write_note(task, note)
+        manifest = _require_same_shard(task, manifest)
+    write_manifest(task, manifest)
     if is_unknown:
-        return ShardOutcome(note.packed, "kept")
+        return ShardOutcome(manifest.packed, "kept")
     _unfinished_of(task).replace(task.target)
     _sync_folder(task.target.parent)
-    return ShardOutcome(note.packed, "packed")
+    return ShardOutcome(manifest.packed, "packed")
 
 
-def _require_same_shard(task: ShardTask, note: ShardNote) -> ShardNote:
-    """Return the note for a shard that lies there, which must hold the bytes just written."""
+def _require_same_shard(task: ShardTask, manifest: ShardManifest) -> ShardManifest:
+    """Return the manifest of a shard that is there, which must hold the bytes just written."""
     with task.target.open("rb", buffering=0) as file:
         status = os.fstat(file.fileno())
-        found = read_checksums(file, status.st_size, parts=[], after_bytes=lambda count: None)
-    if found.sha256 != note.packed.sha256:
+        found = read_checksums(file, status.st_size, parts=[], after_bytes=no_advance)
+    if found.sha256 != manifest.packed.sha256:
         raise ShardError(
             f"{task.target}: is there and was not packed here by this plan. Move it away, or pack "
             f"into an empty folder."
         )
-    return replace(note, modified_ns=status.st_mtime_ns)
+    return replace(manifest, modified_ns=status.st_mtime_ns)
 
 
 def _sync_folder(folder: Path) -> None:
@@ -195,8 +196,8 @@ def _sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
-def _written(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardNote:
-    """Write a shard's bytes; return what is to be noted of it."""
+def _written(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardManifest:
+    """Write a shard's bytes; return its manifest."""
     output = _Output(file)
     scenes = {scene.id.key: scene for scene in task.shard.scenes}
     for key, members in groupby(task.shard.members, key=lambda each: each.name.partition(".")[0]):
@@ -209,7 +210,7 @@ def _written(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardNote:
     )  # fmt: skip
     modified_ns = os.fstat(file.fileno()).st_mtime_ns
     rows = {key: row_digest(scene) for key, scene in scenes.items()}
-    return ShardNote(packed, modified_ns, tuple(output.sources), rows)
+    return ShardManifest(packed, modified_ns, tuple(output.sources), rows)
 
 
 def _write_scene(
@@ -270,10 +271,136 @@ def _require_read_back(task: ShardTask, file: FileIO, packed: PackedShard) -> No
         file,
         os.fstat(file.fileno()).st_size,
         parts=[(member.offset, member.size) for member in planned],
-        after_bytes=lambda count: None,
+        after_bytes=no_advance,
     )
     if (found, checksums) != (planned, Checksums(packed.sha256, packed.crc32s)):
         raise ShardError(
             f"{task.target}: does not read back as it was written. Check the disk and the memory "
             f"of this machine, then run the same command again."
+        )
+
+
+def require_indexed_metadata(scene: Scene, texts: Mapping[str, bytes], *, root: str) -> None:
+    """Refuse to pack metadata files that contradict the index of their release.
+
+    Raises:
+        ShardError: Naming the first such file, what it says and what to do.
+    """
+    for name, difference in metadata_differences(scene, texts)[:1]:
+        where = Path(root, scene.id.key, name)
+        raise ShardError(
+            f"{where}: {difference}. The index is older than the file: run `stereogenbench index` "
+            f"on the release again, then the same command."
+        )
+
+
+def read_released(
+    source: Path, size: int, *, take: Callable[[bytes], object], after_bytes: Advance
+) -> SourceStamp:
+    """Hand over all bytes of a file, in pieces of a few megabytes.
+
+    Args:
+        source: The file.
+        size: How many bytes it had when the plan was made.
+        take: Called with each piece, in order.
+        after_bytes: Called with the number of bytes, after each piece.
+
+    Returns:
+        The file as it was while it was read.
+
+    Raises:
+        ShardError: If it is missing, unreadable, has another size or changes meanwhile.
+    """
+    with _opened(source) as file:
+        before = os.fstat(file.fileno())
+        _require_planned_size(source, size, before.st_size)
+        crc32, left = 0, size
+        while left:
+            chunk = _read(source, file, min(left, _CHUNK_BYTES))
+            if not chunk:
+                _require_planned_size(source, size, size - left)
+            take(chunk)
+            crc32 = zlib.crc32(chunk, crc32)
+            left -= len(chunk)
+            after_bytes(len(chunk))
+        if _identity(_status(source)) != _identity(before):
+            raise ShardError(
+                f"{source}: was changed while it was packed. Let nothing write to the release, "
+                f"then run the same command again."
+            )
+    return SourceStamp(size, before.st_mtime_ns, crc32)
+
+
+def read_packed_depth(
+    source: Path, size: int, *, frames: int, after_bytes: Advance
+) -> tuple[bytes, SourceStamp]:
+    """Return a released depth video as blosc2's frames, and the file as it was.
+
+    Args:
+        source: The video.
+        size: How many bytes it had when the plan was made.
+        frames: How many frames it must have.
+        after_bytes: Called with the number of the video's bytes that each frame stands for.
+
+    Raises:
+        ShardError: If it cannot be read, or not be packed bit for bit.
+    """
+    parts: list[bytes] = []
+    seen = read_released(source, size, take=parts.append, after_bytes=lambda count: after_bytes(0))
+    left = size
+
+    def after_frame() -> None:
+        nonlocal left
+        after_bytes(min(size // frames, left))
+        left -= min(size // frames, left)
+
+    try:
+        content = packed_depth(
+            io.BytesIO(b"".join(parts)), name=str(source), frames=frames, after_frame=after_frame
+        )
+    except MediaError as error:
+        raise ShardError(str(error)) from error
+    after_bytes(left)
+    return content, seen
+
+
+def _opened(source: Path) -> FileIO:
+    if not stat.S_ISREG(_status(source).st_mode):
+        raise ShardError(f"{source}: is no file. Put the release's own file in its place.")
+    try:
+        return FileIO(source)
+    except OSError as error:
+        raise _unreadable(source, error) from error
+
+
+def _status(source: Path) -> os.stat_result:
+    try:
+        return source.stat()
+    except OSError as error:
+        raise _unreadable(source, error) from error
+
+
+def _read(source: Path, file: FileIO, size: int) -> bytes:
+    try:
+        return file.read(size)
+    except OSError as error:
+        raise _unreadable(source, error) from error
+
+
+def _unreadable(source: Path, error: OSError) -> ShardError:
+    return ShardError(
+        f"{source}: cannot be read ({error.strerror}). "
+        + cure_of(error, "Fetch it again, then run the same command again.")
+    )
+
+
+def _identity(status: os.stat_result) -> tuple[int, int, int]:
+    return status.st_ino, status.st_size, status.st_mtime_ns
+
+
+def _require_planned_size(source: Path, planned: int, size: int) -> None:
+    if size != planned:
+        raise ShardError(
+            f"{source}: has {size} bytes, and had {planned} when the plan was made. Let nothing "
+            f"write to the release; run `stereogenbench index` again if it has an index."
         )

@@ -5,7 +5,9 @@ import os
 import signal
 
 import pytest
+from typer.testing import CliRunner
 
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.engine import LOCAL, RayCluster, engine_of
 from stereogenbench_data.errors import StorageError
 
@@ -94,3 +96,20 @@ def test_tasks_on_a_device_have_a_gpu_each():
 def test_an_unknown_engine_is_refused_with_those_there_are():
     with pytest.raises(StorageError, match=r"engine 'dask'.* local, ray, ray://HOST:PORT"):
         engine_of("dask")
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["index {release} -o {out}/index.parquet", "pack {release} {out}/shards",
+     "audit {release} -o {out}/audit.md", "evaluate {release} {out} --tier G1",
+     "synth {out}/scenes", "verify {shards}"],
+    ids=lambda command: command.partition(" ")[0],
+)  # fmt: skip
+def test_each_batch_command_takes_an_engine(command, small_release, small_shards, tmp_path):
+    arguments = command.format(release=small_release, shards=small_shards, out=tmp_path)
+
+    ended = CliRunner().invoke(app, [*arguments.split(), "--engine", "dask"])
+
+    assert ended.exit_code == 2
+    assert "engine 'dask'" in ended.output
+    assert list(tmp_path.iterdir()) == []

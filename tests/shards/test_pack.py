@@ -19,7 +19,7 @@ import pytest
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.commands import app
-from stereogenbench_data.engine import LOCAL
+from stereogenbench_data.engine import LOCAL, no_advance
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
@@ -28,7 +28,7 @@ from stereogenbench_data.shards.manifest import ShardTask
 from stereogenbench_data.shards.pack import OversizedSceneWarning, pack, prepare
 from stereogenbench_data.shards.plan import PlannedMember, PlannedShard, plan_shards
 from stereogenbench_data.shards.verify import verify
-from stereogenbench_data.shards.writer import pack_shard, pack_task
+from stereogenbench_data.shards.writer import pack_task
 from stereogenbench_data.sources.files import locked
 from tests.servers.tools import small_disk
 
@@ -78,6 +78,12 @@ def tars(folder):
 def names_in(shard):
     with tarfile.open(shard) as tar:
         return tar.getnames()
+
+
+def pack_shard(plan, number, out):
+    """Pack one shard of a plan in this process."""
+    task = ShardTask(plan.shards[number], plan.root, str(out), plan.digest)
+    return pack_task(task, no_advance).shard
 
 
 def test_shards_hold_the_bytes_of_the_release_and_nothing_else(packed, small_release):

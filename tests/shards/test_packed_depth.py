@@ -21,7 +21,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.video import VideoReader
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES, depth_name, rgb_name
-from stereogenbench_data.shards.companion_files import write_foreign_indexes
+from stereogenbench_data.shards.companion_files import write_companion_files
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.unpack import unpack
 from stereogenbench_data.shards.verify import verify
@@ -216,7 +216,7 @@ def damaged(shards):
         }
         altered = SceneIndex.from_scenes(scenes, shards, shards=facts)
         altered.write(shards / "index.parquet")
-        write_foreign_indexes(altered, out=shards)
+        write_companion_files(altered, out=shards)
         return [str(each) for each in verify(shards, mode="decode", workers=1).problems]
 
     return damage

@@ -18,11 +18,10 @@ from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Member, ShardFacts
-from stereogenbench_data.shards.companion_files import write_foreign_indexes
+from stereogenbench_data.shards.companion_files import write_companion_files
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.tar import END_OF_ARCHIVE, member_header, padded, read_members
-from stereogenbench_data.shards.verify import verify
-from stereogenbench_data.shards.verify_decode import Problem
+from stereogenbench_data.shards.verify import Problem, verify
 from tests.servers.scene_fixtures import write_video
 
 PAIR = "train-Uniform-000000.tar"
@@ -202,7 +201,7 @@ def toy(small_shards, tmp_path):
     facts = ShardFacts(len(content), sha256(content).hexdigest(), len(FILES))
     index = SceneIndex.from_scenes([scene], root, shards={"x.tar": facts})
     index.write(root / "index.parquet")
-    write_foreign_indexes(index, out=root)
+    write_companion_files(index, out=root)
 
     def verified(other):
         (root / "x.tar").write_bytes(other)
