@@ -198,6 +198,7 @@ def _gathered(
 
 
 Points = Float64[np.ndarray, " n"]
+_Prediction = tuple[Points, Bool[np.ndarray, " n"]]
 _Numbers = tuple[UInt16[np.ndarray, " n"], Bool[np.ndarray, " n"]]
 
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
@@ -272,6 +273,8 @@ class SceneFrames:
         self._streams = streams
         self._bands: dict[tuple[int, int], Luma] = {}
         self._stored: dict[tuple[int, int, int], tuple[FrameMatch, dict[Flip, _Numbers]]] = {}
+        self._predicted_by: Hypothesis | None = None
+        self._predictions: dict[tuple[int, int], tuple[FrameMatch, _Prediction | None]] = {}
         self._depths: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     @property
@@ -413,20 +416,35 @@ class SceneFrames:
 
     def predicted(
         self, frame_match: FrameMatch, hypothesis: Hypothesis, *, depth_file: int | None = None
-    ) -> tuple[Points, Bool[np.ndarray, " n"]] | None:
+    ) -> _Prediction | None:
         """Return the disparity of matched pixels at the declared unit, and where it is known.
 
         None where the frame of depth does not exist. ``depth_file`` is read in place of the one
-        that the hypothesis names.
+        that the hypothesis names. The predictions of one hypothesis are kept, read-only, until
+        another is asked for: it is fitted, scored and drawn at many scales.
         """
         file = hypothesis.depth_file(frame_match.left) if depth_file is None else depth_file
+        if hypothesis != self._predicted_by:
+            self._predicted_by, self._predictions = hypothesis, {}
+        key = (id(frame_match), file)
+        if key not in self._predictions:
+            # The frame match is kept too, so that no other can get its identity.
+            prediction = self._predict(frame_match, hypothesis, file=file)
+            self._predictions[key] = (frame_match, prediction)
+        return self._predictions[key][1]
+
+    def _predict(
+        self, frame_match: FrameMatch, hypothesis: Hypothesis, *, file: int
+    ) -> _Prediction | None:
         frame = frame_match.frame + hypothesis.frame_lag
         if not 0 <= frame < self.scene.frames:
             return None
         units, known = self._numbers(frame_match, frame=frame, file=file)[hypothesis.flip]
         number = np.where(known, units, 1).astype(np.float64)
         place = frame_match.rows, frame_match.columns
-        return self.disparity_of(number, frame_match, hypothesis, place=place, file=file), known
+        disparity_px = self.disparity_of(number, frame_match, hypothesis, place=place, file=file)
+        disparity_px.flags.writeable = known.flags.writeable = False
+        return disparity_px, known
 
     def disparity_of(
         self,
