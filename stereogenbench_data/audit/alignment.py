@@ -55,7 +55,7 @@ _VISIBLE: Final = 0.02
 _BEND: Final = 0.004
 """Largest second difference of 1 / depth in a smooth patch, as a share, beside four steps."""
 _COARSE: Final = 0.05
-"""Depth stored in steps larger than this share of itself tells nothing here."""
+"""Depth stored in steps larger than this share of itself is too coarse to compare."""
 _WINDOW: Final = {"depth": 0.05, "motion": 0.1}
 """Relative differences of depth from which on a point has no weight."""
 CERTAIN: Final = 6.0

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -13,7 +14,6 @@ from stereogenbench_data.audit.audit_records import (
     AuditLimits,
     AuditReport,
     AuditRow,
-    CameraAudit,
     Finding,
     PairAudit,
     SceneAudit,
@@ -55,10 +55,10 @@ def table_rows(
 def _rig_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
     rigs = [scene.rig for scene in scenes]
     recorded = sum(rig.intrinsics_recorded for rig in rigs)
-    told = f"{recorded} numbers recorded in px" if recorded else "none recorded in px"
+    source = f"{recorded} numbers recorded in px" if recorded else "none recorded in px"
     yield AuditRow(
         "intrinsics",
-        f"largest deviation of fx, fy, cx, cy from f / s W ({told})",
+        f"largest deviation of fx, fy, cx, cy from f / s W ({source})",
         f"{_number(_largest(rig.intrinsics_px for rig in rigs))} px",
         AUDIT["intrinsics"],
         f"{limits.intrinsics_px:g} px",
@@ -215,7 +215,10 @@ def _alignment_rows(
 
 
 def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
-    for name, count_of in (("RGB", _rgb_frames), ("depth", _depth_frames)):
+    for name, count_of in (
+        ("RGB", attrgetter("rgb_frames")),
+        ("depth", attrgetter("depth_frames")),
+    ):
         counts = [count for scene in scenes for camera in scene.cameras
                   if (count := count_of(camera)) >= 0]  # fmt: skip
         expected = [int(limits.frames) or scene.frames for scene in scenes for _ in scene.cameras]
@@ -229,14 +232,6 @@ def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[A
             f"{FRAMES_A_SCENE} of a video, 0 missing",
             f"{limits.frames:g}" if limits.frames else "as poses",
         )
-
-
-def _rgb_frames(camera: CameraAudit) -> int:
-    return camera.rgb_frames
-
-
-def _depth_frames(camera: CameraAudit) -> int:
-    return camera.depth_frames
 
 
 def _picture_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
@@ -274,12 +269,12 @@ def _picture_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator
 
 def _finding_rows(findings: Sequence[Finding]) -> Iterator[AuditRow]:
     checks = dict.fromkeys([*_CHECKS, *(finding.check for finding in findings)])
-    told = [
+    counts = [
         f"{check} {count}"
         for check in checks
         if (count := len({each.scene for each in findings if each.check == check}))
     ]
-    yield AuditRow("findings", "scenes with", ", ".join(told) or "none", "none", "none")
+    yield AuditRow("findings", "scenes with", ", ".join(counts) or "none", "none", "none")
 
 
 def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:

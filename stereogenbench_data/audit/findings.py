@@ -23,7 +23,7 @@ from stereogenbench_data.schema.release import ADJACENT_PAIRS, CAMERA_COUNT, dep
 
 
 def findings_of(scene: SceneAudit, limits: AuditLimits) -> list[Finding]:
-    """Return what is wrong with a scene, or beyond a limit; nothing is said twice."""
+    """Return what is wrong with a scene, or beyond a limit; each thing once."""
     found = [
         Finding(scene.key, name, "unreadable", _without_place(text, name))
         for name, text in scene.problems
@@ -37,8 +37,8 @@ def findings_of(scene: SceneAudit, limits: AuditLimits) -> list[Finding]:
             (depth_name(number), _depth_findings),
         ):
             if name not in unreadable:
-                told = of_camera(scene, number, limits)
-                found += [Finding(scene.key, name, check, text) for check, text in told]
+                of_file = of_camera(scene, number, limits)
+                found += [Finding(scene.key, name, check, text) for check, text in of_file]
     return found
 
 
@@ -115,7 +115,7 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
         each.is_first and each.check == "depth" and each.what != "focal" for each in found.estimates
     )
     for each in found.estimates:
-        # Depth that contradicts itself tells nothing of focal lengths.
+        # Depth that contradicts itself cannot confirm a focal length.
         if each.is_first and not (has_wrong_depth and each.check == "motion"):
             yield from _estimate_findings(scene, each, limits)
     for camera, lag, gained in found.lags:
@@ -185,7 +185,7 @@ def limit_of(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> float:
     if each.what == "shift_y":
         return limits.picture_shift_px
     shift_px = limits.picture_shift_px * max(1.0, _SHARP_PX / scene.alignment.width_px)
-    # A factor is told no better than the shift that it causes.
+    # A factor is known no better than the shift that it causes.
     least = shift_px / max(scene.alignment.disparity_px, 1e-6)
     return shift_px if each.what == "shift_x" else max(limits.picture_scale, least)
 
@@ -197,18 +197,20 @@ _ENOUGH: Final = 1000
 def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Untested]:
     """Return the checks of `alignment` that the content of a scene did not allow."""
     found = scene.alignment
-    told: list[tuple[str, str, str, str]] = []
+    untested: list[tuple[str, str, str, str]] = []
     blind = _cameras_without(found.pairs, "see_through")
     if blind:
-        told.append(("depth consistency", "", _cameras(blind), "too few points of smooth surfaces"))
+        untested.append(
+            ("depth consistency", "", _cameras(blind), "too few points of smooth surfaces")
+        )
     if found.moved_smooth < _ENOUGH:
-        told.append(("motion", "", "", "too few points of smooth surfaces, or one frame"))
+        untested.append(("motion", "", "", "too few points of smooth surfaces, or one frame"))
     elif found.moved_px < _STILL_PX:
         why = f"points move by {found.moved_px:.2f} px from one audited frame to the next"
-        told.append(("motion", "", "", why))
+        untested.append(("motion", "", "", why))
     blind = _cameras_without(found.pairs, "correlation")
     if blind:
-        told.append(("picture content", "", _cameras(blind), "no texture, or no depth"))
+        untested.append(("picture content", "", _cameras(blind), "no texture, or no depth"))
     late = [
         camera for camera in range(CAMERA_COUNT)
         if min((gain for of, _, gain in found.lags if of == camera), default=0.0)
@@ -216,13 +218,13 @@ def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Untested]:
     ]  # fmt: skip
     if late:
         why = "pictures of the frames beside fit as well, or there are none"
-        told.append(("picture time", "", _cameras(late), why))
-    told += _untested_fits(scene, limits)
-    return [Untested(scene.key, *each) for each in told]
+        untested.append(("picture time", "", _cameras(late), why))
+    untested += _untested_fits(scene, limits)
+    return [Untested(scene.key, *each) for each in untested]
 
 
 def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str, str, str, str]]:
-    """Yield the quantities of which less than what would be a finding cannot be told from 0."""
+    """Yield the quantities whose limit is smaller than what could be seen in this scene."""
     for check, whats in (
         ("depth", ("scale", "ray", "shift_x", "shift_y")),
         ("motion", ("scale", "focal", "focal_x", "focal_y")),
@@ -314,10 +316,10 @@ def _rgb_findings(scene: SceneAudit, number: int, limits: AuditLimits) -> Iterat
         yield "missing frames", f"has {camera.rgb_frames} frames of {expected}"
     if camera.brightness.value < limits.brightness:
         what = "95 % of the picture are darker than"
-        yield "too dark", _told(camera.brightness, limits.brightness, what)
+        yield "too dark", _dark_or_flat(camera.brightness, limits.brightness, what)
     elif camera.contrast.value < limits.contrast:
         what = "the picture's grey levels span"
-        yield "flat", _told(camera.contrast, limits.contrast, what)
+        yield "flat", _dark_or_flat(camera.contrast, limits.contrast, what)
     if camera.change.value < limits.change and not camera.contrast.value < limits.contrast:
         yield (
             "frozen",
@@ -373,7 +375,7 @@ def _payload_findings(camera: CameraAudit, limits: AuditLimits) -> Iterator[tupl
         )
 
 
-def _told(least: At, limit: float, what: str) -> str:
+def _dark_or_flat(least: At, limit: float, what: str) -> str:
     return f"frame {least.frame}: {what} {least.value:.0f} of 255 (limit {limit:g})"
 
 
@@ -383,7 +385,7 @@ def broken_finding(key: str, text: str) -> Finding:
     Args:
         key: The scene's key.
         text: What is wrong with it; the place that it may begin with, a scene's or a file's, is
-            not said again.
+            left out.
     """
     before, found, rest = text.partition(key)
     if not found or " " in before:

@@ -83,7 +83,7 @@ def open_for_audit(
     progress: Progress | None = None,
     **filters: Unpack[SceneFilters],
 ) -> SceneIndex:
-    """Return the index of some data of which scenes may be broken; those are told by the index.
+    """Return the index of some data some of whose scenes may be broken; the index lists those.
 
     Args:
         data: Whatever `SceneIndex.open` opens.
@@ -91,7 +91,7 @@ def open_for_audit(
         workers: Processes that walk a tree that has no index.
         engine: Where they are.
         progress: Called with the scenes walked, and all there are.
-        **filters: Scenes of a tree that their paths tell to be none of these are not described.
+        **filters: Scenes of a tree whose paths do not match are not described.
 
     Raises:
         StorageError: If there is no such data, or no such scene in it, whole or not.
@@ -212,8 +212,8 @@ class _Concerned:
             return not self.wanted
 
     def matches(self, scene: SceneId) -> bool:
-        """Return whether nothing that the path tells rules a scene out."""
-        return all(getattr(scene, name) in (*told, None) for name, told in self.wanted.items())
+        """Return whether the path of a scene is in line with the filters."""
+        return all(getattr(scene, name) in (*values, None) for name, values in self.wanted.items())
 
 
 def _chosen(
@@ -324,10 +324,10 @@ def _known(journal: Journal, stamps: Mapping[str, str]) -> dict[str, SceneAudit]
 
 def _stamp(index: SceneIndex, scene: Scene) -> str:
     """Return a short text that changes when a scene's row or one of its local files does."""
-    told: list[Any] = [row_of(scene)]
+    parts: list[Any] = [row_of(scene)]
     if not index.shards and not is_remote(index.root):
         try:
-            told.append(open_scene_folder(index.root, scene.id.key).stamps())
+            parts.append(open_scene_folder(index.root, scene.id.key).stamps())
         except StorageError as error:
-            told.append(str(error))
-    return hashlib.sha256(json.dumps(told).encode()).hexdigest()[:32]
+            parts.append(str(error))
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]

@@ -2,14 +2,14 @@
 
 Source: "StereoGenBench: A Synthetic Multi-Camera Benchmark for Stereo Generation under Controlled
 Baseline Regimes"; each table or paragraph is named where its figures are. Figures are kept as the
-paper prints them, so that as many digits are compared as it tells.
+paper prints them, so that as many digits are compared as it prints.
 
 The paper does not contradict itself in them, but for what its words leave open:
 
 - its first table says that baselines are of 1-150 cm, which holds for adjacent cameras only:
   pairs of a Pairwise_Uniform rig reach 200 cm, and those of a Uniform rig may reach 750 cm;
 - Pairwise_Uniform is meant for pairs of 10-200 cm, and 150 of its baselines are shorter;
-- whether standard deviations divide by n or by n - 1 is not said; ours divide by n, as those of
+- whether standard deviations divide by n or by n - 1 is not stated; ours divide by n, as those of
   the dataset's viewer do.
 """
 

@@ -31,20 +31,6 @@ _MATRIX: Final = re.compile(r"(k|k_matrix|camera_matrix|intrinsics?(_matrix)?|k_
 _PLACES: Final = {"fx_px": (0, 0), "fy_px": (1, 1), "cx_px": (0, 2), "cy_px": (1, 2)}
 
 
-def deviations_px(documents: list[dict[str, Any]], intrinsics: Intrinsics) -> list[float]:
-    """Return how far each recorded number of pixels is from the intrinsics.
-
-    Args:
-        documents: Metadata files as parsed from JSON.
-        intrinsics: What the paper's equation gives.
-    """
-    return [
-        abs(value - getattr(intrinsics, name))
-        for document in documents
-        for name, value in recorded_px(document)
-    ]
-
-
 def recorded_px(node: Any) -> Iterator[tuple[str, float]]:
     """Yield the name (of `Intrinsics`) and the value of each number of pixels, at any depth."""
     if isinstance(node, list):
@@ -90,7 +76,12 @@ def rig_audit(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -> 
     intrinsics = rig_intrinsics(rig)
     fx_px = rig.focal_mm / rig.sensor_width_mm * rig.image_width_px
     fy_px = rig.focal_mm / rig.sensor_height_mm * rig.image_height_px
-    recorded = deviations_px(documents, replace(intrinsics, fx_px=fx_px, fy_px=fy_px))
+    expected = replace(intrinsics, fx_px=fx_px, fy_px=fy_px)
+    recorded = [
+        abs(value - getattr(expected, name))
+        for document in documents
+        for name, value in recorded_px(document)
+    ]
     deviations = [abs(intrinsics.fx_px - fx_px), abs(intrinsics.fy_px - fy_px), *recorded]
     left, right = (list(cameras) for cameras in zip(*CAMERA_PAIRS, strict=True))
     posed_cm = np.linalg.norm(poses.centres[:, right] - poses.centres[:, left], axis=-1)

@@ -51,12 +51,19 @@ from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.sources.members import MemberSource
 from stereogenbench_data.sources.retry import RetryPolicy
 
+LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
+"""The non-adjacent pair that the paper audits beside the primary one."""
+
+_METADATA: Final = (BASELINE_JSON, TRAJECTORY_JSON)
+
 Result = TypeVar("Result")
 Arguments = ParamSpec("Arguments")
 
 
 class AuditedFiles:
     """A scene's metadata, frame counts and decoded frames.
+
+    A file that cannot be read is noted once in ``problems``, and not tried again.
 
     Attributes:
         problems: File name to what was wrong with it.
@@ -167,12 +174,6 @@ class AuditedFiles:
         return self._encoding(camera).known_unit_m
 
 
-LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
-"""The non-adjacent pair that the paper audits beside the primary one."""
-
-_METADATA: Final = (BASELINE_JSON, TRAJECTORY_JSON)
-
-
 @dataclass(frozen=True, slots=True)
 class AuditTask:
     """What is to be audited; travels to worker processes.
@@ -276,7 +277,14 @@ class _SceneCheck:
             if text is not None
         ]
         text = texts[TRAJECTORY_JSON]
-        poses = None if text is None else self.files.attempt(TRAJECTORY_JSON, _poses, text)
+        poses = (
+            None
+            if text is None
+            else self.files.attempt(
+                TRAJECTORY_JSON,
+                lambda: CameraPoses.from_trajectory(parse_trajectory(text, where=TRAJECTORY_JSON)),
+            )
+        )
         if poses is None:
             return RigAudit(fx_px=self.intrinsics.fx_px, fy_px=self.intrinsics.fy_px), None
         rig = rig_audit(self.scene.rig, poses, [each for each in documents if each is not None])
@@ -397,7 +405,3 @@ class _SceneCheck:
             occluder_side=side,
             twin=twins[0] if twins else -1,
         )
-
-
-def _poses(text: bytes) -> CameraPoses:
-    return CameraPoses.from_trajectory(parse_trajectory(text, where=TRAJECTORY_JSON))

@@ -30,7 +30,6 @@ from stereogenbench_data.audit.paper_figures import (
 from stereogenbench_data.audit.statistics import (
     ADJACENT_COLUMNS,
     FOCAL_EDGES_MM,
-    Distribution,
     FamilyStatistics,
     Statistics,
     branch_rows,
@@ -47,7 +46,7 @@ _RELEASE_SIZED: Final = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One figure of the paper beside ours, both as texts with as many digits as the paper tells."""
+    """One figure of the paper beside ours, both as texts with as many digits as the paper has."""
 
     table: str
     item: str
@@ -97,31 +96,19 @@ def _count_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
 
 def _baseline_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
     branches = {(each.split, each.family): each for each in found.branches}
-    for table, kind, figures in (
-        (ADJACENT_TABLE, "adjacent", ADJACENT), (ALL_PAIRS_TABLE, "all pairs", ALL_PAIRS),
-    ):  # fmt: skip
-        for (split, family), told in figures.items():
+    for table, kind, attribute, figures in (
+        (ADJACENT_TABLE, "adjacent", "adjacent_cm", ADJACENT),
+        (ALL_PAIRS_TABLE, "all pairs", "all_pairs_cm", ALL_PAIRS),
+    ):
+        for (split, family), expected in figures.items():
             branch = branches.get((split, family))
-            for name, paper in told.items():
+            for name, paper in expected.items():
+                ours = "-"
+                if branch is not None:
+                    decimals = len(paper.partition(".")[2])
+                    ours = f"{getattr(getattr(branch, attribute), name):.{decimals}f}"
                 item = f"{kind}, {split} {family}: {name}" + (" (cm)" if name != "count" else "")
-                yield (
-                    split,
-                    Line(table, item, paper, _as_told(_distribution(branch, kind), name, paper)),
-                )
-
-
-def _distribution(branch: FamilyStatistics | None, kind: str) -> Distribution | None:
-    if branch is None:
-        return None
-    return branch.adjacent_cm if kind == "adjacent" else branch.all_pairs_cm
-
-
-def _as_told(spread: Distribution | None, name: str, paper: str) -> str:
-    """Return a figure with as many decimals as the paper's, a dash where there is none."""
-    if spread is None:
-        return "-"
-    decimals = len(paper.partition(".")[2])
-    return f"{getattr(spread, name):.{decimals}f}"
+                yield split, Line(table, item, paper, ours)
 
 
 def _short_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
@@ -148,15 +135,15 @@ def _bin_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
 
 def _focal_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
     low, high = FOCAL_MM
-    told = f"{low:g} to {high:g}"
+    paper = f"{low:g} to {high:g}"
     for split in SPLITS:
         spreads = [each.focal_mm for each in found.branches if each.split == split]
         if not spreads:
             continue
         least, most = min(each.min for each in spreads), max(each.max for each in spreads)
-        ours = told if low <= least and most <= high else f"{least:g} to {most:g}"
+        ours = paper if low <= least and most <= high else f"{least:g} to {most:g}"
         item = f"focal lengths within (mm), {split}"
-        yield split, Line("appendix on generation parameters", item, told, ours)
+        yield split, Line("appendix on generation parameters", item, paper, ours)
 
 
 def _map_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
@@ -268,7 +255,7 @@ def _map_rows(branches: Sequence[FamilyStatistics]) -> Iterator[Sequence[str]]:
         yield (name, *(f"{each.maps[name]:,}" if name in each.maps else "-" for each in branches))
 
 
-_BINS: Final = 40
+_HISTOGRAM_BINS: Final = 40
 _COLOURS: Final = {"IPD_Gaussian": "#4477aa", "Uniform": "#ee6677", "Pairwise_Uniform": "#228833"}
 _COLUMNS: Final = 3
 _HEADROOM: Final = 1.3
@@ -303,7 +290,9 @@ def write_plots(
         is_pairwise = family == "Pairwise_Uniform"
         shown_cm = baselines_cm if is_pairwise else baselines_cm[:, ADJACENT_COLUMNS]
         what = "all pairs" if is_pairwise else "adjacent"
-        _histogram(axes, shown_cm.ravel(), bins=_BINS, colour=_COLOURS.get(family, "#777777"))
+        _histogram(
+            axes, shown_cm.ravel(), bins=_HISTOGRAM_BINS, colour=_COLOURS.get(family, "#777777")
+        )
         axes.set(title=f"{title}, {what}", xlabel="baseline (cm)", ylabel="pairs")
     _save(figure, baselines)
     figure = _figure(len(panels))

@@ -2,7 +2,7 @@
 
     python -m tests.audit.contract_trial FOLDER --seed 7 --scenes 12
 
-draws as many scenes, rewrites their files in ways that the doctor is not told, asks it about each
+draws as many scenes, rewrites their files in ways that the doctor does not know, runs it on each
 alone by four frames, and prints a table of verdicts. Each is kept in FOLDER/verdicts.jsonl.
 ``--also ROOT`` spoils copies of scenes in the released layout beside those that are drawn.
 """

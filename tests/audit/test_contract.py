@@ -161,7 +161,7 @@ def test_ray_depth_behind_a_long_lens_is_told_from_a_unit_that_is_a_little_off(l
 FITTING = CameraCheck(tuple(CameraFigures(camera, 999, 0.9, 1.0, 0.0, 0.0) for camera in range(6)))
 
 
-def diagnosed(**said):
+def diagnosed(**changes):
     """A scene's diagnosis: the declared contract holds, and no other answer was tested."""
     planar = Hypothesis()
     basics = {
@@ -170,11 +170,11 @@ def diagnosed(**said):
         "declared": planar, "best": planar, "scale_error": 0.001, "agreement": 0.9,
         "offsets_px": {(0, 1): 0.0}, "check": FITTING,
     }  # fmt: skip
-    return SceneDiagnosis(**(basics | said))
+    return SceneDiagnosis(**(basics | changes))
 
 
-def judged(**said):
-    return judge([diagnosed(**said)], declared=DepthEncoding())
+def judged(**changes):
+    return judge([diagnosed(**changes)], declared=DepthEncoding())
 
 
 def test_a_unit_that_the_other_kind_explains_as_well_is_left_open():
@@ -373,10 +373,10 @@ def test_a_shifted_picture_is_not_told_from_depth_of_the_other_camera():
         Rival("order", each.order, Evidence(9.0, 0.1))
         for each in Hypothesis(order=swapped).alternatives("order")
     )
-    said = {"best": Hypothesis(order=swapped), "rivals": rivals, "gain": Evidence(9.0, 0.1)}
+    changes = {"best": Hypothesis(order=swapped), "rivals": rivals, "gain": Evidence(9.0, 0.1)}
 
-    alone = judged(**said)
-    shifted = judged(**said, changed="offset", offsets_px={(0, 1): -3.0, (1, 2): 0.0})
+    alone = judged(**changes)
+    shifted = judged(**changes, changed="offset", offsets_px={(0, 1): -3.0, (1, 2): 0.0})
 
     assert wrong_topics(alone) == {"left and right"}
     assert any(swapped in line for line in alone.beside)

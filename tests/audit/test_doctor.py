@@ -33,12 +33,12 @@ def test_a_right_tree_ends_with_0_and_says_what_was_tested(detailed_release, tmp
 
 
 def test_a_wrong_quotient_ends_with_1_and_no_unit_to_paste(detailed_release):
-    said = run(detailed_release, "--unit-m", "0.1")
+    text = run(detailed_release, "--unit-m", "0.1")
     result = run(detailed_release, "--json", "--unit-m", "0.1")
 
-    assert said.exit_code == result.exit_code == 1
-    assert "Paste" not in said.stdout
-    assert "Nothing to paste" in said.stdout
+    assert text.exit_code == result.exit_code == 1
+    assert "Paste" not in text.stdout
+    assert "Nothing to paste" in text.stdout
     document = json.loads(result.stdout)
     assert "Only unit / (focal length x baseline) is seen" in document["quotient_means"]
     assert document["is_wrong"]

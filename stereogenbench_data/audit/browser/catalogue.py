@@ -17,6 +17,11 @@ from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, base
 from stereogenbench_data.selection.filters import filter_scenes
 from stereogenbench_data.selection.pairs import PairList, baselines_cm, choose_pairs
 
+MOST_ROWS: Final = 200
+"""How many scenes one answer lists at most."""
+
+_KEPT_CHOICES: Final = 32
+
 FACETS: Final = {"split": "split", "subset": "subset", "family": "family", "map": "map_name"}
 """The filters of which the page lists every value, and the columns that have them."""
 PairKind = Literal["primary", "adjacent", "all"]
@@ -96,12 +101,6 @@ def _range(query: Mapping[str, list[str]], name: str) -> tuple[float, float] | N
         if ends[-1].is_integer():
             ends[-1] = int(ends[-1])
     return None if ends == [0.0, 1e6] else (ends[0], ends[1])
-
-
-MOST_ROWS: Final = 200
-"""How many scenes one answer lists at most."""
-
-_KEPT_CHOICES: Final = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -81,7 +81,7 @@ class PageServer(ThreadingHTTPServer):
             self._waiting[request] = time.monotonic()
 
     def end_waiting(self, request: socket.socket) -> None:
-        """Note that a connection has asked something, or ends: its place is its own."""
+        """Note that a connection has sent a request, or ends: nobody may take its place."""
         with self._lock:
             self._waiting.pop(request, None)
 
@@ -113,7 +113,7 @@ class PageServer(ThreadingHTTPServer):
             self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing: a browser that went away is no error, and errors are told to the page."""
+        """Log nothing: a browser that went away is no error, and errors are sent to the page."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -145,7 +145,7 @@ class _Handler(BaseHTTPRequestHandler):
         if status == HTTPStatus.NOT_IMPLEMENTED:
             status = HTTPStatus.METHOD_NOT_ALLOWED
         self.close_connection = True
-        self._send(status, _told(message or status.phrase), body="send")
+        self._send(status, _error(message or status.phrase), body="send")
 
     def log_message(self, format: str, *args: Any) -> None:
         """Keep quiet."""
@@ -154,22 +154,22 @@ class _Handler(BaseHTTPRequestHandler):
         refusal = self._refusal()
         if refusal:
             self.close_connection = True
-            self._send(HTTPStatus.FORBIDDEN, _told(refusal), body=body)
+            self._send(HTTPStatus.FORBIDDEN, _error(refusal), body=body)
             return
         parts = urlsplit(self.path)
         try:
             query = parse_qs(parts.query, max_num_fields=200, errors="strict")
             answer = self.server.service.answer(parts.path, query)
         except SelectionError as error:
-            self._send(HTTPStatus.BAD_REQUEST, _told(str(error)), body=body)
+            self._send(HTTPStatus.BAD_REQUEST, _error(str(error)), body=body)
         except StereoGenBenchError as error:
-            told = _told(f"{type(error).__name__}: {error}")
-            self._send(HTTPStatus.UNPROCESSABLE_ENTITY, told, body=body)
+            response = _error(f"{type(error).__name__}: {error}")
+            self._send(HTTPStatus.UNPROCESSABLE_ENTITY, response, body=body)
         except ValueError:
-            self._send(HTTPStatus.BAD_REQUEST, _told("the question is malformed"), body=body)
+            self._send(HTTPStatus.BAD_REQUEST, _error("the question is malformed"), body=body)
         else:
             if answer is None:
-                self._send(HTTPStatus.NOT_FOUND, _told("there is nothing here"), body=body)
+                self._send(HTTPStatus.NOT_FOUND, _error("there is nothing here"), body=body)
             else:
                 self._send(HTTPStatus.OK, answer, body=body)
 
@@ -200,5 +200,5 @@ class _Handler(BaseHTTPRequestHandler):
                 self.wfile.write(answer.content)
 
 
-def _told(message: str) -> Response:
+def _error(message: str) -> Response:
     return Response(json.dumps({"error": message}).encode(), "application/json")

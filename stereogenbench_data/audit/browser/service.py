@@ -27,7 +27,7 @@ STATIC: Final = {
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 } | {f"/{name}.js": (f"{name}.js", "text/javascript; charset=utf-8") for name in _SCRIPTS}
-"""The files of the page, by their paths: nothing else on disk can be asked for."""
+"""The files of the page, by their paths: no other file on disk is served."""
 
 _JPEG_QUALITY: Final = 95
 _MAP_FIELDS: Final = ("disparity", "valid", "depth")
@@ -112,15 +112,15 @@ class Service:
         """Return a map as little-endian float32, row by row, nan where nothing was measured."""
         _, row, pair, frame = self._moment(query)
         sample = self._reader.pair(row, pair=pair, frame=frame, fields=_MAP_FIELDS)
-        told = np.where(sample["valid"], sample[name], np.float32(np.nan)).astype("<f4")
-        return Response(told.tobytes(), "application/octet-stream", keep=True)
+        numbers = np.where(sample["valid"], sample[name], np.float32(np.nan)).astype("<f4")
+        return Response(numbers.tobytes(), "application/octet-stream", keep=True)
 
     def _visible(self, query: Query) -> Response:
         """Return one byte a pixel, 1 where the right camera sees it too."""
         _, row, pair, frame = self._moment(query)
         sample = self._reader.pair(row, pair=pair, frame=frame, fields=("visible",))
-        told = sample["visible"].astype(np.uint8).tobytes()
-        return Response(told, "application/octet-stream", keep=True)
+        numbers = sample["visible"].astype(np.uint8).tobytes()
+        return Response(numbers, "application/octet-stream", keep=True)
 
     def _moment(self, query: Query) -> tuple[str, int, tuple[int, int], int]:
         key = _text(query, "key")

@@ -133,19 +133,19 @@ class CameraComparison:
     def __init__(
         self,
         views: SceneFrames,
-        frame_matches: Sequence[FrameMatch],
+        matches: Sequence[FrameMatch],
         contract: ScoredContract,
         *,
         depth_step: float,
     ) -> None:
         """Take frame matches from both sides by turns, and a contract with its scale fitted."""
         self._views = views
-        self._frame_matches = frame_matches
+        self._matches = matches
         self._contract = contract
         self._depth_step = depth_step
         self._most_log_scale = max(MOST_LOG_SCALE, depth_step / 4)
         self._partner: dict[int, FrameMatch] = {}
-        for here, there in zip(frame_matches[::2], frame_matches[1::2], strict=True):
+        for here, there in zip(matches[::2], matches[1::2], strict=True):
             self._partner |= {id(here): there, id(there): here}
         self._pairs = {beside.pair: beside for beside in self._besides()}
 
@@ -184,7 +184,7 @@ class CameraComparison:
 
     def _besides(self) -> Iterator[_Beside]:
         by_pair: dict[Pair, list[tuple[FrameMatch, FrameMatch]]] = {}
-        for here, there in zip(self._frame_matches[::2], self._frame_matches[1::2], strict=True):
+        for here, there in zip(self._matches[::2], self._matches[1::2], strict=True):
             by_pair.setdefault(here.pair, []).append((here, there))
         for pair, both in by_pair.items():
             found = self._beside(pair, both)
@@ -294,12 +294,8 @@ class CameraComparison:
         own = self._of(camera)
         neighbour = next((beside for beside in own if not set(beside.pair) & behind), own[0])
         (other,) = set(neighbour.pair) - {camera}
-        frame_matches = [
-            frame_match
-            for frame_match in self._frame_matches
-            if (frame_match.left, frame_match.right) == (other, camera)
-        ]
-        middle = frame_matches[len(frame_matches) // 2]
+        matches = [match for match in self._matches if (match.left, match.right) == (other, camera)]
+        middle = matches[len(matches) // 2]
         frames = self._views.scene.frames
         now = self._share([(middle, self._band(middle.frame, camera))])
         readings = [
@@ -311,20 +307,14 @@ class CameraComparison:
             band = np.roll(self._band(middle.frame, camera), -rows, axis=0)
             readings.append((self._share([(middle, band)]), ""))
         for lag in range(-_FARTHEST_FRAMES, _FARTHEST_FRAMES + 1):
-            usable = [
-                frame_match
-                for frame_match in frame_matches
-                if 0 <= frame_match.frame + lag < frames
-            ]
+            usable = [match for match in matches if 0 <= match.frame + lag < frames]
             if lag and usable:
-                frame_match = min(usable, key=lambda each: abs(each.frame - middle.frame))
-                share = self._share([(frame_match, self._band(frame_match.frame + lag, camera))])
+                match = min(usable, key=lambda each: abs(each.frame - middle.frame))
+                share = self._share([(match, self._band(match.frame + lag, camera))])
                 many = "s" if abs(lag) > 1 else ""
                 word = "late" if lag > 0 else "early"
                 readings.append((share, f"{abs(lag)} frame{many} {word}"))
-        everywhere = [
-            each for each in self._frame_matches if (each.left, each.right) == (other, camera)
-        ]
+        everywhere = [each for each in self._matches if (each.left, each.right) == (other, camera)]
         share, words = max(readings, default=(0.0, ""))
         elsewhere = self._share_elsewhere(everywhere)
         # Where disparities are small another place explains what is wrong with rows as well.
@@ -344,13 +334,13 @@ class CameraComparison:
             return f"camera {camera} {words}"
         return f"pictures of camera {camera} are {words}" if words else row_fault or ""
 
-    def _share_elsewhere(self, frame_matches: Sequence[FrameMatch]) -> float:
+    def _share_elsewhere(self, matches: Sequence[FrameMatch]) -> float:
         """Return the share of matches that depth explains if the two stand otherwise apart."""
         found, predicted = [], []
-        for frame_match in frame_matches:
-            prediction = self._views.predicted(frame_match, self._contract.hypothesis)
+        for match in matches:
+            prediction = self._views.predicted(match, self._contract.hypothesis)
             if prediction is not None:
-                found.append(frame_match.matched_px[prediction[1]])
+                found.append(match.matched_px[prediction[1]])
                 predicted.append(prediction[0][prediction[1]])
         if not sum(map(len, found)):
             return 0.0
@@ -360,26 +350,24 @@ class CameraComparison:
             voted_scale(found_px, sign * predicted_px) * sign * predicted_px - found_px
             for sign in (1, -1)
         ]
-        return max(float((np.abs(away) < frame_matches[0].grain_px).mean()) for away in aways)
+        return max(float((np.abs(away) < matches[0].grain_px).mean()) for away in aways)
 
     def _band(self, frame: int, camera: int) -> Luma:
         return self._views.band(frame, camera)
 
-    def _share(self, frame_matches: Sequence[tuple[FrameMatch, Luma]]) -> float:
+    def _share(self, matches: Sequence[tuple[FrameMatch, Luma]]) -> float:
         """Return the share of matches with other right pictures that depth explains."""
         near, count = 0, 0
         hypothesis = self._contract.hypothesis
-        for frame_match, right in frame_matches:
-            found = match_rows(self._views.band(frame_match.frame, frame_match.left), right)
-            file = hypothesis.depth_file(frame_match.left)
-            frame = min(
-                max(frame_match.frame + hypothesis.frame_lag, 0), self._views.scene.frames - 1
-            )
+        for match, right in matches:
+            found = match_rows(self._views.band(match.frame, match.left), right)
+            file = hypothesis.depth_file(match.left)
+            frame = min(max(match.frame + hypothesis.frame_lag, 0), self._views.scene.frames - 1)
             units, known = self._views.depth(frame, file)
             place = found.rows, found.columns
             number = np.where(known[place], units[place], 1).astype(np.float64)
             predicted = self._contract.scale * self._views.disparity_of(
-                number, frame_match, hypothesis, place=place, file=file
+                number, match, hypothesis, place=place, file=file
             )
             near += int((np.abs(predicted - found.disparity_px) < found.grain_px).sum())
             count += len(found.rows)
@@ -429,32 +417,30 @@ class CameraComparison:
     def _better_depth(self, camera: int, *, scale: float) -> str:
         """Return another reading of one camera's depth that explains clearly more, in words."""
         hypothesis = self._contract.hypothesis
-        frame_matches = [
-            frame_match for frame_match in self._frame_matches if frame_match.left == camera
-        ]
-        now = self._shares(frame_matches, hypothesis)
+        matches = [match for match in self._matches if match.left == camera]
+        now = self._shares(matches, hypothesis)
         subject = f"depth of camera {camera}"
         lagged: dict[str, Hypothesis] = {}
         readings: list[tuple[str, Float64[np.ndarray, " matches"]]] = [
             (
                 f"{subject} is {scale:.4g} x that of the others",
-                self._shares(frame_matches, hypothesis, factor=scale),
+                self._shares(matches, hypothesis, factor=scale),
             )
         ]
         for question in _READINGS:
             for other in hypothesis.alternatives(question):
                 words = _READINGS[question].format(getattr(other, question))
-                factor = self._own_factor(frame_matches, other) if question == "form" else 1.0
+                factor = self._own_factor(matches, other) if question == "form" else 1.0
                 words = f"{subject} fits better {words}"
                 if question == "frame_lag":
                     lagged[words] = other
-                readings.append((words, self._shares(frame_matches, other, factor=factor)))
+                readings.append((words, self._shares(matches, other, factor=factor)))
         for file in range(CAMERA_COUNT):
             if file != hypothesis.depth_file(camera):
                 readings.append(
                     (
                         f"{subject} fits worse than that of file {file} does in its place",
-                        self._shares(frame_matches, hypothesis, file=file),
+                        self._shares(matches, hypothesis, file=file),
                     )
                 )
         best, most = "", 0.0
@@ -479,38 +465,33 @@ class CameraComparison:
         """
         lag = self._contract.hypothesis.frame_lag - lagged.frame_lag
         (neighbour,) = set(self._of(camera)[0].pair) - {camera}
-        frame_matches = [
-            frame_match
-            for frame_match in self._frame_matches
-            if (frame_match.left, frame_match.right) == (neighbour, camera)
-            and 0 <= frame_match.frame + lag < self._views.scene.frames
+        matches = [
+            match
+            for match in self._matches
+            if (match.left, match.right) == (neighbour, camera)
+            and 0 <= match.frame + lag < self._views.scene.frames
         ]
         now, then = (
-            self._share(
-                [
-                    (frame_match, self._band(frame_match.frame + by, camera))
-                    for frame_match in frame_matches
-                ]
-            )
+            self._share([(match, self._band(match.frame + by, camera)) for match in matches])
             for by in (0, lag)
         )
         return then > now + _LEAST_LATER
 
-    def _own_factor(self, frame_matches: Sequence[FrameMatch], hypothesis: Hypothesis) -> float:
+    def _own_factor(self, matches: Sequence[FrameMatch], hypothesis: Hypothesis) -> float:
         """Return the factor that most of a camera's matches agree on."""
         ratios = []
-        for frame_match in frame_matches:
-            predicted = self._views.predicted(frame_match, hypothesis)
+        for match in matches:
+            predicted = self._views.predicted(match, hypothesis)
             if predicted is not None:
                 disparity_px, known = predicted
-                ratio = frame_match.matched_px[known] / (self._contract.scale * disparity_px[known])
+                ratio = match.matched_px[known] / (self._contract.scale * disparity_px[known])
                 ratios.append(ratio[ratio > 0])
         positive = np.concatenate(ratios) if ratios else np.ones(1)
         return math.exp(float(np.median(np.log(positive)))) if len(positive) else 1.0
 
     def _shares(
         self,
-        frame_matches: Sequence[FrameMatch],
+        matches: Sequence[FrameMatch],
         hypothesis: Hypothesis,
         *,
         file: int | None = None,
@@ -521,17 +502,15 @@ class CameraComparison:
         Depth agrees more sharply with depth than with matches, some of which are wrong. ``factor``
         is what depth is divided by, in that disparity is multiplied.
         """
-        shares = np.full(len(frame_matches), np.nan)
-        for place, frame_match in enumerate(frame_matches):
-            predicted = self._views.predicted(frame_match, hypothesis, depth_file=file)
-            other = self._views.predicted(self._partner[id(frame_match)], self._contract.hypothesis)
+        shares = np.full(len(matches), np.nan)
+        for place, match in enumerate(matches):
+            predicted = self._views.predicted(match, hypothesis, depth_file=file)
+            other = self._views.predicted(self._partner[id(match)], self._contract.hypothesis)
             if predicted is not None and other is not None:
                 known = predicted[1] & other[1]
                 expected_px = -self._contract.scale * other[0][known]
                 away = self._contract.scale * factor * predicted[0][known] - expected_px
-                allowed = _LEAST_AWAY * frame_match.grain_px + 2 * self._depth_step * np.abs(
-                    expected_px
-                )
+                allowed = _LEAST_AWAY * match.grain_px + 2 * self._depth_step * np.abs(expected_px)
                 shares[place] = float((np.abs(away) < allowed).mean()) if known.any() else np.nan
         return shares
 
@@ -576,26 +555,23 @@ _READINGS: Final[dict[Question, str]] = {
 
 
 def row_terms(
-    views: SceneFrames, frame_match: FrameMatch
+    views: SceneFrames, match: FrameMatch
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Return how far lower the left picture lies at each match: numerator and denominator.
 
     One step of Lucas and Kanade along the column, over five rows, at the disparity that was found.
     """
-    left, right = (
-        views.band(frame_match.frame, frame_match.left),
-        views.band(frame_match.frame, frame_match.right),
-    )
-    place = frame_match.columns - frame_match.matched_px
+    left, right = (views.band(match.frame, match.left), views.band(match.frame, match.right))
+    place = match.columns - match.matched_px
     numerator, denominator = np.zeros(len(place)), np.zeros(len(place))
     for beside in range(-_ROWS_BESIDE, _ROWS_BESIDE + 1):
-        rows = np.clip(frame_match.rows + beside, 1, len(left) - 2)
+        rows = np.clip(match.rows + beside, 1, len(left) - 2)
         there, inside = sample_along_rows(right, rows, place)
         above, _ = sample_along_rows(right, rows - 1, place)
         below, _ = sample_along_rows(right, rows + 1, place)
-        own = (left[rows + 1, frame_match.columns] - left[rows - 1, frame_match.columns]) / 2
+        own = (left[rows + 1, match.columns] - left[rows - 1, match.columns]) / 2
         slope = ((below - above) / 2 + own) / 2
-        numerator += np.where(inside, slope * (there - left[rows, frame_match.columns]), 0)
+        numerator += np.where(inside, slope * (there - left[rows, match.columns]), 0)
         denominator += np.where(inside, slope * slope, 0)
     return numerator, denominator
 

@@ -186,21 +186,19 @@ class Search:
     def __init__(
         self,
         views: SceneFrames,
-        frame_matches: Sequence[FrameMatch],
+        matches: Sequence[FrameMatch],
         *,
         least_log_scale: float = LEAST_LOG_SCALE,
     ) -> None:
         """Take what the contracts are judged by, and how far off a unit may be."""
         self._views = views
         self._least_log_scale = least_log_scale
-        self._every = frame_matches
+        self._every = matches
         near = views.neighbours(Hypothesis())
         # Those next but one are for the comparison of cameras.
-        self._frame_matches = [
-            frame_match for frame_match in frame_matches if frame_match.pair in near
-        ] or list(frame_matches)
-        self._bias = BIAS_PX / max(disparity_px(frame_matches), 1e-6)
-        self._bias_beside_offset = BIAS_PX / max(spread_px(frame_matches), 1e-6)
+        self._matches = [match for match in matches if match.pair in near] or list(matches)
+        self._bias = BIAS_PX / max(disparity_px(matches), 1e-6)
+        self._bias_beside_offset = BIAS_PX / max(spread_px(matches), 1e-6)
         self._fitted: dict[tuple[Hypothesis, Free], _Candidate] = {}
         self._likely: dict[Hypothesis, tuple[Hypothesis, ...]] = {}
         self._powers: dict[tuple[Hypothesis, Free], RayPower] = {}
@@ -209,7 +207,7 @@ class Search:
     def candidate(self, hypothesis: Hypothesis, *, free: Free) -> _Candidate:
         """Return a contract, fitted."""
         if (hypothesis, free) not in self._fitted:
-            score = fit_hypothesis(self._views, self._frame_matches, hypothesis, free=free)
+            score = fit_hypothesis(self._views, self._matches, hypothesis, free=free)
             self._fitted[hypothesis, free] = _Candidate(free, score)
         return self._fitted[hypothesis, free]
 
@@ -220,7 +218,7 @@ class Search:
             other.free,
             score_hypothesis(
                 self._views,
-                self._frame_matches,
+                self._matches,
                 hypothesis,
                 scale=score.scale,
                 offsets_px=score.offsets_px,
@@ -287,11 +285,7 @@ class Search:
         """Return the orders that explain most matches, whatever the scale."""
         if current not in self._likely:
             orders = current.alternatives("order")
-            few = [
-                frame_match
-                for frame_match in self._frame_matches
-                if frame_match.frame == self._frame_matches[0].frame
-            ]
+            few = [match for match in self._matches if match.frame == self._matches[0].frame]
             shares = {order: voted_agreement(self._views, few, order) for order in orders}
             best = sorted(orders, key=lambda order: -shares[order])[:_PROMISING]
             self._likely[current] = tuple(best)
@@ -337,13 +331,13 @@ class Search:
         """Return what a contract leaves to explain, its scale fitted."""
         fitted_too = self.candidate(contract.hypothesis, free=_freed(contract.free, "scale"))
         hypothesis = contract.hypothesis
-        frame_matches = self._every
+        matches = self._every
         if hypothesis.order != self.declared.hypothesis.order:
             # Other files stand beside each other.
-            frames = len({frame_match.frame for frame_match in frame_matches})
-            frame_matches = self._views.frame_matches(frames=frames, hypothesis=hypothesis)
+            frames = len({match.frame for match in matches})
+            matches = self._views.frame_matches(frames=frames, hypothesis=hypothesis)
         return CameraComparison(
-            self._views, frame_matches, fitted_too.score, depth_step=depth_step
+            self._views, matches, fitted_too.score, depth_step=depth_step
         ).check()
 
     def rivals(self, best: _Candidate) -> tuple[Rival, ...]:
@@ -383,23 +377,23 @@ class Search:
             return self.gain(best, self.declared)
         moved = [
             place
-            for place, frame_match in enumerate(self._frame_matches)
-            if abs(frame_match.shift_px(best.score.offsets_px)) >= LEAST_OFFSET_PX
+            for place, match in enumerate(self._matches)
+            if abs(match.shift_px(best.score.offsets_px)) >= LEAST_OFFSET_PX
         ]
         ours, theirs = (
             replace(score, errors=[score.errors[place] for place in moved])
             for score in (best.score, self.declared.score)
         )
-        return evidence([self._frame_matches[place] for place in moved], ours, theirs)
+        return evidence([self._matches[place] for place in moved], ours, theirs)
 
     def without_parallax(self, best: _Candidate) -> Evidence:
         """Return by how much a contract is better than if all were infinitely far."""
-        flat = score_hypothesis(self._views, self._frame_matches, best.hypothesis, scale=1e-12)
-        return evidence(self._frame_matches, best.score, flat)
+        flat = score_hypothesis(self._views, self._matches, best.hypothesis, scale=1e-12)
+        return evidence(self._matches, best.score, flat)
 
     def gain(self, better: _Candidate, worse: _Candidate) -> Evidence:
         """Return by how much one contract is better than another."""
-        found = evidence(self._frame_matches, better.score, worse.score)
+        found = evidence(self._matches, better.score, worse.score)
         kind = better.hypothesis.kind
         only_kind = better.hypothesis.changes_from(worse.hypothesis) == ("kind",)
         # Coarse depth has a shape of its own.
@@ -417,7 +411,7 @@ class Search:
         free = _freed(candidate.free, "scale")
         if (planar, free) not in self._powers:
             start = self.candidate(planar, free=free).score
-            self._powers[planar, free] = ray_power(self._views, self._frame_matches, start)
+            self._powers[planar, free] = ray_power(self._views, self._matches, start)
         return self._powers[planar, free]
 
     def _is_better(self, other: _Candidate, current: _Candidate) -> bool:
@@ -477,15 +471,15 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
     Raises:
         MediaError: If a video does not decode, or has another size than the scene's metadata say.
     """
-    frame_matches = views.frame_matches(frames=frames)
+    matches = views.frame_matches(frames=frames)
     file = views.primary[0]
     declared = Hypothesis.declared(views.encoding)
     basics: dict[str, Any] = {
         "key": views.scene.id.key,
-        "views": len(frame_matches) // 2,
+        "views": len(matches) // 2,
         "pairs": tuple(views.chosen_pairs(Hypothesis())),
-        "matches": sum(len(frame_match.rows) for frame_match in frame_matches[::2]),
-        "textured": sum(frame_match.textured for frame_match in frame_matches[::2]),
+        "matches": sum(len(match.rows) for match in matches[::2]),
+        "textured": sum(match.textured for match in matches[::2]),
         "unit_m": views.unit_m(file),
         "unit_source": "user" if views.encoding.unit_m else views.scene.depth_unit_source[file],
         "focal_ratios": focal_ratios(views.scene.rig),
@@ -498,23 +492,23 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
             problem=f"no texture: {basics['textured']:,} pixels have any, and "
             f"{basics['matches']:,} were found in both pictures",
         )  # fmt: skip
-    basics["depth_step"] = views.depth_step(frame_matches[0].frame)
+    basics["depth_step"] = views.depth_step(matches[0].frame)
     if basics["depth_step"] > _COARSEST_STEP:
         return SceneDiagnosis(
             **basics, best=declared,
             problem=f"stored depth is too coarse: its steps are {basics['depth_step']:.0%} of it",
         )  # fmt: skip
-    basics["spread_px"] = spread_px(frame_matches)
+    basics["spread_px"] = spread_px(matches)
     least_log_scale = allowed_log_scale(basics["depth_step"])
-    basics["disparity_px"] = disparity_px(frame_matches)
+    basics["disparity_px"] = disparity_px(matches)
     if basics["disparity_px"] < _LEAST_PARALLAX_PX:
         return SceneDiagnosis(
             **basics, best=declared,
             problem=f"too little parallax: disparities are of {basics['disparity_px']:.2f} px",
         )  # fmt: skip
-    search = Search(views, frame_matches, least_log_scale=least_log_scale)
+    search = Search(views, matches, least_log_scale=least_log_scale)
     best, check = _checked(search, search.best(), depth_step=basics["depth_step"])
-    share_told = agreement(views, frame_matches, best.score)
+    share_told = agreement(views, matches, best.score)
     parallax = search.without_parallax(best)
     if math.isnan(share_told) or not parallax.is_clear():
         problem = (

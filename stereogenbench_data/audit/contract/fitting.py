@@ -50,60 +50,60 @@ class Term:
     ``large_px`` is the 90th percentile of the predicted sizes.
     """
 
-    frame_match: FrameMatch
+    match: FrameMatch
     predicted_px: Points
     large_px: float
 
     @property
     def matched_px(self) -> Points:
         """The disparity that was found."""
-        return self.frame_match.matched_px
+        return self.match.matched_px
 
     @property
     def pair(self) -> Pair:
         """The two files, the lower number first."""
-        return self.frame_match.pair
+        return self.match.pair
 
     @property
     def sign(self) -> int:
         """1 if the pixels are those of the lower number, whose way offsets are counted, else -1."""
-        return 1 if self.frame_match.left < self.frame_match.right else -1
+        return 1 if self.match.left < self.match.right else -1
 
 
 def fit_hypothesis(
-    views: SceneFrames, frame_matches: Sequence[FrameMatch], hypothesis: Hypothesis, *, free: Free
+    views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis, *, free: Free
 ) -> ScoredContract:
     """Return a hypothesis with the scale and offsets that explain the pictures best."""
-    terms = [] if free == "nothing" else fit_terms(views, frame_matches, hypothesis)
+    terms = [] if free == "nothing" else fit_terms(views, matches, hypothesis)
     if not terms:
-        return score_hypothesis(views, frame_matches, hypothesis)
+        return score_hypothesis(views, matches, hypothesis)
     scale, offsets_px = _start(terms, free=free)
     scale, offsets_px, error = _refined(views, terms, scale, offsets_px, free=free)
     return score_hypothesis(
-        views, frame_matches, hypothesis, scale=scale, offsets_px=offsets_px, scale_error=error
+        views, matches, hypothesis, scale=scale, offsets_px=offsets_px, scale_error=error
     )
 
 
 def fit_terms(
-    views: SceneFrames, frame_matches: Sequence[FrameMatch], hypothesis: Hypothesis
+    views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
 ) -> list[Term]:
     """Return the frame matches for which a hypothesis predicts anything, with its predictions."""
     terms = []
-    for frame_match in frame_matches:
-        predicted = views.predicted(frame_match, hypothesis)
+    for match in matches:
+        predicted = views.predicted(match, hypothesis)
         if predicted is not None and predicted[1].any():
             disparity_px, known = predicted
             predicted_px = disparity_px[known]
             large_px = float(np.percentile(np.abs(predicted_px), 90))
-            terms.append(Term(frame_match.at(known), predicted_px, large_px))
+            terms.append(Term(match.at(known), predicted_px, large_px))
     return terms
 
 
 def voted_agreement(
-    views: SceneFrames, frame_matches: Sequence[FrameMatch], hypothesis: Hypothesis
+    views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
 ) -> float:
     """Return how many matches a hypothesis explains at the scale that most of them agree on."""
-    terms = fit_terms(views, frame_matches, hypothesis)
+    terms = fit_terms(views, matches, hypothesis)
     if not terms:
         return 0.0
     found = np.concatenate([term.matched_px for term in terms])
@@ -239,7 +239,7 @@ def _equations(
     normals = np.zeros((len(terms), len(unknowns), len(unknowns)))
     rights = np.zeros((len(terms), len(unknowns)))
     for number, term in enumerate(terms):
-        disparity_px = scale * term.predicted_px + term.frame_match.shift_px(offsets_px)
+        disparity_px = scale * term.predicted_px + term.match.shift_px(offsets_px)
         difference, slope, weight = _compared(views, term, disparity_px)
         if weight is None:
             continue
@@ -261,7 +261,7 @@ def _compared(
     The weight is robust, and 0 for pixels that leave the picture or were matched elsewhere. It is
     None where too few are left.
     """
-    match = term.frame_match
+    match = term.match
     there, slope, inside = sample_with_slope(
         views.band(match.frame, match.right), match.rows, match.columns - disparity_px
     )
@@ -339,10 +339,10 @@ class RayPower:
 
 
 def ray_power(
-    views: SceneFrames, frame_matches: Sequence[FrameMatch], contract: ScoredContract
+    views: SceneFrames, matches: Sequence[FrameMatch], contract: ScoredContract
 ) -> RayPower:
     """Return the power that fits a contract's pictures best, scale and its offsets fitted too."""
-    terms = fit_terms(views, frame_matches, contract.hypothesis)
+    terms = fit_terms(views, matches, contract.hypothesis)
     pairs = list(contract.offsets_px)
     log_scale, bend = math.log(contract.scale), 0.0
     offsets_px = dict(contract.offsets_px)
@@ -351,11 +351,11 @@ def ray_power(
         normals = np.zeros((len(terms), 2 + len(pairs), 2 + len(pairs)))
         rights = np.zeros((len(terms), 2 + len(pairs)))
         for number, term in enumerate(terms):
-            frame_match = term.frame_match
-            log_ray = np.log(views.ray_per_planar[frame_match.rows, frame_match.columns])
+            match = term.match
+            log_ray = np.log(views.ray_per_planar[match.rows, match.columns])
             grown_px = term.predicted_px * np.exp(log_scale + bend * log_ray)
             difference, slope, weight = _compared(
-                views, term, grown_px + frame_match.shift_px(offsets_px)
+                views, term, grown_px + match.shift_px(offsets_px)
             )
             if weight is None:
                 continue

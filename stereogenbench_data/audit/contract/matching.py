@@ -197,6 +197,7 @@ def _gathered(
 
 
 Points = Float64[np.ndarray, " n"]
+_Prediction = tuple[Points, Bool[np.ndarray, " n"]]
 _Numbers = tuple[UInt16[np.ndarray, " n"], Bool[np.ndarray, " n"]]
 
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
@@ -271,6 +272,8 @@ class SceneFrames:
         self._streams = streams
         self._bands: dict[tuple[int, int], Luma] = {}
         self._stored: dict[tuple[int, int, int], tuple[FrameMatch, dict[Flip, _Numbers]]] = {}
+        self._predicted_by: Hypothesis | None = None
+        self._predictions: dict[tuple[int, int], tuple[FrameMatch, _Prediction | None]] = {}
         self._depths: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
 
     @property
@@ -316,23 +319,23 @@ class SceneFrames:
         self._depths[frame, file] = units, stored.measured & (units > 0)
         return self._depths[frame, file]
 
-    def _numbers(self, frame_match: FrameMatch, *, frame: int, file: int) -> dict[Flip, _Numbers]:
+    def _numbers(self, match: FrameMatch, *, frame: int, file: int) -> dict[Flip, _Numbers]:
         """Return what a depth frame stores at a frame match's pixels, as it is and turned over.
 
         Only these numbers are kept: whole maps of all lags and cameras would fill the memory.
         """
-        key = (id(frame_match), frame, file)
+        key = (id(match), frame, file)
         if key not in self._stored:
             units, known = self.depth(frame, file)
             height, width = units.shape
             places: dict[Flip, tuple[np.ndarray, np.ndarray]] = {
-                "none": (frame_match.rows, frame_match.columns),
-                "vertical": (height - 1 - frame_match.rows, frame_match.columns),
-                "horizontal": (frame_match.rows, width - 1 - frame_match.columns),
+                "none": (match.rows, match.columns),
+                "vertical": (height - 1 - match.rows, match.columns),
+                "horizontal": (match.rows, width - 1 - match.columns),
             }
             numbers = {flip: (units[place], known[place]) for flip, place in places.items()}
             # The frame match is kept too, so that no other can get its identity.
-            self._stored[key] = (frame_match, numbers)
+            self._stored[key] = (match, numbers)
         return self._stored[key][1]
 
     def depth_step(self, frame: int) -> float:
@@ -357,12 +360,12 @@ class SceneFrames:
         """
         pairs = self.chosen_pairs(hypothesis or Hypothesis())
         files = dict.fromkeys(itertools.chain.from_iterable(pairs))
-        frame_matches: list[FrameMatch] = []
+        matches: list[FrameMatch] = []
         for frame in chosen_frames(self.scene.frames, count=frames):
             found = match_pairs({file: self.band(frame, file) for file in files}, pairs)
             for (left, right), row_matches in found.items():
-                frame_matches += self._both_ways(frame, left, right, row_matches)
-        return frame_matches
+                matches += self._both_ways(frame, left, right, row_matches)
+        return matches
 
     def chosen_pairs(self, hypothesis: Hypothesis) -> list[tuple[int, int]]:
         """Return pairs in which every camera stands beside others: next to it, and next but one.
@@ -399,37 +402,52 @@ class SceneFrames:
         matched_px = row_matches.disparity_px[keep].astype(np.float64)
         width = here.shape[1]
         found = np.clip(np.rint(columns - matched_px), 0, width - 1).astype(np.int64)
-        frame_matches = (
+        matches = (
             _frame_match(here, rows, columns, matched_px, frame=frame, files=(left, right)),
             _frame_match(there, rows, found, -matched_px, frame=frame, files=(right, left)),
         )
         here_seen, there_seen = (
-            replace(frame_match, textured=row_matches.textured, grain_px=row_matches.grain_px)
-            for frame_match in frame_matches
+            replace(match, textured=row_matches.textured, grain_px=row_matches.grain_px)
+            for match in matches
         )
         return here_seen, there_seen
 
     def predicted(
-        self, frame_match: FrameMatch, hypothesis: Hypothesis, *, depth_file: int | None = None
-    ) -> tuple[Points, Bool[np.ndarray, " n"]] | None:
+        self, match: FrameMatch, hypothesis: Hypothesis, *, depth_file: int | None = None
+    ) -> _Prediction | None:
         """Return the disparity of matched pixels at the declared unit, and where it is known.
 
         None where the frame of depth does not exist. ``depth_file`` is read in place of the one
-        that the hypothesis names.
+        that the hypothesis names. The predictions of one hypothesis are kept, read-only, until
+        another is asked for: it is fitted, scored and drawn at many scales.
         """
-        file = hypothesis.depth_file(frame_match.left) if depth_file is None else depth_file
-        frame = frame_match.frame + hypothesis.frame_lag
+        file = hypothesis.depth_file(match.left) if depth_file is None else depth_file
+        if hypothesis != self._predicted_by:
+            self._predicted_by, self._predictions = hypothesis, {}
+        key = (id(match), file)
+        if key not in self._predictions:
+            # The frame match is kept too, so that no other can get its identity.
+            prediction = self._predict(match, hypothesis, file=file)
+            self._predictions[key] = (match, prediction)
+        return self._predictions[key][1]
+
+    def _predict(
+        self, match: FrameMatch, hypothesis: Hypothesis, *, file: int
+    ) -> _Prediction | None:
+        frame = match.frame + hypothesis.frame_lag
         if not 0 <= frame < self.scene.frames:
             return None
-        units, known = self._numbers(frame_match, frame=frame, file=file)[hypothesis.flip]
+        units, known = self._numbers(match, frame=frame, file=file)[hypothesis.flip]
         number = np.where(known, units, 1).astype(np.float64)
-        place = frame_match.rows, frame_match.columns
-        return self.disparity_of(number, frame_match, hypothesis, place=place, file=file), known
+        place = match.rows, match.columns
+        disparity_px = self.disparity_of(number, match, hypothesis, place=place, file=file)
+        disparity_px.flags.writeable = known.flags.writeable = False
+        return disparity_px, known
 
     def disparity_of(
         self,
         number: Points,
-        frame_match: FrameMatch,
+        match: FrameMatch,
         hypothesis: Hypothesis,
         *,
         place: tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]],
@@ -440,16 +458,13 @@ class SceneFrames:
         per_m = 1 / (unit_m * number) if hypothesis.form == "depth" else number / unit_m
         if hypothesis.kind == "ray":
             per_m *= self.ray_per_planar[place]
-        disparity_px: Points = (
-            self.intrinsics.fx_px * self.baseline_m(frame_match, hypothesis) * per_m
-        )
+        disparity_px: Points = self.intrinsics.fx_px * self.baseline_m(match, hypothesis) * per_m
         return disparity_px
 
-    def baseline_m(self, frame_match: FrameMatch, hypothesis: Hypothesis) -> float:
+    def baseline_m(self, match: FrameMatch, hypothesis: Hypothesis) -> float:
         """Return the signed baseline of a frame match's two files."""
         left, right = (
-            hypothesis.camera_of(file, content="rgb")
-            for file in (frame_match.left, frame_match.right)
+            hypothesis.camera_of(file, content="rgb") for file in (match.left, match.right)
         )
         lateral_m = self.scene.lateral_m
         baseline_m = lateral_m[right] - lateral_m[left]
@@ -483,22 +498,14 @@ def _frame_match(
     )
 
 
-def disparity_px(frame_matches: Sequence[FrameMatch]) -> float:
+def disparity_px(matches: Sequence[FrameMatch]) -> float:
     """Return the root mean square of found disparities."""
-    return float(
-        np.sqrt(
-            (np.concatenate([frame_match.matched_px for frame_match in frame_matches]) ** 2).mean()
-        )
-    )
+    return float(np.sqrt((np.concatenate([match.matched_px for match in matches]) ** 2).mean()))
 
 
-def spread_px(frame_matches: Sequence[FrameMatch]) -> float:
+def spread_px(matches: Sequence[FrameMatch]) -> float:
     """Return the root mean square of found disparities about the mean of each frame match."""
-    spreads = [
-        frame_match.matched_px - frame_match.matched_px.mean()
-        for frame_match in frame_matches
-        if len(frame_match.rows)
-    ]
+    spreads = [match.matched_px - match.matched_px.mean() for match in matches if len(match.rows)]
     return float(np.sqrt((np.concatenate(spreads) ** 2).mean())) if spreads else 0.0
 
 

@@ -56,15 +56,13 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     above, below = figure.subfigures(2, 1, height_ratios=(2, 1))
     with closing(task.streams()) as streams:
         views = SceneFrames(task.scene, streams, encoding=report.declared)
-        frame_matches = views.frame_matches(frames=task.frames)
+        matches = views.frame_matches(frames=task.frames)
         figure.suptitle(f"{diagnosis.key}: {_title(diagnosis)}", fontsize=12)
-        _draw_views(above.subplots(2, 3).ravel(), views, frame_matches, diagnosis)
+        _draw_views(above.subplots(2, 3).ravel(), views, matches, diagnosis)
         wide, near, others = below.subplots(1, 3)
         found_m = diagnosis.unit_m / diagnosis.scale
-        _draw_curves(
-            wide, views, frame_matches, diagnosis, units_m=np.sort([*_WIDE_M, *found_m * _NEAR])
-        )
-        _draw_curves(near, views, frame_matches, diagnosis, units_m=found_m * _NEAR)
+        _draw_curves(wide, views, matches, diagnosis, units_m=np.sort([*_WIDE_M, *found_m * _NEAR]))
+        _draw_curves(near, views, matches, diagnosis, units_m=found_m * _NEAR)
         _draw_rivals(others, diagnosis)
     with open_output(path) as file:
         figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=90)
@@ -106,28 +104,22 @@ def _title(diagnosis: SceneDiagnosis) -> str:
 def _draw_views(
     axes: Sequence[Any],
     views: SceneFrames,
-    frame_matches: Sequence[FrameMatch],
+    matches: Sequence[FrameMatch],
     diagnosis: SceneDiagnosis,
 ) -> None:
-    frame_match = max(
-        frame_matches,
-        key=lambda frame_match: (frame_match.left, frame_match.right) == views.primary,
-    )
+    match = max(matches, key=lambda match: (match.left, match.right) == views.primary)
     left, right = (
-        views.rgb(frame_match.frame, file).transpose(1, 2, 0)
-        for file in (frame_match.left, frame_match.right)
+        views.rgb(match.frame, file).transpose(1, 2, 0) for file in (match.left, match.right)
     )
     best_scale = 1.0
     if diagnosis.changed in ("scale", "both") or diagnosis.best.form != diagnosis.declared.form:
         best_scale = diagnosis.scale
     shift_px = 0.0
     if diagnosis.changed in ("offset", "both"):
-        shift_px = frame_match.shift_px(diagnosis.offsets_px)
-    by_declared = _warped(views, frame_match, diagnosis.declared, right, scale=1.0, shift_px=0.0)
-    by_best = _warped(
-        views, frame_match, diagnosis.best, right, scale=best_scale, shift_px=shift_px
-    )
-    pair = f"frame {frame_match.frame}, cam {frame_match.left} and {frame_match.right}"
+        shift_px = match.shift_px(diagnosis.offsets_px)
+    by_declared = _warped(views, match, diagnosis.declared, right, scale=1.0, shift_px=0.0)
+    by_best = _warped(views, match, diagnosis.best, right, scale=best_scale, shift_px=shift_px)
+    pair = f"frame {match.frame}, cam {match.left} and {match.right}"
     pictures: list[tuple[str, Any]] = [
         (f"left ({pair})", left),
         ("right, warped by the declared contract", by_declared[0]),
@@ -145,7 +137,7 @@ def _draw_views(
 
 def _warped(
     views: SceneFrames,
-    frame_match: FrameMatch,
+    match: FrameMatch,
     hypothesis: Hypothesis,
     right: UInt8[np.ndarray, "h w 3"],
     *,
@@ -156,7 +148,7 @@ def _warped(
     height, width = right.shape[:2]
     rows, columns = np.divmod(np.arange(height * width), width)
     everywhere = FrameMatch(
-        frame=frame_match.frame, left=frame_match.left, right=frame_match.right,
+        frame=match.frame, left=match.left, right=match.right,
         rows=rows, columns=columns,
         matched_px=np.zeros(0), brightness=np.zeros(0, np.float32),
         slope=np.zeros(0, np.float32), cells=np.zeros(0, np.int64), cap=1.0, textured=0,
@@ -190,7 +182,7 @@ def _difference(
 def _draw_curves(
     axis: Any,
     views: SceneFrames,
-    frame_matches: Sequence[FrameMatch],
+    matches: Sequence[FrameMatch],
     diagnosis: SceneDiagnosis,
     *,
     units_m: Float64[np.ndarray, " k"],
@@ -205,7 +197,7 @@ def _draw_curves(
         axis.plot(
             units_m,
             [
-                _score_db(views, frame_matches, hypothesis, scale=diagnosis.unit_m / unit_m)
+                _score_db(views, matches, hypothesis, scale=diagnosis.unit_m / unit_m)
                 for unit_m in units_m
             ],
             label=name,
@@ -223,12 +215,12 @@ def _draw_curves(
 
 
 def _score_db(
-    views: SceneFrames, frame_matches: Sequence[FrameMatch], hypothesis: Hypothesis, *, scale: float
+    views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis, *, scale: float
 ) -> float:
-    errors = score_hypothesis(views, frame_matches, hypothesis, scale=scale).errors
+    errors = score_hypothesis(views, matches, hypothesis, scale=scale).errors
     shares = [
-        max(float(np.nanmean(part)) / frame_match.cap, _FLOOR)
-        for part, frame_match in zip(errors, frame_matches, strict=True)
+        max(float(np.nanmean(part)) / match.cap, _FLOOR)
+        for part, match in zip(errors, matches, strict=True)
         if np.isfinite(part).any()
     ]
     return -10 * float(np.mean(np.log10(shares))) if shares else math.nan

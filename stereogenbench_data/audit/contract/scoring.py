@@ -201,7 +201,7 @@ def _cubic(band: Luma, rows: np.ndarray, columns: Points) -> tuple[Any, tuple[An
 
 def score_hypothesis(
     views: SceneFrames,
-    frame_matches: Sequence[FrameMatch],
+    matches: Sequence[FrameMatch],
     hypothesis: Hypothesis,
     *,
     scale: float = 1.0,
@@ -214,26 +214,26 @@ def score_hypothesis(
     """
     offsets_px = offsets_px or {}
     errors = []
-    for frame_match in frame_matches:
-        predicted = views.predicted(frame_match, hypothesis)
-        squares = np.full(len(frame_match.rows), np.nan, dtype=np.float32)
+    for match in matches:
+        predicted = views.predicted(match, hypothesis)
+        squares = np.full(len(match.rows), np.nan, dtype=np.float32)
         if predicted is not None:
             disparity_px, known = predicted
-            shift_px = frame_match.shift_px(offsets_px)
+            shift_px = match.shift_px(offsets_px)
             there, inside = sample_along_rows(
-                views.band(frame_match.frame, frame_match.right),
-                frame_match.rows,
-                frame_match.columns - (scale * disparity_px + shift_px),
+                views.band(match.frame, match.right),
+                match.rows,
+                match.columns - (scale * disparity_px + shift_px),
             )
-            square = (there - frame_match.brightness) ** 2
-            capped = np.where(inside, np.minimum(square, frame_match.cap), frame_match.cap)
+            square = (there - match.brightness) ** 2
+            capped = np.where(inside, np.minimum(square, match.cap), match.cap)
             squares[known] = capped[known]
         errors.append(squares)
     return ScoredContract(hypothesis, scale, offsets_px, scale_error, errors)
 
 
 def evidence(
-    frame_matches: Sequence[FrameMatch], better: ScoredContract, worse: ScoredContract
+    matches: Sequence[FrameMatch], better: ScoredContract, worse: ScoredContract
 ) -> Evidence:
     """Return by how many dB one contract explains a scene better than another.
 
@@ -252,17 +252,17 @@ def evidence(
     share = _FINE_CAP if same_places else 1.0
     sums = np.zeros((2, 0, SIDE_CELLS**2))
     orders_differ = better.hypothesis.order != worse.hypothesis.order
-    for frame_match, low, high in zip(frame_matches, better.errors, worse.errors, strict=True):
+    for match, low, high in zip(matches, better.errors, worse.errors, strict=True):
         if orders_differ and better.hypothesis.reads_alike(
-            worse.hypothesis, left=frame_match.left, right=frame_match.right
+            worse.hypothesis, left=match.left, right=match.right
         ):
             continue
         both = np.isfinite(low) & np.isfinite(high)
         if both.sum() >= _FEWEST_POINTS:
             cells = [
                 np.bincount(
-                    frame_match.cells[both],
-                    weights=np.minimum(part[both], share * frame_match.cap),
+                    match.cells[both],
+                    weights=np.minimum(part[both], share * match.cap),
                     minlength=SIDE_CELLS**2,
                 )
                 for part in (low, high)
@@ -295,17 +295,15 @@ def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:
     return mean
 
 
-def agreement(
-    views: SceneFrames, frame_matches: Sequence[FrameMatch], contract: ScoredContract
-) -> float:
+def agreement(views: SceneFrames, matches: Sequence[FrameMatch], contract: ScoredContract) -> float:
     """Return the share of matches that a contract explains to a pixel; nan if it predicts none."""
     near, count = 0, 0
-    for frame_match in frame_matches:
-        predicted = views.predicted(frame_match, contract.hypothesis)
+    for match in matches:
+        predicted = views.predicted(match, contract.hypothesis)
         if predicted is not None:
             disparity_px, known = predicted
-            shift_px = frame_match.shift_px(contract.offsets_px)
-            away = contract.scale * disparity_px + shift_px - frame_match.matched_px
-            near += int((np.abs(away[known]) < frame_match.grain_px).sum())
+            shift_px = match.shift_px(contract.offsets_px)
+            away = contract.scale * disparity_px + shift_px - match.matched_px
+            near += int((np.abs(away[known]) < match.grain_px).sum())
             count += int(known.sum())
     return near / count if count else math.nan
