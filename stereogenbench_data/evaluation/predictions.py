@@ -24,8 +24,7 @@ from av.video.reformatter import Interpolation, VideoReformatter
 from PIL import Image
 
 from stereogenbench_data.errors import EvaluationError, MediaError, StorageError, cure_of
-from stereogenbench_data.media.planes import plane_numbers
-from stereogenbench_data.media.video import VideoReader, probe, read_rgb
+from stereogenbench_data.media.video import VideoReader, plane_numbers, probe, read_rgb
 
 Pair = tuple[int, int]
 Size = tuple[int, int]

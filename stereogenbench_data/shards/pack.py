@@ -12,7 +12,7 @@ from pathlib import Path
 from stereogenbench_data.engine.process_pool import run_tasks
 from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.index.table import INDEX_NAME, SceneIndex, warn_if_stale
-from stereogenbench_data.media.depth_frame_file import CODEC_NAME, blosc2_module
+from stereogenbench_data.media.depth_frames import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT, PACKED_DEPTH_NAMES
 from stereogenbench_data.shards.companion_files import write_foreign_indexes
