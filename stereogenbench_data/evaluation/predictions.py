@@ -26,8 +26,7 @@ from PIL import Image
 from stereogenbench_data.errors import EvaluationError, MediaError, StorageError, cure_of
 from stereogenbench_data.evaluation.tiers import Tier
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.planes import plane_numbers
-from stereogenbench_data.media.video import VideoReader, probe, read_rgb
+from stereogenbench_data.media.video import VideoReader, plane_numbers, probe, read_rgb
 from stereogenbench_data.samples.fields import Sample
 
 Pair = tuple[int, int]

@@ -1,4 +1,4 @@
-"""Which frame a presentation time stands for: its place in the order of presentation.
+"""Maps presentation times to frame numbers, counted in the order of presentation.
 
 `SteadyClock` needs only the header and holds for a constant frame rate; `TableClock` knows the
 time of every frame. Times are integers in ticks of the stream's time base.
@@ -61,7 +61,7 @@ Clock = SteadyClock | TableClock
 
 
 def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | None:
-    """Return the clock that the header tells, None where it contradicts itself or ``frames``.
+    """Return the clock that the header describes, None if it contradicts itself or ``frames``.
 
     An MP4 header lists every sample: their number and their decoding times must be those of
     ``frames`` frames at one rate. Of Matroska only the duration can be compared.
@@ -100,12 +100,12 @@ def table_clock(
     """Return the times of all frames, read by going through all packets from where they stand.
 
     Frames of an intra-only codec are counted in the order of the file, with which their times
-    must agree; and with the rate, where the header tells one.
+    must agree; and with the rate, if the header gives one.
 
     Args:
         container: An open file.
         name: What messages call it.
-        steady: The clock that the header tells, if it tells one.
+        steady: The clock that the header describes, if it describes one.
 
     Raises:
         MediaError: If a packet is cut short, carries no time or another packet's time, or one
@@ -124,7 +124,7 @@ def table_clock(
             if packet.pts is None:
                 raise MediaError(
                     f"{name}: its frame number {len(times)} as stored carries no presentation "
-                    f"time, so no frame can be found by number: store it as MP4 or Matroska anew."
+                    f"time, so no frame can be found by number: write it again as MP4 or Matroska."
                 )
             times.append(packet.pts)
     except av.FFmpegError as error:
@@ -139,7 +139,7 @@ def table_clock(
     if twice is not None:
         raise MediaError(
             f"{name}: two frames are shown at the same time ({twice} ticks), so their order is "
-            f"not defined: store it anew with one time a frame."
+            f"not defined: write it again with one time for each frame."
         )
     return TableClock(times)
 
@@ -158,10 +158,10 @@ def require_file_order(times: Sequence[int], steady: SteadyClock | None, *, name
                 f"they are shown. A time was altered: compare the file with its checksum, or "
                 f"fetch it again."
             )
-    odd = [n for n, pts in enumerate(times) if steady is not None and steady.index(pts) != n]
-    if odd:
+    wrong = [n for n, pts in enumerate(times) if steady is not None and steady.index(pts) != n]
+    if wrong:
         raise MediaError(
-            f"{name}: its frame number {odd[0]} as stored is shown at {times[odd[0]]} ticks, which "
-            f"is not its time at the rate that the header tells. A time was altered: compare the "
+            f"{name}: its frame number {wrong[0]} as stored is shown at {times[wrong[0]]} ticks, "
+            f"which is not its time at the rate in the header. A time was altered: compare the "
             f"file with its checksum, or fetch it again."
         )

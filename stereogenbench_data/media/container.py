@@ -1,7 +1,7 @@
-"""Opening an MP4 or Matroska file: what its header says, and nothing that leads out of the file.
+"""Opens MP4 and Matroska files, reads their headers, and never opens a second file or address.
 
-FFmpeg knows playlist and script formats that open further files and addresses. Only the two
-containers of the release are let in, and a path is never read as an address.
+FFmpeg also reads playlist and script formats, which open further files and addresses. Only the two
+containers of the release are allowed, and a path is never read as an address.
 """
 
 import errno
@@ -27,10 +27,10 @@ class BinaryFile(Protocol):
         """Return at most so many bytes."""
 
     def seek(self, offset: int, whence: int = 0, /) -> int:
-        """Go to a place; return it."""
+        """Move to an offset; return it."""
 
     def tell(self) -> int:
-        """Return where the file stands."""
+        """Return the current offset."""
 
 
 VideoFile = str | Path | BinaryFile
@@ -66,21 +66,21 @@ _OUT_OF_FILES: Final = (errno.EMFILE, errno.ENFILE)
 
 @dataclass(frozen=True, slots=True)
 class StreamFacts:
-    """What a video file is.
+    """The facts in a video file's header.
 
     Attributes:
         codec: FFmpeg's name of the codec, such as "h264" or "ffv1".
         pixel_format: FFmpeg's name of the stored pixel format, such as "yuv420p" or "gray16le";
-            empty where it was not asked for and the header does not tell it.
+            empty where the header does not give it and no picture was decoded.
         width_px: Width of every picture.
         height_px: Height of every picture.
         frames: Number of pictures.
-        frame_rate_hz: Average rate; 0.0 where the file does not tell.
+        frame_rate_hz: Average rate; 0.0 if the file does not give one.
         tags: Metadata of the container and of the stream, keys in lower case. A key that both
             have, with another value, is kept as ``stream.<key>`` too.
-        is_colour: Whether its pictures are of colours alone, see `is_colour_format`; None where
-            only a picture would tell.
-        pixel_aspect: Width of a pixel in heights of one, 0.0 where the file does not tell.
+        is_colour: Whether its pictures hold colours only, see `is_colour_format`; None if only
+            a decoded picture could show it.
+        pixel_aspect: Width of a pixel over its height; 0.0 if the file does not give it.
         container: FFmpeg's names of the container, such as "matroska,webm".
     """
 
@@ -165,7 +165,7 @@ def _require_file(path: Path, *, name: str) -> None:
 
 
 def exact(ratio: Ratio | None) -> Fraction | None:
-    """Return a rate, time base or aspect as a fraction, None where the file does not tell it.
+    """Return a rate, time base or aspect as a fraction, None if the file does not give it.
 
     PyAV 18 gives None for a value that is not set, PyAV 19 a ratio of zero or with a zero below,
     and it rounds the product of two of its ratios.
@@ -194,17 +194,17 @@ def stream_facts(
 ) -> StreamFacts:
     """Return the header's facts; ``frames`` is what the caller knows of the number of pictures.
 
-    With pixel format "later", it is empty where the header does not tell it.
+    With pixel format "later", it is empty if the header does not give it.
 
     Raises:
         MediaError: If the codec cannot be decoded or the header lacks size or pixel format.
     """
     stream = container.streams.video[0]
     context = stream.codec_context
-    told = context.pix_fmt is not None or pixel_format == "later"
-    if not (told and context.width > 0 and context.height > 0):
+    is_known = context.pix_fmt is not None or pixel_format == "later"
+    if not (is_known and context.width > 0 and context.height > 0):
         raise MediaError(
-            f"{name}: its header tells no picture (codec {context.name}, pixel format "
+            f"{name}: its header describes no picture (codec {context.name}, pixel format "
             f"{context.pix_fmt}, {context.width}x{context.height}). The file is cut short or "
             f"damaged: fetch it again."
         )
@@ -229,7 +229,7 @@ def stream_facts(
 def is_colour_format(pixel_format: str) -> bool:
     """Return whether a pixel format holds three colours of 8 bits or more, and nothing else.
 
-    Neither a palette nor an alpha channel is let in: what they mean for a view is not defined.
+    Palettes and alpha channels are refused: what they mean for a view is not defined.
     """
     layout = av.VideoFormat(pixel_format)
     return (
@@ -250,7 +250,7 @@ def merged_tags(container: Mapping[str, str], stream: Mapping[str, str]) -> dict
 
 
 def frames_by_duration(container: InputContainer) -> int | None:
-    """Return how many frames fill the time from start to end, None where that is no number.
+    """Return how many frames fill the time from start to end, None if it is not a whole number.
 
     Matroska's duration, as FFmpeg writes it, is the time at which the last frame ends.
     """
@@ -268,7 +268,7 @@ def require_whole_payload(container: InputContainer, *, name: str) -> None:
     """Raise where the header's own table of samples (MP4) reaches beyond the end of the file.
 
     Raises:
-        MediaError: If so; the message tells how many bytes are missing.
+        MediaError: If so; the message has the size that the header claims and the file's own.
     """
     entries = container.streams.video[0].index_entries
     end = max((entry.pos + entry.size for entry in entries), default=0)

@@ -1,12 +1,18 @@
-"""One run of a decoder over a stream: seeking, skipping, and checking that no picture is missing.
+"""One run of a decoder over a stream: it seeks, skips, and checks that no picture is missing.
 
-A `Decoder` gives up (`Astray`) at the first picture that is not the one its clock told; whoever
-drives it decides whether the file is at fault.
+A `Decoder` raises `UnexpectedPicture` at the first picture that is not due by its clock. Its caller
+decides whether the file is at fault.
+
+FFV1 keeps a checksum in each slice of a picture. FFmpeg's decoder replaces a damaged slice with
+that of the picture before and only logs it. So checksums are verified before a packet is decoded.
+
+Source: RFC 9043, sections 4.8 (slice footer) and 4.9.3 (CRC-32, most significant bit first).
 """
 
+import zlib
 from collections import deque
 from collections.abc import Iterator
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, Final
 
 from av.container import InputContainer
@@ -15,12 +21,11 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from stereogenbench_data.media.clock import INTRA_ONLY, Clock
-from stereogenbench_data.media.integrity import fails_slice_checksums
 
 if TYPE_CHECKING:
     VideoPacket = Packet[VideoStream]
 else:
-    VideoPacket = Packet  # generic in PyAV's stubs alone
+    VideoPacket = Packet  # generic only in PyAV's stubs
 
 _SKIPS_EXACTLY: Final = frozenset({"h264", "hevc", "mpeg4"})
 """Codecs whose decoders drop, on NONREF, only pictures that no other is predicted from."""
@@ -29,8 +34,20 @@ _BLIND_JUMP: Final = 8
 """Frames to decode through rather than to seek, while a file's key frames are not known."""
 
 
-class Astray(Exception):
-    """The pictures that came are not those that the clock told."""
+_SIZE_BYTES: Final = 3
+_FOOTER_BYTES: Final = 8
+"""A footer with a checksum: three bytes of size, one of error status, four of checksum."""
+
+_MIRRORED: Final = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+"""Bytes with their bits in reverse order: zlib's CRC-32 takes the least significant bit first."""
+
+_CHECKSUM_STARTS: Final = (0xFFFFFFFF, 0xA1CEFD61)
+"""What zlib's CRC-32 starts from, and ends at over a whole slice: FFV1 of version 3, and of
+version 4 as FFmpeg's experimental encoder writes it."""
+
+
+class UnexpectedPicture(Exception):
+    """The decoder gave another picture than the one that is due by the clock."""
 
 
 class Decoder:
@@ -41,7 +58,7 @@ class Decoder:
     """
 
     def __init__(self, container: InputContainer, *, clock: Clock, threads: int) -> None:
-        """Take over a container that stands at its start."""
+        """Take over a container that was just opened."""
         self._container = container
         self._clock = clock
         self._stream: VideoStream = container.streams.video[0]
@@ -74,7 +91,7 @@ class Decoder:
         """Return a frame by the shortest way: decoding on, or from the key frame before it.
 
         Raises:
-            Astray: If other pictures come than the clock tells.
+            UnexpectedPicture: If another picture comes than is due by the clock.
             av.FFmpegError: If a packet cannot be read or decoded.
         """
         if self._must_seek(index):
@@ -87,20 +104,20 @@ class Decoder:
         """Return a frame by decoding on, all the way.
 
         Raises:
-            Astray: If other pictures come than the clock tells.
+            UnexpectedPicture: If another picture comes than is due by the clock.
             av.FFmpegError: If a packet cannot be read or decoded.
         """
         found = -1
         while found < index:
             found, frame = self._pull()
             if frame.is_corrupt:
-                raise Astray(f"the picture of frame {found} is damaged")
+                raise UnexpectedPicture(f"the picture of frame {found} is damaged")
         if found > index:
-            raise Astray(f"frame {found} came where frame {index} was due")
+            raise UnexpectedPicture(f"frame {found} came where frame {index} was due")
         # All that is shown before a picture is stored before the decoder gives it.
         missing = set(range(self._next, index)) - self._fed
         if missing:
-            raise Astray(f"frame {min(missing)} is missing before it")
+            raise UnexpectedPicture(f"frame {min(missing)} is missing before it")
         self._fed = {fed for fed in self._fed if fed > index}
         self._next = index + 1
         return frame
@@ -137,19 +154,19 @@ class Decoder:
         Of what is stored before a key frame only the times are read: nothing of it is decoded.
 
         Args:
-            first: Where the stream stands: at the key frame before the frame, or at the start.
+            first: The packet that the stream is at: a key frame before the frame, or the first.
             index: The frame.
         """
         if not first.is_keyframe:
             # FFV1 keeps its statistics from the last key frame on, and shows nonsense without.
-            raise Astray(f"the packet shown at {first.pts} ticks is no key frame")
+            raise UnexpectedPicture(f"the packet shown at {first.pts} ticks is no key frame")
         place = self._index(first)
         if place > max(0, index - 1):
-            raise Astray(f"frame {place} by its time is stored where another is due")
+            raise UnexpectedPicture(f"frame {place} by its time is stored where another is due")
         if index == 0:
             after = list(islice(self._packets, 1))
             if any(packet.size and self._index(packet) != 1 for packet in after):
-                raise Astray("the packet after the first one is not of frame 1")
+                raise UnexpectedPicture("the packet after the first one is not of frame 1")
             return [first, *after]
         entries = self._stream.index_entries
         key = entries.search_timestamp(self._clock.latest(index))
@@ -158,7 +175,9 @@ class Decoder:
         found = [first]
         for due, packet in enumerate(islice(self._packets, index - place), place + 1):
             if not packet.size or self._index(packet) != due:
-                raise Astray(f"something shown at {packet.pts} ticks is stored as frame {due}")
+                raise UnexpectedPicture(
+                    f"something shown at {packet.pts} ticks is stored as frame {due}"
+                )
             if packet.is_keyframe:
                 self._stored_before = due - 1
                 found.clear()
@@ -170,14 +189,16 @@ class Decoder:
         self._packets = self._container.demux(self._stream)
         first = next(self._packets, None)
         if first is None:
-            raise Astray("nothing is stored where it should be")
+            raise UnexpectedPicture("nothing is stored where it should be")
         return first
 
     def _index(self, shown: VideoPacket | VideoFrame) -> int:
-        """Return the frame that a packet or picture stands for."""
+        """Return the number of the frame of a packet or picture."""
         index = None if shown.pts is None else self._clock.index(shown.pts)
         if index is None:
-            raise Astray(f"something is shown at {shown.pts} ticks, where no frame is due")
+            raise UnexpectedPicture(
+                f"something is shown at {shown.pts} ticks, where no frame is due"
+            )
         return index
 
     def _pull(self) -> tuple[int, VideoFrame]:
@@ -185,7 +206,7 @@ class Decoder:
         while not self._pending:
             packet = next(self._packets, None)
             if packet is None:
-                raise Astray("the stream ends before it")
+                raise UnexpectedPicture("the stream ends before it")
             self._feed(packet)
         return self._pending.popleft()
 
@@ -199,14 +220,41 @@ class Decoder:
         index = self._index(packet)
         if self._is_intra_only:
             if self._stored_before is not None and index != self._stored_before + 1:
-                raise Astray(
+                raise UnexpectedPicture(
                     f"frame {index} by its time is stored after frame {self._stored_before}"
                 )
             self._stored_before = index
         if packet.is_corrupt:
-            raise Astray(f"the packet of frame {index} is cut short")
+            raise UnexpectedPicture(f"the packet of frame {index} is cut short")
         if self._has_checksums and fails_slice_checksums(bytes(packet)):
-            raise Astray(f"the packet of frame {index} fails its checksum")
+            raise UnexpectedPicture(f"the packet of frame {index} fails its checksum")
         self._fed.add(index)
         self._newest = max(self._newest, index)
         self._context.skip_frame = "NONREF" if index < self._skip_until else "DEFAULT"
+
+
+def fails_slice_checksums(packet: bytes) -> bool:
+    """Return whether a packet of FFV1 version 3 or later contradicts its own checksums.
+
+    A packet whose slices carry no checksums never does.
+    """
+    if _slice_ends(packet, footer_bytes=_SIZE_BYTES) is not None:
+        return False
+    ends = _slice_ends(packet, footer_bytes=_FOOTER_BYTES)
+    if ends is None:
+        return True
+    slices = (packet[start:end].translate(_MIRRORED) for start, end in pairwise(ends))
+    return any(
+        all(zlib.crc32(mirrored, start) != start for start in _CHECKSUM_STARTS)
+        for mirrored in slices
+    )
+
+
+def _slice_ends(packet: bytes, *, footer_bytes: int) -> list[int] | None:
+    """Return 0 and where each slice ends, None if the sizes in the footers do not add up."""
+    ends = [len(packet)]
+    while ends[-1] > 0:
+        footer = ends[-1] - footer_bytes
+        size = int.from_bytes(packet[max(footer, 0) : footer + _SIZE_BYTES], "big")
+        ends.append(footer - size)
+    return ends[::-1] if ends[-1] == 0 else None

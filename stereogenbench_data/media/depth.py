@@ -16,10 +16,8 @@ from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.disparity import planar_from_ray
 from stereogenbench_data.media.container import StreamFacts, VideoFile
-from stereogenbench_data.media.depth_frame_file import CODEC_NAME, PACKED_SUFFIX
-from stereogenbench_data.media.depth_frames import DepthFrames
-from stereogenbench_data.media.planes import plane_numbers
-from stereogenbench_data.media.video import VideoReader
+from stereogenbench_data.media.depth_frames import CODEC_NAME, PACKED_SUFFIX, DepthFrames
+from stereogenbench_data.media.video import VideoReader, plane_numbers
 from stereogenbench_data.schema.records import DepthEncoding, DepthRisk
 from stereogenbench_data.schema.release import DEFAULT_DEPTH_UNIT_M
 
@@ -63,10 +61,10 @@ def resolve_encoding(
         return contract.with_file_unit(DEFAULT_DEPTH_UNIT_M, source="default")
     units_m = {unit_m for value in scales.values() if (unit_m := _unit_m(value)) is not None}
     if len(units_m) != 1:
-        told = ", ".join(f"{key}={value!r}" for key, value in sorted(scales.items()))
+        found = ", ".join(f"{key}={value!r}" for key, value in sorted(scales.items()))
         raise MediaError(
-            f"{name}: its tags must tell one positive number of metres in a stored unit of depth, "
-            f"found {told}: correct the tags, or pass DepthEncoding(unit_m=...)."
+            f"{name}: its tags must give one positive number of metres for a stored unit of depth, "
+            f"found {found}: correct the tags, or pass DepthEncoding(unit_m=...)."
         )
     return contract.with_file_unit(units_m.pop(), source="tag")
 
@@ -161,7 +159,7 @@ def read_depth_units(
     Args:
         reader: An open depth video, or depth packed by blosc2.
         index: Which frame of the file, from 0; `depth_frame_index` tells which an RGB frame needs.
-        encoding: The depth contract, which decides what streams are let in.
+        encoding: The depth contract, which decides what streams are accepted.
 
     Returns:
         uint16 (h, w), in stored units; read-only, of the decoded picture's own memory where that
@@ -211,7 +209,7 @@ def depth_m_from_units(
         units: Stored numbers.
         measured: Where depth was measured, see `measured`.
         encoding: The depth contract.
-        intrinsics: The camera of this picture; needed, and used, for ``kind="ray"`` alone.
+        intrinsics: The camera of this picture; needed and used only for ``kind="ray"``.
 
     Returns:
         float32, the float64 result rounded once. With ``form="inverse"`` a measured 0 is inf.

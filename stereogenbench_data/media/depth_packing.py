@@ -17,21 +17,21 @@ from jaxtyping import UInt16
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.container import VideoFile, exact, open_container, text_tags
 from stereogenbench_data.media.depth import ANY_DEPTH, read_depth_units, require_depth_stream
-from stereogenbench_data.media.depth_frame_file import (
+from stereogenbench_data.media.depth_frames import (
+    DepthFrames,
     StoredClip,
     blosc2_module,
     compressed_chunk,
     frame_file,
     is_zeros,
 )
-from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.video import VideoReader
 from stereogenbench_data.schema.records import DepthEncoding
 
 _ANY_BITS: Final = DepthEncoding(accept=ANY_DEPTH.accept - {"lossy", "chroma"})
 _FFV1_OPTIONS: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
 _WRITERS_TAGS: Final = frozenset({"encoder", "duration"})
-"""Tags that whoever writes a Matroska file sets itself."""
+"""Tags that every writer of Matroska files sets itself."""
 
 AfterFrame = Callable[[], None]
 
@@ -49,7 +49,7 @@ def packed_depth(
 
     Raises:
         ExtraError: If blosc2 is not installed.
-        MediaError: If the video cannot be decoded or is no FFV1 of one grey plane, or what was
+        MediaError: If the video cannot be decoded or is not FFV1 of one grey plane, or what was
             packed does not read back as it was.
     """
     chunks, pts = [], []
@@ -57,7 +57,7 @@ def packed_depth(
         facts = reader.facts
         if facts.codec != "ffv1":
             raise MediaError(
-                f"{name}: its depth is stored by codec {facts.codec}, and blosc2 packs FFV1 alone. "
+                f"{name}: its depth is stored by codec {facts.codec}, and blosc2 packs only FFV1. "
                 f"Pack with --depth-codec released."
             )
         require_depth_stream(
@@ -98,7 +98,7 @@ def packed_depth(
 def _ticks(frame: av.VideoFrame, *, name: str) -> int:
     if frame.pts is None:
         raise MediaError(
-            f"{name}: a frame has no time, so that the video could not be written anew. Pack with "
+            f"{name}: a frame has no time, so the video could not be written again. Pack with "
             f"--depth-codec released."
         )
     return frame.pts
@@ -179,11 +179,11 @@ def _require_same_video(packed: DepthFrames, target: Path) -> None:
             if shown_s != pts * Fraction(*clip.time_base):
                 raise _not_unpacked(name, f"frame {index} is shown at {shown_s} s")
     with open_container(target, name=str(target)) as container:
-        for found, told in (
+        for found, stored in (
             (text_tags(container.metadata), clip.tags),
             (text_tags(container.streams.video[0].metadata), clip.stream_tags),
         ):
-            lost = {key for key in told if found.get(key) != told[key]}
+            lost = {key for key in stored if found.get(key) != stored[key]}
             lost -= {key for key in lost if key.lower() in _WRITERS_TAGS}
             if lost:
                 raise _not_unpacked(name, f"the tags {sorted(lost)} are lost")

@@ -111,18 +111,18 @@ def picture_siting(frame: VideoFrame) -> str:
         width=32, height=32, format="yuv444p", interpolation=Interpolation.BILINEAR, threads=1
     ).to_ndarray()
     for siting in _SITINGS:
-        told = Converter().convert(
+        converted = Converter().convert(
             small, size=(32, 32), pixel_format="yuv444p", flags="bilinear", siting=siting
         )
-        if np.array_equal(told.to_ndarray(), tagged):
+        if np.array_equal(converted.to_ndarray(), tagged):
             return siting
     return CENTRE
 
 
 def coded_siting(codec: str, extradata: bytes | None) -> str | None:
-    """Return the siting that a codec's header tells, "center" where it tells none.
+    """Return the siting in a codec's header, "center" if it has none.
 
-    None is returned for codecs whose pictures tell it (`picture_siting`).
+    None is returned for codecs whose pictures carry it (`picture_siting`).
     """
     if codec in _SAYS_NOTHING:
         return CENTRE

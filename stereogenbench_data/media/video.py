@@ -14,7 +14,7 @@ import numpy as np
 from av.container import InputContainer
 from av.video.frame import VideoFrame
 from av.video.reformatter import Interpolation, VideoReformatter
-from jaxtyping import UInt8
+from jaxtyping import UInt8, UInt16
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.clock import (
@@ -35,10 +35,8 @@ from stereogenbench_data.media.container import (
     require_whole_payload,
     stream_facts,
 )
-from stereogenbench_data.media.decoder import Astray, Decoder
-from stereogenbench_data.media.depth_frame_file import PACKED_SUFFIX
-from stereogenbench_data.media.depth_frames import probe_packed
-from stereogenbench_data.media.planes import plane_numbers
+from stereogenbench_data.media.decoder import Decoder, UnexpectedPicture
+from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, probe_packed
 from stereogenbench_data.media.siting import (
     CENTRE,
     Converter,
@@ -49,11 +47,9 @@ from stereogenbench_data.media.siting import (
 )
 from stereogenbench_data.schema.records import Rig
 
-__all__ = ["StreamFacts", "VideoReader", "probe", "read_rgb", "require_pixel_aspect"]
-
 NO_COLOUR: Final = (
     ", and a video of views holds YUV or RGB with 8 bits or more a colour, without alpha channel "
-    "and palette. Another video stands under this name, or it was made otherwise: fetch it again."
+    "and palette. Another video has this name, or it was encoded differently: fetch it again."
 )
 """How the refusal of a video that should hold colours ends."""
 
@@ -78,17 +74,17 @@ def probe(
         name: What messages call the file. One that ends in ``.b2frame`` is of depth that blosc2
             packed.
         pixel_format: "later" spares the decoding of a picture (tens of milliseconds of large
-            H.264), where only that would tell the pixel format.
+            H.264), where only that would show the pixel format.
 
     Raises:
         StorageError: If the file cannot be read.
-        MediaError: If it is no MP4 or Matroska video, is cut short or holds no frame.
+        MediaError: If it is not an MP4 or Matroska video, is cut short or holds no frame.
     """
     if name.endswith(PACKED_SUFFIX):
         return probe_packed(file, name=name)
     with open_container(file, name=name, pixel_format=pixel_format) as container:
         require_whole_payload(container, name=name)
-        frames = _told_frames(container)
+        frames = _frames_in_header(container)
         facts = stream_facts(container, name=name, frames=frames, pixel_format=pixel_format)
     is_intra_only = facts.codec in INTRA_ONLY
     if frames and not (is_intra_only and isinstance(file, str | Path)):
@@ -104,8 +100,8 @@ def probe(
     return replace(facts, frames=frames)
 
 
-def _told_frames(container: InputContainer) -> int:
-    """Return how many frames the header tells, 0 where it does not tell or cannot be trusted."""
+def _frames_in_header(container: InputContainer) -> int:
+    """Return how many frames the header claims, 0 if it does not say or cannot be trusted."""
     stream = container.streams.video[0]
     if stream.frames:
         is_cut = any(entry.is_discard for entry in stream.index_entries)
@@ -150,8 +146,8 @@ class VideoReader:
 
         Raises:
             StorageError: If the file cannot be read.
-            MediaError: If it is no video, is cut short or has another number of frames, as far as
-                the header tells. What the header does not tell, the frames concerned raise.
+            MediaError: If it is not a video, is cut short or has another number of frames, as far
+                as the header shows. Other faults are raised by the frames that they concern.
         """
         for what, value in (("frames", frames), ("threads", threads)):
             if value < 1:
@@ -173,9 +169,9 @@ class VideoReader:
             require_whole_payload(container, name=name)
             context = container.streams.video[0].codec_context
             self.size_px = (context.width, context.height)
-            """Width and height by the header; 0 where it does not tell."""
+            """Width and height by the header; 0 if it does not give them."""
             self.pixel_aspect = float(exact(container.streams.video[0].sample_aspect_ratio) or 0)
-            """Width of a pixel in heights of one by the header; 0 where it does not tell."""
+            """Width of a pixel over its height by the header; 0 if it does not give it."""
             coded_chroma = has_coded_chroma(context.codec.canonical_name, context.extradata)
             self._is_coded_grey = coded_chroma is False
             self._siting = coded_siting(context.codec.canonical_name, context.extradata)
@@ -196,7 +192,7 @@ class VideoReader:
         """What the header says, with ``frames`` as they were asked for.
 
         Raises:
-            MediaError: If the header does not tell size and pixel format.
+            MediaError: If the header lacks size or pixel format.
         """
         if self._facts is None:
             # A file object is read from one place at a time.
@@ -228,7 +224,7 @@ class VideoReader:
         """Return a frame as `frame` does, of a video of views.
 
         Raises:
-            MediaError: If it cannot be read, or is no colour picture.
+            MediaError: If it cannot be read, or is not a colour picture.
         """
         return self.require_colour(self.frame(index), index)
 
@@ -280,7 +276,7 @@ class VideoReader:
             self._decoder = self._opened(pixel_format="later")
         try:
             return self._decoder.reach(index)
-        except (Astray, av.FFmpegError):
+        except (UnexpectedPicture, av.FFmpegError):
             self._drop_decoder()
         return self._reach_from_start(index)
 
@@ -292,7 +288,7 @@ class VideoReader:
         self._decoder = self._opened(pixel_format="needed")
         try:
             return self._decoder.decode_to(index)
-        except (Astray, av.FFmpegError) as error:
+        except (UnexpectedPicture, av.FFmpegError) as error:
             self._drop_decoder()
             reason = error.strerror if isinstance(error, av.FFmpegError) else error
             raise MediaError(
@@ -328,7 +324,7 @@ class VideoReader:
         if found != expected:
             raise MediaError(
                 f"{self.name}: frame {index} is {found[0]} {found[1]}x{found[2]} where "
-                f"{expected[0]} {expected[1]}x{expected[2]} is expected: store the file anew."
+                f"{expected[0]} {expected[1]}x{expected[2]} is expected: write the file again."
             )
         if self._is_seen and not frame.rotation:
             return
@@ -352,13 +348,13 @@ class VideoReader:
             self._decoder = None
 
 
-def require_pixel_aspect(told: float, rig: Rig, *, name: str) -> None:
-    """Refuse a video whose header tells pixels of another shape than the rig's sensor has.
+def require_pixel_aspect(pixel_aspect: float, rig: Rig, *, name: str) -> None:
+    """Refuse a video whose header gives pixels another shape than the rig's sensor has.
 
     Args:
-        told: Width of a pixel in heights of one; 0 where the header does not tell. Square pixels
-            are what many writers tell of all videos, so 1 is let pass.
-        rig: Whose sensor and picture size tell the pixels' shape.
+        pixel_aspect: Width of a pixel over its height; 0 if the header does not give it. Many
+            writers tag all videos with square pixels, so 1 is accepted.
+        rig: Its sensor and picture size give the shape of the pixels.
         name: What messages call the file.
 
     Raises:
@@ -366,11 +362,11 @@ def require_pixel_aspect(told: float, rig: Rig, *, name: str) -> None:
     """
     width_mm = rig.sensor_width_mm / rig.image_width_px
     height_mm = rig.sensor_height_mm / rig.image_height_px
-    if told not in (0, 1) and abs(told * height_mm / width_mm - 1) > _ASPECT_SHARE:
+    if pixel_aspect not in (0, 1) and abs(pixel_aspect * height_mm / width_mm - 1) > _ASPECT_SHARE:
         raise MediaError(
-            f"{name}: is tagged to have pixels {told:.4g} times as wide as high, and those of the "
-            f"rig's sensor are {width_mm / height_mm:.4g} times as wide as high. It was stretched "
-            f"for another shape: fetch it again, or store it without that tag."
+            f"{name}: is tagged to have pixels {pixel_aspect:.4g} times as wide as high, and those "
+            f"of the rig's sensor are {width_mm / height_mm:.4g} times as wide as high. It was "
+            f"stretched for another shape: fetch it again, or store it without that tag."
         )
 
 
@@ -378,6 +374,26 @@ def _is_upright(matrix: bytes) -> bool:
     """Return whether FFmpeg's display matrix shows a picture as it is stored."""
     x_x, x_y, _, y_x, y_y, *_ = np.frombuffer(matrix, "=i4")
     return bool(x_x > 0 and y_y > 0 and x_y == 0 and y_x == 0)
+
+
+def plane_numbers(
+    frame: VideoFrame, plane: int, *, dtype: str, per_pixel: int = 1
+) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
+    """Return a plane that is as high as the picture, as a view of the frame's own memory.
+
+    Args:
+        frame: A picture, whose rows may be padded.
+        plane: Which plane, from 0.
+        dtype: "u1", "<u2" or ">u2", as the numbers are stored.
+        per_pixel: How many numbers stand in the plane for each pixel.
+
+    Returns:
+        (h, w * per_pixel), of the dtype as stored.
+    """
+    source = frame.planes[plane]
+    row_length = source.line_size // np.dtype(dtype).itemsize
+    numbers = np.frombuffer(memoryview(source), dtype=dtype, count=frame.height * row_length)
+    return numbers.reshape(frame.height, row_length)[:, : frame.width * per_pixel]
 
 
 def read_rgb(
@@ -391,7 +407,7 @@ def read_rgb(
     """Return a frame as red, green and blue planes.
 
     At the stored size the numbers equal those of ``ffmpeg -pix_fmt rgb24``, bit for bit for
-    progressive 8-bit video, its colour matrix and range as the file tells them. Chroma lies where
+    progressive 8-bit video, its colour matrix and range as the file gives them. Chroma lies where
     the file is tagged to have it, and in the middle of its pixels without a tag. At another size
     they are scaled before the conversion, antialiased, with pixel centres kept (u' = s u, where
     the first pixel's centre is 0.5): by area where the picture shrinks, else bicubic. The scaled
@@ -425,7 +441,7 @@ def read_rgb(
         out = np.empty((3, height, width), dtype=np.uint8)
     elif out.shape != (3, height, width) or out.dtype != np.uint8:
         raise MediaError(
-            f"{reader.name}: frame {index} needs room of uint8 (3, {height}, {width}), got "
+            f"{reader.name}: frame {index} needs an array of uint8 (3, {height}, {width}), got "
             f"{out.dtype} {out.shape}: pass a fitting array or none."
         )
     try:
@@ -433,7 +449,7 @@ def read_rgb(
     except av.FFmpegError as error:
         raise MediaError(
             f"{reader.name}: frame {index} ({frame.format.name}, {frame.width}x{frame.height}) "
-            f"cannot be converted to RGB of {width}x{height} ({error.strerror}): store it anew."
+            f"cannot be converted to RGB of {width}x{height} ({error.strerror}): write it again."
         ) from error
     if picture.format.name == "rgb24":
         pixels = plane_numbers(picture, 0, dtype="u1", per_pixel=3)

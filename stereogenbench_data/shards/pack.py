@@ -17,7 +17,7 @@ from stereogenbench_data.errors import ShardError, cure_of
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.depth_frame_file import CODEC_NAME, blosc2_module
+from stereogenbench_data.media.depth_frames import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT, METADATA_FILES, PACKED_DEPTH_NAMES
 from stereogenbench_data.shards.companion_files import write_companion_files

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.decoder import fails_slice_checksums
 from stereogenbench_data.media.depth import read_depth_units
-from stereogenbench_data.media.integrity import fails_slice_checksums
 from stereogenbench_data.media.video import VideoReader, read_rgb
 from stereogenbench_data.schema.records import DepthEncoding
 

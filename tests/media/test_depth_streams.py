@@ -7,8 +7,7 @@ import pytest
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.container import StreamFacts
 from stereogenbench_data.media.depth import ANY_DEPTH, read_depth_units, require_depth_stream
-from stereogenbench_data.media.planes import plane_numbers
-from stereogenbench_data.media.video import VideoReader, probe
+from stereogenbench_data.media.video import VideoReader, plane_numbers, probe
 from stereogenbench_data.schema.records import DepthEncoding
 
 HEIGHT, WIDTH = 30, 54  # rows that FFmpeg pads
