@@ -65,11 +65,17 @@ def test_every_python_that_is_named_is_tested_and_admitted():
 def test_every_path_and_name_on_a_page_for_developers_exists(page):
     if not (HOME / page).exists():
         pytest.skip(f"there is no {page}")
-    text = re.sub(r"```.*?```", "", (HOME / page).read_text(), flags=re.DOTALL)
-    words = set(re.findall(r"`([^`\n]+)`", text)) - {"shared/"}
+    whole = (HOME / page).read_text()
+    text = re.sub(r"```.*?```", "", whole, flags=re.DOTALL)
+    words = {*re.findall(r"`([^`\n]+)`", text), *re.findall(r"(?:\w+/)+\w+\.py", whole)} - {
+        "shared/"
+    }
     is_path = re.compile(r"[\w.-]+(/[\w.-]+)*(/|\.(py|md|txt|toml))").fullmatch
     is_name = re.compile(r"_?[A-Z][A-Za-z]+[a-z]|_?[A-Z_]{6,}").fullmatch
-    code = "\n".join(path.read_text() for path in (HOME / "stereogenbench_data").rglob("*.py"))
+    folders = (HOME / "stereogenbench_data", HOME / "tests")
+    code = "\n".join(path.read_text() for folder in folders for path in folder.rglob("*.py"))
 
-    assert [word for word in words if is_path(word) and not (HOME / word).exists()] == []
+    paths = [word for word in words if is_path(word)]
+    roots = (HOME, HOME / "stereogenbench_data")
+    assert [path for path in paths if not any((root / path).exists() for root in roots)] == []
     assert [word for word in words if is_name(word) and not re.search(rf"\b{word}\b", code)] == []
