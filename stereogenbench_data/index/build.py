@@ -356,8 +356,8 @@ def _depth_notes(scenes: list[Scene]) -> list[str]:
             except MediaError as error:
                 first[codec, pixel_format] = str(error)
     return [
-        f"{told} ({counted(others[kind], 'other video')} likewise.)" if others[kind] else told
-        for kind, told in first.items()
+        f"{note} ({counted(others[kind], 'other video')} likewise.)" if others[kind] else note
+        for kind, note in first.items()
     ]
 
 

@@ -254,13 +254,13 @@ def _held(files: Mapping[str, object], name: str) -> str:
 
 
 def _probed(folder: SceneFolder, key: str, name: str) -> StreamFacts:
-    video, told = folder.video(name), f"{key}/{name}"
+    video, where = folder.video(name), f"{key}/{name}"
     try:
         if name.endswith(".mp4"):
-            facts = probe(video, name=told, pixel_format="later")
+            facts = probe(video, name=where, pixel_format="later")
             if facts.is_colour is not None:
                 return facts
-        return probe(video, name=told)
+        return probe(video, name=where)
     finally:
         if isinstance(video, MemberFile):
             video.close()
@@ -353,14 +353,14 @@ def _require_kinds(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> None
     Depth that lost something is let pass: a user's own `DepthEncoding` may accept it.
     """
     for name, fact in facts.items():
-        told = f"{key}/{name}"
-        require_pixel_aspect(fact.pixel_aspect, rig, name=told)
+        where = f"{key}/{name}"
+        require_pixel_aspect(fact.pixel_aspect, rig, name=where)
         if name.endswith("_rgb.mp4") and not fact.is_colour:
             stored = fact.pixel_format or "grey"
-            raise MediaError(f"{told}: is stored by codec {fact.codec} as {stored}{NO_COLOUR}")
+            raise MediaError(f"{where}: is stored by codec {fact.codec} as {stored}{NO_COLOUR}")
         if name.endswith("_depth.mkv"):
             require_depth_stream(
-                codec=fact.codec, pixel_format=fact.pixel_format, encoding=ANY_DEPTH, name=told
+                codec=fact.codec, pixel_format=fact.pixel_format, encoding=ANY_DEPTH, name=where
             )
     depths = {name: fact for name, fact in facts.items() if name.endswith("_depth.mkv")}
     grey = sum(not fact.is_colour for fact in depths.values())
@@ -431,7 +431,7 @@ def _valid_ratio(folder: SceneFolder, key: str, frames: int) -> float:
 
 
 def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Difference]:
-    """Return what a scene's metadata files tell otherwise than its row of an index.
+    """Return where a scene's metadata files differ from its row of an index.
 
     Compared are path, split, family, map, rig, baselines, labels, caption, number of frames, the
     cameras' places and the rig's residual; not what the videos alone tell.
@@ -451,13 +451,13 @@ def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Diffe
             try:
                 found += compare(scene, texts)
             except SchemaError as error:
-                told = str(error).removeprefix(f"{scene.id.key}/")
-                name, _, reason = told.partition(": ")
+                message = str(error).removeprefix(f"{scene.id.key}/")
+                name, _, reason = message.partition(": ")
                 found.append((name, reason.rstrip(".")))
     return list(dict.fromkeys(found))
 
 
-def _told(name: str, what: str, found: object, indexed: object) -> Difference:
+def _difference(name: str, what: str, found: object, indexed: object) -> Difference:
     return name, f"tells {what} {_brief(found)}, and by the index it is {_brief(indexed)}"
 
 
@@ -474,8 +474,8 @@ def _differing_place(scene: Scene) -> Iterator[Difference]:
         return
     for name in ("split", "subset", "family", "map_name"):
         found, indexed = getattr(place, name), getattr(scene.id, name)
-        is_told = found is not None or scene.id.split == "train"
-        if is_told and found != indexed:
+        is_known = found is not None or scene.id.split == "train"
+        if is_known and found != indexed:
             yield "", f"its path tells {name} {found!r}, and by the index it is {indexed!r}"
 
 
@@ -486,7 +486,7 @@ def _differing_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Differe
             continue
         found, indexed = getattr(rig, each.name), getattr(scene.rig, each.name)
         if not _same(found, indexed):
-            yield _told(BASELINE_JSON, each.name, found, indexed)
+            yield _difference(BASELINE_JSON, each.name, found, indexed)
 
 
 def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
@@ -498,30 +498,32 @@ def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diff
         found, indexed = getattr(merged, each.name), getattr(scene.labels, each.name)
         if found != indexed:
             is_marked = getattr(labels, each.name) is None and found is not None
-            yield _told(COMPLETE_JSON if is_marked else BASELINE_JSON, each.name, found, indexed)
+            yield _difference(
+                COMPLETE_JSON if is_marked else BASELINE_JSON, each.name, found, indexed
+            )
 
 
 def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
     where = f"{scene.id.key}/{TRAJECTORY_JSON}"
     trajectory = parse_trajectory(texts[TRAJECTORY_JSON], where=where)
     if trajectory.frame_count != scene.frames:
-        yield _told(TRAJECTORY_JSON, "frames", trajectory.frame_count, scene.frames)
+        yield _difference(TRAJECTORY_JSON, "frames", trajectory.frame_count, scene.frames)
         return
     poses = CameraPoses.from_trajectory(trajectory)
     lateral_m = lateral_offsets_m(poses)
     if not np.allclose(lateral_m, scene.lateral_m, rtol=0, atol=_SAME_M):
         places_m = tuple(map(float, lateral_m))
-        yield _told(TRAJECTORY_JSON, "lateral_m", places_m, scene.lateral_m)
+        yield _difference(TRAJECTORY_JSON, "lateral_m", places_m, scene.lateral_m)
     residual_px = rectification_residual_px(poses, rig_intrinsics(scene.rig))
     if not math.isclose(residual_px, scene.rig_residual_px, rel_tol=_SAME_PX, abs_tol=_SAME_PX):
-        yield _told(TRAJECTORY_JSON, "rig_residual_px", residual_px, scene.rig_residual_px)
+        yield _difference(TRAJECTORY_JSON, "rig_residual_px", residual_px, scene.rig_residual_px)
 
 
 def _differing_caption(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
     names = [name for name in (DESCRIPTION_JSON, DESCRIPTION_TXT) if name in texts]
     caption = caption_of(texts, key=scene.id.key)
     if names and caption != scene.caption:
-        yield _told(names[0], "the caption", caption, scene.caption)
+        yield _difference(names[0], "the caption", caption, scene.caption)
 
 
 def _same(found: Any, indexed: Any) -> bool:

@@ -1,14 +1,13 @@
 """A cache of members on a local disk, shared by the processes of a machine.
 
-An item is one member, stored whole under a name made of the dataset's revision, the shard's path
-and the member's place, size and checksum. It is written beside its place and moved there, so that
-no reader meets half of one; a lock lets one process fetch it while others wait. When the limit is
-reached, items that were not used for longest go. A reader keeps what it has opened even then: its
-open file stays whole until it is closed. A cache that may only be read serves what it holds.
+An item is one member. Its name is a hash of the dataset's revision, the shard's path and the
+member's place, size and checksum. It is written beside its place and renamed, so that no reader
+sees half of one; one process fetches it under a lock while others wait. When the limit is reached,
+the least recently used items are deleted; a file that a reader has open stays whole until it is
+closed. A read-only cache serves what it holds.
 
-A stored item bears a time of change that follows from its name. Whatever is written into it later
-changes that time: then its checksum decides whether it is still what was fetched. When it was used
-last is its time of access.
+The modification time of an item follows from its name, and its access time is its last use. Writing
+into an item changes the modification time; then its checksum decides whether it is still valid.
 """
 
 import hashlib
@@ -205,8 +204,8 @@ class ShardCache:
         Its part is made at full size at once, so that all who count see it.
         """
         with self._locked("size") as ledger:
-            told = ledger.read_bytes()
-            used = int(told) if told.isdigit() else self.used_bytes()
+            recorded = ledger.read_bytes()
+            used = int(recorded) if recorded.isdigit() else self.used_bytes()
             if used + size > self.limit_bytes:
                 used = self._evict(down_to=max(0, int(_FULL * self.limit_bytes) - size))
             ledger.write_text(str(used + size))

@@ -31,8 +31,8 @@ _NETWORK_ERRORS: Final = (
 )
 """What file systems raise; a module that was not imported raised nothing."""
 
-_TOLD_OF_CHANGE: Final = ("ETag", "etag", "LastModified", "last_modified", "mtime", "size")
-"""What file systems tell of a file that changes when the file does."""
+_CHANGE_MARKS: Final = ("ETag", "etag", "LastModified", "last_modified", "mtime", "size")
+"""What file systems state of a file that changes with it."""
 
 _COMMIT: Final = re.compile(r"[0-9a-f]{40}")
 
@@ -123,12 +123,12 @@ class FilesystemTransport:
         """Refuse a file that is not the one that was read from before, as far as it tells."""
         if not isinstance(details, Mapping):
             return
-        now = {name: str(details[name]) for name in _TOLD_OF_CHANGE if name in details}
+        now = {name: str(details[name]) for name in _CHANGE_MARKS if name in details}
         before = self._seen.setdefault("first", now)
         changed = [name for name in before if name in now and before[name] != now[name]]
         if changed:
-            told = [f"its {name} was {before[name]} and is {now[name]}" for name in changed]
-            raise self._replaced(", ".join(told))
+            changes = [f"its {name} was {before[name]} and is {now[name]}" for name in changed]
+            raise self._replaced(", ".join(changes))
 
     def _replaced(self, changes: str) -> ShardError:
         return ShardError(
@@ -154,7 +154,7 @@ class FilesystemTransport:
 
     @contextmanager
     def _named_errors(self) -> Iterator[None]:
-        """Turn what file systems raise into a fault to try again, or an error that says why not."""
+        """Turn what file systems raise into a `TransientError`, or an error that says the cure."""
         try:
             yield
         except StorageError:
@@ -222,14 +222,14 @@ def _pinned(files: Any, path: str) -> str:
         revision,
     )
     if key not in _commits:
-        told = files._api.repo_info(found.repo_id, repo_type=found.repo_type, revision=revision)
-        _commits[key] = told.sha
+        info = files._api.repo_info(found.repo_id, repo_type=found.repo_type, revision=revision)
+        _commits[key] = info.sha
     pinned = f"{found.repo_type}s/{found.repo_id}@{_commits[key]}"
     return f"{pinned}/{found.path_in_repo}".rstrip("/") if _commits[key] else path
 
 
 _commits: Final[dict[tuple[int, str, str, str, str], str | None]] = {}
-"""Commits of the Hub's branches, as this process has met them."""
+"""Commits of the Hub's branches, as this process has resolved them."""
 
 
 def _within(attempt: Attempt, call: Callable[[], _T]) -> _T:

@@ -1,4 +1,4 @@
-"""Ranges over http and https, with urllib3; every answer is checked to be the part asked for.
+"""Ranges over http and https, with urllib3; every response is checked to be the part requested.
 
 Errors do not chain urllib3's own: their messages hold the whole URL, with what is secret in it.
 """
@@ -54,7 +54,7 @@ _current_attempt: Final[ContextVar[Attempt | None]] = ContextVar("_current_attem
 
 @dataclass(frozen=True, slots=True)
 class _Version:
-    """What a server tells of an object that changes when the object does; "" is not told."""
+    """What a server states of an object that changes with it; "" where it states nothing."""
 
     etag: str
     modified: str
@@ -92,16 +92,16 @@ class WebTransport:
         self._seen: dict[str, _Version] = {}
 
     def size(self, attempt: Attempt) -> int:
-        """Return how many bytes the object has, as told with its first byte."""
+        """Return how many bytes the object has, as the response for its first byte states."""
         response = self._get(0, 1, attempt)
         response.close()
-        told = self._size_told(response)
-        if not _NUMBER.fullmatch(told):
+        stated = self._stated_size(response)
+        if not _NUMBER.fullmatch(stated):
             raise StorageError(
-                f"{self._where}: its server does not tell how large it is ({told[:80]!r}): fetch "
+                f"{self._where}: its server does not tell how large it is ({stated[:80]!r}): fetch "
                 f"the data and pass the folder."
             )
-        return int(told)
+        return int(stated)
 
     def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
@@ -167,21 +167,21 @@ class WebTransport:
 
     def _redirected(self, url: str, response: urllib3.BaseHTTPResponse) -> str:
         """Return where an answer sends its reader, if that is a place to go to."""
-        told = response.headers.get("Location", "").strip()
+        stated = response.headers.get("Location", "").strip()
         length = response.headers.get("Content-Length", "")
         if _NUMBER.fullmatch(length) and int(length) <= _CHUNK:
             response.drain_conn()  # so that the connection can be used again
         response.close()
         try:
-            there = urljoin(url, told)
+            there = urljoin(url, stated)
         except ValueError:
-            there = told
+            there = stated
         try:
             parts = split_url(there)
         except StorageError:
             parts = split_url("")
         reason = ""
-        if not told:
+        if not stated:
             reason = "names no place to go to"
         elif parts.scheme not in WEB_SCHEMES or not parts.hostname:
             reason = f"sends on to {shown(there)[:200]!r}, which is no URL of a web server"
@@ -210,7 +210,7 @@ class WebTransport:
 
     def _require_same(self, response: urllib3.BaseHTTPResponse) -> None:
         """Refuse an answer from another object than the one that was read from before."""
-        size = self._size_told(response)
+        size = self._stated_size(response)
         now = _Version(
             etag=response.headers.get("ETag", "").strip(),
             modified=response.headers.get("Last-Modified", "").strip(),
@@ -235,7 +235,7 @@ class WebTransport:
         raise StorageError(f"{self._where}: the server answers {answer}. {cure}")
 
     def _require_part(self, response: urllib3.BaseHTTPResponse, start: int, stop: int) -> None:
-        """Refuse an answer that is not the part asked for, or its beginning."""
+        """Refuse a response that is not the requested part, or its beginning."""
         if response.status == 200:
             size = response.headers.get("Content-Length", "")[:20]
             if start == 0 and size == str(stop):
@@ -257,21 +257,21 @@ class WebTransport:
                 f"to {stop - 1}. It does not honour ranges: use another, {_FETCH}."
             )
 
-    def _size_told(self, response: urllib3.BaseHTTPResponse) -> str:
-        """Return the whole object's size as an answer tells it: a number, or whatever it is."""
+    def _stated_size(self, response: urllib3.BaseHTTPResponse) -> str:
+        """Return the whole object's size as a response states it, a number or not."""
         if response.status == 200:
             return response.headers.get("Content-Length", "")
         return self._content_range(response)[2]
 
     def _content_range(self, response: urllib3.BaseHTTPResponse) -> tuple[str, str, str]:
-        """Return first and last byte (empty where there are none) and size, as told."""
-        told = response.headers.get("Content-Range", "")
-        found = _PART.fullmatch(told)
+        """Return first and last byte (empty where there are none) and size, as stated."""
+        stated = response.headers.get("Content-Range", "")
+        found = _PART.fullmatch(stated)
         if found is None:
             response.close()
             raise StorageError(
                 f"{self._where}: the server answers {response.status} and does not tell which "
-                f"part it sends (Content-Range: {told[:80]!r}): use another, {_FETCH}."
+                f"part it sends (Content-Range: {stated[:80]!r}): use another, {_FETCH}."
             )
         first, last, size = found.groups(default="")
         return first, last, size
@@ -364,12 +364,12 @@ def _reason(error: BaseException) -> str:
     return type(inner).__name__
 
 
-def _retry_after_s(told: str) -> float:
+def _retry_after_s(header: str) -> float:
     """Return how many seconds a Retry-After header asks to wait, 0 where it does not."""
-    if re.fullmatch("[0-9]+", told):
-        return float(told)
+    if re.fullmatch("[0-9]+", header):
+        return float(header)
     try:
-        until = parsedate_to_datetime(told)
+        until = parsedate_to_datetime(header)
         until = until if until.tzinfo else until.replace(tzinfo=UTC)
         return max(0.0, (until - datetime.now(UTC)).total_seconds())
     except (ValueError, TypeError, IndexError, OverflowError):

@@ -108,7 +108,7 @@ class RetryPolicy:
 
 
 class Attempt:
-    """The time limits of one attempt: it is told of each wait for bytes and limits the next one."""
+    """The time limits of one attempt: it counts each wait for bytes and limits the next one."""
 
     def __init__(self, policy: RetryPolicy, *, left_s: float) -> None:
         """Begin with the head of a response, in a read that has so many seconds left."""
