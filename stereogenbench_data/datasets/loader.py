@@ -77,8 +77,8 @@ class LoaderStats(NamedTuple):
         workers: How many worker processes run for it.
         videos_open: How many videos this process has open for it; each worker has its own.
         videos_limit: How many videos a process opens for it at the most.
-        batches_held: How many batches of its workers lie in shared slots that the loop still holds
-            any part of.
+        batches_held: How many batches of its workers are open in shared slots: the loop holds a
+            part of them, or they arrived ahead of their turn.
     """
 
     epoch: int

@@ -14,13 +14,13 @@ from threading import Event
 from typing import Final
 
 from stereogenbench_data.engine import Progress
-from stereogenbench_data.errors import StorageError, cure_of
+from stereogenbench_data.errors import StorageError, describe_os_error
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.index.tree import ListedTree
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import METADATA_FILES
-from stereogenbench_data.sources.files import open_atomic
+from stereogenbench_data.sources.files import copy_with_crc32, open_atomic
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.members import open_local, require_own_files
 from stereogenbench_data.sources.remote import RemoteObject
@@ -190,8 +190,7 @@ def _require_room(dest: Path, needed: int) -> None:
 
 
 def _why_not_written(place: Path, error: OSError) -> str:
-    cure = cure_of(error, "Choose another folder.")
-    return f"{place}: cannot be written ({error.strerror or error}). {cure}"
+    return describe_os_error(f"{place}: cannot be written", error, "Choose another folder.")
 
 
 def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> None:
@@ -199,11 +198,8 @@ def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> No
     member = wanted.member
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        crc32 = 0
         with open_atomic(place) as file:
-            for data in _until(stop, _chunks(index, member)):
-                file.write(data)
-                crc32 = zlib.crc32(data, crc32)
+            crc32 = copy_with_crc32(_until(stop, _chunks(index, member)), file.write)
             if member.crc32 not in (None, crc32):
                 raise StorageError(
                     f"{wanted.key}/{wanted.name}: came with crc32 {crc32:08x}, and the index says "

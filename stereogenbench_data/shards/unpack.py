@@ -4,16 +4,16 @@ What was packed unchanged comes out unchanged, byte for byte. Depth that blosc2 
 FFV1 video again, whose pictures, times and tags are compared with what was packed.
 """
 
-import errno
 import io
 import shutil
 import zlib
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final, Literal
 
 from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
-from stereogenbench_data.errors import MediaError, ShardError, cure_of
+from stereogenbench_data.errors import DISK_FULL, MediaError, ShardError, describe_os_error
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frames import DepthFrames
@@ -21,7 +21,7 @@ from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
-from stereogenbench_data.sources.files import try_locked
+from stereogenbench_data.sources.files import copy_with_crc32, try_locked
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.members import open_local
 from stereogenbench_data.sources.ranged_file import MemberFile
@@ -143,10 +143,10 @@ def _opened(data: str | Path, root: str | Path | None) -> SceneIndex:
 
 
 def _why_not_written(out: Path, error: OSError) -> str:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if error.errno in DISK_FULL:
         return f"{out}: the disk is full. Make room, then run the same command again to go on."
-    cure = cure_of(error, "Unpack into another folder.")
-    return f"{error.filename or out}: cannot be written ({error.strerror or error}). {cure}"
+    what = f"{error.filename or out}: cannot be written"
+    return describe_os_error(what, error, "Unpack into another folder.")
 
 
 def unpack_scene(
@@ -190,12 +190,13 @@ def _member_of(task: _UnpackTask, member: Member) -> MemberFile:
 def _copy(
     file: MemberFile, member: Member, target: Path, *, where: str, after_bytes: Advance
 ) -> None:
-    crc32 = 0
     with target.open("xb") as output:
-        while chunk := file.read(_CHUNK_BYTES):
+
+        def write(chunk: bytes) -> None:
             output.write(chunk)
-            crc32 = zlib.crc32(chunk, crc32)
             after_bytes(len(chunk))
+
+        crc32 = copy_with_crc32(iter(partial(file.read, _CHUNK_BYTES), b""), write)
     _require_crc32(crc32, member, where=where)
 
 

@@ -4,7 +4,6 @@ Its members are made from files of the release that are as they were planned and
 meanwhile.
 """
 
-import errno
 import hashlib
 import io
 import os
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from stereogenbench_data.engine import Advance, no_advance
-from stereogenbench_data.errors import MediaError, ShardError, cure_of
+from stereogenbench_data.errors import DISK_FULL, MediaError, ShardError, cure_of, describe_os_error
 from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.schema.records import Scene
@@ -49,7 +48,6 @@ from stereogenbench_data.sources.files import open_exclusive
 UNFINISHED: Final = ".tmp"
 
 _CHUNK_BYTES: Final = 4 * 1024 * 1024
-_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +109,13 @@ def _unfinished_of(task: ShardTask) -> Path:
 
 
 def _why_not_written(task: ShardTask, error: OSError) -> str:
-    if error.errno in _FULL:
+    if error.errno in DISK_FULL:
         return (
             f"{task.target}: the disk is full; the shard needs {task.shard.size} bytes. What was "
             f"begun is removed: make room, then run the same command again to go on from here."
         )
-    cure = cure_of(error, "Pack into another folder.")
-    return f"{task.target}: cannot be written ({error.strerror or error}). {cure}"
+    what = f"{task.target}: cannot be written"
+    return describe_os_error(what, error, "Pack into another folder.")
 
 
 class _Output:
