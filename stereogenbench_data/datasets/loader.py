@@ -32,9 +32,10 @@ from stereogenbench_data.samples.streams import StreamStats
 _ORDERED: Final = "or torch's own DataLoader over the dataset"
 _INSTEAD: Final = {
     "sampler": f"use seed= and order=, {_ORDERED}",
+    "lanes": "it is called shuffle_groups",
     "batch_sampler": f"use seed= and order=, {_ORDERED} with EpochBatches",
 }
-"""Options of `DataLoader` that would undo the order, and what to use for them."""
+"""Options that a loader does not take, and what to use instead."""
 
 
 class LoaderOptions(EpochOptions, total=False):

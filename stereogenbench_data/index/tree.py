@@ -121,7 +121,7 @@ def release_root_of(folder: Path) -> Path | None:
 def _where_to_point(folder: Path, *, root: Path) -> str:
     other = release_root_of(folder)
     if other == Path(os.path.abspath(root)):  # noqa: PTH100 (resolve would follow links)
-        return " Rename the folder."
+        return ""  # the folder's name is at fault, and the error says so
     return f" Move it, or point at {other} instead." if other else " Move it to such a path."
 
 
