@@ -36,12 +36,8 @@ def require_opencv() -> ModuleType:
 class Sift:
     """SIFT keypoints of the luma, described upright, as rectified views are not turned.
 
-    Of points that SIFT finds in several orientations one is kept, and of all those with the
+    Points that SIFT finds in several orientations are kept once, and of all points those with the
     strongest response. Descriptors are whole numbers, so matches are the same on every machine.
-
-    Attributes:
-        name: What tables call it.
-        settings: Every choice that its answers depend on.
     """
 
     def __init__(self, *, keypoints: int = KEYPOINTS, ratio: float = RATIO) -> None:
@@ -101,11 +97,6 @@ def _strongest(points: Any, *, at_most: int) -> list[Any]:
 _SUBPIXELS: Final = 16
 _LEAST_PX: Final = -16
 _BLOCK_PX: Final = 5
-_UNIQUENESS_PERCENT: Final = 10
-_SPECKLE_PIXELS: Final = 100
-_SPECKLE_PX: Final = 2
-_LEFT_RIGHT_PX: Final = 1
-_GRADIENT_CAP: Final = 63
 
 
 class Sgbm:
@@ -114,10 +105,6 @@ class Sgbm:
     The few negative ones tell a view that is shifted the wrong way, or not at all, from one that
     is shifted a little. It has no answer in the columns at both sides whose search range leaves
     the picture, and none for larger disparities.
-
-    Attributes:
-        name: What tables call it.
-        settings: Every choice that its answers depend on.
     """
 
     def __init__(self, *, disparities: int = 192) -> None:
@@ -128,34 +115,33 @@ class Sgbm:
         """
         self._cv2 = require_opencv()
         self._disparities = disparities
-        small_step, large_step = 8 * 3 * _BLOCK_PX**2, 32 * 3 * _BLOCK_PX**2
-        self._matcher = self._cv2.StereoSGBM_create(
-            minDisparity=_LEAST_PX,
-            numDisparities=disparities,
-            blockSize=_BLOCK_PX,
-            P1=small_step,
-            P2=large_step,
-            disp12MaxDiff=_LEFT_RIGHT_PX,
-            preFilterCap=_GRADIENT_CAP,
-            uniquenessRatio=_UNIQUENESS_PERCENT,
-            speckleWindowSize=_SPECKLE_PIXELS,
-            speckleRange=_SPECKLE_PX,
-            mode=self._cv2.STEREO_SGBM_MODE_SGBM,
-        )
-        self.name = f"SGBM (OpenCV {self._cv2.__version__})"
-        self.settings: Settings = {
+        chosen = {
             "least_disparity_px": _LEAST_PX,
             "disparities": disparities,
             "block_px": _BLOCK_PX,
-            "p1": small_step,
-            "p2": large_step,
-            "left_right_px": _LEFT_RIGHT_PX,
-            "uniqueness_percent": _UNIQUENESS_PERCENT,
-            "speckle_pixels": _SPECKLE_PIXELS,
-            "speckle_px": _SPECKLE_PX,
-            "prefilter_cap": _GRADIENT_CAP,
-            "mode": "five directions",
+            "p1": 8 * 3 * _BLOCK_PX**2,
+            "p2": 32 * 3 * _BLOCK_PX**2,
+            "left_right_px": 1,
+            "uniqueness_percent": 10,
+            "speckle_pixels": 100,
+            "speckle_px": 2,
+            "prefilter_cap": 63,
         }
+        self._matcher = self._cv2.StereoSGBM_create(
+            minDisparity=chosen["least_disparity_px"],
+            numDisparities=chosen["disparities"],
+            blockSize=chosen["block_px"],
+            P1=chosen["p1"],
+            P2=chosen["p2"],
+            disp12MaxDiff=chosen["left_right_px"],
+            preFilterCap=chosen["prefilter_cap"],
+            uniquenessRatio=chosen["uniqueness_percent"],
+            speckleWindowSize=chosen["speckle_pixels"],
+            speckleRange=chosen["speckle_px"],
+            mode=self._cv2.STEREO_SGBM_MODE_SGBM,
+        )
+        self.name = f"SGBM (OpenCV {self._cv2.__version__})"
+        self.settings: Settings = {**chosen, "mode": "five directions"}
 
     def __call__(self, left: Picture, right: Picture) -> Float32[np.ndarray, "h w"]:
         """Return the left picture's disparity in pixels; nan where it has no answer.

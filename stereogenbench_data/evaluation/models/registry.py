@@ -6,14 +6,13 @@ To add a model, write a class with the members of its kind in `interfaces` and n
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 from stereogenbench_data.errors import EvaluationError
 
 ModelKind = Literal[
     "keypoint matcher", "stereo matcher", "pair metric", "image features", "video features"
 ]
-OptionName = Literal["device", "weights", "checkout"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,20 +31,14 @@ class ModelOptions:
     checkout: Path | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ModelEntry:
-    """One model.
-
-    Attributes:
-        path: Its class, as "module:class" within `stereogenbench_data.evaluation.models`.
-        options: The `ModelOptions` that the class takes.
-    """
+class ModelEntry(NamedTuple):
+    """The class of a model, as "module:class" of this folder, and the `ModelOptions` it takes."""
 
     path: str
-    options: tuple[OptionName, ...] = ()
+    options: tuple[str, ...] = ()
 
 
-_LEARNED: Final[tuple[OptionName, ...]] = ("device", "weights")
+_LEARNED: Final = ("device", "weights")
 
 MODELS: Final[dict[ModelKind, dict[str, ModelEntry]]] = {
     "keypoint matcher": {
