@@ -42,11 +42,11 @@ class MatchScore:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetMatches:
-    """The left keypoints, and which are found again in the target: the same for all predictions.
+    """The left keypoints, and which the target shows: the same for all predictions.
 
     Attributes:
         left: Keypoints of the left picture.
-        matched: Which are found again in the target.
+        matched: Which of them are found again in the target.
         epipolar_px: How many rows a match may be off.
         size_px: Height and width of the pictures.
         matcher: The name of the matcher they were found by.
@@ -64,8 +64,8 @@ def target_matches(
 ) -> TargetMatches:
     """Return the left keypoints and which of them the rendered target shows.
 
-    The left keypoints are detected once, so that a keypoint is the same element of both sets
-    exactly if it is the same keypoint.
+    The left keypoints are detected once, so the two sets that E_match compares are of the same
+    keypoints.
 
     Raises:
         EvaluationError: If the two are not pictures of one size.
@@ -90,11 +90,12 @@ def match_error(
         EvaluationError: If it is not a picture of the target's size, or the matcher another.
     """
     require_pictures(predicted)
+    height, width = against.size_px
     if predicted.shape[1:] != against.size_px or matcher.name != against.matcher:
         raise EvaluationError(
-            f"the target was matched at {against.size_px[1]}x{against.size_px[0]} by "
-            f"{against.matcher}, the prediction is to be at {predicted.shape[2]}x"
-            f"{predicted.shape[1]} by {matcher.name}: both must be the same."
+            f"the target was matched at {width}x{height} by {against.matcher}, and the prediction "
+            f"is {predicted.shape[2]}x{predicted.shape[1]}, by {matcher.name}: match both at one "
+            f"size by one matcher."
         )
     matched = _matched(against.left, predicted, matcher=matcher, epipolar_px=against.epipolar_px)
     common = int(np.count_nonzero(matched & against.matched))
@@ -123,12 +124,12 @@ def mutual_matches(
 ) -> Int64[np.ndarray, "m 2"]:
     """Return mutual nearest neighbours that pass the ratio test in both directions.
 
-    Clearly: the distance of descriptors to the nearest is at most ``ratio`` times that to the
-    second nearest. As kornia's match_smnn, in float64.
+    The distance of descriptors to the nearest must be at most ``ratio`` times that to the second
+    nearest. Same as kornia's match_smnn, in float64.
 
     Returns:
-        Pairs (left, right) in ascending order of the left; none where a side has below two
-        keypoints, as there is no second nearest then.
+        Pairs (left, right), the left ascending; none where a side has fewer than two keypoints
+        and so no second nearest.
     """
     if min(len(left.xy_px), len(right.xy_px)) < 2:
         return np.zeros((0, 2), dtype=np.int64)
@@ -147,7 +148,7 @@ def mutual_matches(
 
 
 def _nearest(squared: torch.Tensor, *, ratio: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return which column is nearest to each row, and whether it is so clearly."""
+    """Return which column is nearest to each row, and whether it passes the ratio test."""
     nearest, index = squared.clamp(min=0).topk(2, dim=1, largest=False)
     clear = (nearest[:, 0] <= ratio**2 * nearest[:, 1]) & (nearest[:, 1] > 0)
     return index[:, 0], clear
