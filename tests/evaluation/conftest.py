@@ -1,18 +1,14 @@
 """Small scenes to be scored, and right views of them on disk."""
 
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from stereogenbench_data.evaluation.predictions import frame_name, item_name
+from stereogenbench_data.evaluation.predictions import frame_name, item_name, open_frames
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.request import Request
-from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.synthesis import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
@@ -45,10 +41,8 @@ def protocol() -> EvaluationProtocol:
 def rendered(index: SceneIndex, scene: str, camera: int, frame: int, *, size=SIZE) -> np.ndarray:
     """Return a view as it is scored, uint8 (3, h, w)."""
     row = list(index.column("key")).index(scene)
-    request = Request(kind="pairs", fields=("right",), layout="single", size=size)
-    with closing(SampleLoader(index, request)) as loader:
-        address = Address(row, 0 if camera else 1, (camera,), (frame,))
-        return loader.load(address, clip="frame", generator=np.random.default_rng(0))["right"]
+    with open_frames(index, ("right",), size=size) as load:
+        return load(row, (0 if camera else 1, camera), frame)["right"]
 
 
 def write_pngs(folder: Path, index: SceneIndex, *, camera=1, size=SIZE, frames=range(FRAMES)):

@@ -1,7 +1,6 @@
 """SD: hand-worked lines, and SGBM on photographs with measured disparity."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -215,9 +214,8 @@ def test_a_frames_record_has_sd_by_every_fit_of_one_estimate(
     sample = {
         "left": picture, "right": picture, "disparity": truth[None], "visible": EVERYWHERE[None],
     }  # fmt: skip
-    frame = TargetFrame(sample, None, stored_right=lambda: picture)
-    reader = SimpleNamespace(read=lambda wanted, samples: [picture])
-    scorer = PairScorer(models, reader, wanted=None)
+    frame = TargetFrame(sample, None, load_stored=lambda: sample)
+    scorer = PairScorer(models, lambda wanted, samples: [picture], wanted=None)
 
     scorer.add([frame])
     columns = scorer.scores().columns
