@@ -1,6 +1,7 @@
 """The protocol: every choice that scores depend on, and the models that these choices name."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -9,10 +10,10 @@ from typing import Any, Final
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.columns import (
     COLUMNS,
+    FRAME_METRICS,
     IMAGE_DISTANCES,
     OFFLINE_METRICS,
     VIDEO_DISTANCES,
-    columns_of,
     require_metrics,
 )
 from stereogenbench_data.evaluation.metrics.matching import match_settings
@@ -107,8 +108,9 @@ class EvaluationProtocol:
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns of every frame, in the order of `COLUMNS`."""
+        filled = {name for metric in self.metrics for name in FRAME_METRICS.get(metric, ())}
         fits = ("", *self.fits)
-        return tuple(name for name in columns_of(self.metrics) if COLUMNS[name].fit in fits)
+        return tuple(name for name in COLUMNS if name in filled and COLUMNS[name].fit in fits)
 
     def label(self, column: str) -> str:
         """Return what tables call a column: with the backend, where it is not the paper's."""
@@ -181,8 +183,11 @@ class MetricModels:
             "depth": "as the files state" if protocol.depth is None else repr(protocol.depth),
             "metrics": list(protocol.metrics),
             "averages": "frames first, then scenes; intervals are Student's over scenes",
-            "versions": _versions(),
+            "versions": {},
         }
+        for package in _VERSIONS:
+            with suppress(PackageNotFoundError):
+                settings["versions"][package] = version(package)
         of_metric: dict[str, Any] = {
             "psnr": lambda: PSNR_SETTINGS,
             "ssim": lambda: SSIM_SETTINGS,
@@ -190,9 +195,9 @@ class MetricModels:
             "e_match": lambda: match_settings(self.keypoint_matcher),
             "sd": lambda: scale_settings(self.stereo_matcher, method=protocol.fit),
         }
-        parts: Mapping[str, Any] = self.pair_metrics | self.image_features | self.video_features
+        learned: Mapping[str, Any] = self.pair_metrics | self.image_features | self.video_features
         for name in protocol.metrics:
-            found = of_metric[name]() if name in of_metric else parts[name].settings
+            found = of_metric[name]() if name in of_metric else learned[name].settings
             settings[name] = dict(found)
         return settings
 
@@ -201,16 +206,6 @@ class MetricModels:
 def models_of(protocol: EvaluationProtocol) -> MetricModels:
     """Return the models of a protocol, kept for the next scene that this process scores.
 
-    ``models_of.cache_clear()`` lets go of what was loaded.
+    ``models_of.cache_clear()`` drops them.
     """
     return MetricModels(protocol)
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for package in _VERSIONS:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found
