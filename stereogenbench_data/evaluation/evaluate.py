@@ -29,9 +29,8 @@ from stereogenbench_data.evaluation.predictions import (
     PredictionFolder,
     PredictionSource,
 )
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, models_of
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol, models_of, require_tier
 from stereogenbench_data.evaluation.scene_scores import SceneWork, score_scene
-from stereogenbench_data.evaluation.tiers import require_tier
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.plan import Selection

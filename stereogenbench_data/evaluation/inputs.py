@@ -27,8 +27,12 @@ from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
 from stereogenbench_data.errors import EvaluationError, StorageError, describe_os_error
 from stereogenbench_data.evaluation.evaluate import select_workload
 from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, open_frames
-from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
-from stereogenbench_data.evaluation.tiers import Tier, require_tier
+from stereogenbench_data.evaluation.protocol import (
+    PAPER_SIZE,
+    EvaluationProtocol,
+    Tier,
+    require_tier,
+)
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.plan import Selection

@@ -31,7 +31,7 @@ from stereogenbench_data.errors import (
     cure_of,
     describe_os_error,
 )
-from stereogenbench_data.evaluation.tiers import Tier
+from stereogenbench_data.evaluation.protocol import Tier
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.video import VideoReader, plane_numbers, probe, read_rgb
 from stereogenbench_data.samples.fields import Sample

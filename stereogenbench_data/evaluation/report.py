@@ -15,9 +15,9 @@ from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
 from stereogenbench_data.evaluation.controls import Relation
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.predictions import pair_name
+from stereogenbench_data.evaluation.protocol import TIERS
 from stereogenbench_data.evaluation.reference import DISCREPANCIES, PAPER
 from stereogenbench_data.evaluation.tables import Table, TableRow
-from stereogenbench_data.evaluation.tiers import TIERS
 from stereogenbench_data.schema.text import counted, markdown_text
 from stereogenbench_data.sources.files import write_atomic
 

@@ -6,7 +6,7 @@ their features need all frames of the scene.
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from typing import Any, Literal
 
@@ -348,14 +348,7 @@ def _p_psnr(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str
 
 
 def _e_match(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
-    score = match_error(picture, against=target.matches, matcher=target.matcher)
-    return {
-        "e_match": score.error,
-        "keypoints": score.keypoints,
-        "target_matches": score.target_matches,
-        "predicted_matches": score.predicted_matches,
-        "common_matches": score.common,
-    }
+    return asdict(match_error(picture, against=target.matches, matcher=target.matcher))
 
 
 def _sd(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:

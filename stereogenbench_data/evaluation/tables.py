@@ -24,16 +24,16 @@ from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.metrics.scale import SD_OF_THE_PAPER
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
 from stereogenbench_data.evaluation.reference import (
+    SOURCES,
     ReferenceRow,
     TableName,
     reference_rows,
-    reference_table,
 )
 from stereogenbench_data.schema.release import BASELINE_BINS, FAMILIES, FRAME_COUNT, baseline_bin
 
 PairsShown = Literal["primary", "all"]
 
-_SOURCES: Final[Mapping[str, tuple[TableName, ...]]] = {
+_TABLES_OF_THE_PAPER: Final[Mapping[str, tuple[TableName, ...]]] = {
     "branches": ("main", "unseen"),
     "bins_primary": ("bins",),
     "controls": ("controls",),
@@ -318,7 +318,7 @@ def _notes(
     if any(COLUMNS[column].fit for column in of_frames):
         notes.append(f"SD: {SD_OF_THE_PAPER}.")
     if any(row.is_papers for row in rows):
-        sources = "; ".join(reference_table(each).source for each in _SOURCES[name])
+        sources = "; ".join(SOURCES[each] for each in _TABLES_OF_THE_PAPER[name])
         notes.append(f"Rows of the paper as printed: {sources}.")
         others = [
             protocol.label(column)

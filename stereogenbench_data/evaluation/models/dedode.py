@@ -42,11 +42,7 @@ class DeDoDeMatcher:
     """DeDoDe keypoints, matched as mutual nearest neighbours; a `KeypointMatcher`."""
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the networks.
-
-        Args:
-            weights: The folder of the two files; None for that of torch.hub's checkpoints.
-            device: Where to compute.
+        """Load the networks; the arguments are those of `ModelOptions`.
 
         Raises:
             ExtraError: If kornia or a file is missing.

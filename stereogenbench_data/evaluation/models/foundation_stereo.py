@@ -42,13 +42,10 @@ class FoundationStereoMatcher:
     def __init__(
         self, *, checkout: Path | None, weights: Path | None = None, device: str = "cpu"
     ) -> None:
-        """Load the network.
+        """Load the network; the arguments are those of `ModelOptions`.
 
-        Args:
-            checkout: The folder of a clone of FoundationStereo's repository.
-            weights: The folder of model_best_bp2.pth and cfg.yaml; None for
-                pretrained_models/23-51-11 in the checkout.
-            device: Where to compute.
+        The folder of weights has model_best_bp2.pth and cfg.yaml; it is pretrained_models/23-51-11
+        in the checkout unless given.
 
         Raises:
             ExtraError: If the checkout, what it needs or a file is missing.

@@ -34,14 +34,10 @@ class I3dFeatures:
     min_frames = 10
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the network.
-
-        Args:
-            weights: The folder of its file; None for that of torch.hub's checkpoints.
-            device: Where to compute.
+        """Load the network; the arguments are those of `ModelOptions`.
 
         Raises:
-            ExtraError: If the file is missing.
+            ExtraError: If the file of weights is missing.
             EvaluationError: If it does not hold this network's weights.
         """
         network = InflatedInception()

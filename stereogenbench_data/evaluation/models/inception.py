@@ -42,14 +42,10 @@ class InceptionFeatures:
     name = "Inception-v3 (TensorFlow, 2015-12-05)"
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the network.
-
-        Args:
-            weights: The folder of its file; None for that of torch.hub's checkpoints.
-            device: Where to compute.
+        """Load the network; the arguments are those of `ModelOptions`.
 
         Raises:
-            ExtraError: If the file is missing.
+            ExtraError: If the file of weights is missing.
             EvaluationError: If it does not hold this network's weights.
         """
         network = Inception()

@@ -45,12 +45,10 @@ class Lpips:
     name = "LPIPS"
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the network.
+        """Load the network; the arguments are those of `ModelOptions`.
 
-        Args:
-            weights: The folder of AlexNet's file; None for that of torch.hub's checkpoints. The
-                few numbers on top of it come from the installed package lpips.
-            device: Where to compute.
+        AlexNet's file is in the folder of weights; the few numbers on top of it come from the
+        installed package lpips.
 
         Raises:
             ExtraError: If the package or the file is missing.

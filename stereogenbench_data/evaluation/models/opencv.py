@@ -40,7 +40,7 @@ class Sift:
     strongest response. Descriptors are whole numbers, so matches are the same on every machine.
     """
 
-    def __init__(self, *, keypoints: int = KEYPOINTS, ratio: float = RATIO) -> None:
+    def __init__(self, *, keypoints: int = KEYPOINTS) -> None:
         """Make a matcher of up to so many keypoints a picture.
 
         Raises:
@@ -49,13 +49,12 @@ class Sift:
         self._cv2 = require_opencv()
         self._sift = self._cv2.SIFT_create(enable_precise_upscale=True)
         self._keypoints = keypoints
-        self._ratio = ratio
         self.name = f"SIFT (OpenCV {self._cv2.__version__})"
         self.settings: Settings = {
             "keypoints": keypoints,
             "orientation": "upright",
             "upscale": "precise",
-            "ratio": ratio,
+            "ratio": RATIO,
             "matching": "mutual nearest neighbours, ratio in both directions",
         }
 
@@ -81,7 +80,7 @@ class Sift:
 
     def match(self, left: Keypoints, right: Keypoints) -> Int64[np.ndarray, "m 2"]:
         """Return mutual nearest neighbours."""
-        return mutual_matches(left, right, ratio=self._ratio)
+        return mutual_matches(left, right)
 
 
 def _strongest(points: Any, *, at_most: int) -> list[Any]:
