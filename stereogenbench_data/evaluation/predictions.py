@@ -307,12 +307,10 @@ class PredictionSource(Protocol):
     @property
     def name(self) -> str:
         """What tables call it."""
-        ...
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """Fields of a sample that it needs."""
-        ...
 
     def stamp(self, wanted: PairFrames) -> str:
         """Return a text that changes when the right views of a pair do.
@@ -320,11 +318,9 @@ class PredictionSource(Protocol):
         Raises:
             PredictionFault: If there are none, or several that could be meant.
         """
-        ...
 
     def open(self, index: SceneIndex) -> AbstractContextManager[Read]:
         """Open a scene; the index holds it, and other scenes that are read for it."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,11 +43,9 @@ def test_an_unknown_name_is_answered_with_the_known_ones(kind):
         load_model(kind, "raft")
 
 
-@pytest.mark.parametrize(
-    "entry", [entry for models in MODELS.values() for entry in models.values()], ids=str
-)
-def test_every_model_of_the_registry_can_be_imported(entry):
-    module, _, name = entry.path.partition(":")
+@pytest.mark.parametrize("path", [path for models in MODELS.values() for path in models.values()])
+def test_every_model_of_the_registry_can_be_imported(path):
+    module, _, name = path.partition(":")
 
     assert getattr(import_module(f"stereogenbench_data.evaluation.models.{module}"), name).__doc__
 

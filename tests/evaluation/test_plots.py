@@ -56,16 +56,14 @@ def test_the_papers_sd_is_drawn_beside_the_filtered_fit_alone(results, tmp_path,
         )
         for one in results
     ]
-    drawn = []
-    monkeypatch.setattr(
-        plots, "_draw_reference", lambda axes, results, metric: drawn.append(metric) or []
-    )
+    asked = []
+    monkeypatch.setattr(plots, "reference_rows", lambda table, tier: asked.append(table) or [])
     files = write_plots(tmp_path, with_sd)
 
     assert [path.name for path in files] == [
         "sd_filtered_by_baseline.png", "sd_least_squares_by_baseline.png",
     ]  # fmt: skip
-    assert drawn == ["sd"]
+    assert asked == ["bins"]
 
 
 def test_methods_of_two_tiers_are_not_drawn_together(scored_index, tmp_path, protocol):

@@ -37,12 +37,10 @@ class Model(Protocol):
     @property
     def name(self) -> str:
         """What tables call it, with its version."""
-        ...
 
     @property
     def settings(self) -> Settings:
         """Every choice that its answers depend on, so that scores of other choices differ."""
-        ...
 
 
 @runtime_checkable
@@ -51,11 +49,9 @@ class KeypointMatcher(Model, Protocol):
 
     def detect(self, picture: Picture) -> Keypoints:
         """Return a picture's keypoints: of the same picture, always the same in the same order."""
-        ...
 
     def match(self, left: Keypoints, right: Keypoints) -> Int64[np.ndarray, "m 2"]:
         """Return indices of matched keypoints (left, right), each left keypoint at most once."""
-        ...
 
 
 @runtime_checkable
@@ -67,7 +63,6 @@ class StereoMatcher(Model, Protocol):
 
         x_right = x_left - disparity: positive in front of the cameras.
         """
-        ...
 
 
 @runtime_checkable
@@ -76,7 +71,6 @@ class PairMetric(Model, Protocol):
 
     def __call__(self, predicted: Pictures, target: Pictures) -> Float64[np.ndarray, " n"]:
         """Return one number for each picture."""
-        ...
 
 
 @runtime_checkable
@@ -85,7 +79,6 @@ class ImageFeatures(Model, Protocol):
 
     def __call__(self, pictures: Pictures) -> Float64[np.ndarray, "n dim"]:
         """Return the features of each picture."""
-        ...
 
 
 @runtime_checkable
@@ -95,11 +88,9 @@ class VideoFeatures(Model, Protocol):
     @property
     def min_frames(self) -> int:
         """How many frames a clip needs."""
-        ...
 
     def __call__(self, clips: Clips) -> Float64[np.ndarray, "n dim"]:
         """Return the features of each clip."""
-        ...
 
 
 def require_rgb(pixels: Picture | Pictures | Clips, what: str, *, axes: str) -> None:
