@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.metrics.matching import (
@@ -16,6 +15,7 @@ from stereogenbench_data.evaluation.metrics.matching import (
 )
 from stereogenbench_data.evaluation.models.interfaces import KeypointMatcher, Keypoints
 from stereogenbench_data.evaluation.models.opencv import Sift
+from tests.evaluation.conftest import photograph
 
 
 def view(number: int, *, height: int = 8, width: int = 9) -> np.ndarray:
@@ -180,11 +180,7 @@ def test_mutual_matches_are_those_of_a_search_by_loops():
 
 @pytest.fixture(scope="module")
 def cones(ground_truth):
-    def read(name):
-        with Image.open(ground_truth / "cones" / name) as picture:
-            return np.asarray(picture.convert("RGB")).transpose(2, 0, 1)
-
-    return read("left.png"), read("right.png")
+    return tuple(photograph(ground_truth / "cones" / f"{side}.png") for side in ("left", "right"))
 
 
 @pytest.fixture(scope="module")

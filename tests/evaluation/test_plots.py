@@ -11,8 +11,7 @@ from stereogenbench_data import EvaluationError, EvaluationProtocol, score_contr
 from stereogenbench_data.evaluation import plots
 from stereogenbench_data.evaluation.aggregate import tally
 from stereogenbench_data.evaluation.plots import write_plots
-from tests.evaluation.conftest import SIZE
-from tests.evaluation.test_evaluate import scored
+from tests.evaluation.conftest import SIZE, scored
 
 
 @pytest.fixture(scope="module")

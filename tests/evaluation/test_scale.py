@@ -15,6 +15,7 @@ from stereogenbench_data.evaluation.models.interfaces import StereoMatcher
 from stereogenbench_data.evaluation.models.opencv import Sgbm
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol, MetricModels
 from stereogenbench_data.evaluation.scene_scores import PairScorer, TargetFrame
+from tests.evaluation.conftest import photograph
 
 METHODS = ("filtered", "least_squares", "theil_sen")
 SIZE = (20, 30)
@@ -231,13 +232,10 @@ def test_a_frames_record_has_sd_by_every_fit_of_one_estimate(
 
 @pytest.fixture(scope="module")
 def cloth(ground_truth):
-    def read(name):
-        with Image.open(ground_truth / "cloth3" / name) as picture:
-            return np.asarray(picture)
-
-    left, right = (read(f"view{number}.png").transpose(2, 0, 1) for number in (1, 5))
-    disparity = read("disp1.png").astype(np.float32) / 2
-    return left, right, disparity
+    folder = ground_truth / "cloth3"
+    left, right = (photograph(folder / f"view{number}.png") for number in (1, 5))
+    with Image.open(folder / "disp1.png") as picture:
+        return left, right, np.asarray(picture).astype(np.float32) / 2
 
 
 @pytest.fixture(scope="module")
