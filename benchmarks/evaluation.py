@@ -24,8 +24,9 @@ from PIL import Image
 
 from benchmarks.results import Say, spread_of
 from stereogenbench_data.evaluation.evaluate import Workload, select_workload
+from stereogenbench_data.evaluation.frame_metrics import MetricModels
 from stereogenbench_data.evaluation.predictions import PredictionFolder, frame_name, item_name
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, MetricModels
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.evaluation.scene_scores import SceneWork, one_thread, score_scene
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding

@@ -15,6 +15,7 @@ from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, grouped, tally
 from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
+from stereogenbench_data.evaluation.frame_metrics import fields_of, models_of
 from stereogenbench_data.evaluation.metrics.frechet import (
     FeatureStatistics,
     FrechetDistance,
@@ -29,7 +30,7 @@ from stereogenbench_data.evaluation.predictions import (
     PredictionFolder,
     PredictionSource,
 )
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, models_of, require_tier
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol, require_tier
 from stereogenbench_data.evaluation.scene_scores import SceneWork, score_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import counted
@@ -168,7 +169,7 @@ def select_workload(
     selection.setdefault("frames", "all")
     dataset = StereoPairs(
         data,
-        fields=tuple(dict.fromkeys((*protocol.fields, *inputs))),
+        fields=tuple(dict.fromkeys((*fields_of(protocol), *inputs))),
         size=protocol.size,
         depth=protocol.depth,
         **selection,

@@ -4,10 +4,10 @@ A few frames are in memory at a time, so that learned models get batches. Clips 
 their features need all frames of the scene.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -16,21 +16,15 @@ from av.video.reformatter import VideoReformatter
 
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.frame_metrics import (
+    OF_FRAME,
+    CachedKeypoints,
+    MetricModels,
+    TargetFrame,
+    fields_of,
+    models_of,
+)
 from stereogenbench_data.evaluation.metrics.frechet import FeatureStatistics
-from stereogenbench_data.evaluation.metrics.matching import (
-    TargetMatches,
-    match_error,
-    target_matches,
-)
-from stereogenbench_data.evaluation.metrics.pixels import (
-    PatchScore,
-    outside_window,
-    patch_psnr,
-    psnr_db,
-    ssim,
-)
-from stereogenbench_data.evaluation.metrics.scale import fit_scale
-from stereogenbench_data.evaluation.models.interfaces import Keypoints, Settings
 from stereogenbench_data.evaluation.models.opencv import require_opencv
 from stereogenbench_data.evaluation.predictions import (
     Pair,
@@ -41,7 +35,7 @@ from stereogenbench_data.evaluation.predictions import (
     open_frames,
     scaled_rgb,
 )
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, MetricModels, models_of
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import PAIR_FIELDS, Sample
 
@@ -122,7 +116,7 @@ def score_scene(
                 )
         load_stored = stack.enter_context(open_frames(work.index, ("right",)))
         for samples in _batches(work, row):
-            matcher = _CachedKeypoints(models)
+            matcher = CachedKeypoints(models)
             for wanted in work.pairs:
                 targets = [
                     TargetFrame(
@@ -144,7 +138,7 @@ def score_scene(
 def _batches(work: SceneWork, row: int) -> Iterator[dict[Pair, list[Sample]]]:
     """Yield the samples of a few frames of each pair; equal pictures are one array."""
     protocol, frames = work.protocol, work.pairs[0].frames
-    needed = {*protocol.fields, *(each for source in work.sources for each in source.inputs)}
+    needed = {*fields_of(protocol), *(each for source in work.sources for each in source.inputs)}
     fields = tuple(name for name in PAIR_FIELDS if name in needed)
     with open_frames(work.index, fields, size=protocol.size, depth=protocol.depth) as load:
         for start in range(0, len(frames), protocol.batch_frames):
@@ -157,31 +151,6 @@ def _batches(work: SceneWork, row: int) -> Iterator[dict[Pair, list[Sample]]]:
                         sample[view] = pictures.setdefault(camera, sample[view])
                     samples[pair].append(sample)
             yield samples
-
-
-@dataclass(frozen=True, slots=True)
-class _CachedKeypoints:
-    """The models' keypoint matcher; it detects the keypoints of one and the same array once."""
-
-    models: MetricModels
-    found: dict[int, tuple[Any, Keypoints]] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        return self.models.keypoint_matcher.name
-
-    @property
-    def settings(self) -> Settings:
-        return self.models.keypoint_matcher.settings
-
-    def detect(self, picture: Any) -> Keypoints:
-        if id(picture) not in self.found:
-            # The picture is kept too, so that no other takes its identity.
-            self.found[id(picture)] = picture, self.models.keypoint_matcher.detect(picture)
-        return self.found[id(picture)][1]
-
-    def match(self, left: Keypoints, right: Keypoints) -> Any:
-        return self.models.keypoint_matcher.match(left, right)
 
 
 @contextmanager
@@ -202,52 +171,6 @@ def one_thread() -> Iterator[None]:
     finally:
         opencv.setNumThreads(before[0])
         torch.set_num_threads(before[1])
-
-
-class TargetFrame:
-    """One frame of one pair, with the parts of its scores that do not depend on the prediction.
-
-    Attributes:
-        sample: Its fields, pictures at the evaluated size.
-        left: The left view, uint8 (3, h, w).
-        right: The rendered right view, uint8 (3, h, w).
-        matcher: The matcher of keypoints.
-    """
-
-    def __init__(
-        self, sample: Sample, matcher: _CachedKeypoints, *, load_stored: Callable[[], Sample]
-    ) -> None:
-        """Take the sample; ``load_stored`` returns the one whose right view has its stored size."""
-        self.sample = sample
-        self.left, self.right = sample["left"], sample["right"]
-        self.matcher = matcher
-        self._load_stored = load_stored
-
-    @cached_property
-    def scaled_from_stored(self) -> "TargetFrame":
-        """The frame whose right view is scaled in RGB, as predictions of the stored size are.
-
-        The one of the sample is scaled before it becomes RGB, with other roundings.
-        """
-        stored, size = self._load_stored()["right"], self.right.shape[1:]
-        right = scaled_rgb(stored, size=size, scaler=VideoReformatter())
-        sample = {**self.sample, "right": right}
-        return TargetFrame(sample, self.matcher, load_stored=self._load_stored)
-
-    @cached_property
-    def ceiling(self) -> PatchScore:
-        """P-PSNR of the rendered view."""
-        return patch_psnr(self.left, self.right)
-
-    @cached_property
-    def outside(self) -> float:
-        """The share of measured pixels whose disparity P-PSNR does not search."""
-        return outside_window(self.sample["disparity"][0], self.sample["valid"][0])
-
-    @cached_property
-    def matches(self) -> TargetMatches:
-        """The matches of left and rendered right view."""
-        return target_matches(self.left, self.right, matcher=self.matcher)
 
 
 class PairScorer:
@@ -301,8 +224,8 @@ class PairScorer:
             targets.append(frame if has_size else frame.scaled_from_stored)
             pictures.append(scaled_rgb(picture, size=frame.right.shape[1:], scaler=scaler))
             for metric in models.protocol.metrics:
-                if metric in _OF_FRAME:
-                    numbers = _OF_FRAME[metric](pictures[-1], targets[-1], models)
+                if metric in OF_FRAME:
+                    numbers = OF_FRAME[metric].score(pictures[-1], targets[-1], models)
                     for name, number in numbers.items():
                         columns[name].append(float(number))
         rendered = [target.right for target in targets]
@@ -335,50 +258,3 @@ class PairScorer:
                 sides = (np.stack(views)[None] for views in zip(*self._clip, strict=True))
                 self._merge(name, *map(features, sides))
         return self._scores
-
-
-def _p_psnr(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
-    score = patch_psnr(target.left, picture)
-    return {
-        "p_psnr": score.mean_db,
-        "p_psnr_pooled": score.pooled_db,
-        "p_psnr_ceiling": target.ceiling.mean_db,
-        "p_psnr_outside": target.outside,
-    }
-
-
-def _e_match(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
-    return asdict(match_error(picture, against=target.matches, matcher=target.matcher))
-
-
-def _sd(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
-    """Return SD by each fit of the protocol, all of one disparity map."""
-    estimated_px = models.stereo_matcher(target.left, picture)
-    found: dict[str, float] = {}
-    for method in models.protocol.fits:
-        fit = fit_scale(
-            estimated_px,
-            target.sample["disparity"][0],
-            scored=target.sample["visible"][0],
-            method=method,
-        )
-        found |= {
-            f"sd_{method}": fit.drift,
-            f"sd_{method}_slope": fit.slope,
-            f"sd_{method}_offset_px": fit.offset_px,
-            f"sd_{method}_valid": fit.valid_ratio,
-            f"sd_{method}_outliers": fit.outlier_ratio,
-            f"sd_{method}_residual_px": fit.residual_std_px,
-            f"sd_{method}_r2": fit.r_squared,
-            "sd_answered": fit.answered_ratio,
-        }
-    return found
-
-
-_OF_FRAME: Mapping[str, Any] = {
-    "psnr": lambda picture, target, models: {"psnr": psnr_db(picture, target.right)},
-    "ssim": lambda picture, target, models: {"ssim": ssim(picture, target.right)},
-    "p_psnr": _p_psnr,
-    "e_match": _e_match,
-    "sd": _sd,
-}

@@ -10,11 +10,12 @@ from PIL import Image
 from scipy.stats import linregress
 
 from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.frame_metrics import MetricModels, TargetFrame
 from stereogenbench_data.evaluation.metrics.scale import fit_scale, scale_settings
 from stereogenbench_data.evaluation.models.interfaces import StereoMatcher
 from stereogenbench_data.evaluation.models.opencv import Sgbm
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, MetricModels
-from stereogenbench_data.evaluation.scene_scores import PairScorer, TargetFrame
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+from stereogenbench_data.evaluation.scene_scores import PairScorer
 from tests.evaluation.conftest import photograph
 
 METHODS = ("filtered", "least_squares", "theil_sen")

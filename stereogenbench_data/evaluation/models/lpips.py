@@ -61,8 +61,8 @@ class Lpips:
                 f"AlexNet: {TRUNK.how_to_fetch(weights)}, or name the folder that it is in "
                 f"(--weights)."
             )
-        heads = read_weights(Path(package.origin).parent / HEADS, what="LPIPS")
         path = weights_path(TRUNK, folder=weights)
+        heads = read_weights(Path(package.origin).parent / HEADS, what="LPIPS")
         trunk = {
             name: value
             for name, value in read_weights(path, what=TRUNK.what).items()
@@ -142,7 +142,7 @@ class PerceptualDistance(nn.Module):
         return total
 
     def _activations(self, pictures: torch.Tensor) -> list[torch.Tensor]:
-        """Return what follows each rectification, of unit length at each pixel."""
+        """Return the output of each ReLU, of unit length at each pixel."""
         shift, scale = (
             torch.tensor(values, device=pictures.device)[:, None, None]
             for values in (_SHIFT, _SCALE)
