@@ -14,33 +14,8 @@ from typing import Any, Final
 from av.video.reformatter import VideoReformatter
 
 from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
-from stereogenbench_data.evaluation.metrics.matching import (
-    TargetMatches,
-    match_error,
-    match_settings,
-    target_matches,
-)
-from stereogenbench_data.evaluation.metrics.pixels import (
-    PATCH_SETTINGS,
-    PSNR_SETTINGS,
-    SSIM_SETTINGS,
-    PatchScore,
-    outside_window,
-    patch_psnr,
-    psnr_db,
-    ssim,
-)
-from stereogenbench_data.evaluation.metrics.scale import fit_scale, scale_settings
-from stereogenbench_data.evaluation.models.interfaces import (
-    ImageFeatures,
-    KeypointMatcher,
-    Keypoints,
-    PairMetric,
-    Picture,
-    Settings,
-    StereoMatcher,
-    VideoFeatures,
-)
+from stereogenbench_data.evaluation.metrics import matching, pixels, scale
+from stereogenbench_data.evaluation.models import interfaces
 from stereogenbench_data.evaluation.models.registry import ModelKind, load_model
 from stereogenbench_data.evaluation.predictions import scaled_rgb
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
@@ -64,29 +39,33 @@ class MetricModels:
         self.protocol = protocol
 
     @cached_property
-    def keypoint_matcher(self) -> KeypointMatcher:
+    def keypoint_matcher(self) -> interfaces.KeypointMatcher:
         """What finds the matches of E_match."""
-        matcher: KeypointMatcher = self._load("keypoint matcher", self.protocol.keypoint_matcher)
+        matcher: interfaces.KeypointMatcher = self._load(
+            "keypoint matcher", self.protocol.keypoint_matcher
+        )
         return matcher
 
     @cached_property
-    def stereo_matcher(self) -> StereoMatcher:
+    def stereo_matcher(self) -> interfaces.StereoMatcher:
         """What finds the disparity of SD."""
-        matcher: StereoMatcher = self._load("stereo matcher", self.protocol.stereo_matcher)
+        matcher: interfaces.StereoMatcher = self._load(
+            "stereo matcher", self.protocol.stereo_matcher
+        )
         return matcher
 
     @cached_property
-    def pair_metrics(self) -> dict[str, PairMetric]:
+    def pair_metrics(self) -> dict[str, interfaces.PairMetric]:
         """The learned metrics of pairs of pictures, by column."""
         return self._load_metrics("pair metric", {"lpips": "lpips"})
 
     @cached_property
-    def image_features(self) -> dict[str, ImageFeatures]:
+    def image_features(self) -> dict[str, interfaces.ImageFeatures]:
         """The features of each distance between sets of frames."""
         return self._load_metrics("image features", IMAGE_DISTANCES)
 
     @cached_property
-    def video_features(self) -> dict[str, VideoFeatures]:
+    def video_features(self) -> dict[str, interfaces.VideoFeatures]:
         """The features of each distance between sets of clips."""
         return self._load_metrics("video features", VIDEO_DISTANCES)
 
@@ -140,7 +119,7 @@ class CachedKeypoints:
     """The models' keypoint matcher; it detects the keypoints of one and the same array once."""
 
     models: MetricModels
-    found: dict[int, tuple[Any, Keypoints]] = field(default_factory=dict)
+    found: dict[int, tuple[Any, interfaces.Keypoints]] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -148,18 +127,18 @@ class CachedKeypoints:
         return self.models.keypoint_matcher.name
 
     @property
-    def settings(self) -> Settings:
+    def settings(self) -> interfaces.Settings:
         """Its settings."""
         return self.models.keypoint_matcher.settings
 
-    def detect(self, picture: Picture) -> Keypoints:
+    def detect(self, picture: interfaces.Picture) -> interfaces.Keypoints:
         """Return the keypoints of a picture."""
         if id(picture) not in self.found:
             # The picture is kept too, so that no other takes its identity.
             self.found[id(picture)] = picture, self.models.keypoint_matcher.detect(picture)
         return self.found[id(picture)][1]
 
-    def match(self, left: Keypoints, right: Keypoints) -> Any:
+    def match(self, left: interfaces.Keypoints, right: interfaces.Keypoints) -> Any:
         """Return indices of matched keypoints."""
         return self.models.keypoint_matcher.match(left, right)
 
@@ -195,23 +174,23 @@ class TargetFrame:
         return TargetFrame(sample, self.matcher, load_stored=self._load_stored)
 
     @cached_property
-    def ceiling(self) -> PatchScore:
+    def ceiling(self) -> pixels.PatchScore:
         """P-PSNR of the rendered view."""
-        return patch_psnr(self.left, self.right)
+        return pixels.patch_psnr(self.left, self.right)
 
     @cached_property
     def outside(self) -> float:
         """The share of measured pixels whose disparity P-PSNR does not search."""
-        return outside_window(self.sample["disparity"][0], self.sample["valid"][0])
+        return pixels.outside_window(self.sample["disparity"][0], self.sample["valid"][0])
 
     @cached_property
-    def matches(self) -> TargetMatches:
+    def matches(self) -> matching.TargetMatches:
         """The matches of left and rendered right view."""
-        return target_matches(self.left, self.right, matcher=self.matcher)
+        return matching.target_matches(self.left, self.right, matcher=self.matcher)
 
 
 def _p_psnr(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
-    score = patch_psnr(target.left, picture)
+    score = pixels.patch_psnr(target.left, picture)
     return {
         "p_psnr": score.mean_db,
         "p_psnr_pooled": score.pooled_db,
@@ -221,7 +200,7 @@ def _p_psnr(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str
 
 
 def _e_match(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
-    return asdict(match_error(picture, against=target.matches, matcher=target.matcher))
+    return asdict(matching.match_error(picture, against=target.matches, matcher=target.matcher))
 
 
 def _sd(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, float]:
@@ -229,7 +208,7 @@ def _sd(picture: Any, target: TargetFrame, models: MetricModels) -> dict[str, fl
     estimated_px = models.stereo_matcher(target.left, picture)
     found: dict[str, float] = {}
     for method in models.protocol.fits:
-        fit = fit_scale(
+        fit = scale.fit_scale(
             estimated_px,
             target.sample["disparity"][0],
             scored=target.sample["visible"][0],
@@ -258,25 +237,27 @@ class FrameMetric:
         fields: The fields of a sample that it needs besides both views.
     """
 
-    score: Callable[[Picture, TargetFrame, MetricModels], Mapping[str, float]]
-    settings: Callable[[MetricModels], Settings]
+    score: Callable[[interfaces.Picture, TargetFrame, MetricModels], Mapping[str, float]]
+    settings: Callable[[MetricModels], interfaces.Settings]
     fields: tuple[str, ...] = ()
 
 
 OF_FRAME: Final[dict[str, FrameMetric]] = {
     "psnr": FrameMetric(
-        lambda picture, target, models: {"psnr": psnr_db(picture, target.right)},
-        lambda models: PSNR_SETTINGS,
+        lambda picture, target, models: {"psnr": pixels.psnr_db(picture, target.right)},
+        lambda models: pixels.PSNR_SETTINGS,
     ),
     "ssim": FrameMetric(
-        lambda picture, target, models: {"ssim": ssim(picture, target.right)},
-        lambda models: SSIM_SETTINGS,
+        lambda picture, target, models: {"ssim": pixels.ssim(picture, target.right)},
+        lambda models: pixels.SSIM_SETTINGS,
     ),
-    "e_match": FrameMetric(_e_match, lambda models: match_settings(models.keypoint_matcher)),
-    "p_psnr": FrameMetric(_p_psnr, lambda models: PATCH_SETTINGS, ("disparity", "valid")),
+    "e_match": FrameMetric(
+        _e_match, lambda models: matching.match_settings(models.keypoint_matcher)
+    ),
+    "p_psnr": FrameMetric(_p_psnr, lambda models: pixels.PATCH_SETTINGS, ("disparity", "valid")),
     "sd": FrameMetric(
         _sd,
-        lambda models: scale_settings(models.stereo_matcher, method=models.protocol.fit),
+        lambda models: scale.scale_settings(models.stereo_matcher, method=models.protocol.fit),
         ("disparity", "visible"),
     ),
 }
