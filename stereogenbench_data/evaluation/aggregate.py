@@ -1,6 +1,6 @@
-"""What a method scored: frames are averaged first, then the pairs of a scene, then scenes.
+"""The scores of a method: frames are averaged first, then the pairs of a scene, then scenes.
 
-Every scene counts once, however many frames and pairs it has, and intervals are over scenes.
+Every scene counts once, whatever the number of its frames and pairs. Intervals are over scenes.
 """
 
 import math

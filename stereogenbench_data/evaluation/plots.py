@@ -1,6 +1,6 @@
 """Each metric against the baseline: a point for each pair, bins with intervals, the paper's bins.
 
-Methods of one plot are of one tier and scored in one way.
+A plot shows methods of one tier that were scored in one way.
 """
 
 from collections.abc import Iterable, Sequence

@@ -41,7 +41,7 @@ class Sift:
     """
 
     def __init__(self, *, keypoints: int = KEYPOINTS) -> None:
-        """Make a matcher of up to so many keypoints a picture.
+        """Make a matcher that keeps at most ``keypoints`` of each picture.
 
         Raises:
             ExtraError: If OpenCV is not installed.
@@ -101,13 +101,13 @@ _BLOCK_PX: Final = 5
 class Sgbm:
     """Semi-global matching with left-right check, disparities from -16 up to 175 px.
 
-    The few negative ones tell a view that is shifted the wrong way, or not at all, from one that
-    is shifted a little. It has no answer in the columns at both sides whose search range leaves
-    the picture, and none for larger disparities.
+    The negative ones distinguish a view that is shifted the wrong way, or not at all, from one that
+    is shifted a little. There is no answer for larger disparities, nor in the columns at both sides
+    whose search range leaves the picture.
     """
 
     def __init__(self, *, disparities: int = 192) -> None:
-        """Make a matcher of so many disparities, a multiple of 16.
+        """Make a matcher that searches ``disparities`` values, a multiple of 16.
 
         Raises:
             ExtraError: If OpenCV is not installed.
