@@ -24,7 +24,7 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine import LOCAL, Advance
+from stereogenbench_data.engine import LOCAL, Advance, Engine
 from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
 from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, item_name
 from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
@@ -53,10 +53,12 @@ class ExportOptions(Selection, total=False):
 
     Attributes:
         workers: How many processes, None for one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with (frames done, frames in all).
     """
 
     workers: int | None
+    engine: Engine
     progress: Progress
 
 
@@ -119,7 +121,7 @@ def export_inputs(
     done = total - sum(len(work.wanted.frames) for work in works)
     after_frames = frame_counter(progress, done=done, total=total)
     with closing(
-        LOCAL.map(
+        options.get("engine", LOCAL).map(
             _write_item,
             works,
             name=lambda work: f"{work.wanted.scene}, pair {work.wanted.pair}",
