@@ -68,9 +68,9 @@ def test_tables_of_fields_and_pictures_stand_in_the_pages(built):
     assert (site / "pictures" / "sheet.png").stat().st_size < 400_000
 
 
-def test_the_reference_tells_what_a_class_takes_and_of_whom_a_default_is_zero(built):
+def test_the_reference_shows_signatures_and_defaults_of_zero(built):
     reference, commands = text_of(built[1], "api"), text_of(built[1], "commands")
 
     assert "StereoPairs(data, *," in " ".join(reference.split())
     assert "_MappedScenes" not in reference
-    assert re.search(r"--seed\s+What chance decides follows from it\.\s+0\s", commands)
+    assert re.search(r"--seed\s+Seed of all that is random\.\s+0\s", commands)

@@ -1,4 +1,4 @@
-"""``stereogenbench doctor``: the depth contract, found from the pictures themselves."""
+"""``stereogenbench doctor``: find the depth contract from the pictures."""
 
 import json
 import math
@@ -10,6 +10,7 @@ import typer
 
 from stereogenbench_data.cli.options import (
     DataOptions,
+    EngineOption,
     JsonOption,
     OutOption,
     SceneOptions,
@@ -28,13 +29,13 @@ if TYPE_CHECKING:
 
 
 QUOTIENT_MEANS = (
-    "Only unit / (focal length x baseline) is seen in disparity: which of the three is wrong where "
-    "the quotient is, or whether two of them make up for each other, no picture tells."
+    "Disparity shows only the quotient unit / (focal length x baseline). No picture tells which of "
+    "the three is wrong, or whether two of them cancel out."
 )
 NOT_ASKED = (
-    "Not asked here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
-    "beside the poses, colours, depth that lies a pixel aside or where there is no texture, "
-    "frames other than those looked at."
+    "Not tested here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
+    "beside the poses, colours, depth that is off by a pixel or lies where there is no texture, "
+    "and all other frames."
 )
 _DB_NOTE = (
     "dB of the quotient, kind and offset count small differences under a tight cap: they "
@@ -46,35 +47,38 @@ _DB_NOTE = (
 def doctor(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     *,
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Look at so many scenes.")] = 6,
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes to look at.")] = 6,
     frames: Annotated[int, typer.Option(min=1, help="Frames of each scene.")] = 4,
     chosen: SceneOptions,
     unit_m: Annotated[
         float | None,
-        typer.Option(help="Ask about this many metres in a stored unit [as tagged, else 0.1]."),
+        typer.Option(help="Declare this many metres in a stored unit [as tagged, else 0.1]."),
     ] = None,
     kind: Annotated[
-        Literal["planar", "ray"], typer.Option(help="Ask about depth along the axis or the ray.")
+        Literal["planar", "ray"], typer.Option(help="Declare depth along the axis or the ray.")
     ] = "planar",
     form: Annotated[
-        Literal["depth", "inverse"], typer.Option(help="Ask about stored depth, or its inverse.")
+        Literal["depth", "inverse"], typer.Option(help="Declare stored depth or its inverse.")
     ] = "depth",
     frame_lag: Annotated[
-        int, typer.Option(help="Ask about depth frame t + LAG for RGB frame t.")
+        int, typer.Option(help="Declare that RGB frame t has depth frame t + LAG.")
     ] = 0,
     out: OutOption = None,
     as_json: JsonOption = False,
     workers: WorkersOption = None,
+    engine: EngineOption = "local",
 ) -> None:
-    """Find out from the pictures how stored depth becomes metres, and where it belongs.
+    """Find from the pictures how stored depth becomes metres, and which picture it belongs to.
 
-    Compares what a scene's cameras see with what depth predicts: planar or ray, inverse, frame lag,
-    camera order, flips, offset, unit / (focal length x baseline), and each camera beside the
-    others. -o writes a picture. The exit status is 0 if the declared contract fits or nothing can
-    be told, 1 if another one is clearly better or a camera does not fit, 2 if it could not be done.
+    The doctor compares what the cameras of a scene see with what depth predicts: planar or ray,
+    inverse, frame lag, camera order, flips, offset, unit / (focal length x baseline), and each
+    camera beside the others. -o writes a picture. The exit status is 0 if the declared contract
+    fits or the pictures cannot tell, 1 if another one is clearly better or a camera does not fit,
+    2 if the command failed.
     """
     from stereogenbench_data.audit.contract.doctor import diagnose
     from stereogenbench_data.audit.contract.picture import draw_report, require_picture_file
+    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.schema.records import DepthEncoding
 
     if out is not None:
@@ -89,6 +93,7 @@ def doctor(  # noqa: PLR0913 - one parameter an option
             frames=frames,
             depth=depth,
             workers=workers,
+            engine=engine_of(engine),
             progress=progress,
             filters=filters,
         )
@@ -119,24 +124,17 @@ def _lines(report: "DoctorReport") -> list[str]:
     if silent and len(silent) < len(report.scenes):
         lines += [f"{scene.key}: cannot tell: {scene.problem}" for scene in silent]
     for verdict in report.verdicts:
-        lines += ["", *_verdict_lines(verdict, report)]
+        lines.append("")
+        if len(report.verdicts) > 1:
+            lines.append(f"{counted(len(verdict.scenes), 'scene')}: {', '.join(verdict.scenes)}")
+        rows = [("question", "declared", "pictures say", "", "next best")]
+        rows += [_row(answer) for answer in verdict.answers]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines += ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        lines += ["", *_conclusion(verdict, report), *_tested_lines(verdict), *verdict.beside]
     if any(math.isfinite(scene.gain.mean_db) for scene in report.scenes):
         lines += ["", QUOTIENT_MEANS, _DB_NOTE]
     return lines
-
-
-def _verdict_lines(verdict: "Verdict", report: "DoctorReport") -> list[str]:
-    lines = []
-    if len(report.verdicts) > 1:
-        lines.append(f"{counted(len(verdict.scenes), 'scene')}: {', '.join(verdict.scenes)}")
-    rows = [_row(answer) for answer in verdict.answers]
-    rows.insert(0, ("question", "declared", "pictures say", "", "next best"))
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    for row in rows:
-        cells = [text.ljust(width) for text, width in zip(row, widths, strict=False)]
-        lines.append("  ".join([*cells, row[4]]).rstrip())
-    lines += ["", *_conclusion(verdict, report), *_tested_lines(verdict)]
-    return [*lines, *verdict.beside]
 
 
 def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
@@ -166,7 +164,7 @@ def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
 
 
 def _tested_lines(verdict: "Verdict") -> list[str]:
-    """Return which cameras were tested, how much is explained, and what is not asked here."""
+    """Return which cameras were tested, how much is explained, and what is not tested here."""
     lines = []
     if math.isfinite(verdict.agreement):
         lines.append(
@@ -194,14 +192,12 @@ def _cameras(cameras: Sequence[int]) -> str:
 
 
 def _row(answer: "Answer") -> tuple[str, str, str, str, str]:
-    last = answer.note
+    notes = [answer.note] if answer.note else []
+    is_wrong = "wrong" in answer.status
     if answer.behind is not None and math.isfinite(answer.behind.mean_db):
-        gain = _gain_words(answer.behind)
-        said = f"declared is {gain} worse" if "wrong" in answer.status else f"{gain} worse"
-        last = f"{said}; {answer.note}" if answer.note else said
-    return answer.topic, answer.declared, answer.found or "?", answer.status.upper() if (
-        "wrong" in answer.status
-    ) else answer.status, last  # fmt: skip
+        notes.insert(0, f"{'declared is ' * is_wrong}{_gain_words(answer.behind)} worse")
+    status = answer.status.upper() if is_wrong else answer.status
+    return answer.topic, answer.declared, answer.found or "?", status, "; ".join(notes)
 
 
 def _gain_words(gain: "Gain") -> str:
@@ -211,32 +207,30 @@ def _gain_words(gain: "Gain") -> str:
 
 
 def _json(report: "DoctorReport") -> str:
+    from stereogenbench_data.audit.contract.verdict import encoding_line
+
+    verdicts = []
+    for verdict in report.verdicts:
+        paste = None if verdict.encoding is None else encoding_line(verdict.encoding)
+        verdicts.append(asdict(verdict) | {"paste": paste})
+    scenes = []
+    for scene in report.scenes:
+        offsets_px = [{"pair": pair, "px": px} for pair, px in scene.offsets_px.items()]
+        scenes.append(asdict(scene) | {"offsets_px": offsets_px})
     document = {
         "data": report.data,
         "is_wrong": report.is_wrong,
         "quotient_means": QUOTIENT_MEANS,
         "not_asked": NOT_ASKED,
-        "verdicts": [_plain(_verdict_document(verdict)) for verdict in report.verdicts],
-        "scenes": [_plain(_scene_document(asdict(scene))) for scene in report.scenes],
+        "verdicts": verdicts,
+        "scenes": scenes,
         "left_out": report.left_out,
     }
-    return json.dumps(document, indent=2)
-
-
-def _verdict_document(verdict: "Verdict") -> dict[str, Any]:
-    from stereogenbench_data.audit.contract.verdict import encoding_line
-
-    encoding = verdict.encoding
-    return asdict(verdict) | {"paste": None if encoding is None else encoding_line(encoding)}
-
-
-def _scene_document(scene: dict[str, Any]) -> dict[str, Any]:
-    offsets_px = [{"pair": pair, "px": px} for pair, px in scene["offsets_px"].items()]
-    return scene | {"offsets_px": offsets_px}
+    return json.dumps(_plain(document), indent=2)
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON has it: numbers that are none become null."""
+    """Return a value as JSON has it; numbers that are not finite become null."""
     if isinstance(value, dict):
         return {str(name): _plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple | set | frozenset):

@@ -43,7 +43,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     ] = None,
     name: Annotated[str | None, typer.Option(help="The dataset's name [StereoGenBench].")] = None,
     release: Annotated[
-        str | None, typer.Option("--release", help="MAJOR.MINOR.PATCH of the data [1.0.0].")
+        str | None, typer.Option(help="MAJOR.MINOR.PATCH of the data [1.0.0].")
     ] = None,
     published: Annotated[
         datetime | None,
