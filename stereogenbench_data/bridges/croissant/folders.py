@@ -4,7 +4,7 @@ JSON files outside tars can be parsed, so scenes and pairs are read from each ``
 the descriptor does not depend on the number of scenes.
 """
 
-from typing import Any, Final
+from typing import Final
 
 from stereogenbench_data.bridges.croissant.nodes import (
     ENCODINGS,
@@ -94,11 +94,8 @@ def _file_sets(suffixes: dict[str, str]) -> dict[str, tuple[str | list[str], str
     }
 
 
-def _in_json(files: str, path: str, *, then: str | None = None) -> dict[str, Any]:
-    source: Node = {"fileSet": {"@id": files}, "extract": {"jsonPath": path}}
-    if then is not None:
-        source["transform"] = {"jsonPath": then}
-    return {"source": source}
+def _in_json(files: str, path: str) -> Node:
+    return {"source": {"fileSet": {"@id": files}, "extract": {"jsonPath": path}}}
 
 
 def _scenes() -> Node:
@@ -120,26 +117,18 @@ def _scenes() -> Node:
 
 
 def _pairs() -> Node:
+    each_pair = "$.pairwise_pairs[*]"
     fields = [
         field(
             "pairs/scene_id", "sc:Text", "Path of the scene.",
             **of_file("pair-files", "fullpath", regex=_KEY),
         ),
         *(
-            field(f"pairs/{name}", kind, text, **_in_json("pair-files", path))
-            for name, kind, text, path in (
-                (
-                    "camera_left", "sc:Integer", "Number of the left camera.",
-                    "$.pairwise_pairs[*].camera_index_a",
-                ),
-                (
-                    "camera_right", "sc:Integer", "Number of the right camera.",
-                    "$.pairwise_pairs[*].camera_index_b",
-                ),
-                (
-                    "baseline_cm", "sc:Float", "Distance of the two cameras, in cm.",
-                    "$.pairwise_pairs[*].baseline_cm",
-                ),
+            field(f"pairs/{name}", kind, about, **_in_json("pair-files", f"{each_pair}.{key}"))
+            for name, key, kind, about in (
+                ("camera_left", "camera_index_a", "sc:Integer", "Number of the left camera."),
+                ("camera_right", "camera_index_b", "sc:Integer", "Number of the right camera."),
+                ("baseline_cm", "baseline_cm", "sc:Float", "Distance of the two cameras, in cm."),
             )
         ),
     ]  # fmt: skip
