@@ -98,19 +98,23 @@ def _in_json(files: str, path: str) -> Node:
     return {"source": {"fileSet": {"@id": files}, "extract": {"jsonPath": path}}}
 
 
+def _scene_of(records: str, files: str, about: str = "Path of the scene.") -> Node:
+    return field(f"{records}/scene_id", "sc:Text", about, **of_file(files, "fullpath", regex=_KEY))
+
+
 def _scenes() -> Node:
+    intrinsics = "$.camera_intrinsics"
     fields = [
-        field(
-            "scenes/scene_id", "sc:Text", "Path of the scene: split, subset, family, map, number.",
-            **of_file("scene-files", "fullpath", regex=_KEY),
+        _scene_of(
+            "scenes", "scene-files", "Path of the scene: split, subset, family, map, number."
         ),
         field(
             "scenes/focal_mm", "sc:Float", "Focal length of all six cameras, in mm.",
-            **_in_json("scene-files", "$.camera_intrinsics.focal_length_mm"),
+            **_in_json("scene-files", f"{intrinsics}.focal_length_mm"),
         ),
         field(
             "scenes/sensor_width_mm", "sc:Float", "Width of the sensor, in mm.",
-            **_in_json("scene-files", "$.camera_intrinsics.sensor_width_mm"),
+            **_in_json("scene-files", f"{intrinsics}.sensor_width_mm"),
         ),
     ]  # fmt: skip
     return record_set("scenes", "Every scene once.", fields, key={"@id": "scenes/scene_id"})
@@ -119,10 +123,7 @@ def _scenes() -> Node:
 def _pairs() -> Node:
     each_pair = "$.pairwise_pairs[*]"
     fields = [
-        field(
-            "pairs/scene_id", "sc:Text", "Path of the scene.",
-            **of_file("pair-files", "fullpath", regex=_KEY),
-        ),
+        _scene_of("pairs", "pair-files"),
         *(
             field(f"pairs/{name}", kind, about, **_in_json("pair-files", f"{each_pair}.{key}"))
             for name, key, kind, about in (
@@ -131,19 +132,14 @@ def _pairs() -> Node:
                 ("baseline_cm", "baseline_cm", "sc:Float", "Distance of the two cameras, in cm."),
             )
         ),
-    ]  # fmt: skip
+    ]
     return record_set("pairs", "Every stereo pair once: 15 a scene.", fields)
 
 
 def _descriptions() -> Node:
-    fields = [
-        field(
-            "descriptions/scene_id", "sc:Text", "Path of the scene.",
-            **of_file("description-files", "fullpath", regex=_KEY),
-        ),
-        field(
-            "descriptions/text", "sc:Text", "What a model says of the scene.",
-            **of_file("description-files", "content"),
-        ),
-    ]  # fmt: skip
+    text = field(
+        "descriptions/text", "sc:Text", "What a model says of the scene.",
+        **of_file("description-files", "content"),
+    )  # fmt: skip
+    fields = [_scene_of("descriptions", "description-files"), text]
     return record_set("descriptions", "Machine-written descriptions, where there are any.", fields)
