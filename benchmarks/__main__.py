@@ -94,13 +94,13 @@ def measure(options: argparse.Namespace, *, report: Callable[[str], None]) -> li
         workloads, others = chosen(options)
         plan = Plan(rounds=rounds, resume=options.resume)
         failed += run_races(workloads, material, results, plan=plan, report=report)
-        failed += _measure_others(others, material, results, options=options, report=report)
+        failed += measure_others(others, material, results, options=options, report=report)
     write_pages(results, options.out)
     report(f"results are in {options.out}")
     return failed
 
 
-def _measure_others(
+def measure_others(
     names: list[str],
     material: Material,
     results: Results,
@@ -108,6 +108,7 @@ def _measure_others(
     options: argparse.Namespace,
     report: Callable[[str], None],
 ) -> list[str]:
+    """Run the measurements beside the races; return a message for each failure."""
     rounds = 1 if options.quick else options.rounds
     work = {
         "accuracy": lambda: measure_accuracy(material, rounds=rounds, cases=CASES, report=report),

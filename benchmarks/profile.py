@@ -109,7 +109,7 @@ def measure_profile(material: Material, *, rounds: int, report: Report) -> dict[
                 if not data.exists():
                     continue
                 report(f"profile: {workload.name} from {source}")
-                runs = [in_a_fork(functools.partial(_profiled, job, data)) for _ in range(rounds)]
+                runs = [in_a_fork(functools.partial(profiled, job, data)) for _ in range(rounds)]
                 found[f"{workload.name} from {source}"] = {
                     "title": workload.title,
                     "missing": runs[0]["missing"],
@@ -121,7 +121,8 @@ def measure_profile(material: Material, *, rounds: int, report: Report) -> dict[
     return found
 
 
-def _profiled(job: Job, data: Path) -> dict[str, Any]:
+def profiled(job: Job, data: Path) -> dict[str, Any]:
+    """Return milliseconds a sample by label for a workload in one worker, and missing functions."""
     torch.set_num_threads(1)
     spans = Spans()
     missing = spans.install()

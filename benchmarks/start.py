@@ -66,7 +66,7 @@ def measure_start(material: Material, *, rounds: int, report: Report) -> dict[st
         check=False,
     )
     report("start: index of 8,493 scenes")
-    index = [in_a_fork(lambda: _open_and_select(material)) for _ in range(rounds)]
+    index = [in_a_fork(lambda: open_and_select(material)) for _ in range(rounds)]
     report("start: first batch, cold")
     first = _first_batches(material, rounds=rounds)
     report("start: resuming at half an epoch")
@@ -103,7 +103,8 @@ def _python(*words: str, rounds: int) -> dict[str, float]:
     return spread_of(times)
 
 
-def _open_and_select(material: Material) -> dict[str, float]:
+def open_and_select(material: Material) -> dict[str, float]:
+    """Return the seconds to open the full index and to select from it."""
     began = time.perf_counter()
     index = SceneIndex.open(material.full_index)
     opened = time.perf_counter()
@@ -222,10 +223,11 @@ def _bare_s(job: Job, wanted: list[Wanted]) -> float:
 def measure_memory(material: Material, *, batches: int, report: Report) -> dict[str, Any]:
     """Return the section of the results on a worker's memory: all pairs, default settings."""
     report(f"memory: {batches} batches")
-    return in_a_fork(lambda: _watch(material, batches=batches, report=report))
+    return in_a_fork(lambda: watch_memory(material, batches=batches, report=report))
 
 
-def _watch(material: Material, *, batches: int, report: Report) -> dict[str, Any]:
+def watch_memory(material: Material, *, batches: int, report: Report) -> dict[str, Any]:
+    """Return the memory of workers in this process's loader, in megabytes after every batch."""
     workers, size = 2, 4
     pairs = StereoPairs(material.many, pairs="all", frames="all")
     loader = pairs.loader(size, num_workers=workers, seed=0)

@@ -107,7 +107,7 @@ def test_the_functions_that_the_profile_times_are_there():
 def test_the_parts_of_a_profile_add_up_to_the_whole(material):
     job = Job(TINY["all-frames"], material)
 
-    found = clock.in_a_fork(lambda: profile._profiled(job, job.tree))
+    found = clock.in_a_fork(lambda: profile.profiled(job, job.tree))
 
     assert found["ms"]["decoding depth"] > 0
     assert found["ms"]["decoding colour"] > 0
@@ -115,8 +115,8 @@ def test_the_parts_of_a_profile_add_up_to_the_whole(material):
 
 
 def test_starting_and_memory_are_measured(material):
-    index = start._open_and_select(material)
-    watched = clock.in_a_fork(lambda: start._watch(material, batches=2, report=str))
+    index = start.open_and_select(material)
+    watched = clock.in_a_fork(lambda: start.watch_memory(material, batches=2, report=str))
 
     assert index["pairs"] == 15 * round(774 * material.scale)
     assert watched["batches"] == 2
@@ -201,7 +201,7 @@ def test_a_step_that_fails_is_told_and_the_others_are_measured(material, tmp_pat
     monkeypatch.setattr(__main__, "measure_profile", lambda *_, **__: {"all": 1})
     results, reported = Results(tmp_path / "results.json"), []
 
-    failed = __main__._measure_others(
+    failed = __main__.measure_others(
         ["memory", "profile"],
         material,
         results,
@@ -228,10 +228,10 @@ def test_options_choose_workloads_and_workers():
     assert others == ["memory"]
 
 
-def test_the_command_is_said_to_need_a_checkout(tmp_path):
+def test_the_command_names_the_checkout_that_it_needs(tmp_path):
     code = (
         "import sys, pathlib, stereogenbench_data.cli.bench as bench; "
-        "bench.__file__ = '/nowhere/at/all/bench.py'; bench._checkout()"
+        "bench.__file__ = '/nowhere/at/all/bench.py'; bench.bench()"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
