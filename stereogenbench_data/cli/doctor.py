@@ -146,20 +146,20 @@ def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
             f"Another contract is {_gain_words(verdict.gain)} better than the declared one."
         )
     if verdict.choices:
-        lines.append("One of these explains the quotient, and the pictures do not tell which:")
+        lines.append("One of these explains the quotient; the pictures cannot tell which:")
         lines += [f"  - {choice}" for choice in verdict.choices]
     if verdict.encoding is not None:
         lines.append(f"Paste: {encoding_line(verdict.encoding)}")
     elif verdict.is_wrong:
-        lines.append("Nothing to paste: no DepthEncoding is sure to put this right.")
+        lines.append("Nothing to paste: no DepthEncoding is certain to correct this.")
     elif verdict.fits:
         lines.append(f"The declared contract fits: {encoding_line(report.declared)}")
     elif math.isfinite(verdict.agreement) and not verdict.unexplained_cameras:
         open_topics = [a.topic for a in verdict.answers if a.status == "cannot tell"]
-        untold = f" Not told: {', '.join(open_topics)}." if open_topics else ""
-        lines.append(f"Cannot tell on the whole: nothing contradicts what is declared.{untold}")
+        undecided = f" Undecided: {', '.join(open_topics)}." if open_topics else ""
+        lines.append(f"Cannot tell: nothing contradicts the declared contract.{undecided}")
     else:
-        lines.append("Cannot tell: the pictures do not decide on the declared contract.")
+        lines.append("Cannot tell: the pictures do not decide about the declared contract.")
     return lines
 
 
@@ -180,7 +180,7 @@ def _tested_lines(verdict: "Verdict") -> list[str]:
         lines.append(f"Depth and pictures tested: {_cameras(verdict.tested_cameras)}.")
     if verdict.untested_cameras:
         lines.append(
-            f"NOT TESTED, for want of matches: {_cameras(verdict.untested_cameras)}. "
+            f"NOT TESTED, too few matches: {_cameras(verdict.untested_cameras)}. "
             "Run `stereogenbench audit`."
         )
     return [*lines, NOT_ASKED]
