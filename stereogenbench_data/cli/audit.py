@@ -11,11 +11,10 @@ import typer
 from stereogenbench_data.cli.opening import full_place
 from stereogenbench_data.cli.options import (
     DataOptions,
-    EngineOption,
     JsonOption,
     OutOption,
     SceneOptions,
-    WorkersOption,
+    WorkOptions,
     complete_from,
     grouped,
 )
@@ -79,8 +78,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
         ),
     ] = None,
     as_json: JsonOption = False,
-    workers: WorkersOption = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
 ) -> None:
     """Measure whether data are right, and list what is wrong.
 
@@ -93,7 +91,6 @@ def audit(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.audit import geometry_audit
     from stereogenbench_data.audit.audit_records import AuditLimits
     from stereogenbench_data.audit.audit_table import audit_markdown
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.schema.records import DepthEncoding
 
     if out is not None and out.is_dir():
@@ -114,7 +111,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
         depth=None if contract == DepthEncoding() else contract,
         limits=AuditLimits.parse(limit or []),
     )
-    options: Any = chosen.filters() | {"workers": workers, "engine": engine_of(engine)}
+    options: Any = chosen.filters() | work.options()
     with progress_bar("reading the index", unit="scenes") as progress:
         index = geometry_audit.open_for_audit(
             source.data, root=source.data_root, progress=progress, **options

@@ -10,11 +10,10 @@ import typer
 
 from stereogenbench_data.cli.options import (
     DataOptions,
-    EngineOption,
     JsonOption,
     OutOption,
     SceneOptions,
-    WorkersOption,
+    WorkOptions,
     grouped,
 )
 from stereogenbench_data.cli.outcome import FINDINGS
@@ -65,8 +64,7 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     ] = 0,
     out: OutOption = None,
     as_json: JsonOption = False,
-    workers: WorkersOption = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
 ) -> None:
     """Find from the pictures how stored depth becomes metres, and which picture it belongs to.
 
@@ -78,7 +76,6 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     """
     from stereogenbench_data.audit.contract.doctor import diagnose
     from stereogenbench_data.audit.contract.picture import draw_report, require_picture_file
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.schema.records import DepthEncoding
 
     if out is not None:
@@ -92,8 +89,7 @@ def doctor(  # noqa: PLR0913 - one parameter an option
             scenes=scenes,
             frames=frames,
             depth=depth,
-            workers=workers,
-            engine=engine_of(engine),
+            **work.options(),
             progress=progress,
             filters=filters,
         )

@@ -14,11 +14,10 @@ import typer
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
-    EngineOption,
     JsonOption,
     SceneOptions,
     SplitOption,
-    WorkersOption,
+    WorkOptions,
     depth_of,
     grouped,
 )
@@ -244,8 +243,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
     chosen: PairsOptions,
     size: SizeOption = PAPER_SIZE,
     depth_unit_m: DepthUnitOption = None,
-    workers: WorkersOption = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
 ) -> None:
     """Write the inputs of a tier: left views as PNG; G0 adds geometry, G1 the camera.
 
@@ -253,7 +251,6 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
     method as PREDICTIONS/ITEM/000.png ... or PREDICTIONS/ITEM.mp4, then run `stereogenbench
     evaluate` with the same selection. To continue a stopped run, run it again.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.evaluation.inputs import export_inputs as exported
 
     size_px, selection = parse_picture_size(size), chosen.selection()
@@ -265,8 +262,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
             tier=tier,
             size=size_px,
             depth=depth_of(depth_unit_m),
-            workers=workers,
-            engine=engine_of(engine),
+            **work.options(),
             progress=progress,
             **selection,
         )
@@ -299,8 +295,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
         typer.Option(min=0, help="Most pairs whose right view may be missing or unusable."),
     ] = 0,
     report: ReportOptions,
-    workers: WorkersOption = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
 ) -> None:
     """Score a method's right views by the paper's protocol, beside the paper's own rows.
 
@@ -308,7 +303,6 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON, plots) and
     partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it again.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.evaluation.evaluate import evaluate as evaluated
     from stereogenbench_data.evaluation.tables import tables_of
 
@@ -325,8 +319,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
             name=called,
             protocol=protocol,
             out=folder / "partial",
-            workers=workers,
-            engine=engine_of(engine, device=scoring.device),
+            **work.options(device=scoring.device),
             allow_missing=allow_missing,
             progress=progress,
             **selection,
@@ -336,15 +329,14 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
 
 @grouped
 @resumable()
-def controls(  # noqa: PLR0913 - one parameter an option
+def controls(
     source: DataOptions,
     *,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random right views.")] = 0,
     chosen: EvalPairsOptions,
     scoring: ProtocolOptions,
     report: ControlsReportOptions,
-    workers: WorkersOption = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
 ) -> None:
     """Score the calibration controls: a perfect, a copied, a wrong and a random right view.
 
@@ -353,7 +345,6 @@ def controls(  # noqa: PLR0913 - one parameter an option
     whether the relations between them hold; the exit status is 1 if one does not. It goes to --out
     [evaluation/controls]. To continue a stopped run, run it again.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.evaluation.controls import relations, score_controls
     from stereogenbench_data.evaluation.tables import branch_table, control_table, explaining_table
 
@@ -366,8 +357,7 @@ def controls(  # noqa: PLR0913 - one parameter an option
             protocol=protocol,
             seed=seed,
             out=folder / "partial",
-            workers=workers,
-            engine=engine_of(engine, device=scoring.device),
+            **work.options(device=scoring.device),
             progress=progress,
             **selection,
         )

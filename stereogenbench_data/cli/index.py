@@ -10,12 +10,12 @@ from rich.console import Console
 
 from stereogenbench_data.cli.opening import full_place
 from stereogenbench_data.cli.options import (
-    EngineOption,
     FamilyOption,
     JsonOption,
     MapOption,
     SplitOption,
-    workers_option,
+    WorkOptions,
+    grouped,
 )
 from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _INDEX_NAME = "index.parquet"
 
 
+@grouped
 @resumable()
 def index(  # noqa: PLR0913 - one parameter an option
     root: Annotated[
@@ -40,8 +41,7 @@ def index(  # noqa: PLR0913 - one parameter an option
             "--out", "-o", help=f"Index file to write [ROOT/{_INDEX_NAME}; for a URL here]."
         ),
     ] = None,
-    workers: Annotated[int | None, workers_option("Processes that read scenes")] = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
     valid_depth: Annotated[
         bool,
         typer.Option(
@@ -61,7 +61,6 @@ def index(  # noqa: PLR0913 - one parameter an option
     listed and left out; the exit status is 1 if a scene is broken. --split, --family and --map
     restrict which scenes are read.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.index.build import SceneJournal, walk
     from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
@@ -94,8 +93,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     ):
         report = walk(
             root,
-            workers=workers,
-            engine=engine_of(engine),
+            **work.options(),
             progress=progress,
             journal=journal,
             valid_depth=mode,

@@ -86,11 +86,6 @@ def depth_of(unit_m: float | None) -> "DepthEncoding | None":
     return None if unit_m is None else DepthEncoding(unit_m=unit_m)
 
 
-def workers_option(processes: str = "Processes") -> Any:
-    """Return ``--workers``, with a help text that says what the processes do."""
-    return typer.Option(min=1, help=f"{processes} [one a core].")
-
-
 RootOption = Annotated[
     str | None,
     typer.Option(
@@ -125,7 +120,7 @@ DepthUnitOption = Annotated[
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")]
-WorkersOption = Annotated[int | None, workers_option()]
+WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes [one a core].")]
 EngineOption = Annotated[
     str,
     typer.Option(
@@ -198,3 +193,24 @@ class SceneOptions:
             "caption": self.caption,
         }
         return {name: value for name, value in options.items() if value not in (None, [], ())}
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkOptions:
+    """How many processes do the work of a command, and where."""
+
+    workers: WorkersOption = None
+    engine: EngineOption = "local"
+
+    def options(self, *, device: str = "cpu") -> dict[str, Any]:
+        """Return ``workers`` and ``engine`` as the functions that do batch work take them.
+
+        Args:
+            device: Where tasks compute; on Ray each has its own GPU unless it is "cpu".
+
+        Raises:
+            StorageError: If there is no engine of that name.
+        """
+        from stereogenbench_data.engine import engine_of
+
+        return {"workers": self.workers, "engine": engine_of(self.engine, device=device)}

@@ -9,19 +9,18 @@ import typer
 
 from stereogenbench_data.cli.opening import open_index
 from stereogenbench_data.cli.options import (
-    EngineOption,
     JsonOption,
     RootOption,
     ShardsOptions,
-    WorkersOption,
+    WorkOptions,
     grouped,
-    workers_option,
 )
 from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted, plain_line
 
 
+@grouped
 @resumable()
 def pack(  # noqa: PLR0913 - one parameter an option
     root: Annotated[str, typer.Argument(help="Released tree, or its index file.")],
@@ -39,8 +38,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
         str,
         typer.Option(help="I/N packs every N-th shard from the I-th on: one part per machine."),
     ] = "1/1",
-    workers: Annotated[int | None, workers_option("Processes that pack")] = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
     depth_codec: Annotated[
         Literal["released", "blosc2"],
         typer.Option(
@@ -56,7 +54,6 @@ def pack(  # noqa: PLR0913 - one parameter an option
     change and metadata. `stereogenbench verify` reads every byte. With --part, run the same command
     once for each I; the last one to finish writes the index.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.shards.pack import pack as packed_by
     from stereogenbench_data.shards.plan import parse_size
 
@@ -74,8 +71,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
             target_bytes=target_bytes,
             depth_codec=depth_codec,
             part=(int(number), int(count)),
-            workers=workers,
-            engine=engine_of(engine),
+            **work.options(),
             progress=progress,
         )
     if as_json:
@@ -110,14 +106,12 @@ def verify(
         bool, typer.Option("--deep", help="Decode every video too, and count its frames.")
     ] = False,
     as_json: JsonOption = False,
-    workers: Annotated[int | None, workers_option("Processes that read")] = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
 ) -> None:
     """Read every byte of shards, and list what is wrong.
 
     The exit status is 0 if nothing is wrong, 1 if something is, 2 if they cannot be verified.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.shards.verify import verify as verified
 
     with progress_bar("verifying", unit="MB") as progress:
@@ -125,8 +119,7 @@ def verify(
             source.shards,
             root=source.data_root,
             mode="decode" if deep else "bytes",
-            workers=workers,
-            engine=engine_of(engine),
+            **work.options(),
             progress=progress,
         )
     if as_json:
@@ -150,8 +143,7 @@ def unpack(
     source: ShardsOptions,
     out: Annotated[Path, typer.Argument(help="Folder for the scenes.")],
     *,
-    workers: WorkersOption = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Turn shards back into released scenes; check each file against the index.
@@ -160,7 +152,6 @@ def unpack(
     video again, with the same numbers, times and tags. Nothing is overwritten. To continue a
     stopped run, run it again: it keeps the scenes that exist.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.shards.unpack import unpack as unpacked
 
     with progress_bar("unpacking", unit="MB") as progress:
@@ -168,8 +159,7 @@ def unpack(
             source.shards,
             out,
             root=source.data_root,
-            workers=workers,
-            engine=engine_of(engine),
+            **work.options(),
             progress=progress,
         )
     if as_json:

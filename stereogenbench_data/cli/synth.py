@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 import typer
 
 from stereogenbench_data.cli.options import (
-    EngineOption,
     JsonOption,
+    WorkOptions,
     complete_from,
-    workers_option,
+    grouped,
 )
 from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
@@ -27,6 +27,7 @@ RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"
 """The same as in `synthesis.request`, which the help does not import."""
 
 
+@grouped
 @resumable()
 def synth(  # noqa: PLR0913 - one parameter an option
     out: Annotated[Path, typer.Argument(help="Folder to write train/ or eval/ into.")],
@@ -55,8 +56,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
     rotation: Annotated[
         RotationForm, typer.Option(help="How trajectory.json records rotations.")
     ] = "rotator",
-    workers: Annotated[int | None, workers_option("Processes that draw")] = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Draw scenes with exact depth, poses and intrinsics, in the released layout.
@@ -64,7 +64,6 @@ def synth(  # noqa: PLR0913 - one parameter an option
     To continue a stopped run, run it again: it keeps the scenes that the same request wrote. Scene
     i is the same for any number of scenes and workers.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.synthesis.produce import synthesise
     from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
@@ -83,9 +82,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
         ),
     )
     with progress_bar("drawing", unit="frames") as progress:
-        keys = synthesise(
-            out, request, workers=workers, engine=engine_of(engine), progress=progress
-        )
+        keys = synthesise(out, request, progress=progress, **work.options())
     if as_json:
         typer.echo(json.dumps({"root": str(out), "scenes": keys}, indent=2))
     else:
