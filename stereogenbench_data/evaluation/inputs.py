@@ -23,7 +23,7 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import EvaluationError, StorageError, describe_os_error
 from stereogenbench_data.evaluation.evaluate import select_workload
 from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, open_frames
@@ -49,10 +49,12 @@ class ExportOptions(Selection, total=False):
 
     Attributes:
         workers: How many processes, None for one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with (frames done, frames in all).
     """
 
     workers: int | None
+    engine: Engine
     progress: Progress
 
 
@@ -115,7 +117,7 @@ def export_inputs(
     advance = advance_of(options.get("progress"), done=done, total=total)
     advance(0)
     with closing(
-        LOCAL.map(
+        options.get("engine", LOCAL).map(
             _write_item,
             works,
             name=lambda work: work.wanted.label,

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import DISK_FULL, MediaError, ShardError, describe_os_error
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.table import SceneIndex
@@ -66,6 +66,7 @@ def unpack(
     *,
     root: str | Path | None = None,
     workers: int | None = None,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
 ) -> UnpackReport:
     """Turn shards back into a tree in the released layout.
@@ -78,6 +79,7 @@ def unpack(
         root: The folder of the shards, by your word, where an index file does not lie in it.
         out: Folder for the tree; made if need be.
         workers: Processes that work at the same time; None is one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called now and then with the bytes of members done, and all there are.
 
     Raises:
@@ -111,7 +113,7 @@ def unpack(
                     f"unpack into another."
                 )
             try:
-                outcomes = LOCAL.map(
+                outcomes = engine.map(
                     unpack_scene,
                     tasks,
                     name=lambda task: task.scene.id.key,

@@ -9,7 +9,7 @@ What cannot be seen: unit, focal length and baselines enter disparity as one quo
 wrong one looks like a wrong other, and two may make up for each other.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnose_scene
 from stereogenbench_data.audit.contract.matching import SceneFrames
 from stereogenbench_data.audit.contract.verdict import Verdict, group_by_contract, judge
-from stereogenbench_data.engine import LOCAL, Advance
+from stereogenbench_data.engine import LOCAL, Advance, Engine
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
@@ -86,6 +86,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
     frames: int = 4,
     depth: DepthEncoding | None = None,
     workers: int | None = None,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
     filters: SceneFilters | None = None,
 ) -> DoctorReport:
@@ -97,6 +98,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
         frames: How many frames of each, in up to five pairs.
         depth: The contract to ask about; None for what files and release state.
         workers: Processes, None for one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with the scenes done and all there are.
         filters: Which scenes; None for all.
 
@@ -124,10 +126,13 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
     ]
     tasks = [_task(index, int(row), frames=frames, encoding=encoding) for row in chosen]
     found = []
-    for diagnosis in _diagnoses(tasks, workers=workers):
-        found.append(diagnosis)
-        if progress is not None:
-            progress(len(found), len(tasks))
+    with closing(
+        engine.map(_diagnose, tasks, name=lambda task: task.scene.id.key, workers=workers)
+    ) as diagnoses:
+        for diagnosis in diagnoses:
+            found.append(diagnosis)
+            if progress is not None:
+                progress(len(found), len(tasks))
     found.sort(key=lambda diagnosis: diagnosis.key)
     verdicts = tuple(judge(group, declared=encoding) for group in group_by_contract(found))
     return DoctorReport(index.where, encoding, tuple(found), verdicts, left_out)
@@ -144,13 +149,6 @@ def _task(index: SceneIndex, row: int, *, frames: int, encoding: DepthEncoding) 
     paths = {member.path for member in scene.members.values()}
     shards = {path: facts for path, facts in index.shards.items() if path in paths}
     return DiagnosisTask(scene, index.root, shards, index.digest, frames, encoding, index.retry)
-
-
-def _diagnoses(tasks: list[DiagnosisTask], *, workers: int | None) -> Iterator[SceneDiagnosis]:
-    with closing(
-        LOCAL.map(_diagnose, tasks, name=lambda task: task.scene.id.key, workers=workers)
-    ) as results:
-        yield from results
 
 
 def _diagnose(task: DiagnosisTask, after_bytes: Advance) -> SceneDiagnosis:
