@@ -11,15 +11,11 @@ import stat
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
-from io import FileIO
 from itertools import count
 from pathlib import Path
 from typing import BinaryIO, Final, Literal
 
-from stereogenbench_data.errors import ShardError, StorageError
-
-PARTS: Final = ".parts"
-"""Folder beside the shards that holds their manifests and locks."""
+from stereogenbench_data.errors import StorageError
 
 _USUAL_WRITERS: Final = 8
 """Temporary file names of one target that are searched for files of killed writers."""
@@ -185,31 +181,6 @@ def try_locked(path: Path) -> Iterator[bool]:
         finally:
             if state == "held":
                 unlock_descriptor(file.fileno())
-
-
-@contextmanager
-def open_exclusive(path: Path) -> Iterator[FileIO]:
-    """Open a new, empty shard for this process alone; it is removed unless it was renamed.
-
-    The lock is a file in ``.parts``, which stays. On a file system without locks nothing keeps two
-    processes from writing one file; one of them will find it altered or gone.
-
-    Raises:
-        ShardError: If another process has it.
-    """
-    lock = path.parent / PARTS / f"{path.name}.lock"
-    lock.parent.mkdir(parents=True, exist_ok=True)
-    with try_locked(lock) as is_ours:
-        if not is_ours:
-            raise ShardError(
-                f"{path}: another process is packing this shard. Give each process a part of its "
-                f"own (--part I/N), or wait for that one."
-            )
-        try:
-            with FileIO(path, "w+") as file:
-                yield file
-        finally:
-            path.unlink(missing_ok=True)
 
 
 def copy_with_crc32(chunks: Iterable[bytes], write: Callable[[bytes], object]) -> int:
