@@ -98,7 +98,7 @@ def test_a_name_that_begins_or_ends_with_dots_is_let_through(root):
 
 
 def test_a_file_of_another_size_is_named_with_both_sizes(root):
-    with pytest.raises(StorageError, match=r"b.json: has 5 bytes, and the index says 6. The file"):
+    with pytest.raises(StorageError, match=r"b.json: has 5 bytes, .* index says 6\. .*[Ff]etch it"):
         open_local(root, Member("a/b.json", 0, 6))
 
 
@@ -137,14 +137,14 @@ def test_a_pipe_in_a_files_place_is_named_and_not_waited_for(root, scene):
     os.mkfifo(root / "pipe")
     scene = with_file(scene, Member("pipe", 0, 0))
 
-    with pytest.raises(StorageError, match=r"pipe: b.json: is no file. Put the release's own"):
+    with pytest.raises(StorageError, match=r"pipe: b.json: not a file. Put the release's own"):
         MemberSource(root, shards={}).read(scene, "b.json")
 
 
 def test_a_folder_in_a_files_place_is_named(root, scene):
     scene = with_file(scene, Member("a", 0, (root / "a").stat().st_size))
 
-    with pytest.raises(StorageError, match=r"a: b.json: is no file. Put the release"):
+    with pytest.raises(StorageError, match=r"a: b.json: not a file. Put the release"):
         MemberSource(root, shards={}).read(scene, "b.json")
 
 

@@ -7,11 +7,11 @@ import urllib3
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources import http as web_transport
-from stereogenbench_data.sources.members import read_range, size_of
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy, TransientError
 from tests.servers.fault import Answer, serving
 from tests.servers.raw import raw_serving
+from tests.sources.source_kit import read_range, size_of
 
 DATA = bytes(range(256)) * 1000
 
@@ -50,20 +50,6 @@ def test_a_range_is_asked_for_alone(served):
 def test_the_size_costs_one_byte(served):
     assert size_of(f"{served.url}/x.tar") == len(DATA)
     assert served.sent == 1
-
-
-def test_a_local_file_is_read_by_range_too(tmp_path):
-    (tmp_path / "x y.tar").write_bytes(DATA)
-
-    for place in (tmp_path / "x y.tar", (tmp_path / "x y.tar").as_uri()):
-        assert read_range(place, 1000, 3000) == DATA[1000:3000]
-        assert size_of(place) == len(DATA)
-    with pytest.raises(StorageError, match=r"gone.tar: cannot be read \(No such file"):
-        size_of(tmp_path / "gone.tar")
-    with pytest.raises(StorageError, match=r"gone.tar: cannot be read \(No such file"):
-        read_range(tmp_path / "gone.tar", 0, 1)
-    with pytest.raises(StorageError, match=r"x y.tar: ends at byte 256000"):
-        read_range(tmp_path / "x y.tar", 0, len(DATA) + 1)
 
 
 def test_an_answer_cut_short_is_gone_on_with_where_it_ended(served, clock):
