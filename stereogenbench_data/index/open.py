@@ -1,12 +1,12 @@
 """Opening an index: from a place, whatever it is, to a checked table of scenes.
 
-    a file ─────────────────────┬─ read ── where its data are ── digest ── what is new there
+    a file ─────────────────────┬─ read ── root of its data ── digest ── is it stale?
     a folder with an index file ┘
-    a URL ──────── fetched ─────── read ──────────────────────── digest
+    a URL ──────── fetched ─────── read ────────────────────── digest
     a folder or URL without one ── its scenes are described
 
-An index file may come from a stranger. What it names is opened only where that can do no harm; for
-any other place the user names the root.
+An index file may come from a stranger. A place that it names is opened only if that is harmless;
+any other root is for the user to name.
 """
 
 import warnings
@@ -29,6 +29,7 @@ from stereogenbench_data.index.parquet import (
 )
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
 from stereogenbench_data.index.tree import find_remote_scenes
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.filesystems import MissingObject
 from stereogenbench_data.sources.location import (
     is_remote,
@@ -52,7 +53,7 @@ _SHOWN: Final = 10
 
 
 class IncompleteSceneWarning(UserWarning):
-    """Some scenes of the data cannot be used: the message names them and says why."""
+    """Some scenes of the data cannot be used; the message names them and the reasons."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +61,9 @@ class OpenedTable:
     """An index as it was opened.
 
     Attributes:
-        table: One row a scene, checked; its columns are `rows.SCHEMA`.
-        head: What is known beside the rows; its root is where the data are.
-        stale: What the root holds that the index does not know, or lacks of it, and the cure.
+        table: One row per scene, checked; its columns are `rows.SCHEMA`.
+        head: What is known besides the rows; its root is where the data are.
+        stale: How the root differs from the index, and the cure; "" if it does not.
     """
 
     table: pa.Table
@@ -75,8 +76,8 @@ def open_table(
 ) -> OpenedTable:
     """Return the scenes of some data; `SceneIndex.open` describes the arguments and the errors.
 
-    Warns of scenes that cannot be used, and of an index that is older than its data, in the name
-    of the caller's caller.
+    Warnings name scenes that cannot be used, and an index that is older than its data; they point
+    at the caller's caller.
     """
     named_root = None if root is None else _require_root(root)
     if is_remote(data):
@@ -95,8 +96,7 @@ def open_table(
                 f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or "
                 f"a folder in the released layout."
             )
-    left_out = {**opened.head.incomplete, **opened.head.broken}
-    if left_out:
+    if left_out := opened.head.incomplete | opened.head.broken:
         warnings.warn(f"{where}: {_listed(left_out)}", IncompleteSceneWarning, stacklevel=3)
     if opened.stale:
         warnings.warn(opened.stale, StaleIndexWarning, stacklevel=3)
@@ -104,11 +104,11 @@ def open_table(
 
 
 def open_file(path: Path, *, root: str | None) -> OpenedTable:
-    """Return the index in a file, whose data are where the user or, within limits, the file says.
+    """Return the index in a file. The user or, within limits, the file names its data's root.
 
     Raises:
-        StorageError: If it is damaged or not an index of this version, or its data are where only
-            the user may send us.
+        StorageError: If it is damaged or not an index of this version, or only the user may name
+            the place of its data.
     """
     table, head = read_index_file(path, where=str(path))
     head = replace(head, root=_recorded_root(path, head, table) if root is None else root)
@@ -119,20 +119,20 @@ def open_file(path: Path, *, root: str | None) -> OpenedTable:
 
 
 def warn_if_stale(root: str | Path) -> None:
-    """Warn if a folder has an index that does not know what was just written into it."""
+    """Warn if a folder has an index that lacks what was just written into it."""
     path = local_path(root) / INDEX_NAME
     if not path.is_file():
         return
     try:
         stale = open_file(path, root=None).stale
     except StorageError:
-        return  # an index that cannot be read raises an error when it is opened
+        return  # opening an index that cannot be read raises the error
     if stale:
         warnings.warn(stale, StaleIndexWarning, stacklevel=3)
 
 
 def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> OpenedTable:
-    """Fetch an index. Its data lie beside it unless the user names their root."""
+    """Fetch an index. Its data are beside it, unless the user names another root."""
     beside, name = split_name(url)
     is_folder = not name.endswith(".parquet")
     if is_folder:
@@ -149,7 +149,7 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
-            f"{size:,}. It was not read: is it another file?"
+            f"{size:,}. It was not read: pass the index."
         )
     content = pa.BufferReader(remote.read(0, size))
     table, head = read_index_file(content, where=remote.where)
@@ -178,17 +178,16 @@ def _require_few_scenes(root: str) -> None:
     found = find_remote_scenes(root)
     if len(found.keys) > MOST_REMOTE_SCENES:
         raise StorageError(
-            f"{shown(root)}: has no {INDEX_NAME}, and the headers of {len(found.keys)} scenes "
-            "are too many to be fetched each time. Index it once, or the part you need: "
-            f"`stereogenbench index {shown(root)} -o index.parquet --split eval`, and open "
-            "that file."
+            f"{shown(root)}: has no {INDEX_NAME}, and {len(found.keys)} scenes are too many to "
+            f"fetch their headers each time. Index it once, or the part you need: `stereogenbench "
+            f"index {shown(root)} -o index.parquet --split eval`, and open that file."
         )
 
 
 def _require_digest(table: pa.Table, head: IndexHead, *, where: str) -> None:
     if table_digest(table) != head.digest:
         raise StorageError(
-            f"{where}: its rows are not those that were written. {made_again(where)}"
+            f"{where}: its rows were changed after they were written. {made_again(where)}"
         )
 
 
@@ -199,8 +198,8 @@ def _require_root(root: str | Path) -> str:
     folder = local_path(root)
     if not str(root) or not folder.is_dir():
         raise StorageError(
-            f"{str(root)!r}: is no folder, and was named as the root of an index's data. Name the "
-            f"folder, or the URL, to which the paths in the index are relative."
+            f"{str(root)!r}: not a folder, and was named as the root of an index's data. Name the "
+            f"folder or URL to which the paths in the index are relative."
         )
     return str(folder)
 
@@ -216,8 +215,8 @@ def _require_no_root(where: str | Path, root: str | None) -> None:
 def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
     """Return the data's root: the index's own folder if the data are there, else the recorded one.
 
-    A recorded root is opened only below the index's own folder, or at a URL that
-    `why_not_from_a_file` allows.
+    A recorded root must be below the index's own folder, or a URL that `why_not_from_a_file`
+    allows.
 
     Raises:
         StorageError: If the user must name the root, or it is not a folder.
@@ -235,20 +234,20 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
         raise _must_be_named(path, recorded, "it is outside the index's own folder")
     if not folder.is_dir():
         raise StorageError(
-            f"{path}: its data were at {folder}, which is no folder now. Move the index into "
+            f"{path}: its data were at {folder}, which is not a folder now. Move the index into "
             f"the data's root, or run `stereogenbench index` again."
         )
     return str(folder)
 
 
 def _are_beside(table: pa.Table, folder: Path) -> bool:
-    """Return whether a file of the first scene lies below a folder."""
+    """Return whether a file of the first scene is below a folder."""
     members = table.column("members")[0].as_py()
     return any((folder / member["path"]).exists() for member in members)
 
 
 def _recorded_folder(recorded: str, beside: Path) -> Path | None:
-    """Return the folder that a recorded path means, links followed; None if there is none."""
+    """Return the folder of a recorded path, with links resolved; None if the path is invalid."""
     try:
         folder = local_path(recorded) if recorded[:5].lower() == "file:" else Path(recorded)
         return (beside / folder).resolve()
@@ -274,5 +273,4 @@ def _listed(left_out: Mapping[str, str]) -> str:
     ]
     if len(lines) > _SHOWN:
         lines[_SHOWN:] = [f"and {len(lines) - _SHOWN} more"]
-    count = f"{len(left_out)} scene{'s' if len(left_out) > 1 else ''} cannot be used:"
-    return "\n  ".join([count, *lines])
+    return "\n  ".join([f"{counted(len(left_out), 'scene')} cannot be used:", *lines])

@@ -113,7 +113,7 @@ def test_what_is_no_file_in_a_shards_place_is_named_and_not_waited_for(root, in_
     (root / "x.tar").unlink()
     make(root / "x.tar")
 
-    with pytest.raises(ShardError, match=r"x.tar: cannot be read \(it is no regular file\). Fetch"):
+    with pytest.raises(ShardError, match=r"x.tar: cannot be read \(not a regular file\). Fetch"):
         MemberSource(root, shards=shards).open(scene, "b.json")
 
 
@@ -256,7 +256,7 @@ def test_every_error_is_made_of_one_text_that_shows_no_login():
      "http://u:PW@h..h/x"],
 )  # fmt: skip
 def test_a_url_that_is_none_is_named_without_its_login(url):
-    with pytest.raises(StorageError, match=r"is no URL: correct it") as caught:
+    with pytest.raises(StorageError, match=r"not a URL: correct it") as caught:
         SceneIndex.open(url)
     assert "PW" not in str(caught.value)
 

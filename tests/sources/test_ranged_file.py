@@ -214,7 +214,7 @@ def test_bytes_can_be_read_into_a_buffer():
 
 
 def test_a_place_before_the_start_is_refused():
-    with pytest.raises(ValueError, match="there is no place -1 in a file"):
+    with pytest.raises(ValueError, match="a file has no position -1"):
         Store(10).open().seek(-1)
 
 

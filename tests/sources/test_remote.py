@@ -163,7 +163,7 @@ def test_the_whole_may_be_sent_where_the_whole_is_asked_for(served):
     [
         ("bytes 6-8/256000", r"sends bytes 6 to 8 when asked for 5 to 8. It does not honour"),
         ("bytes 5-9/256000", r"sends bytes 5 to 9 when asked for 5 to 8. It does not honour"),
-        ("pages 5-8/256000", r"does not tell which part it sends \(Content-Range: 'pages 5-8/256"),
+        ("pages 5-8/256000", r"does not state which part it sends \(Content-Range: 'pages 5-8/256"),
     ],
 )
 def test_another_part_than_the_one_asked_for_is_refused(served, told, message):
@@ -181,7 +181,7 @@ def test_a_file_that_ends_before_the_range_is_told(served):
 def test_a_size_that_is_not_told_is_an_error(served):
     served.always["x.tar"] = Answer(content_range="bytes 0-0/*")
 
-    with pytest.raises(StorageError, match="its server does not tell how large it is"):
+    with pytest.raises(StorageError, match="its server does not state its size"):
         size_of(f"{served.url}/x.tar")
 
 
@@ -242,7 +242,7 @@ def test_a_query_is_neither_shown_nor_chained(clock):
 
 
 def test_a_url_that_is_none_is_told(clock):
-    with pytest.raises(StorageError, match="is no URL: correct it"):
+    with pytest.raises(StorageError, match="not a URL: correct it"):
         RemoteObject("http://a:b:c/x", retry=clock.policy()).read(0, 9)
 
 
@@ -500,9 +500,7 @@ def test_a_length_that_is_no_number_is_named(told):
 
     with (
         raw_serving(whole) as url,
-        pytest.raises(
-            StorageError, match=rf"its server does not tell how large it is \('{told[:80]}'\)"
-        ),
+        pytest.raises(StorageError, match=rf"its server does not state its size \('{told[:80]}'\)"),
     ):
         RemoteObject(f"{url}/x.tar").size()
 
@@ -520,7 +518,7 @@ def test_a_content_range_that_is_none_is_named(told, status):
     with (
         raw_serving(odd) as url,
         pytest.raises(
-            StorageError, match=rf"answers {status} and does not tell which part it sends"
+            StorageError, match=rf"answers {status} and does not state which part it sends"
         ) as caught,
     ):
         RemoteObject(f"{url}/x.tar").read(0, 9)
@@ -530,12 +528,12 @@ def test_a_content_range_that_is_none_is_named(told, status):
 @pytest.mark.parametrize(
     ("location", "message"),
     [
-        (None, "the server answers 302 and names no place to go to"),
-        ("http://[::1", r"sends on to 'http://\[::1', which is no URL of a web server"),
-        ("file:///etc/passwd", "sends on to 'file:///etc/passwd', which is no URL of a web server"),
-        ("ftp://me:word@h/x", "sends on to 'ftp://h/x', which is no URL of a web server"),
-        ("http://h:99999/", "sends on to 'http://h:99999/', which is no URL of a web server"),
-        ("http://a..b/", "is redirected to http://a..b/, which is no URL"),
+        (None, "the server answers 302 and redirects without a location"),
+        ("http://[::1", r"redirects to 'http://\[::1', which is not a URL of a web server"),
+        ("file:///etc/passwd", "redirects to 'file:///etc/passwd', which is not a URL"),
+        ("ftp://me:word@h/x", "redirects to 'ftp://h/x', which is not a URL of a web server"),
+        ("http://h:99999/", "redirects to 'http://h:99999/', which is not a URL of a web server"),
+        ("http://a..b/", "is redirected to http://a..b/, which is not a URL"),
     ],
 )
 def test_a_redirect_to_no_place_is_named(served, location, message):
@@ -549,7 +547,7 @@ def test_a_redirect_to_no_place_is_named(served, location, message):
 @pytest.mark.parametrize(
     ("url", "there", "message"),
     [
-        ("https://8.8.8.8/x", "http://8.8.8.8/x", "sends on from https to http://8.8.8.8/x, which"),
+        ("https://8.8.8.8/x", "http://8.8.8.8/x", "redirects from https to http://8.8.8.8/x,"),
         ("https://8.8.8.8/x", "https://127.0.0.1/y", "inside this machine's own network"),
         ("http://8.8.8.8/x", "http://[::ffff:10.0.0.1]/y", "inside this machine's own network"),
         ("http://8.8.8.8/x", "http://169.254.169.254/", "inside this machine's own network"),
