@@ -32,7 +32,7 @@ from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes, find
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
-from stereogenbench_data.schema.release import TRAIN_MAPS, depth_name
+from stereogenbench_data.schema.release import TRAIN_MAPS, Subset, depth_name
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
 
@@ -60,7 +60,7 @@ class TreeReport:
     incomplete: dict[str, str]
     broken: dict[str, str]
     notes: tuple[str, ...]
-    is_part: bool = False
+    is_part: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,32 +144,9 @@ class Journal:
             self._file.close()
 
 
-class SceneJournal(Journal):
-    """A journal of scenes that were described."""
-
-    def __init__(self, path: Path, *, walk: str) -> None:
-        """Read what a journal of this walk holds; see `Journal`."""
-        super().__init__(path, work={"walk": walk, "columns": SCHEMA.names})
-
-    def __enter__(self) -> "SceneJournal":
-        """Return the journal itself."""
-        return self
-
-    def find(self, key: str, *, stamp: str) -> Scene | None:
-        """Return a scene described before, None if it was not or its files have changed."""
-        row = self.value(key, stamp=stamp)
-        try:
-            return None if row is None else scene_of(row)
-        except (ValueError, KeyError, TypeError, IndexError, AttributeError):
-            return None
-
-    def add(self, scene: Scene, *, stamp: str) -> None:
-        """Write a scene.
-
-        Raises:
-            StorageError: If the file cannot be written.
-        """
-        self.note(scene.id.key, row_of(scene), stamp=stamp)
+def scene_journal(path: Path, *, walk: str) -> Journal:
+    """Return the journal of the scenes that a walk has described; see `Journal`."""
+    return Journal(path, work={"walk": walk, "columns": SCHEMA.names})
 
 
 def walk(  # noqa: PLR0913 - each is an option of the command
@@ -178,7 +155,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     workers: int | None = None,
     engine: Engine = LOCAL,
     progress: Progress | None = None,
-    journal: SceneJournal | None = None,
+    journal: Journal | None = None,
     valid_depth: ValidDepth = "skip",
     wanted: Callable[[SceneId], bool] | None = None,
 ) -> TreeReport:
@@ -214,11 +191,11 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     for outcome in engine.map(task, pending, name=str, workers=workers):
         outcomes[outcome.key] = outcome
         if journal is not None and outcome.scene is not None:
-            journal.add(outcome.scene, stamp=outcome.stamp)
+            journal.note(outcome.key, row_of(outcome.scene), stamp=outcome.stamp)
         if progress is not None:
             progress(len(outcomes), total)
-    report = _report(root, folders, [outcomes[key] for key in folders.keys])
-    return replace(report, is_part=wanted is not None)
+    in_order = [outcomes[key] for key in folders.keys]
+    return _report(root, folders, in_order, is_part=wanted is not None)
 
 
 def _chosen(
@@ -254,51 +231,53 @@ class _DescribeTask:
         return _Outcome(key, "whole", scene, stamp)
 
 
-def _reused(
-    root: str | Path, keys: Iterable[str], journal: SceneJournal | None
-) -> dict[str, _Outcome]:
+def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> dict[str, _Outcome]:
+    """Return the scenes that a journal holds and whose files have not changed."""
     outcomes: dict[str, _Outcome] = {}
-    if journal is None or not len(journal):
-        return outcomes
-    for key in keys:
-        try:
+    for key in keys if journal is not None and len(journal) else ():
+        with suppress(
+            StorageError, ValueError, KeyError, TypeError, IndexError, AttributeError
+        ):  # of the folder, or of a damaged row: the scene is described again
             stamp = stamp_of(SceneFolder(root, key).stamps())
-        except StorageError:
-            continue
-        scene = journal.find(key, stamp=stamp)
-        if scene is not None:
-            outcomes[key] = _Outcome(key, "whole", scene, stamp)
+            row = None if journal is None else journal.value(key, stamp=stamp)
+            if row is not None:
+                outcomes[key] = _Outcome(key, "whole", scene_of(row), stamp)
     return outcomes
 
 
-def _report(root: str | Path, folders: FoundScenes, outcomes: list[_Outcome]) -> TreeReport:
+def _report(
+    root: str | Path, folders: FoundScenes, outcomes: list[_Outcome], *, is_part: bool
+) -> TreeReport:
     ids = [parse_scene_key(key) for key in folders.keys]
     maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
     found = [outcome.scene for outcome in outcomes if outcome.scene is not None]
-    scenes = tuple(replace(scene, id=_with_subset(scene.id, maps)) for scene in found)
+    scenes, unnamed, labels = [], set(), []
+    for scene in found:
+        if scene.id.split == "eval" and scene.id.subset is None:
+            unnamed.add(scene.id.key.split("/")[1])
+            subset: Subset = "seen_map" if scene.id.map_name in maps else "unseen_map"
+            scenes.append(replace(scene, id=replace(scene.id, subset=subset)))
+        else:
+            scenes.append(scene)
+        if scene.labels.map_name not in (None, scene.id.map_name):
+            labels.append(
+                f"{scene.id.key}: its files call the map {scene.labels.map_name!r}; the folder's "
+                f"name is used"
+            )
+    subsets = [
+        f"eval/{folder} names no subset; a scene there counts as seen_map if its map occurs in "
+        f"train, of this tree or of the release, else as unseen_map"
+        for folder in sorted(unnamed)
+    ]
     broken = {out.key: out.reason for out in outcomes if out.kind == "broken"}
     return TreeReport(
         root=str(root),
-        scenes=scenes,
+        scenes=tuple(scenes),
         incomplete={out.key: out.reason for out in outcomes if out.kind == "incomplete"},
         broken=dict(sorted((folders.refused | broken).items())),
-        notes=(*_subset_notes(found), *_label_notes(found), *_depth_notes(found)),
+        notes=(*subsets, *labels, *_depth_notes(found)),
+        is_part=is_part,
     )
-
-
-def _with_subset(scene: SceneId, train_maps: frozenset[str] | set[str]) -> SceneId:
-    if scene.split == "train" or scene.subset is not None:
-        return scene
-    return replace(scene, subset="seen_map" if scene.map_name in train_maps else "unseen_map")
-
-
-def _subset_notes(scenes: list[Scene]) -> list[str]:
-    unnamed = [s.id.key.split("/")[1] for s in scenes if s.id.split == "eval" and not s.id.subset]
-    return [
-        f"eval/{folder} names no subset; a scene there counts as seen_map if its map occurs in "
-        f"train, of this tree or of the release, else as unseen_map"
-        for folder in sorted(set(unnamed))
-    ]
 
 
 def _depth_notes(scenes: list[Scene]) -> list[str]:
@@ -323,13 +302,4 @@ def _depth_notes(scenes: list[Scene]) -> list[str]:
     return [
         f"{note} ({counted(others[kind], 'other video')} likewise.)" if others[kind] else note
         for kind, note in first.items()
-    ]
-
-
-def _label_notes(scenes: list[Scene]) -> list[str]:
-    return [
-        f"{scene.id.key}: its files call the map {scene.labels.map_name!r}; the folder's name is "
-        f"used"
-        for scene in scenes
-        if scene.labels.map_name not in (None, scene.id.map_name)
     ]

@@ -11,7 +11,7 @@ any other root is for the user to name.
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -56,24 +56,12 @@ class IncompleteSceneWarning(UserWarning):
     """Some scenes of the data cannot be used; the message names them and the reasons."""
 
 
-@dataclass(frozen=True, slots=True)
-class OpenedTable:
-    """An index as it was opened.
-
-    Attributes:
-        table: One row per scene, checked; its columns are `rows.SCHEMA`.
-        head: What is known besides the rows; its root is where the data are.
-        stale: How the root differs from the index, and the cure; "" if it does not.
-    """
-
-    table: pa.Table
-    head: IndexHead
-    stale: str = ""
+Opened = tuple[pa.Table, IndexHead, str]
+"""A checked table with one row per scene; what is known besides, with the root where the data are;
+and how the root differs from the index, with the cure, "" if it does not."""
 
 
-def open_table(
-    data: str | Path, *, root: str | Path | None, retry: RetryPolicy | None
-) -> OpenedTable:
+def open_table(data: str | Path, *, root: str | Path | None, retry: RetryPolicy | None) -> Opened:
     """Return the scenes of some data; `SceneIndex.open` describes the arguments and the errors.
 
     Warnings name scenes that cannot be used, and an index that is older than its data; they point
@@ -82,28 +70,29 @@ def open_table(
     named_root = None if root is None else _require_root(root)
     if is_remote(data):
         where = shown(data)
-        opened = _open_url(str(data), root=named_root, retry=retry)
+        table, head, stale = _open_url(str(data), root=named_root, retry=retry)
     else:
         path = local_path(data)
         where = str(path)
         if path.is_dir() and not (path / INDEX_NAME).is_file():
             _require_no_root(path, named_root)
-            opened = _open_tree(path)
+            table, head, stale = _open_tree(path)
         elif path.is_dir() or path.is_file():
-            opened = open_file(path / INDEX_NAME if path.is_dir() else path, root=named_root)
+            file = path / INDEX_NAME if path.is_dir() else path
+            table, head, stale = _open_file(file, root=named_root)
         else:
             raise StorageError(
                 f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or "
                 f"a folder in the released layout."
             )
-    if left_out := opened.head.incomplete | opened.head.broken:
+    if left_out := head.incomplete | head.broken:
         warnings.warn(f"{where}: {_listed(left_out)}", IncompleteSceneWarning, stacklevel=3)
-    if opened.stale:
-        warnings.warn(opened.stale, StaleIndexWarning, stacklevel=3)
-    return opened
+    if stale:
+        warnings.warn(stale, StaleIndexWarning, stacklevel=3)
+    return table, head, stale
 
 
-def open_file(path: Path, *, root: str | None) -> OpenedTable:
+def _open_file(path: Path, *, root: str | None) -> Opened:
     """Return the index in a file. The user or, within limits, the file names its data's root.
 
     Raises:
@@ -114,8 +103,8 @@ def open_file(path: Path, *, root: str | None) -> OpenedTable:
     head = replace(head, root=_recorded_root(path, head, table) if root is None else root)
     _require_digest(table, head, where=str(path))
     if is_remote(head.root):
-        return OpenedTable(table, head)
-    return OpenedTable(table, head, stale_message(table, head, index_file=path))
+        return table, head, ""
+    return table, head, stale_message(table, head, index_file=path)
 
 
 def warn_if_stale(root: str | Path) -> None:
@@ -124,14 +113,14 @@ def warn_if_stale(root: str | Path) -> None:
     if not path.is_file():
         return
     try:
-        stale = open_file(path, root=None).stale
+        _, _, stale = _open_file(path, root=None)
     except StorageError:
         return  # opening an index that cannot be read raises the error
     if stale:
         warnings.warn(stale, StaleIndexWarning, stacklevel=3)
 
 
-def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> OpenedTable:
+def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opened:
     """Fetch an index. Its data are beside it, unless the user names another root."""
     beside, name = split_name(url)
     is_folder = not name.endswith(".parquet")
@@ -144,7 +133,13 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
         if not is_folder:
             raise
         _require_no_root(shown(beside), root)
-        _require_few_scenes(beside)
+        count = len(find_remote_scenes(beside).keys)
+        if count > MOST_REMOTE_SCENES:
+            raise StorageError(
+                f"{shown(beside)}: has no {INDEX_NAME}, and {count} scenes are too many to fetch "
+                f"their headers each time. Index it once, or the part you need: `stereogenbench "
+                f"index {shown(beside)} -o index.parquet --split eval`, and open that file."
+            ) from None
         return _open_tree(beside)
     if size > MAX_INDEX_BYTES:
         raise StorageError(
@@ -155,10 +150,10 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
     table, head = read_index_file(content, where=remote.where)
     head = replace(head, root=root or beside)
     _require_digest(table, head, where=remote.where)
-    return OpenedTable(table, head)
+    return table, head, ""
 
 
-def _open_tree(root: str | Path) -> OpenedTable:
+def _open_tree(root: str | Path) -> Opened:
     """Describe the scenes of a folder or URL in the released layout."""
     # In this process: a script without `if __name__ == "__main__"` could start no others.
     report, where = walk(root, workers=1), shown(root)
@@ -170,18 +165,7 @@ def _open_tree(root: str | Path) -> OpenedTable:
     if not report.scenes:
         raise StorageError(f"{where}: no scene is finished: {_listed(report.incomplete)}")
     head = IndexHead(root=report.root, incomplete=report.incomplete, is_part=report.is_part)
-    return OpenedTable(table_of_scenes(report.scenes, where=where), head)
-
-
-def _require_few_scenes(root: str) -> None:
-    """Refuse a tree behind a URL that is too large to be described each time it is opened."""
-    found = find_remote_scenes(root)
-    if len(found.keys) > MOST_REMOTE_SCENES:
-        raise StorageError(
-            f"{shown(root)}: has no {INDEX_NAME}, and {len(found.keys)} scenes are too many to "
-            f"fetch their headers each time. Index it once, or the part you need: `stereogenbench "
-            f"index {shown(root)} -o index.parquet --split eval`, and open that file."
-        )
+    return table_of_scenes(report.scenes, where=where), head, ""
 
 
 def _require_digest(table: pa.Table, head: IndexHead, *, where: str) -> None:
@@ -222,7 +206,9 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
         StorageError: If the user must name the root, or it is not a folder.
     """
     beside, recorded = path.parent, head.root
-    if recorded == "." or not table.num_rows or _are_beside(table, beside):
+    if recorded == "." or not table.num_rows:
+        return str(beside)
+    if any((beside / file["path"]).exists() for file in table.column("members")[0].as_py()):
         return str(beside)
     if is_remote(recorded):
         reason = why_not_from_a_file(recorded)
@@ -238,12 +224,6 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
             f"the data's root, or run `stereogenbench index` again."
         )
     return str(folder)
-
-
-def _are_beside(table: pa.Table, folder: Path) -> bool:
-    """Return whether a file of the first scene is below a folder."""
-    members = table.column("members")[0].as_py()
-    return any((folder / member["path"]).exists() for member in members)
 
 
 def _recorded_folder(recorded: str, beside: Path) -> Path | None:

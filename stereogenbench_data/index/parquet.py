@@ -30,12 +30,6 @@ from stereogenbench_data.sources.members import UNSAFE_PATH
 
 INDEX_NAME: Final = "index.parquet"
 
-_OF_RELEASE: Final = "Run `stereogenbench index ROOT` again."
-_OF_SHARDS: Final = (
-    "It is the index of shards: fetch it again or, where they were packed, run the same "
-    "`stereogenbench pack` again, which keeps finished shards."
-)
-
 _FORMAT: Final = 1
 _LARGEST: Final = 2**63
 _METADATA_KEY: Final = b"stereogenbench_data.index"
@@ -63,7 +57,12 @@ def made_again(where: str) -> str:
     if is_remote(where):
         return "Fetch it again; if it is damaged there, too, tell who published it."
     shards = local_path(where).parent.glob("*.tar")
-    return _OF_RELEASE if next(shards, None) is None else _OF_SHARDS
+    if next(shards, None) is None:
+        return "Run `stereogenbench index ROOT` again."
+    return (
+        "It is the index of shards: fetch it again or, where they were packed, run the same "
+        "`stereogenbench pack` again, which keeps finished shards."
+    )
 
 
 def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Table, IndexHead]:

@@ -74,6 +74,7 @@ _T = TypeVar("_T")
 
 ValidDepth = Literal["skip", "sample"]
 
+_DESCRIPTIONS: Final = (DESCRIPTION_JSON, DESCRIPTION_TXT)
 _NEEDED: Final = (COMPLETE_JSON, BASELINE_JSON, TRAJECTORY_JSON, *VIDEO_FILES)
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
@@ -181,10 +182,8 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     rig, labels = parse_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
     marked = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
     trajectory = parse_trajectory(folder.read(TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}")
-    described: dict[str, bytes] = {
-        name: folder.read(name) for name in (DESCRIPTION_JSON, DESCRIPTION_TXT) if name in files
-    }
-    caption = caption_of(described, key=key)
+    texts: dict[str, bytes] = {name: folder.read(name) for name in _DESCRIPTIONS if name in files}
+    caption = _caption(texts, key=key)
     depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
     facts = {name: _probed(folder, key, _held(files, name)) for name in VIDEO_FILES}
     counts = {name: fact.frames for name, fact in facts.items()}
@@ -201,7 +200,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
     return Scene(
         id=parse_scene_key(key),
-        labels=merged_labels(labels, marked),
+        labels=_merged_labels(labels, marked),
         caption=caption,
         rig=rig,
         frames=frames,
@@ -250,16 +249,8 @@ def _require_finished(key: str, files: Mapping[str, object]) -> None:
         )
 
 
-def caption_of(texts: Mapping[str, bytes], *, key: str) -> str:
-    """Return a scene's caption from its files: the detailed one, else the short one.
-
-    Args:
-        texts: File name to bytes, with the descriptions that there are.
-        key: The scene's, for messages.
-
-    Raises:
-        SchemaError: If a description does not follow the format.
-    """
+def _caption(texts: Mapping[str, bytes], *, key: str) -> str:
+    """Return a scene's caption from its files: the detailed one, else the short one, else ""."""
     if DESCRIPTION_JSON in texts:
         description = parse_description(texts[DESCRIPTION_JSON], where=f"{key}/{DESCRIPTION_JSON}")
         written = description.detailed_caption or description.short_caption
@@ -270,7 +261,7 @@ def caption_of(texts: Mapping[str, bytes], *, key: str) -> str:
     return ""
 
 
-def merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
+def _merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
     """Return the labels of baseline.json; those it lacks come from the completion mark."""
     known = {name: value for name, value in asdict(labels).items() if value is not None}
     return SceneLabels(**(asdict(marked) | known))
@@ -450,7 +441,7 @@ def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diff
     key = scene.id.key
     _, labels = parse_rig(texts[BASELINE_JSON], where=f"{key}/{BASELINE_JSON}")
     marked = parse_complete(texts[COMPLETE_JSON], where=f"{key}/{COMPLETE_JSON}")
-    merged = merged_labels(labels, marked)
+    merged = _merged_labels(labels, marked)
     for each in fields(SceneLabels):
         found, indexed = getattr(merged, each.name), getattr(scene.labels, each.name)
         if found != indexed:
@@ -477,8 +468,8 @@ def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diffe
 
 
 def _differing_caption(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
-    names = [name for name in (DESCRIPTION_JSON, DESCRIPTION_TXT) if name in texts]
-    caption = caption_of(texts, key=scene.id.key)
+    names = [name for name in _DESCRIPTIONS if name in texts]
+    caption = _caption(texts, key=scene.id.key)
     if names and caption != scene.caption:
         yield _difference(names[0], "the caption", caption, scene.caption)
 

@@ -85,8 +85,8 @@ class SceneIndex:
                 another version, only you may name the place of its data, or scenes of a tree are
                 broken.
         """
-        opened = open_table(data, root=root, retry=retry)
-        return cls(opened.table, opened.head, retry=retry, stale=opened.stale)
+        table, head, stale = open_table(data, root=root, retry=retry)
+        return cls(table, head, retry=retry, stale=stale)
 
     @classmethod
     def from_scenes(

@@ -10,6 +10,7 @@ import os
 import re
 import socket
 from collections.abc import Generator, Mapping
+from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -173,15 +174,10 @@ class WebTransport:
         if _NUMBER.fullmatch(length) and int(length) <= _CHUNK:
             response.drain_conn()  # so that the connection can be used again
         response.close()
-        try:
+        there, parts, reason = stated, split_url(""), ""
+        with suppress(ValueError, StorageError):
             there = urljoin(url, stated)
-        except ValueError:
-            there = stated
-        try:
             parts = split_url(there)
-        except StorageError:
-            parts = split_url("")
-        reason = ""
         if not stated:
             reason = "redirects without a location"
         elif parts.scheme not in WEB_SCHEMES or not parts.hostname:

@@ -133,10 +133,13 @@ class RemoteObject:
                 self._wait(state, error, received=0, doing="asked for its size")
 
     def _wait(self, state: RetryState, error: TransientError, *, received: int, doing: str) -> None:
+        policy = self._policy
         if not state.wait(error, received=received):
             raise StorageError(
                 f"{self.where}: cannot be read, {doing} ({state.describe(error)}). Check the "
                 f"network and the server, then try again; or fetch the data and pass the folder; "
                 f"or allow a slower server: SceneIndex.open(..., retry=RetryPolicy(...)), which "
-                f"has {self._policy.limits} now."
+                f"has least_rate_bytes_s={policy.least_rate_bytes_s:.10g} over "
+                f"window_s={policy.window_s:g}, timeout_s={policy.timeout_s:g}, "
+                f"longest_read_s={policy.longest_read_s:g} now."
             ) from error

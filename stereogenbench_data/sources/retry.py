@@ -96,14 +96,6 @@ class RetryPolicy:
         self.sleep(wait_s)
         return True
 
-    @property
-    def limits(self) -> str:
-        """The limits on a server's speed, for messages."""
-        return (
-            f"least_rate_bytes_s={self.least_rate_bytes_s:.10g} over window_s={self.window_s:g}, "
-            f"timeout_s={self.timeout_s:g}, longest_read_s={self.longest_read_s:g}"
-        )
-
 
 class Attempt:
     """The time limits of one attempt: it counts each wait for bytes and limits the next one.

@@ -217,6 +217,7 @@ def with_path(path):
     [
         (lambda table, head: head.update(format=2), "of format 2, and this version .* reads fo"),
         (lambda table, head: head.update(broken=3), "description of itself was altered"),
+        (lambda table, head: head.update(incomplete={"a": 3}), "description of itself was altered"),
         (lambda table, head: head.update(root=3), "description of itself was altered"),
         (lambda table, head: head["shards"].update(x=3), "description of itself was altered"),
         (
@@ -363,9 +364,8 @@ def test_an_index_elsewhere_opens_once_the_user_says_where_its_data_are(scenes, 
 
     with pytest.raises(
         StorageError,
-        match=rf"{kept}: its data are not beside it, and it records their root as {tmp_path}/data. "
-        r"A file may not choose such a place \(it is outside the index's own folder\). If you "
-        rf"trust it, name the root yourself: SceneIndex.open\('{kept}', root=...\), or --root",
+        match=rf"{kept}: .*root as {tmp_path}/data.*\(it is outside the index's own folder\).* "
+        rf"SceneIndex.open\('{kept}', root=...\), or --root",
     ):
         SceneIndex.open(kept)
     for root in (tmp_path / "data", str(tmp_path / "data"), (tmp_path / "data").as_uri()):
@@ -539,14 +539,6 @@ def test_a_value_that_no_scene_has_is_refused_though_the_digest_is_right(
     altered(path, edit)
 
     with pytest.raises(StorageError, match=rf"index.parquet: {match}"):
-        SceneIndex.open(path)
-
-
-def test_reasons_that_are_no_texts_are_refused(scenes, tmp_path):
-    path = written(scenes, tmp_path)
-    altered(path, lambda table, head: head.update(incomplete={"a": 3}))
-
-    with pytest.raises(StorageError, match="its description of itself was altered"):
         SceneIndex.open(path)
 
 

@@ -25,7 +25,7 @@ DATA = bytes(number * 7 % 256 for number in range(100_000))
 
 
 class Shard(RemoteObject):
-    """A shard that is here; it notes what is fetched, and hands out other bytes as it is told."""
+    """A local shard that records what is fetched, and returns the bytes in `wrong` first."""
 
     def __init__(self, data=DATA, *, where="https://h/x.tar"):
         super().__init__(where)
@@ -123,8 +123,7 @@ def test_bytes_that_stay_wrong_are_an_error_and_are_not_kept(cache, shard, tmp_p
 
     with pytest.raises(
         ShardError,
-        match=r"https://h/x.tar: the 2000 bytes from 1000 on have crc32 [0-9a-f]{8}, and the index "
-        r"says [0-9a-f]{8}, twice. The shard was damaged or replaced",
+        match=r"https://h/x.tar: the 2000 bytes from 1000 on .* [0-9a-f]{8}, twice.*use the",
     ):
         cache.open(member(1000, 2000), remote=shard, revision="1")
     assert items(tmp_path) == []

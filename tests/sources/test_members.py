@@ -97,16 +97,6 @@ def test_a_name_that_begins_or_ends_with_dots_is_let_through(root):
     assert member_path(root, Member("a/..b.", 0, 1)) == root / "a" / "..b."
 
 
-def test_a_file_of_another_size_is_named_with_both_sizes(root):
-    with pytest.raises(StorageError, match=r"b.json: has 5 bytes, .* index says 6\. .*[Ff]etch it"):
-        open_local(root, Member("a/b.json", 0, 6))
-
-
-def test_a_file_that_is_gone_is_named(root):
-    with pytest.raises(StorageError, match=r"c.json: cannot be read \(No such file.*index` again"):
-        open_local(root, Member("a/c.json", 0, 5))
-
-
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
 def test_what_is_no_file_in_a_shards_place_is_named_and_not_waited_for(root, in_shard, make):
     scene, shards = in_shard

@@ -68,8 +68,7 @@ def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, clock):
 
     with pytest.raises(
         StorageError,
-        match=r"x.tar: cannot be read, at byte 0 of 9 \(the server answers 503 Service Unavailable;"
-        r" 6 tries\). Check the network and the server",
+        match=r"x.tar: .* byte 0 of 9 \(the server answers 503 .*; 6 tries\). Check the network",
     ):
         remote.read(0, 9)
     assert clock.waits_s == [0.5, 1.0, 2.0, 3.0, 3.0]
@@ -145,8 +144,7 @@ def test_a_server_that_ignores_ranges_is_refused_before_it_has_sent_all(served):
 
     with pytest.raises(
         StorageError,
-        match=r"sends the whole file \(256000 bytes\) when asked for bytes 5 to 9. Members are "
-        r"read in parts: use a server that honours ranges, as nginx does",
+        match=r"x.tar: .*whole file \(256000 bytes\) .* bytes 5 to 9.* use a server that honours",
     ):
         read_range(f"{served.url}/x.tar", 5, 9)
 
@@ -190,8 +188,7 @@ def test_a_file_of_another_size_than_the_index_says_is_told_before_it_is_read(se
 
     with pytest.raises(
         ShardError,
-        match=r"x.tar: has 256000 bytes, and the index says 255999. The index is of another pack, "
-        r"or the file was replaced or cut short",
+        match=r"x.tar: has 256000 bytes, and the index says 255999. .*use the index that was made",
     ):
         remote.read(0, 9)
     assert served.sent == 1
@@ -421,9 +418,8 @@ def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, 
         raw_serving(answering) as url,
         pytest.raises(
             StorageError,
-            match=rf"x.tar: cannot be read, at byte \d+ of 65536 \({reason}; 2 tries\)[^(]*"
-            r".*RetryPolicy\(...\)\), which has least_rate_bytes_s=1000000 over window_s=0.2, "
-            r"timeout_s=0.4, longest_read_s=600 now",
+            match=rf"x.tar: .* byte \d+ of 65536 \({reason}; 2 tries\).*RetryPolicy\(...\)\).* "
+            r"least_rate_bytes_s=1000000 over window_s=0.2, timeout_s=0.4, longest_read_s=600",
         ),
     ):
         RemoteObject(f"{url}/x.tar", retry=retry).read(0, 65536)
