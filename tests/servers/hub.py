@@ -62,7 +62,10 @@ class HubHandler(FileHandler):
         elif found := re.fullmatch(rf"/api/datasets/{REPOSITORY}(?:/revision/(.+))?", path):
             self._known(found[1], lambda: {"id": REPOSITORY, "sha": COMMIT, "siblings": []})
         elif found := re.fullmatch(rf"/api/datasets/{REPOSITORY}/tree/([^/]+)/?(.*)", path):
-            self._known(found[1], lambda: self._tree(found[2]))
+            if (self.server.folder / found[2]).is_dir():
+                self._known(found[1], lambda: self._tree(found[2]))
+            else:
+                self._refuse(404, "EntryNotFound")
         elif found := re.fullmatch(rf"/datasets/{REPOSITORY}/resolve/([^/]+)/(.+)", path):
             self._redirect(found[2])
         else:

@@ -553,10 +553,10 @@ def test_a_redirect_to_no_place_is_named(served, location, message):
 def test_a_redirect_into_the_own_network_or_without_tls_is_refused(
     monkeypatch, url, there, message
 ):
-    def moved(*_):
+    def moved(*_, **how):
         return urllib3.HTTPResponse(status=302, headers={"Location": there})
 
-    monkeypatch.setattr(web_transport.WebTransport, "_ask", moved)
+    monkeypatch.setattr(urllib3.PoolManager, "request", moved)
 
     with pytest.raises(StorageError, match=message):
         read_range(url, 0, 9)
