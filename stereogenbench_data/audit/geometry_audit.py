@@ -26,7 +26,7 @@ from stereogenbench_data.index.build import Journal, walk
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
-from stereogenbench_data.index.scene_folder import open_scene_folder
+from stereogenbench_data.index.scene_folder import SceneFolder
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
@@ -327,7 +327,7 @@ def _stamp(index: SceneIndex, scene: Scene) -> str:
     parts: list[Any] = [row_of(scene)]
     if not index.shards and not is_remote(index.root):
         try:
-            parts.append(open_scene_folder(index.root, scene.id.key).stamps())
+            parts.append(SceneFolder(index.root, scene.id.key).stamps())
         except StorageError as error:
             parts.append(str(error))
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]

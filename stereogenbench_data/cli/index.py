@@ -61,7 +61,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     listed and left out; the exit status is 1 if a scene is broken. --split, --family and --map
     restrict which scenes are read.
     """
-    from stereogenbench_data.index.build import SceneJournal, walk
+    from stereogenbench_data.index.build import scene_journal, walk
     from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.sources.location import is_remote, local_path, shown
@@ -88,7 +88,7 @@ def index(  # noqa: PLR0913 - one parameter an option
     done_before = target.with_name(f"{target.name}.journal")
     with (
         writing(done_before),
-        SceneJournal(done_before, walk=f"{full_place(root)} valid_depth={mode}") as journal,
+        scene_journal(done_before, walk=f"{full_place(root)} valid_depth={mode}") as journal,
         progress_bar("indexing", unit="scenes") as progress,
     ):
         report = walk(

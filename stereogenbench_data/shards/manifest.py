@@ -8,11 +8,15 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Final
 
 from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.shards.plan import PlannedMember, PlannedShard
-from stereogenbench_data.sources.files import PARTS, write_atomic
+from stereogenbench_data.sources.files import write_atomic
+
+PARTS: Final = ".parts"
+"""Folder beside the shards that holds their manifests and locks."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT, METADATA_FILES, PACKED_DEPTH_NAMES
 from stereogenbench_data.shards.companion_files import write_companion_files
 from stereogenbench_data.shards.manifest import (
+    PARTS,
     PackedShard,
     ShardManifest,
     ShardTask,
@@ -44,7 +45,7 @@ from stereogenbench_data.shards.writer import (
     pack_task,
     require_indexed_metadata,
 )
-from stereogenbench_data.sources.files import PARTS, write_atomic
+from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.members import require_own_files
 
 _PLAN_FILE: Final = "plan.json"

@@ -30,9 +30,9 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.companion_files import companion_files
+from stereogenbench_data.shards.manifest import PARTS
 from stereogenbench_data.shards.tar import TarMember, read_checksums, read_members
 from stereogenbench_data.shards.writer import UNFINISHED
-from stereogenbench_data.sources.files import PARTS
 from stereogenbench_data.sources.location import shown
 
 _FETCH: Final = "Fetch the shard again, or pack it again."

@@ -9,8 +9,8 @@ import io
 import os
 import stat
 import zlib
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from io import FileIO
 from itertools import groupby
@@ -24,6 +24,7 @@ from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import METADATA_FILES
 from stereogenbench_data.shards.manifest import (
+    PARTS,
     PackedShard,
     ShardManifest,
     ShardTask,
@@ -43,7 +44,7 @@ from stereogenbench_data.shards.tar import (
     read_checksums,
     read_members,
 )
-from stereogenbench_data.sources.files import open_exclusive
+from stereogenbench_data.sources.files import try_locked
 
 UNFINISHED: Final = ".tmp"
 
@@ -70,7 +71,7 @@ def pack_task(task: ShardTask, after_bytes: Advance) -> ShardOutcome:
     if done is not None:
         return ShardOutcome(done, "kept")
     try:
-        with open_exclusive(_unfinished_of(task)) as file:
+        with _open_exclusive(_unfinished_of(task)) as file:
             done = find_packed(task) or found_whole(task, after_bytes)
             if done is not None:
                 return ShardOutcome(done, "kept")
@@ -102,6 +103,31 @@ def found_whole(task: ShardTask, after_bytes: Advance) -> PackedShard | None:
     write_manifest(task, replace(manifest, modified_ns=status.st_mtime_ns))
     after_bytes(task.shard.source_bytes)
     return manifest.packed
+
+
+@contextmanager
+def _open_exclusive(path: Path) -> Iterator[FileIO]:
+    """Open a new, empty shard for this process alone; it is removed unless it was renamed.
+
+    The lock is a file in ``.parts``, which stays. On a file system without locks nothing keeps two
+    processes from writing one file; one of them will find it altered or gone.
+
+    Raises:
+        ShardError: If another process has it.
+    """
+    lock = path.parent / PARTS / f"{path.name}.lock"
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with try_locked(lock) as is_ours:
+        if not is_ours:
+            raise ShardError(
+                f"{path}: another process is packing this shard. Give each process a part of its "
+                f"own (--part I/N), or wait for that one."
+            )
+        try:
+            with FileIO(path, "w+") as file:
+                yield file
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def _unfinished_of(task: ShardTask) -> Path:
