@@ -24,11 +24,10 @@ from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards import writer as shard_writer
-from stereogenbench_data.shards.manifest import ShardTask
 from stereogenbench_data.shards.pack import OversizedSceneWarning, pack, prepare
 from stereogenbench_data.shards.plan import PlannedMember, PlannedShard, plan_shards
 from stereogenbench_data.shards.verify import verify
-from stereogenbench_data.shards.writer import pack_task
+from stereogenbench_data.shards.writer import ShardTask, pack_task
 from stereogenbench_data.sources.files import locked
 from tests.servers.tools import small_disk
 
@@ -83,7 +82,7 @@ def names_in(shard):
 def pack_shard(plan, number, out):
     """Pack one shard of a plan in this process."""
     task = ShardTask(plan.shards[number], plan.root, str(out), plan.digest)
-    return pack_task(task, no_advance).shard
+    return pack_task(task, no_advance)[0]
 
 
 def test_shards_hold_the_bytes_of_the_release_and_nothing_else(packed, small_release):
@@ -196,7 +195,7 @@ def test_finished_shards_are_kept_and_progress_counts_them(release, tmp_path):
     assert seen == sorted(seen)
 
 
-def test_a_shard_without_its_note_or_of_another_size_is_not_taken_for_finished(
+def test_a_shard_that_is_missing_or_has_another_size_is_not_taken_for_finished(
     packed, release, tmp_path
 ):
     out = shutil.copytree(packed, tmp_path / "out")
@@ -264,15 +263,10 @@ def test_a_source_that_was_edited_after_its_shard_is_named(tree, tmp_path, index
         (tree / "index.parquet").unlink()
         SceneIndex.open(tree).write(tree / "index.parquet")
 
-    with pytest.raises(ShardError) as told:
+    found = f"{key}: its baseline.json is not the one that {tmp_path / 'out' / NAMES[0]}"
+    with pytest.raises(ShardError, match=rf"{found} .* Remove that shard .* run the same command"):
         pack(tree, tmp_path / "out", target_bytes=ONE_EACH, part=(2, 2), workers=1)
 
-    assert f"{key}: its baseline.json is not the one that {tmp_path / 'out' / NAMES[0]}" in str(
-        told.value
-    )
-    assert "Remove that shard to have it packed anew and run the same command again" in str(
-        told.value
-    )
     assert not (tmp_path / "out" / "index.parquet").exists()
 
 
@@ -314,13 +308,10 @@ def test_metadata_that_the_index_does_not_know_are_not_packed(tree, tmp_path):
     SceneIndex.open(tree).write(tree / "index.parquet")
     focal_changed(next(tree.glob("train/Uniform/*/scene_000001")))
 
-    with pytest.raises(ShardError) as told:
+    match = r"scene_000001/baseline\.json: .* focal_mm .* run `stereogenbench index` on the release"
+    with pytest.raises(ShardError, match=match):
         pack(tree, tmp_path / "out", target_bytes=ONE_EACH, workers=1)
 
-    assert re.search(
-        r"scene_000001/baseline\.json: tells focal_mm .* by the index it is", str(told.value)
-    )
-    assert "run `stereogenbench index` on the release again" in str(told.value)
     assert NAMES[3] not in tars(tmp_path / "out")
 
 
@@ -329,13 +320,13 @@ def test_an_index_that_was_changed_after_a_shard_is_not_written_beside_it(tree, 
     pack(index, out, target_bytes=ONE_EACH, part=(1, 2), workers=1)
     scenes = [replace(index.scene(row), caption="Rain.") for row in range(len(index))]
 
-    with pytest.raises(ShardError, match=r"level\.json: tells the caption .* it is 'Rain\.'"):
+    with pytest.raises(ShardError, match=r"level\.json: .* caption .* 'Rain\.'"):
         pack(SceneIndex.from_scenes(scenes, tree), out, target_bytes=ONE_EACH, workers=1)
 
     assert not (out / "index.parquet").exists()
 
 
-def test_packing_goes_on_without_the_notes_of_finished_shards(packed, release, tmp_path):
+def test_packing_continues_without_the_manifests_of_finished_shards(packed, release, tmp_path):
     out = shutil.copytree(packed, tmp_path / "out")
     shutil.rmtree(out / ".parts")
     (out / NAMES[2]).unlink()
@@ -347,12 +338,12 @@ def test_packing_goes_on_without_the_notes_of_finished_shards(packed, release, t
     assert pack(release, out, target_bytes=ONE_EACH, workers=1).packed == ()
 
 
-def test_without_its_note_a_shard_of_other_bytes_is_refused(packed, release, tmp_path):
+def test_without_its_manifest_a_shard_of_other_bytes_is_refused(packed, release, tmp_path):
     out = shutil.copytree(packed, tmp_path / "out")
     shutil.rmtree(out / ".parts")
     changed_bytes(out / NAMES[2])
 
-    with pytest.raises(ShardError, match=f"{NAMES[2]}: is there and was not packed here by this"):
+    with pytest.raises(ShardError, match=f"{NAMES[2]}: already exists and was not packed"):
         pack(release, out, target_bytes=ONE_EACH, workers=1)
 
 
@@ -360,9 +351,9 @@ def test_of_two_packers_each_reports_what_it_packed(packed, release, tmp_path):
     job = prepare(release, tmp_path, target_bytes=ONE_EACH, part=(1, 1))
     shutil.copytree(packed, tmp_path, dirs_exist_ok=True)
 
-    outcomes = [pack_task(job.task(shard), lambda count: None) for shard in job.shards]
+    outcomes = [pack_task(task, no_advance) for task in job.tasks]
 
-    assert {outcome.work for outcome in outcomes} == {"kept"}
+    assert {work for _, work in outcomes} == {"kept"}
 
 
 KILLED_WHILE_PACKING = """
@@ -540,7 +531,7 @@ def test_a_source_that_is_changed_while_it_is_read_is_an_error(tmp_path, change)
         if len(calls) == 1:
             change(source)
 
-    with pytest.raises(ShardError, match=r"film: (was changed while|has \d+ bytes, and had)"):
+    with pytest.raises(ShardError, match=r"film: (was changed while|ends \d+ bytes before)"):
         pack_task(task, after_bytes)
 
     assert tars(tmp_path) == []
@@ -552,7 +543,7 @@ def test_a_folder_in_the_place_of_a_file_is_an_error(tree, tmp_path):
     source.unlink()
     source.mkdir()
 
-    with pytest.raises(ShardError, match=r"cam_00_rgb\.mp4: is no file"):
+    with pytest.raises(ShardError, match=r"cam_00_rgb\.mp4: is not a file"):
         pack(index, tmp_path / "out", workers=1)
 
 
@@ -609,12 +600,10 @@ def test_a_file_system_without_locks_can_be_packed_into(release, tmp_path, monke
 def test_a_folder_that_holds_another_plan_is_refused(release, packed, tmp_path):
     out = shutil.copytree(packed, tmp_path / "out")
 
-    with pytest.raises(
-        ShardError, match=r"begun with another plan \(4 shards of 250000 bytes"
-    ) as told:
+    match = r"plan\.json: .* another plan \(4 shards of 250000 bytes.* Pack into an empty folder"
+    with pytest.raises(ShardError, match=match):
         pack(release, out, target_bytes=10**9)
 
-    assert "Pack into an empty folder, or remove what is in" in str(told.value)
     assert bytes_of(out) == bytes_of(packed)
 
 
@@ -622,7 +611,7 @@ def test_a_folder_that_holds_another_plan_is_refused(release, packed, tmp_path):
 def test_a_folder_that_holds_something_else_is_refused(release, tmp_path, name):
     (tmp_path / name).write_text("mine")
 
-    with pytest.raises(ShardError, match=f"{name}: is there, and .*empty folder"):
+    with pytest.raises(ShardError, match=f"{name}: already exists .* empty folder"):
         pack(release, tmp_path)
 
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == [name]
@@ -632,15 +621,15 @@ def test_a_shard_that_came_from_elsewhere_meanwhile_is_refused(release, tmp_path
     job = prepare(release, tmp_path, target_bytes=ONE_EACH, part=(1, 1))
     (tmp_path / NAMES[0]).write_text("mine")
 
-    with pytest.raises(ShardError, match="is there and was not packed here by this plan"):
-        pack_task(job.unfinished()[0], lambda count: None)
+    with pytest.raises(ShardError, match=f"{NAMES[0]}: already exists and was not packed"):
+        pack_task(job.unfinished()[0], no_advance)
 
 
 def test_a_foreign_shard_among_ours_is_named(release, packed, tmp_path):
     out = shutil.copytree(packed, tmp_path / "out")
     (out / "train-Uniform-000002.tar").write_bytes(b"")
 
-    with pytest.raises(ShardError, match=r"train-Uniform-000002\.tar: is there, and is no shard"):
+    with pytest.raises(ShardError, match=r"Uniform-000002\.tar: already exists .* empty folder"):
         pack(release, out, target_bytes=ONE_EACH)
 
 
@@ -671,7 +660,7 @@ def test_shards_may_lie_beside_the_splits_of_their_release(tree, packed):
 def test_a_refused_folder_is_left_as_it_was(release, tmp_path):
     (tmp_path / "other.tar").write_text("mine")
 
-    with pytest.raises(ShardError, match="no shard of this plan"):
+    with pytest.raises(ShardError, match=r"other\.tar: already exists"):
         pack(release, tmp_path)
 
     assert [path.name for path in tmp_path.iterdir()] == ["other.tar"]
@@ -692,7 +681,7 @@ def test_scenes_larger_than_a_shard_are_warned_of_once(release, tmp_path):
 
 
 def test_shards_are_not_packed_again(packed, tmp_path):
-    with pytest.raises(ShardError, match="holds shards already"):
+    with pytest.raises(ShardError, match="already holds shards"):
         pack(packed, tmp_path)
 
 

@@ -167,7 +167,7 @@ def test_shards_of_another_codec_are_not_mixed_in(shards, small_release):
 
 
 def test_depth_that_is_packed_is_not_packed_again(packed, tmp_path):
-    with pytest.raises(ShardError, match=r"holds shards already\. To pack again, run `stereogenb"):
+    with pytest.raises(ShardError, match=r"already holds shards\. To pack again, run `stereogenb"):
         pack(packed, tmp_path, depth_codec="blosc2")
 
 
@@ -335,7 +335,9 @@ def test_a_scene_that_is_there_and_differs_is_left_alone(packed, unpacked, tmp_p
     change(tree / KEY / name)
     before = bytes_of(tree)
 
-    with pytest.raises(ShardError, match=rf"scene_000001: is there, and is not .*\({name} differ"):
+    with pytest.raises(
+        ShardError, match=rf"scene_000001: already exists, and is not .*\({name} differ"
+    ):
         unpack(packed, tree, workers=1)
 
     assert bytes_of(tree) == before
@@ -356,9 +358,9 @@ def test_a_damaged_member_is_not_unpacked(shards, tmp_path, name):
 
 
 def test_where_there_are_no_shards_nothing_is_unpacked(packed, small_release, tmp_path):
-    with pytest.raises(ShardError, match="is a released tree already"):
+    with pytest.raises(ShardError, match=r"holds no index\.parquet\. Pass a folder that"):
         unpack(small_release, tmp_path)
-    with pytest.raises(ShardError, match="is far away"):
+    with pytest.raises(ShardError, match="is remote"):
         unpack("https://example.org/shards", tmp_path)
     with pytest.raises(ShardError, match="holds the shards themselves"):
         unpack(packed, packed)

@@ -98,7 +98,7 @@ def test_decoding_counts_every_video_and_progress_ends_at_the_end(small_shards):
         ("at a header", "nothing of a header or of the end of the archive is there"),
         ("in a payload", "'{member}' claims "),
         ("before the end", "nothing of a header or of the end of the archive is there"),
-        ("in the end", "only 512 of the 1024 zeros are there that end the archive"),
+        ("in the end", "only 512 of the 1024 zeros that end the archive"),
     ],
 )
 def test_a_cut_shard_is_told_with_the_place_and_what_is_lost(shards, edit, place, where, found):
@@ -133,7 +133,7 @@ def test_a_flipped_payload_byte_is_told_with_its_member(shards, edit, place):
     (told,) = lines(shards)
 
     assert told.startswith(f"{PAIR}: {SCENES[1]}: cam_03_depth.mkv: its bytes have crc32 ")
-    assert told.endswith(f", and by the index {member.crc32:08x} is right. {FETCH}")
+    assert told.endswith(f", and the index says {member.crc32:08x}. {FETCH}")
 
 
 def test_a_flipped_header_byte_is_told_and_what_follows_is_still_looked_at(shards, edit, place):
@@ -154,7 +154,7 @@ def test_a_byte_between_members_is_told_by_the_shard_alone(shards, edit, place):
 
     (told,) = lines(shards)
 
-    assert told.startswith(f"{PAIR}: all members are whole, and yet the file has ")
+    assert told.startswith(f"{PAIR}: all members are sound, but the file has ")
 
 
 def test_bytes_after_the_end_are_told(shards, edit):
@@ -162,7 +162,7 @@ def test_bytes_after_the_end_are_told(shards, edit):
 
     (told,) = lines(shards)
 
-    assert "all members are whole, and yet the file has" in told
+    assert "all members are sound, but the file has" in told
 
 
 def tar_of(files):
@@ -226,10 +226,10 @@ def test_exchanged_names_are_both_told(toy):
     told = toy(tar_of(exchanged))
 
     assert told == [
-        f"x.tar: {KEY}: cam_00_rgb.mp4: has 512 bytes from byte 2560 on, and by the index 512 "
-        f"from 1536 on. {FETCH}",
-        f"x.tar: {KEY}: cam_01_rgb.mp4: has 512 bytes from byte 1536 on, and by the index 512 "
-        f"from 2560 on. {FETCH}",
+        f"x.tar: {KEY}: cam_00_rgb.mp4: has 512 bytes from byte 2560, and the index says 512 "
+        f"from byte 1536. {FETCH}",
+        f"x.tar: {KEY}: cam_01_rgb.mp4: has 512 bytes from byte 1536, and the index says 512 "
+        f"from byte 2560. {FETCH}",
     ]
 
 
@@ -237,23 +237,21 @@ def test_a_missing_member_is_told_and_so_is_what_moved(toy):
     told = toy(tar_of([FILES[0], FILES[2]]))
 
     assert told[0] == f"x.tar: {KEY}: cam_00_rgb.mp4: is missing. {FETCH}"
-    assert "cam_01_rgb.mp4: has 512 bytes from byte 1536 on" in told[1]
+    assert "cam_01_rgb.mp4: has 512 bytes from byte 1536" in told[1]
     assert len(told) == 2
 
 
 def test_a_member_too_many_is_told(toy):
     told = toy(tar_of([*FILES, (f"{KEY}.cam_09_rgb.mp4", b"more")]))
 
-    assert told == [
-        f"x.tar: {KEY}: cam_09_rgb.mp4: is there, and the index does not know it. {FETCH}"
-    ]
+    assert told == [f"x.tar: {KEY}: cam_09_rgb.mp4: is not in the index. {FETCH}"]
 
 
 def test_a_renamed_scene_is_of_another_pack(toy):
     told = toy(tar_of([(name.replace("0001", "0002"), content) for name, content in FILES]))
 
     assert told == [
-        f"x.tar: holds other scenes than the index says: 1 unknown, 1 not there ({KEY}, "
+        f"x.tar: holds other scenes than the index says: 1 unknown, 1 missing ({KEY}, "
         f"{KEY[:-1]}2); shard and index are of different packs. Put the index beside the shards "
         f"that it was packed with."
     ]
@@ -265,8 +263,8 @@ def test_a_renamed_scene_is_of_another_pack(toy):
         ("a/x.pkl", tarfile.REGTYPE, "'a/x.pkl': may hold code that runs when it is loaded"),
         ("a/x.pyd", tarfile.REGTYPE, "may hold code that runs when it is loaded (.pyd)"),
         ("a/x.pth", tarfile.REGTYPE, "may hold code that runs when it is loaded (.pth)"),
-        ("../x.json", tarfile.REGTYPE, "'../x.json': its name is no relative path"),
-        ("/x.json", tarfile.REGTYPE, "'/x.json': its name is no relative path"),
+        ("../x.json", tarfile.REGTYPE, "'../x.json': its name is not a relative path"),
+        ("/x.json", tarfile.REGTYPE, "'/x.json': its name is not a relative path"),
         ("a/x.mp4", tarfile.SYMTYPE, "'a/x.mp4' is a symbolic link"),
         ("a/x.mp4", tarfile.LNKTYPE, "'a/x.mp4' is a hard link"),
         ("a/x.mp4", tarfile.CHRTYPE, "'a/x.mp4' is a character device"),
@@ -274,7 +272,7 @@ def test_a_renamed_scene_is_of_another_pack(toy):
         ("a/x.mp4", tarfile.GNUTYPE_SPARSE, "'a/x.mp4' is a GNU sparse file"),
         ("a/x.mp4", tarfile.XHDTYPE, "'a/x.mp4' is a PAX header"),
         ("././@LongLink", tarfile.GNUTYPE_LONGNAME, "is a GNU long name"),
-        (FILES[0][0], tarfile.REGTYPE, "_000001.cam_00_depth.mkv' is there a second time"),
+        (FILES[0][0], tarfile.REGTYPE, "_000001.cam_00_depth.mkv' occurs a second time"),
     ],
 )  # fmt: skip
 def test_a_member_that_no_shard_may_hold_is_refused_by_name(toy, name, kind, found):
@@ -310,8 +308,8 @@ def test_shards_that_the_index_does_not_know_are_told(shards):
     (shards / "train-Uniform-000002.tar.tmp").write_bytes(b"half")
 
     assert lines(shards) == [
-        "train-Uniform-000001.tar: is there, and the index does not know it. Put the index "
-        "beside the shards that it was packed with.",
+        "train-Uniform-000001.tar: is not in the index. Put the index beside the shards that it "
+        "was packed with.",
         "train-Uniform-000002.tar.tmp: is an unfinished shard. Run `stereogenbench pack` again, "
         "or remove it.",
     ]
@@ -378,8 +376,8 @@ def test_a_video_with_fewer_frames_is_told_by_decoding(repacked, tmp_path):
     short = write_video(tmp_path / "short.mp4", frames=6, size=(64, 64), tags={})
 
     assert repacked("cam_01_rgb.mp4", short.read_bytes()) == [
-        f"{PAIR}: {SCENES[0]}: cam_01_rgb.mp4: has 6 frames of 64x64 pixels, and by the index 7 "
-        f"of 64x64. Pack the scene again from a video that is whole."
+        f"{PAIR}: {SCENES[0]}: cam_01_rgb.mp4: has 6 frames of 64x64 pixels, and the index says "
+        f"7 of 64x64. Pack the scene again from an undamaged video."
     ]
 
 
@@ -401,7 +399,7 @@ def test_depth_of_another_unit_than_the_index_says_is_told_by_decoding(repacked,
     (told,) = repacked("cam_05_depth.mkv", other.read_bytes())
 
     assert (
-        "cam_05_depth.mkv: is stored as ('ffv1', 'gray16le', 0.5), and by the index as "
+        "cam_05_depth.mkv: is stored as ('ffv1', 'gray16le', 0.5), and the index says "
         "('ffv1', 'gray16le', 0.001)"
     ) in told
 
@@ -420,7 +418,7 @@ def test_a_folder_that_was_not_finished_is_refused(shards):
 
 
 def test_a_folder_without_index_is_refused(tmp_path):
-    with pytest.raises(ShardError, match=r"holds no index\.parquet\. Point at a folder that"):
+    with pytest.raises(ShardError, match=r"holds no index\.parquet\. Pass a folder that"):
         verify(tmp_path)
 
 
@@ -432,7 +430,7 @@ def test_a_released_folder_is_not_shards(small_release, tmp_path):
 
 
 def test_far_shards_are_to_be_fetched(tmp_path):
-    with pytest.raises(ShardError, match=r"is far away\. Fetch the shards"):
+    with pytest.raises(ShardError, match=r"shards: is remote\. Download the shards"):
         verify("https://example.org/shards")
 
 
@@ -475,7 +473,7 @@ def test_an_index_that_contradicts_a_shards_metadata_is_told(shards, member, cha
 
 @pytest.mark.parametrize("name", ["shards.json", f"dali/{PAIR[:-4]}.idx"])
 def test_files_for_other_readers_that_are_missing_or_altered_are_told(shards, name):
-    write = "Fetch it again, or write it anew: run `stereogenbench pack` again."
+    write = "Fetch it again, or run `stereogenbench pack` again to write it."
     content = (shards / name).read_bytes()
     (shards / name).write_bytes(content.replace(b"1", b"2", 1))
     altered = lines(shards)
@@ -512,7 +510,7 @@ def test_an_index_that_contradicts_itself_is_refused(shards):
     index.shards.pop(PAIR)
     index.write(shards / "index.parquet")
 
-    with pytest.raises(ShardError, match=f"in {PAIR} and knows no such shard"):
+    with pytest.raises(ShardError, match=f"in {PAIR}, but does not list this shard"):
         verify(shards)
 
 
@@ -591,4 +589,4 @@ def test_a_link_to_nowhere_is_no_shard(shards):
 
     [line] = lines(shards)
 
-    assert line.startswith(f"{shard.name}: is no file, with ")
+    assert line.startswith(f"{shard.name}: is not a file, with ")
