@@ -58,7 +58,7 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rays:
-    """Rays by their place in the plane at depth 1: right of and below the optical axis.
+    """Rays by their place in the plane at depth 1, to the right of and below the optical axis.
 
     They are either a grid, with ``right`` (1, w) and ``below`` (h, 1), or a list, with both (n,).
     """
