@@ -29,12 +29,7 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.companion_files import companion_files
-from stereogenbench_data.shards.tar import (
-    FETCH_AGAIN,
-    TarMember,
-    read_checksums,
-    read_members,
-)
+from stereogenbench_data.shards.tar import FETCH_AGAIN, TarMember, read_checksums, read_members
 from stereogenbench_data.shards.unpack import open_shards
 from stereogenbench_data.shards.writer import UNFINISHED
 
@@ -64,7 +59,7 @@ class Problem:
 class _ExpectedShard:
     """What the index says of one shard; members are by their whole name in it."""
 
-    root: str
+    path: Path
     shard: str
     facts: ShardFacts
     scenes: list[Scene] = field(default_factory=list)
@@ -129,7 +124,7 @@ def verify(
         index = open_shards(data, root)
     expected = _expected_of(index)
     problems = list(_folder_problems(index, expected))
-    checks = [each for each in expected.values() if Path(each.root, each.shard).is_file()]
+    checks = [each for each in expected.values() if each.path.is_file()]
     scenes = [index.scene(row) for row in range(len(index))] if mode == "decode" else []
     video_bytes = sum(scene.members[name].size for scene in scenes for name in scene.held_videos)
     total = sum(each.facts.size for each in checks) + video_bytes
@@ -166,7 +161,7 @@ def verify(
 
 def _expected_of(index: SceneIndex) -> dict[str, _ExpectedShard]:
     expected = {
-        name: _ExpectedShard(index.root, name, facts)
+        name: _ExpectedShard(Path(index.root, name), name, facts)
         for name, facts in sorted(index.shards.items())
     }
     for scene in map(index.scene, range(len(index))):
@@ -186,7 +181,7 @@ def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> 
     """Yield files that are missing, unknown, or differ from what the index says."""
     there = {path.name for path in Path(index.root).iterdir()}
     for each in expected.values():
-        if not Path(each.root, each.shard).is_file():
+        if not each.path.is_file():
             scenes = counted(len(each.scenes), "scene")
             what = "is not a file" if each.shard in there else "is missing"
             yield each.problem("", f"{what}, with {scenes}")
@@ -212,10 +207,9 @@ def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> 
 
 def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> tuple[list[Problem], set[str]]:
     """Return what is wrong with a shard, and its sound members; a worker process calls this."""
-    path = Path(expected.root, expected.shard)
     try:
-        with path.open("rb", buffering=0) as file:
-            return _check_contents(expected, file, path.stat().st_size, after_bytes)
+        with expected.path.open("rb", buffering=0) as file:
+            return _check_contents(expected, file, expected.path.stat().st_size, after_bytes)
     except OSError as error:
         found = f"cannot be read ({error.strerror or error})"
         return [expected.problem("", found, cure_of(error, FETCH_AGAIN))], set()

@@ -37,12 +37,7 @@ from stereogenbench_data.shards.tar import (
     read_chunks,
     read_members,
 )
-from stereogenbench_data.sources.files import (
-    PARTS,
-    copy_with_crc32,
-    open_exclusive,
-    write_atomic,
-)
+from stereogenbench_data.sources.files import PARTS, copy_with_crc32, open_exclusive, write_atomic
 
 UNFINISHED: Final = ".tmp"
 
@@ -389,10 +384,8 @@ def _copy_source(
         crc32 = copy_with_crc32(_source_chunks(source, file, size), take)
         with readable(source):
             after = source.stat()
-        if any(
-            getattr(after, name) != getattr(before, name)
-            for name in ("st_ino", "st_size", "st_mtime_ns")
-        ):
+        found = (after.st_size, after.st_mtime_ns)
+        if found != (size, before.st_mtime_ns) or not os.path.samestat(after, before):
             raise ShardError(
                 f"{source}: was changed while it was packed. Let nothing write to the release, "
                 f"then run the same command again."

@@ -87,15 +87,15 @@ def test_a_damaged_file_is_refused_and_leaves_nothing_behind(shards_on_the_web, 
     shard = f"shards/{wanted.files[-1].member.path}"
     web.always[shard] = Answer(change=lambda data: bytes([data[0] ^ 1]) + data[1:])
 
-    with pytest.raises(
-        StorageError, match=r"baseline\.json: has crc32 [0-9a-f]{8}, and .* fetch"
-    ):
+    with pytest.raises(StorageError, match=r"baseline\.json: has crc32 [0-9a-f]{8}, and .* fetch"):
         download(index, wanted, tmp_path / "part", workers=1)
 
     assert [path for path in (tmp_path / "part").rglob("*") if path.is_file()] == []
 
 
-def test_a_full_disk_is_told_before_anything_is_fetched(shards_on_the_web, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_before_anything_is_fetched(
+    shards_on_the_web, tmp_path, monkeypatch
+):
     monkeypatch.setattr(download_module, "_SPARE_BYTES", 10**18)
 
     with pytest.raises(StorageError, match=r"part: needs \d+ bytes, and the disk has \d+ left"):

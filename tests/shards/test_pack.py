@@ -30,6 +30,7 @@ from stereogenbench_data.shards.verify import verify
 from stereogenbench_data.shards.writer import ShardTask, pack_task
 from stereogenbench_data.sources.files import locked
 from tests.servers.tools import small_disk
+from tests.shards.shard_files import bytes_of, flip_byte
 
 ONE_EACH = 250_000
 """A target that holds one of the small release's scenes, not two."""
@@ -59,15 +60,6 @@ def packed(release, tmp_path_factory):
 def tree(small_release, tmp_path):
     """A copy of the small release that a test may change."""
     return shutil.copytree(small_release, tmp_path / "release")
-
-
-def bytes_of(folder):
-    """What is public in a folder: name to sha256."""
-    return {
-        path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and ".parts" not in path.parts
-    }
 
 
 def tars(folder):
@@ -209,19 +201,11 @@ def test_a_shard_that_is_missing_or_has_another_size_is_not_taken_for_finished(
     assert bytes_of(out) == bytes_of(packed)
 
 
-def changed_bytes(path):
-    """Change a byte without changing the size, and the time of change for certain."""
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-    os.utime(path, ns=(0, path.stat().st_mtime_ns + 10**9))
-
-
 def test_a_finished_shard_that_was_changed_at_the_same_size_is_packed_again(
     packed, release, tmp_path
 ):
     out = shutil.copytree(packed, tmp_path / "out")
-    changed_bytes(out / NAMES[1])
+    flip_byte(out / NAMES[1])
 
     report = pack(release, out, target_bytes=ONE_EACH, workers=1)
 
@@ -287,7 +271,7 @@ def test_an_edited_video_is_named_whatever_its_size(tree, tmp_path):
     source = next(tree.glob("eval/*/*/*/scene_000000/cam_02_depth.mkv"))
     touched = next(tree.glob("eval/*/*/*/scene_000000/cam_01_depth.mkv"))
     os.utime(touched, (1, 1))
-    changed_bytes(source)
+    flip_byte(source)
 
     with pytest.raises(ShardError, match=r"scene_000000: its cam_02_depth\.mkv is not the one"):
         pack(tree, tmp_path / "out", target_bytes=ONE_EACH, workers=1)
@@ -341,7 +325,7 @@ def test_packing_continues_without_the_manifests_of_finished_shards(packed, rele
 def test_without_its_manifest_a_shard_of_other_bytes_is_refused(packed, release, tmp_path):
     out = shutil.copytree(packed, tmp_path / "out")
     shutil.rmtree(out / ".parts")
-    changed_bytes(out / NAMES[2])
+    flip_byte(out / NAMES[2])
 
     with pytest.raises(ShardError, match=f"{NAMES[2]}: already exists and was not packed"):
         pack(release, out, target_bytes=ONE_EACH, workers=1)
@@ -421,12 +405,12 @@ def test_ctrl_c_ends_with_exit_code_130_and_leaves_no_half_shard(small_release, 
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)
         try:
-            _, told = process.communicate(timeout=30)
+            _, message = process.communicate(timeout=30)
         finally:
             process.kill()
 
     assert process.returncode == 130
-    assert told == "stopped; run the same command again to go on from here\n"
+    assert message == "stopped; run the same command again to go on from here\n"
     assert tars(tmp_path) == []
 
 
@@ -496,17 +480,17 @@ def lengthened(source):
 
 
 def test_a_source_that_grew_after_the_plan_is_an_error(tree, tmp_path):
-    told = change_while_packing(tree, tmp_path / "out", lengthened)
+    message = change_while_packing(tree, tmp_path / "out", lengthened)
 
-    assert "cam_00_rgb.mp4: has " in told
-    assert "when the plan was made. Let nothing write to the release" in told
+    assert "cam_00_rgb.mp4: has " in message
+    assert "when the plan was made. Let nothing write to the release" in message
     assert [name for name in tars(tmp_path / "out") if "train-Uniform" in name] == []
 
 
 def test_a_source_that_shrank_after_the_plan_is_an_error(tree, tmp_path):
-    told = change_while_packing(tree, tmp_path / "out", lambda source: os.truncate(source, 100))
+    message = change_while_packing(tree, tmp_path / "out", lambda source: os.truncate(source, 100))
 
-    assert "cam_00_rgb.mp4: has 100 bytes, and had" in told
+    assert "cam_00_rgb.mp4: has 100 bytes, and had" in message
 
 
 @pytest.mark.parametrize(
@@ -735,7 +719,7 @@ def test_dali_finds_every_file_where_tarfile_finds_it(packed):
         assert [line[at : at + 4] for line in words for at in range(0, len(line), 4)] == expected
 
 
-def test_wids_is_told_of_every_shard(packed):
+def test_wids_lists_every_shard(packed):
     listed = json.loads((packed / "shards.json").read_text())
 
     assert listed == {
@@ -752,7 +736,7 @@ def command(*words):
     return CliRunner().invoke(app, ["pack", *map(str, words)])
 
 
-def test_the_command_packs_and_tells_what_there_is(small_release, tmp_path, packed):
+def test_the_command_packs_and_reports_what_there_is(small_release, tmp_path, packed):
     first = command(small_release, tmp_path, "--shard-size", "250kB", "--part", "1/2")
     second = command(small_release, tmp_path, "--shard-size", "250kB", "--workers", "1")
 
@@ -797,23 +781,6 @@ def test_a_part_that_is_not_written_as_one_is_a_usage_error(small_release, tmp_p
 
     assert result.exit_code == 2
     assert all(word in result.stderr for word in ("--part", "I/N"))
-
-
-def test_help_imports_nothing_heavy():
-    code = (
-        "import sys; from stereogenbench_data.cli import main; sys.argv = ['x', '--help']\n"
-        "try: main.main()\n"
-        "except SystemExit: pass\n"
-        "sys.exit(', '.join({'torch', 'pyarrow', 'av', 'ray', 'numpy'} & sys.modules.keys()))"
-    )
-
-    shown = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False
-    )
-
-    assert "pack" in shown.stdout
-    assert "verify" in shown.stdout
-    assert {word for word in ("torch", "pyarrow", "av", "ray") if word in shown.stderr} == set()
 
 
 KILLED_PACK = """

@@ -16,22 +16,13 @@ from stereogenbench_data.shards.tar import (
     LARGEST_MEMBER_BYTES,
     TarMember,
     member_header,
-    padded,
     read_checksums,
     read_members,
 )
 from tests.servers.tools import require_tool
+from tests.shards.shard_files import tar_of
 
 LONG = f"train/{'f' * 60}/{'m' * 60}/scene_000041.cam_00_rgb.mp4"
-
-
-def tar_of(members):
-    """A tar by our own headers."""
-    blocks = [
-        member_header(name, len(content)) + content + bytes(padded(len(content)) - len(content))
-        for name, content in members
-    ]
-    return b"".join(blocks) + END_OF_ARCHIVE
 
 
 def members_of(content):
@@ -147,7 +138,7 @@ def test_gnu_tar_lists_the_same_files(tmp_path):
     ]
 
 
-def test_members_are_told_with_where_their_bytes_begin():
+def test_members_are_reported_with_where_their_bytes_begin():
     assert members_of(tar_of(TWO)) == [
         TarMember("a/one.json", 512, 600),
         TarMember("a/one.cam_00_rgb.mp4", 512 + 1024 + 512, 2048),
@@ -235,7 +226,7 @@ def test_no_damaged_byte_of_a_header_or_of_the_end_goes_unseen(place, change):
         assert "x.tar: at byte" in str(error)  # noqa: PT017
 
 
-def test_a_damaged_header_is_told_with_its_checksum():
+def test_a_damaged_header_is_reported_with_its_checksum():
     content = bytearray(tar_of(TWO))
     content[1536 + 3] ^= 1
 
