@@ -117,8 +117,8 @@ def pack(  # noqa: PLR0913 - each is an option of the command
 
     Raises:
         StorageError: If the release cannot be read or scenes of it are broken, or a worker died.
-        ShardError: If a shard cannot be packed; or the folder lies in the release, or holds
-            another plan, other shards, or shards that were packed from other files.
+        ShardError: If a shard cannot be packed; or the folder is in the release, or holds another
+            plan, other shards, or shards that were packed from other files.
     """
     job = prepare(data, out, target_bytes=target_bytes, depth_codec=depth_codec, part=part)
     tasks = job.unfinished()
@@ -148,8 +148,8 @@ def prepare(
 
     Raises:
         StorageError: If the release cannot be read or scenes of it are broken.
-        ShardError: As `pack` says of the folder; also if no scene fits into a shard, or there is
-            no such part.
+        ShardError: As `pack` says of the folder; if no scene fits into a shard; or if the part is
+            not one of 1 to N.
         ExtraError: If the codec needs a package that is not installed.
     """
     number, count = part
@@ -200,7 +200,7 @@ def _require_fitting(plan: ShardPlan) -> None:
 
 
 def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
-    """Write the index, if all shards of the plan are there by now.
+    """Write the index, if all shards of the plan are finished by now.
 
     Raises:
         StorageError: If the index cannot be written.
@@ -232,7 +232,7 @@ def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
             for manifest in shards
         },
     )
-    # The index comes last: where there is one, everything else is there, too.
+    # The index is written last: where it exists, everything else does, too.
     write_companion_files(index, out=job.out)
     index.write(job.out / INDEX_NAME)
     warn_if_stale(job.out)
@@ -256,10 +256,10 @@ def _scenes_in(scenes: tuple[Scene, ...], shard: ShardManifest) -> Iterator[Scen
 
 
 def _claim_folder(plan: ShardPlan, out: Path) -> None:
-    """Write the plan into the folder, unless it is there; refuse before anything is written.
+    """Write the plan into the folder, unless it was; refuse before anything is written.
 
     Raises:
-        ShardError: If the folder lies in the release, or holds what other plans left.
+        ShardError: If the folder is in the release, or holds files of other plans.
         OSError: If it cannot be written to.
     """
     place = out / PARTS / _PLAN_FILE
@@ -279,9 +279,9 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
         found = None
     if found != expected:
         raise ShardError(
-            f"{place}: this folder was begun with another plan ({_brief(found)}, and this one is "
-            f"{_brief(expected)}): the release, the size of the shards or the depth codec was "
-            f"another. Pack into an empty folder, or remove what is in {out}."
+            f"{place}: this folder is for another plan ({_brief(found)}, and this one is "
+            f"{_brief(expected)}): the release, the size of the shards or the depth codec differs. "
+            f"Pack into an empty folder, or remove what is in {out}."
         )
     _require_no_others(plan, out)
 
@@ -301,7 +301,7 @@ def _require_outside_release(plan: ShardPlan, out: Path) -> None:
     for split in ("train", "eval"):
         if any(place.is_relative_to(each) for each in (root / split, (root / split).resolve())):
             raise ShardError(
-                f"{out}: lies in {plan.root}/{split}, among the scenes of the release. "
+                f"{out}: is in {plan.root}/{split}, among the scenes of the release. "
                 f"Pack into a folder outside it."
             )
 
@@ -309,8 +309,8 @@ def _require_outside_release(plan: ShardPlan, out: Path) -> None:
 def _require_own_shards(plan: ShardPlan, out: Path) -> None:
     """Refuse a folder without a plan that holds anything but shards of this plan.
 
-    A shard that holds the members of this plan by name may be a finished one whose manifest is
-    gone: its bytes are compared when its turn comes.
+    A shard with the same members may be a finished one without its manifest: its bytes are compared
+    later, by the worker that packs it.
     """
     _require_no_others(plan, out)
     ours = [shard for shard in plan.shards if (out / shard.name).exists()]

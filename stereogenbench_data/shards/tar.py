@@ -144,7 +144,7 @@ def read_members(file: BinaryFile, size: int, *, where: str) -> list[TarMember]:
         if len(block) < BLOCK_BYTES:
             what = f"only {len(block)} of the {BLOCK_BYTES} bytes" if block else "nothing"
             raise ShardError(
-                f"{place} {what} of a header or of the end of the archive is there: the shard is "
+                f"{place} there is {what} of a header or of the end of the archive: the shard is "
                 f"cut short. {FETCH_AGAIN}"
             )
         if not any(block):
@@ -168,8 +168,8 @@ def read_members(file: BinaryFile, size: int, *, where: str) -> list[TarMember]:
 def _require_end(file: BinaryFile, left: int, *, place: str) -> None:
     if left < len(END_OF_ARCHIVE):
         raise ShardError(
-            f"{place} only {left} of the {len(END_OF_ARCHIVE)} zeros that end the archive are "
-            f"there: the shard is cut short. {FETCH_AGAIN}"
+            f"{place} there are only {left} of the {len(END_OF_ARCHIVE)} zeros that end the "
+            f"archive: the shard is cut short. {FETCH_AGAIN}"
         )
     for chunk in read_chunks(file, left - BLOCK_BYTES):
         if chunk.strip(b"\0"):

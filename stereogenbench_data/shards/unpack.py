@@ -70,12 +70,12 @@ def unpack(
 ) -> UnpackReport:
     """Turn shards back into a tree in the released layout.
 
-    Scenes that are there already are kept, so a run that was stopped continues when it is run
-    again. Nothing is overwritten.
+    Existing scenes are kept, so a run that was stopped continues when it is run again. Nothing is
+    overwritten.
 
     Args:
         data: The folder of the shards, or its index file.
-        root: The folder of the shards, where the index file lies elsewhere.
+        root: The folder of the shards, if the index file is elsewhere.
         out: Folder for the tree; created if it does not exist.
         workers: The number of processes; None is one a core.
         progress: Called repeatedly with the bytes of members done, and all of them.
@@ -139,7 +139,7 @@ def open_shards(data: str | Path, root: str | Path | None) -> SceneIndex:
 
     Args:
         data: The folder of the shards, or its index file.
-        root: The folder of the shards, where the index file lies elsewhere.
+        root: The folder of the shards, if the index file is elsewhere.
 
     Raises:
         StorageError: If there is no index of shards, or it cannot be opened.
@@ -164,7 +164,7 @@ def open_shards(data: str | Path, root: str | Path | None) -> SceneIndex:
 def unpack_scene(
     task: _UnpackTask, after_bytes: Advance
 ) -> tuple[str, Literal["unpacked", "kept"]]:
-    """Unpack one scene, unless it is there; a worker process calls this.
+    """Unpack one scene, unless it exists; a worker process calls this.
 
     Raises:
         ShardError: As `unpack` says.

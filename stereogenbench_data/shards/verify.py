@@ -108,7 +108,7 @@ def verify(
 
     Args:
         data: The folder of the shards, or its index file.
-        root: The folder of the shards, where the index file lies elsewhere.
+        root: The folder of the shards, if the index file is elsewhere.
         mode: "bytes" reads all bytes; "decode" then also decodes all frames of all videos.
         workers: The number of processes; None is one a core.
         engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster`.
@@ -116,7 +116,7 @@ def verify(
             videos count twice.
 
     Raises:
-        StorageError: If there is no index, it is not one of shards, or a worker died.
+        StorageError: If there is no index of shards, or a worker died.
     """
     with warnings.catch_warnings():
         # A stale index is a problem, reported with the others.
@@ -325,8 +325,8 @@ def _differing(expected: _ExpectedShard, found: dict[str, TarMember]) -> Iterato
 def _apart(members: dict[str, Member]) -> dict[str, Member]:
     """Return members in the order of their bytes, without any that begins inside another.
 
-    Only an altered index has such members, and only a tar that cannot be read lets them through:
-    that is reported.
+    Only an altered index has such members, and only an unreadable tar, which is reported, lets them
+    come this far.
     """
     apart: dict[str, Member] = {}
     end = 0

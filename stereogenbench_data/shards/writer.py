@@ -13,7 +13,7 @@ import stat
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from io import FileIO
 from itertools import groupby
 from pathlib import Path
@@ -113,17 +113,17 @@ def row_digest(scene: Scene) -> str:
 def read_manifest(task: ShardTask) -> ShardManifest | None:
     """Return the manifest that this plan wrote for a shard, None if there is no usable one."""
     try:
-        found = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in json.loads(task.manifest.read_bytes()).items()
-        }
-        sources = tuple(SourceStamp(*stamp) for stamp in found["sources"])
-        manifest = ShardManifest(**found | {"sources": sources, "rows": dict(found["rows"])})
-        counts = set(map(len, (manifest.offsets, manifest.sizes, manifest.crc32s, sources)))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        found = json.loads(task.manifest.read_bytes())
+        found |= {name: tuple(found[name]) for name in ("offsets", "sizes", "crc32s", "members")}
+        found["sources"] = tuple(SourceStamp(*stamp) for stamp in found["sources"])
+        found["rows"] = dict(found["rows"])
+        manifest = ShardManifest(**{each.name: found[each.name] for each in fields(ShardManifest)})
+    except (OSError, ValueError, KeyError, TypeError):
         return None
     is_ours = (manifest.plan, manifest.name) == (task.plan_digest, task.shard.name)
-    return manifest if is_ours and counts == {len(task.shard.members)} else None
+    listed = (manifest.offsets, manifest.sizes, manifest.crc32s, manifest.members, manifest.sources)
+    is_whole = set(map(len, listed)) == {len(task.shard.members)}
+    return manifest if is_ours and is_whole else None
 
 
 def _write_manifest(task: ShardTask, manifest: ShardManifest) -> None:
@@ -180,12 +180,12 @@ def _with_bytes_of(
 def pack_task(
     task: ShardTask, after_bytes: Advance
 ) -> tuple[ShardManifest, Literal["packed", "kept"]]:
-    """Pack one shard into its folder, unless it is there already; a worker process calls this.
+    """Pack one shard into its folder, unless it is finished; a worker process calls this.
 
     Raises:
         ShardError: If a source is missing, unreadable, changes meanwhile or contradicts the index;
-            the disk is full; the shard does not read back as written; a file that was not packed
-            here has its name; or another process is packing it.
+            the disk is full; the shard does not read back as written; another file has its name;
+            or another process is packing it.
     """
     done = find_packed(task)
     if done is not None:

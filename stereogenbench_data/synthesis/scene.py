@@ -220,7 +220,11 @@ def random_scene(rng: np.random.Generator, *, framing: Framing, walk_m_s: float)
     return SceneModel(
         slope=slope,
         ground=_material(rng, textures=_GROUNDS, tile_m=(2.0, 4.0)),
-        static_shapes=tuple(_on_slope(shape, slope=slope) for shape in static_shapes),
+        # The shapes stand on a level ground; here they are raised to the slanted one.
+        static_shapes=tuple(
+            replace(shape, centre=shape.centre + _UP * (slope @ shape.centre[:2]))
+            for shape in static_shapes
+        ),
         clothes=(
             Material("plaster", 0.5, (1.5, 1.05, 0.8)),
             _material(rng, textures=_CLOTHES, tile_m=(0.3, 0.8)),
@@ -239,11 +243,6 @@ def _material(
     red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
     texture = textures[int(rng.integers(len(textures)))]
     return Material(texture, float(rng.uniform(*tile_m)), (red, green, blue))
-
-
-def _on_slope(shape: Shape, *, slope: Float64[np.ndarray, "2"]) -> Shape:
-    """Raise a shape from a level ground at height 0 to the slanted ground."""
-    return replace(shape, centre=shape.centre + _UP * (slope @ shape.centre[:2]))
 
 
 def _rotated_axes(*, yaw: float, tilt: float = 0.0) -> Array:

@@ -322,6 +322,22 @@ def test_packing_continues_without_the_manifests_of_finished_shards(packed, rele
     assert pack(release, out, target_bytes=ONE_EACH, workers=1).packed == ()
 
 
+@pytest.mark.parametrize(
+    "content",
+    ["", "[]", "5", "{}", '{"offsets": 1}', "cut", "of another shard"],
+)
+def test_a_manifest_that_cannot_be_used_counts_as_missing(packed, release, tmp_path, content):
+    out = shutil.copytree(packed, tmp_path / "out")
+    place, other = (out / ".parts" / name.replace(".tar", ".json") for name in NAMES[:2])
+    made = {"cut": place.read_text()[:-5], "of another shard": other.read_text()}
+    place.write_text(made.get(content, content))
+
+    report = pack(release, out, target_bytes=ONE_EACH, workers=1)
+
+    assert report.packed == ()
+    assert bytes_of(out) == bytes_of(packed)
+
+
 def test_without_its_manifest_a_shard_of_other_bytes_is_refused(packed, release, tmp_path):
     out = shutil.copytree(packed, tmp_path / "out")
     shutil.rmtree(out / ".parts")

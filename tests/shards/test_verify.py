@@ -85,9 +85,9 @@ def test_decoding_counts_every_video_and_progress_ends_at_the_end(small_shards):
     ("where", "found"),
     [
         ("in a header", "only 100 of the 512 bytes of a header or of the end of the archive"),
-        ("at a header", "nothing of a header or of the end of the archive is there"),
+        ("at a header", "nothing of a header or of the end of the archive"),
         ("in a payload", "'{member}' claims "),
-        ("before the end", "nothing of a header or of the end of the archive is there"),
+        ("before the end", "nothing of a header or of the end of the archive"),
         ("in the end", "only 512 of the 1024 zeros that end the archive"),
     ],
 )
