@@ -147,7 +147,7 @@ def write_depth_video(
         stream.codec_context.time_base = time_base
         stream.time_base = time_base
         for index, pts in enumerate(clip.pts):
-            frame = _grey_frame(packed.units(index), pixel_format=clip.pixel_format)
+            frame = grey_frame(packed.units(index), pixel_format=clip.pixel_format)
             frame.pts, frame.time_base = pts, time_base
             container.mux(stream.encode(frame))
             after_frame()
@@ -155,7 +155,8 @@ def write_depth_video(
     _require_same_video(packed, target)
 
 
-def _grey_frame(units: UInt16[np.ndarray, "h w"], *, pixel_format: str) -> av.VideoFrame:
+def grey_frame(units: UInt16[np.ndarray, "h w"], *, pixel_format: str) -> av.VideoFrame:
+    """Return depth in stored units as a frame, whose rows may be longer than the array's."""
     height, width = units.shape
     frame = av.VideoFrame(width, height, pixel_format)
     plane = frame.planes[0]

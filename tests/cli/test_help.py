@@ -113,7 +113,7 @@ def test_help_imports_neither_torch_nor_numpy():
         "import sys; from stereogenbench_data.cli.commands import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: pass\n"
-        "heavy = {'torch', 'numpy', 'pyarrow', 'av', 'PIL'} & sys.modules.keys()\n"
+        "heavy = {'torch', 'numpy', 'pyarrow', 'av', 'PIL', 'ray'} & sys.modules.keys()\n"
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
