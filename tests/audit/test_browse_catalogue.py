@@ -8,6 +8,7 @@ import pytest
 from stereogenbench_data import DepthEncoding, SceneIndex, SelectionError, StereoPairs
 from stereogenbench_data.audit.browser.catalogue import Catalogue, Choice, parse_choice
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
+from tests.audit.browsing import run
 
 SCENE = "train/Uniform/SynthStage/scene_000001"
 
@@ -20,12 +21,6 @@ def index(small_release):
 @pytest.fixture(scope="module")
 def catalogue(index, small_release):
     return Catalogue(index, shown_data=str(small_release))
-
-
-def run(line):
-    names = {}
-    exec(line, names)  # the line under test, which is to run as it stands
-    return names
 
 
 QUERIES = [

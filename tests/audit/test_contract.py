@@ -34,7 +34,6 @@ from tests.audit.corruption import (
     copied,
     edit_baseline,
     exchange,
-    lagged,
     late,
     place_cameras,
     rewrite_depth,
@@ -440,7 +439,7 @@ def test_inverse_depth_is_found_with_its_unit(verdict_on):
 
 @pytest.mark.parametrize("lag", [-2, 2])
 def test_a_lag_is_found(verdict_on, lag):
-    verdict = verdict_on(lambda folder: rewrite_depth(folder, lagged(lag)), frames=5)
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, late(lag)), frames=5)
 
     assert wrong_topics(verdict) == {"frame lag"}
     assert f"{lag}" in answer(verdict, "frame lag").found.split(" or ")
@@ -483,7 +482,7 @@ def test_files_numbered_one_too_high_are_seen_and_nothing_is_pasted(verdict_on):
     [
         (5, scaled(0.5), r"is 0\.[45]\d* x that of the others"),
         (1, scaled(1.05), r"is 1\.0[45]\d* x that of the others"),
-        (3, lagged(2), r"fits better with a lag of \+2 frames"),
+        (3, late(2), r"fits better with a lag of \+2 frames"),
         (0, lambda units: np.flip(units, 1), r"fits better flipped \(vertical\)"),
     ],
     ids=["halved", "5 % more", "lagged", "flipped"],
