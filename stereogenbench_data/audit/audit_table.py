@@ -293,7 +293,7 @@ def audit_markdown(report: AuditReport) -> str:
         "",
         "Reprojection: left depth to the right camera, and back by the right depth; pixels whose "
         "two depths differ by more than the tolerance (share of depth + steps of stored depth) "
-        "count as occluded. The paper does not tell its tolerance.",
+        "count as occluded. The paper does not state its tolerance.",
     ]
     lines += _listed("Findings", [str(finding) for finding in report.findings])
     lines += _listed("Not testable", [str(each) for each in report.untested])

@@ -50,9 +50,9 @@ def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
         ("pose/baseline", rig.pairs_max_cm, limits.baseline_cm, "cm",
          "pose-derived and recorded baselines differ by"),
         ("rig rotation", rig.rotation_px, limits.rectified_px, "px",
-         f"cameras are turned against camera 0 by {rig.rotation_deg:.3g} deg, which is"),
+         f"cameras are turned against camera 0 by {rig.rotation_deg:.3g} deg: points move by"),
         ("lateral residual", rig.lateral_px, limits.rectified_px, "px",
-         "cameras stand off the rig's line, which is"),
+         "cameras stand off the rig's line: points move by"),
         ("reprojection", primary.tolerances[-1].median_px, limits.reprojection_px, "px",
          f"median error of pair {primary.left}-{primary.right} is"),
     ):  # fmt: skip
@@ -66,9 +66,8 @@ def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
             limit = 1 - (1 - limits.agreement_long) * narrow
         if pair.agreement < limit:
             text = (
-                f"of the pixels of camera {pair.left} that nothing hides from camera "
-                f"{pair.right}, the two depths agree at {pair.agreement:.1%} "
-                f"(limit {limit:.0%})"
+                f"the two depths agree at {pair.agreement:.1%} of the pixels of camera {pair.left} "
+                f"that nothing hides from camera {pair.right} (limit {limit:.0%})"
             )
             yield Finding(scene.key, "", "agreement", text)
 
@@ -89,16 +88,16 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
         worst = max(through, key=lambda pair: pair.see_through)
         pairs = ", ".join(f"{pair.left}-{pair.right}" for pair in through)
         text = (
-            f"depth of cameras {pairs} contradicts: of pair {worst.left}-{worst.right}, "
-            f"{worst.see_through:.1%} of the points of smooth surfaces lie before what the other "
-            f"camera sees there (limit {limits.see_through:.0%})"
+            f"the depths of cameras {pairs} contradict each other: in pair "
+            f"{worst.left}-{worst.right}, {worst.see_through:.1%} of the points on smooth surfaces "
+            f"lie in front of what the other camera sees there (limit {limits.see_through:.0%})"
         )
         yield Finding(scene.key, "", "depth consistency", text)
     moved = found.moved_through / found.moved_smooth if found.moved_smooth >= 1000 else 0.0
     if moved > limits.moved_through:
         text = (
-            f"depth of one frame contradicts that of the next audited one by the recorded poses at "
-            f"{moved:.0%} of its points (limit {limits.moved_through:.0%})"
+            f"by the recorded poses, depth of one frame contradicts that of the next audited one "
+            f"at {moved:.0%} of its points (limit {limits.moved_through:.0%})"
         )
         yield Finding(scene.key, "", "motion", text)
     has_wrong_depth = bool(through) or any(
@@ -112,8 +111,8 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
         if gained > limits.picture_lag:
             of = "all cameras" if camera < 0 else f"camera {camera}"
             text = (
-                f"pictures of {of} fit better, by {gained:.3f} of correlation, if those of the "
-                f"frame {'before' if lag < 0 else 'after'} are taken "
+                f"pictures of {of} fit better if those of the frame "
+                f"{'before' if lag < 0 else 'after'} are taken: correlation grows by {gained:.3f} "
                 f"(limit {limits.picture_lag:g})"
             )
             name = "" if camera < 0 else rgb_name(camera)
@@ -129,15 +128,16 @@ def _content_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Findin
                 and not math.isnan(pair.correlation)]  # fmt: skip
         if fits and max(fits) < limits.picture_fit:
             text = (
-                f"pictures of camera {camera}, taken to any other camera by depth, correlate with "
-                f"its pictures at {max(fits):.2f} or less (limit {limits.picture_fit:g})"
+                f"pictures of camera {camera}, warped by depth to any other camera, have a "
+                f"correlation of {max(fits):.2f} or less with its pictures "
+                f"(limit {limits.picture_fit:g})"
             )
             yield Finding(scene.key, rgb_name(camera), "picture content", text)
         elif (less := _correlated_less(scene, camera)) > limits.picture_odd:
             text = (
-                f"pictures of camera {camera}, taken to the others by depth, correlate with theirs "
-                f"by {less:.2f} less than the others with each other, or more "
-                f"(limit {limits.picture_odd:g})"
+                f"pictures of camera {camera}, warped by depth to the others, have a correlation "
+                f"with theirs that is at least {less:.2f} less than that of the others with each "
+                f"other (limit {limits.picture_odd:g})"
             )
             yield Finding(scene.key, rgb_name(camera), "picture content", text)
 
@@ -207,7 +207,7 @@ def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Untested]:
         > -limits.picture_lag
     ]  # fmt: skip
     if late:
-        why = "pictures of the frames beside fit as well, or there are none"
+        why = "pictures of the neighbouring frames fit as well, or there are none"
         untested.append(("picture time", "", _cameras(late), why))
     untested += _untested_fits(scene, limits)
     return [Untested(scene.key, *each) for each in untested]
@@ -235,7 +235,7 @@ def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str
             blind = sorted(camera for camera in wanted if not seen.get(camera, math.inf) <= limit)
             if blind:
                 from_on = max(seen.get(camera, math.inf) for camera in blind)
-                why = "nothing tells" if math.isinf(from_on) else f"seen from {from_on:.2g} on"
+                why = "no estimate" if math.isinf(from_on) else f"seen from {from_on:.2g} on"
                 of = _cameras([camera for camera in blind if camera >= 0])
                 yield f"{check} fit", QUANTITIES[what], of, f"{why} (limit {limit:.2g})"
 

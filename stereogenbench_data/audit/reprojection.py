@@ -12,7 +12,7 @@ were kept. ``agreement`` is stricter: the share of pixels for which the right de
 that nothing in the left view hides from the right camera.
 
 Source: the StereoGenBench paper, table of the geometry consistency audit and appendix on geometry
-derivation. The paper does not tell its tolerance; ours are `TOLERANCES`.
+derivation. The paper does not state its tolerance; ours are `TOLERANCES`.
 """
 
 import math

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, Final, Literal, ParamSpec, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 
@@ -55,7 +55,6 @@ LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
 
 
 Result = TypeVar("Result")
-Arguments = ParamSpec("Arguments")
 
 
 class AuditedFiles:
@@ -75,11 +74,7 @@ class AuditedFiles:
         self.intrinsics = rig_intrinsics(self.scene.rig)
 
     def attempt(
-        self,
-        name: str,
-        read: Callable[Arguments, Result],
-        *args: Arguments.args,
-        **kwargs: Arguments.kwargs,
+        self, name: str, read: Callable[..., Result], *args: Any, **kwargs: Any
     ) -> Result | None:
         """Return what ``read`` returns for a file, None if it or an earlier attempt failed."""
         if name in self.problems:
@@ -97,7 +92,7 @@ class AuditedFiles:
 
     def _require_member(self, name: str) -> None:
         if self.scene.held_name(name) not in self.scene.members:
-            raise StorageError("is missing: the index knows no such file of this scene")
+            raise StorageError("is missing: the index has no such file of this scene")
 
     def counted(self, camera: int) -> tuple[int, int]:
         """Return the number of frames of a camera's two videos, -1 for one that does not open."""
@@ -154,7 +149,7 @@ class AuditedFiles:
         if source == "unreadable":
             if self.contract.unit_m is None:
                 raise MediaError(
-                    "its tags do not tell one positive number of metres in a stored unit of depth"
+                    "its tags do not state one positive number of metres in a stored unit of depth"
                 )
             return self.contract
         return self.contract.with_file_unit(self.scene.depth_unit_m[camera], source=source)

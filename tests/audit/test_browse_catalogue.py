@@ -144,8 +144,8 @@ def test_a_scene_outside_the_choice_has_no_place_in_the_list(catalogue):
 @pytest.mark.parametrize(
     ("query", "reason"),
     [
-        ({"bin": ["[1,2)"]}, r"no '\[1,2\)' to choose"),
-        ({"pairs": ["sweep"]}, "no 'sweep' to choose"),
+        ({"bin": ["[1,2)"]}, r"no choice '\[1,2\)'"),
+        ({"pairs": ["sweep"]}, "no choice 'sweep'"),
         ({"focal_low": ["wide"]}, "focal must be of numbers, got 'wide'"),
         ({"baseline_high": ["inf"]}, "baseline must be of finite numbers, got 'inf'"),
     ],

@@ -244,7 +244,7 @@ def test_a_scene_of_one_frame_does_not_tell_the_lag(tmp_path):
 
     assert not verdict.is_wrong
     assert answer(verdict, "frame lag").status == "cannot tell"
-    assert answer(verdict, "frame lag").note.startswith("not tested, for want of frames: -3, -2")
+    assert answer(verdict, "frame lag").note.startswith("not tested, for lack of frames: -3, -2")
     assert answer(verdict, "depth along").status == "confirmed"
 
 
@@ -536,7 +536,7 @@ def test_a_camera_that_is_recorded_elsewhere_is_named(verdict_on):
     verdict = verdict_on(lambda folder: place_cameras(folder, {3: 1.2}))
 
     (fault,) = verdict.faults
-    assert "camera 3 is not where it is said to be" in fault
+    assert "camera 3 is not at its recorded position" in fault
     assert verdict.choices == ()
 
 

@@ -73,7 +73,7 @@ def parse_choice(query: Mapping[str, list[str]]) -> Choice:
     unknown = [name for name in bins if name not in BASELINE_BINS]
     pairs: Any = query.get("pairs", ["all"])[0]
     if unknown or pairs not in get_args(PairKind):
-        raise SelectionError(f"there is no {(unknown or [pairs])[0]!r} to choose.")
+        raise SelectionError(f"there is no choice {(unknown or [pairs])[0]!r}.")
     return Choice(
         texts=texts,
         focal_mm=_range(query, "focal"),
@@ -140,7 +140,7 @@ class Catalogue:
             SelectionError: If there is no such scene.
         """
         if key not in self._row_of:
-            raise SelectionError(f"{key!r} is no key of {len(self.index)} scenes.")
+            raise SelectionError(f"{key!r} is not the key of any of {len(self.index)} scenes.")
         return self._row_of[key]
 
     def about(self) -> dict[str, Any]:

@@ -509,7 +509,7 @@ _TURNED: Final[dict[str, Callable[[Luma], Luma]]] = {
     "upside down": lambda band: band[::-1],
     "turned by 180 degrees": lambda band: band[::-1, ::-1],
 }
-_ELSEWHERE: Final = "is not where it is said to be, or its pictures are aside"
+_ELSEWHERE: Final = "is not at its recorded position, or its pictures are shifted"
 _READINGS: Final[dict[Question, str]] = {
     "frame_lag": "with a lag of {:+d} frames", "flip": "flipped ({})", "form": "as {} depth",
     "kind": "along the {}",

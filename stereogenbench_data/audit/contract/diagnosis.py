@@ -22,6 +22,7 @@ from stereogenbench_data.audit.contract.matching import (
     FrameMatch,
     SceneFrames,
     disparity_px,
+    relative_step,
     spread_px,
 )
 from stereogenbench_data.audit.contract.scoring import (
@@ -483,7 +484,8 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
             f"{basics['matches']:,} were found in both pictures"
         )
         return SceneDiagnosis(**basics, best=declared, problem=problem)
-    step = basics["depth_step"] = views.depth_step(matches[0].frame)
+    units, known = views.depth(matches[0].frame, file)
+    step = basics["depth_step"] = relative_step(units[known])
     if step > _COARSEST_STEP:
         problem = f"stored depth is too coarse: its steps are {step:.0%} of it"
         return SceneDiagnosis(**basics, best=declared, problem=problem)

@@ -327,11 +327,6 @@ class SceneFrames:
             self._stored[key] = (match, numbers)
         return self._stored[key][1]
 
-    def depth_step(self, frame: int) -> float:
-        """Return the `relative_step` of a frame's stored depths."""
-        units, known = self.depth(frame, self.primary[0])
-        return relative_step(units[known])
-
     @cached_property
     def ray_per_planar(self) -> Float64[np.ndarray, "h w"]:
         """The length of each pixel's ray to depth 1."""

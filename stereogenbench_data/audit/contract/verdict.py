@@ -38,7 +38,7 @@ TOPICS: Final[dict[Question, str]] = {
     "order": "left and right",
     "flip": "flip of depth",
 }
-CAMERAS_DIFFER: Final = "not told while cameras do not fit, see below"
+CAMERAS_DIFFER: Final = "not answered while cameras do not fit, see below"
 _WORDS: Final[dict[Any, str]] = {
     "planar": "the optical axis",
     "ray": "the ray",
@@ -121,13 +121,13 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
         note = "by poses and pictures alike"
         return Answer(blank.topic, named, seen, "wrong", nearest, note)
     if question == "order" and best.startswith("depth of") and changes(first, "offset"):
-        note = f"a shifted picture, which is not where its depth is, looks like {describe(best)}"
+        note = f"a picture that is shifted against its depth looks like {describe(best)}"
         return replace(blank, behind=gains.get(declared), note=note)
     if best == declared:
         if close or lacking or not tested:
             return replace(blank, behind=nearest, note=words)
         if not is_sure:
-            note = f"not kept away by the margin: {_named(doubtful)}"
+            note = f"not excluded by the margin: {_named(doubtful)}"
             note = f"{note}; {words}" if words else note
             return replace(
                 blank, found=describe(best), status="not contradicted", behind=nearest, note=note
@@ -169,9 +169,9 @@ def _words_beside(
         words.append(f"fit alike: {_named([best, *close])}")
     if untested:
         want = "frames" if question == "frame_lag" else "depth where it would be"
-        words.append(f"not tested, for want of {want}: {', '.join(map(describe, untested))}")
+        words.append(f"not tested, for lack of {want}: {', '.join(map(describe, untested))}")
     if question == "frame_lag" and abs(best) == max(LAGS):
-        words.append("lags beyond are not asked about")
+        words.append(f"lags beyond {max(LAGS)} frames are not examined")
     return "; ".join(words)
 
 
@@ -327,8 +327,8 @@ def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
             note = f"{found} if depth is along {kind}, as declared if it is not"
             return replace(blank, note=note)
         if unit.uncertainty > abs(math.log(unit.metres / first.unit_m)):
-            return replace(blank, note=f"{found} fits best, but is not surely another")
-        note = "the unit, the focal length or the baselines: they are not told apart"
+            return replace(blank, note=f"{found} fits best, but may be equal")
+        note = "the unit, the focal length or the baselines: the pictures do not show which"
         return replace(blank, found=found, status="wrong", note=note)
     doubt = _doubt(first, unit, found=found)
     if doubt:
@@ -345,7 +345,7 @@ def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
     is_coarse = allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE
     why = "depth is stored in too large steps" if is_coarse else "too little parallax"
     if unit.uncertainty > MARGIN:
-        return f"known to {unit.uncertainty:.0%} alone: {why}"
+        return f"known only to {unit.uncertainty:.0%}: {why}"
     if off > LEAST_LOG_SCALE:
         return f"{found} fits best, but is not clearly better{': ' + why if is_coarse else ''}"
     if off > max(unit.uncertainty, _LEAST_TOLERANCE):
@@ -539,7 +539,7 @@ def _beside(scenes: Sequence[SceneDiagnosis], answers: Sequence[Answer]) -> list
     wrong = {answer.topic for answer in answers if answer.status == "wrong"}
     lines = []
     if TOPICS["flip"] in wrong:
-        lines.append(f"Depth is flipped ({first.best.flip}ly turned over): store it anew.")
+        lines.append(f"Depth is flipped {first.best.flip}ly: store it anew.")
     if first.best.order != first.declared.order and TOPICS["order"] in wrong:
         lines.append(f"Files: {first.best.order}. Rename the files, or correct the metadata.")
     if first.recorded_pair is not None and TOPICS["order"] in wrong:
@@ -552,7 +552,7 @@ def _beside(scenes: Sequence[SceneDiagnosis], answers: Sequence[Answer]) -> list
     if not first.problem and allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE:
         lines.append(
             f"Stored depth is coarse: its steps are {first.depth_step:.1%} of it or more in a "
-            "quarter of the picture, and the quotient is no better known."
+            "quarter of the picture, so the quotient is not known better."
         )
     if _kind_explains_scale(scenes):
         (other,) = first.best.alternatives("kind")
