@@ -177,7 +177,7 @@ def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairLis
     if isinstance(names, Sequence) and names and isinstance(names[0], str):
         keep = np.zeros(found.shape, dtype=bool)
         for name in names:
-            keep |= _in_bin(found, str(name))
+            keep |= in_bin(found, str(name))
     else:
         low, high = require_range("baseline_cm", wanted)
         keep = (found >= low) & (found <= high)
@@ -192,7 +192,12 @@ def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairLis
     return kept[keep.any(axis=1)]
 
 
-def _in_bin(found: Float64[np.ndarray, "n k"], name: str) -> Bool[np.ndarray, "n k"]:
+def in_bin(found: Float64[np.ndarray, "*any"], name: str) -> Bool[np.ndarray, "*any"]:
+    """Return which baselines in cm lie in a bin of `BASELINE_BINS`.
+
+    Raises:
+        SelectionError: If there is no such bin.
+    """
     if name not in BASELINE_BINS:
         raise SelectionError(
             f"there is no baseline bin {name!r}; the bins are {', '.join(BASELINE_BINS)}."

@@ -37,7 +37,7 @@ from stereogenbench_data.shards.tar import (
     read_chunks,
     read_members,
 )
-from stereogenbench_data.sources.files import copy_with_crc32, write_atomic
+from stereogenbench_data.sources.files import copy_with_crc32, try_locked, write_atomic
 
 UNFINISHED: Final = ".tmp"
 
