@@ -152,7 +152,6 @@ class PairGeometry:
         """Where each source pixel lands in the target."""
         if self._facts.is_rectified:
             return project_rectified(self.depth_m, self.disparity)
-        target_from_source = self.target_from_source
         parts = [
             project_through_poses(
                 depth_m.astype(np.float64),
@@ -160,7 +159,7 @@ class PairGeometry:
                 target_intrinsics=self._views.intrinsics,
                 target_from_source=transform,
             )
-            for depth_m, transform in zip(self.depth_m, target_from_source, strict=True)
+            for depth_m, transform in zip(self.depth_m, self.target_from_source, strict=True)
         ]
         return Projection(
             u_px=np.stack([part.u_px for part in parts]),
@@ -204,7 +203,7 @@ class PairGeometry:
 
     @cached_property
     def visible_from_source(self) -> MapBool:
-        """Visible in the target, as far as the source's own depth can tell."""
+        """What is visible in the target, decided by the source's own depth alone."""
         visible: MapBool = visible_from_source(
             self.projection,
             measured=self.stored.measured,
@@ -259,14 +258,13 @@ def _as_seen(transforms: Motions, views: Views) -> Motions:
     return mirrored
 
 
+@dataclass(eq=False)
 class PairSample:
     """One source and one target of a sample, with the way there and the way back."""
 
-    def __init__(self, views: Views, facts: SceneFacts, *, target: int) -> None:
-        """Take the views of both cameras; nothing is computed yet."""
-        self.views = views
-        self.facts = facts
-        self.target = target
+    views: Views
+    facts: SceneFacts
+    target: int
 
     @cached_property
     def ahead(self) -> PairGeometry:

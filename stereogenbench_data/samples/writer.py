@@ -77,7 +77,7 @@ class SampleWriter:
             frames: Where they lie on the sample's time axis.
         """
         pairs = [
-            PairSample(views, facts, target=target)
+            PairSample(views, facts, target)
             for target in self._target_cameras(views.source, views.targets)
         ]
         for field in self._fields:
