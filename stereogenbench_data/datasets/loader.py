@@ -58,15 +58,12 @@ class Loadable(Numbered, Protocol):
 
     def _keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Keep videos open for the scenes that one of so many processes reads at a time."""
-        ...
 
     def stats(self) -> StreamStats:
         """Return how many videos this process has open."""
-        ...
 
     def close(self) -> None:
         """Close the videos that are open in this process."""
-        ...
 
 
 class LoaderStats(NamedTuple):
@@ -371,7 +368,12 @@ class LoaderPass(Iterator[Any]):
                 an error ended it.
             WorkerError: If a worker process died.
         """
-        self._require_own_process()
+        if os.getpid() != self._pid:
+            raise PassError(
+                f"process {self._pid} began this pass, and its fork {os.getpid()} uses it: both "
+                "would take batches from the same workers. Call iter(loader) in the process that "
+                "uses it."
+            )
         with self._lock:
             return self._next()
 
@@ -383,7 +385,12 @@ class LoaderPass(Iterator[Any]):
         workers = self._workers
         if workers is None:
             raise StopIteration
-        self._require_current(workers)
+        if workers.passes != self._number:
+            raise PassError(
+                f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
+                "batches, as another one was begun: workers that persist serve one pass at a time. "
+                "Use a loader for each, or persistent_workers=False."
+            )
         self._over = (
             f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} batches "
             "with an error: begin another one, or load a state."
@@ -424,22 +431,6 @@ class LoaderPass(Iterator[Any]):
     def __del__(self) -> None:
         """End the pass when nobody refers to it."""
         self.close()
-
-    def _require_own_process(self) -> None:
-        if os.getpid() != self._pid:
-            raise PassError(
-                f"process {self._pid} began this pass, and its fork {os.getpid()} uses it: both "
-                "would take batches from the same workers. Call iter(loader) in the process that "
-                "uses it."
-            )
-
-    def _require_current(self, workers: "_Workers") -> None:
-        if workers.passes != self._number:
-            raise PassError(
-                f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
-                "batches, as another one was begun: workers that persist serve one pass at a time. "
-                "Use a loader for each, or persistent_workers=False."
-            )
 
 
 class _Workers:
@@ -510,12 +501,10 @@ class _Workers:
         self._context.stop()
         # Now, and not when the last traceback is gone that knows the iterator. Lightning ends
         # workers in this way, too; where none could be started there is nothing to end.
-        getattr(batches, "_shutdown_workers", _pass)()
+        shutdown = getattr(batches, "_shutdown_workers", None)
+        if shutdown is not None:
+            shutdown()
         forget_slots(self._context.pids)
-
-
-def _pass() -> None:
-    """Do nothing."""
 
 
 class _Numbers(Sampler[list[int]]):

@@ -75,20 +75,15 @@ class SharedEpoch:
         self._advanced_from = int(self._followed[1])
 
 
-def _shared_rows(index: SceneIndex, table: pa.Table) -> torch.Tensor:
+def _parted(index: SceneIndex) -> tuple[Any, ...]:
+    table, rest = index.parted()
     if index not in _rows:
         sink = pa.BufferOutputStream()
         with pa.ipc.new_stream(sink, table.schema) as stream:
             stream.write_table(table)
-        rows = torch.frombuffer(bytearray(sink.getvalue()), dtype=torch.uint8)
-        rows.share_memory_()
-        _rows[index] = rows
-    return _rows[index]
-
-
-def _parted(index: SceneIndex) -> tuple[Any, ...]:
-    table, rest = index.parted()
-    return _joined, (_shared_rows(index, table), rest)
+        _rows[index] = torch.frombuffer(bytearray(sink.getvalue()), dtype=torch.uint8)
+        _rows[index].share_memory_()
+    return _joined, (_rows[index], rest)
 
 
 def _joined(rows: torch.Tensor, rest: dict[str, Any]) -> SceneIndex:
