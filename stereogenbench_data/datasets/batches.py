@@ -98,7 +98,7 @@ class EpochBatch(list[int]):
     """
 
     def __init__(
-        self, numbers: Iterable[int], epoch: int, is_padding: list[bool] | None = None
+        self, numbers: Iterable[int], *, epoch: int, is_padding: list[bool] | None = None
     ) -> None:
         """Hold the numbers."""
         super().__init__(numbers)
@@ -107,7 +107,11 @@ class EpochBatch(list[int]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what a worker process makes the same batch from."""
-        return EpochBatch, (list(self), self.epoch, self.is_padding)
+        return _epoch_batch, (list(self), self.epoch, self.is_padding)
+
+
+def _epoch_batch(numbers: list[int], epoch: int, is_padding: list[bool] | None) -> EpochBatch:
+    return EpochBatch(numbers, epoch=epoch, is_padding=is_padding)
 
 
 class EpochBatches(Sampler[list[int]]):
@@ -160,7 +164,7 @@ class EpochBatches(Sampler[list[int]]):
         )
         most_open = min(max(OPEN_SCENES, rule.batch_size), at_once)
         self.rule = replace(rule, open_scenes=options.get("open_scenes", most_open))
-        self.rank, self.world_size = _parse_group(options.get("rank"), options.get("world_size"))
+        self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
         self.tail = _tail(options, world_size=self.world_size)
         self._follows_the_group = "rank" not in options
         self._resumed = (0, 0)
@@ -503,7 +507,7 @@ def _group() -> tuple[int, int] | None:
     return None
 
 
-def _parse_group(rank: int | None, world_size: int | None) -> tuple[int, int]:
+def _require_group(rank: int | None, world_size: int | None) -> tuple[int, int]:
     """Return rank and world size, given or as torch.distributed says."""
     if rank is None and world_size is None:
         return _group() or (0, 1)

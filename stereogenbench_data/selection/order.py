@@ -6,9 +6,9 @@ scenes, laid end to end, is cut into shuffle groups of equally many samples; gro
 batches n with n mod groups = g. A group deals its scenes to as many streams as it keeps scenes
 open, and interleaves the streams so that each advances evenly, at a pace of its own, to the group's
 end. Within a scene samples ascend: a process that gets every batch of a group opens each video once
-and reads it forwards once. A cut between groups may split a scene: at most groups - 1 scenes.
+and reads it forwards once. A cut between groups may part a scene: groups - 1 scenes at the most.
 
-Random numbers are the raw stream of PCG64, which numpy guarantees never to change.
+Random numbers are the raw stream of PCG64, which numpy keeps the same for ever.
 """
 
 import heapq
@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Int64, UInt64
+from jaxtyping import Float64, Int64, UInt64
 
 from stereogenbench_data.errors import SelectionError
 
@@ -47,11 +47,11 @@ class OrderRule:
     Attributes:
         batch_size: Samples in a batch.
         seed: The seed of the order.
-        shuffle_groups: How many groups the scenes are divided into; fewer where a group would have
+        shuffle_groups: Into how many groups the scenes are parted; fewer where a group would have
             fewer scenes than a batch can show.
-        open_scenes: How many scenes a group interleaves. Below `OPEN_SCENES` this is an upper
-            bound. From `OPEN_SCENES` on a group may open up to twice as many if it has fewer than
-            twice as many, so that its streams are equally long and batches equally mixed.
+        open_scenes: How many scenes a group interleaves. Fewer than `OPEN_SCENES` are never
+            exceeded. From there on there may be more, up to twice as many where a group has fewer
+            than twice as many, so that its streams are equally long and batches equally mixed.
         kind: "shuffled", or "sequential": by the samples' numbers.
     """
 
@@ -72,11 +72,11 @@ class OrderRule:
             raise SelectionError(f"order must be 'shuffled' or 'sequential', got {self.kind!r}.")
 
     def groups_of(self, lengths: Numbers) -> int:
-        """Return how many groups scenes of so many samples are divided into.
+        """Return into how many groups scenes of so many samples are parted.
 
-        There are few enough groups that the longest scene need not come twice in a batch, but at
-        least two, of two scenes each, so that two processes need not decode the same videos. The
-        number divides ``shuffle_groups``, so that processes that share those share these too.
+        So few that the longest scene need not come twice in a batch, but two at least, of two
+        scenes each, so that two processes need not decode the same; and a divisor of
+        ``shuffle_groups``, so that processes that share those out share these too.
         """
         if self.kind == "sequential":
             return 1
@@ -87,10 +87,10 @@ class OrderRule:
         return max(count for count in range(1, most + 1) if self.shuffle_groups % count == 0)
 
     def in_effect(self, lengths: Numbers) -> "OrderRule":
-        """Return the rule that the order of scenes of so many samples follows in effect.
+        """Return what the order of scenes of so many samples depends on: equal for equal orders.
 
-        Equal orders have equal rules: few scenes have fewer groups and open scenes than requested,
-        and a sequential order depends on the batch size alone.
+        Few scenes have fewer groups and open scenes than requested; a sequential
+        order depends on the batch size alone.
         """
         if self.kind == "sequential":
             return OrderRule(self.batch_size, shuffle_groups=1, open_scenes=1, kind="sequential")
@@ -186,8 +186,7 @@ class EpochOrder:
             return np.empty(0, dtype=np.int64)
         count = self.rule.streams_of(len(lengths))
         stream = _assign(lengths, streams=count)
-        # Numbers from 0 up to 1, made of the upper 53 bits.
-        draws = (self._raw(2 * count, part=group + 1) >> np.uint64(11)) * 2.0**-53
+        draws = _uniform(self._raw(2 * count, part=group + 1))
         numbers, times = [], []
         for number, (phase, pace) in enumerate(zip(draws[:count], draws[count:], strict=True)):
             pieces = np.flatnonzero(stream == number)
@@ -222,8 +221,9 @@ class EpochOrder:
 
     def _raw(self, count: int, *, part: int) -> UInt64[np.ndarray, " n"]:
         entropy = (self.rule.seed, self.epoch, _TAG, part + 1)
-        generator = np.random.PCG64(np.random.SeedSequence(entropy))
-        raw: UInt64[np.ndarray, " n"] = generator.random_raw(count)
+        raw: UInt64[np.ndarray, " n"] = np.random.PCG64(np.random.SeedSequence(entropy)).random_raw(
+            count
+        )
         return raw
 
 
@@ -235,8 +235,8 @@ def last_batch(
     Args:
         samples: How many samples the epoch has.
         batch_size: Samples in a batch.
-        tail: "drop": full batches only, equally many for each rank; "wrap": every sample, then
-            samples from the epoch's start until the last batch is full and ranks are even;
+        tail: "drop": whole batches only, equally many for each rank; "wrap": every sample, and
+            samples again from the epoch's start until the last batch is whole and ranks are even;
             "uneven": every sample once.
         world_size: How many ranks share the batches.
         start: The batch from which these ranks go on.
@@ -276,6 +276,12 @@ def _runs(begins: Numbers, lengths: Numbers) -> Numbers:
     runs: Numbers = np.repeat(begins - offsets, lengths)
     runs += np.arange(len(runs))
     return runs
+
+
+def _uniform(raw: UInt64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """Return numbers from 0 up to 1 made of the upper 53 bits."""
+    uniform: Float64[np.ndarray, " n"] = (raw >> np.uint64(11)) * 2.0**-53
+    return uniform
 
 
 class OrderQuality(NamedTuple):
