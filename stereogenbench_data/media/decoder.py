@@ -33,7 +33,6 @@ _SKIPS_EXACTLY: Final = frozenset({"h264", "hevc", "mpeg4"})
 _BLIND_JUMP: Final = 8
 """Frames to decode through rather than to seek, while a file's key frames are not known."""
 
-
 _SIZE_BYTES: Final = 3
 _FOOTER_BYTES: Final = 8
 """A footer with a checksum: three bytes of size, one of error status, four of checksum."""
@@ -216,7 +215,7 @@ class Decoder:
         self._pending.extend((self._index(frame), frame) for frame in packet.decode())
 
     def _register(self, packet: VideoPacket) -> None:
-        """Take note of a packet that is to be decoded."""
+        """Check a packet that is about to be decoded, and record its frame."""
         index = self._index(packet)
         if self._is_intra_only:
             if self._stored_before is not None and index != self._stored_before + 1:

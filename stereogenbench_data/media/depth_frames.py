@@ -18,8 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Literal, NoReturn
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import UInt16
@@ -27,6 +26,7 @@ from jaxtyping import UInt16
 from stereogenbench_data.errors import ExtraError, MediaError
 from stereogenbench_data.media.container import (
     BinaryFile,
+    FrameReader,
     StreamFacts,
     VideoFile,
     merged_tags,
@@ -210,10 +210,7 @@ def parse_header(header: bytes, *, file_bytes: int, name: str) -> FrameHeader:
     description = _description(header, name=name)
     try:
         clip = _clip(description["clip"])
-        sizes, crc32s = (
-            tuple(map(int, description["sizes"])),
-            tuple(map(int, description["crc32s"])),
-        )
+        sizes, crc32s = (tuple(map(int, description[key])) for key in ("sizes", "crc32s"))
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise _unfit(
             name, f"its description of itself is malformed or incomplete ({error!r})"
@@ -317,15 +314,13 @@ def _unfit(name: str, why: str) -> MediaError:
     )
 
 
-class DepthFrames:
+class DepthFrames(FrameReader):
     """An open file of packed depth, whose frames are read by number in any order.
 
     Whatever the file claims is checked before it is used, and no more is decompressed than a
-    frame has. A reader belongs to the thread and the process that opened it.
+    frame has.
 
     Attributes:
-        name: What messages call the file.
-        frames: How many frames it has.
         facts: What the header says, as of a video; the codec is "blosc2".
     """
 
@@ -356,7 +351,16 @@ class DepthFrames:
             self.close()
             raise
         self.frames = len(self._header.sizes)
-        self.facts = _facts(self._header.clip, frames=self.frames)
+        self.facts = StreamFacts(
+            codec=CODEC_NAME,
+            pixel_format=self.clip.pixel_format,
+            width_px=self.clip.width_px,
+            height_px=self.clip.height_px,
+            frames=self.frames,
+            frame_rate_hz=self.clip.rate[0] / self.clip.rate[1],
+            tags=merged_tags(self.clip.tags, self.clip.stream_tags),
+            is_colour=False,
+        )
 
     @property
     def clip(self) -> StoredClip:
@@ -369,10 +373,7 @@ class DepthFrames:
         Raises:
             MediaError: If there is no such frame, or its bytes are not those that were packed.
         """
-        if not 0 <= index < self.frames:
-            raise MediaError(
-                f"{self.name}: has no frame {index}: ask for one of 0 to {self.frames - 1}."
-            )
+        self.require_frame(index)
         size = self._header.sizes[index]
         if size == 0:
             return b""
@@ -411,26 +412,6 @@ class DepthFrames:
         if self._own is not None:
             self._own.close()
 
-    def __enter__(self) -> "DepthFrames":
-        """Return the reader itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the reader."""
-        self.close()
-
-    def __reduce__(self) -> NoReturn:
-        """Refuse to be pickled: an open file belongs to its process."""
-        raise TypeError(
-            f"{self.name}: an open DepthFrames cannot be pickled: "
-            f"pass the path to the other process and open it there."
-        )
-
     def _read_header(self, frames: int | Literal["any"]) -> FrameHeader:
         file_bytes = self._file.seek(0, 2)
         self._file.seek(0)
@@ -458,27 +439,3 @@ class DepthFrames:
                 f"{LARGEST_FRAME_BYTES:,} are read: it is not depth of this release."
             )
         return header
-
-
-def probe_packed(file: VideoFile, *, name: str) -> StreamFacts:
-    """Return what packed depth is, from its header.
-
-    Raises:
-        ExtraError: If blosc2 is not installed.
-        MediaError: If the header was damaged.
-    """
-    with DepthFrames(file, name=name, frames="any") as depth:
-        return depth.facts
-
-
-def _facts(clip: StoredClip, *, frames: int) -> StreamFacts:
-    return StreamFacts(
-        codec=CODEC_NAME,
-        pixel_format=clip.pixel_format,
-        width_px=clip.width_px,
-        height_px=clip.height_px,
-        frames=frames,
-        frame_rate_hz=clip.rate[0] / clip.rate[1],
-        tags=merged_tags(clip.tags, clip.stream_tags),
-        is_colour=False,
-    )

@@ -6,8 +6,7 @@ expect (a gap, a cut, a damaged packet), reading is an error, never a neighbouri
 
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Literal, NoReturn
+from typing import Any, Final, Literal
 
 import av
 import numpy as np
@@ -26,6 +25,7 @@ from stereogenbench_data.media.clock import (
     table_clock,
 )
 from stereogenbench_data.media.container import (
+    FrameReader,
     StreamFacts,
     VideoFile,
     exact,
@@ -36,7 +36,7 @@ from stereogenbench_data.media.container import (
     stream_facts,
 )
 from stereogenbench_data.media.decoder import Decoder, UnexpectedPicture
-from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, probe_packed
+from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
 from stereogenbench_data.media.siting import (
     CENTRE,
     Converter,
@@ -81,7 +81,8 @@ def probe(
         MediaError: If it is not an MP4 or Matroska video, is cut short or holds no frame.
     """
     if name.endswith(PACKED_SUFFIX):
-        return probe_packed(file, name=name)
+        with DepthFrames(file, name=name, frames="any") as depth:
+            return depth.facts
     with open_container(file, name=name, pixel_format=pixel_format) as container:
         require_whole_payload(container, name=name)
         frames = _frames_in_header(container)
@@ -118,18 +119,14 @@ def _frames_in_header(container: InputContainer) -> int:
     return frames if shown and clock.index(max(shown)) == frames - 1 else 0
 
 
-class VideoReader:
+class VideoReader(FrameReader):
     """An open video whose frames are read by number, fastest in ascending order.
 
     A frame ahead within the same group of pictures is reached by decoding on; any other by
     seeking to the key frame before it. On the way, pictures that no other is predicted from are
     skipped. The last frame is kept, so that asking for it again costs nothing.
 
-    A reader belongs to the thread and the process that opened it.
-
     Attributes:
-        name: What messages call the file.
-        frames: How many frames it has.
         scaler: The scaler of pictures whose chroma lies where FFmpeg takes it to be.
         converter: The scaler of all others; both keep their tables from frame to frame. Neither
             has threads of its own: freed in a fork, FFmpeg would wait for them for ever.
@@ -209,10 +206,7 @@ class VideoReader:
         """
         if self._is_closed:
             raise MediaError(f"{self.name}: is closed, so frame {index} cannot be read: reopen it.")
-        if not 0 <= index < self.frames:
-            raise MediaError(
-                f"{self.name}: has no frame {index}: ask for one of 0 to {self.frames - 1}."
-            )
+        self.require_frame(index)
         if self._current is None or self._current[0] != index:
             self._current = None
             frame = self._reach(index)
@@ -226,14 +220,7 @@ class VideoReader:
         Raises:
             MediaError: If it cannot be read, or is not a colour picture.
         """
-        return self.require_colour(self.frame(index), index)
-
-    def require_colour(self, frame: VideoFrame, index: int) -> VideoFrame:
-        """Return a frame of this video, if it is a colour picture.
-
-        Raises:
-            MediaError: If it is none.
-        """
+        frame = self.frame(index)
         if self._is_coded_grey or not is_colour_format(frame.format.name):
             found = "coded as grey" if self._is_coded_grey else f"stored as {frame.format.name}"
             raise MediaError(f"{self.name}: frame {index} is {found}{NO_COLOUR}")
@@ -250,26 +237,6 @@ class VideoReader:
         self._is_closed = True
         self._current = None
         self._drop_decoder()
-
-    def __enter__(self) -> "VideoReader":
-        """Return the reader itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the reader."""
-        self.close()
-
-    def __reduce__(self) -> NoReturn:
-        """Refuse to be pickled: a decoder belongs to its process."""
-        raise TypeError(
-            f"{self.name}: an open VideoReader cannot be pickled: "
-            f"pass the path to the other process and open it there."
-        )
 
     def _reach(self, index: int) -> VideoFrame:
         if self._decoder is None:
@@ -335,7 +302,10 @@ class VideoReader:
             frame, 16, 16, format="gray", interpolation=Interpolation.POINT, threads=1
         )
         matrix: Any = tiny.side_data.get("DISPLAYMATRIX")
-        if matrix is not None and not _is_upright(bytes(matrix)):
+        if matrix is None:
+            return
+        x_x, x_y, _, y_x, y_y, *_ = np.frombuffer(bytes(matrix), "=i4")
+        if not (x_x > 0 and y_y > 0 and x_y == 0 and y_x == 0):
             raise MediaError(
                 f"{self.name}: frame {index} is tagged to be turned or mirrored when it is shown "
                 f"(rotation {frame.rotation} degrees), and the cameras are those of the stored "
@@ -368,12 +338,6 @@ def require_pixel_aspect(pixel_aspect: float, rig: Rig, *, name: str) -> None:
             f"of the rig's sensor are {width_mm / height_mm:.4g} times as wide as high. It was "
             f"stretched for another shape: fetch it again, or store it without that tag."
         )
-
-
-def _is_upright(matrix: bytes) -> bool:
-    """Return whether FFmpeg's display matrix shows a picture as it is stored."""
-    x_x, x_y, _, y_x, y_y, *_ = np.frombuffer(matrix, "=i4")
-    return bool(x_x > 0 and y_y > 0 and x_y == 0 and y_x == 0)
 
 
 def plane_numbers(
@@ -428,9 +392,7 @@ def read_rgb(
         MediaError: If the frame cannot be decoded or is not what it must be, or size or ``out``
             does not fit.
     """
-    frame = reader.frame(index)
-    if content == "colour":
-        reader.require_colour(frame, index)
+    frame = reader.colour_frame(index) if content == "colour" else reader.frame(index)
     height, width = size or (frame.height, frame.width)
     if height < 1 or width < 1:
         raise MediaError(
