@@ -32,7 +32,7 @@ from stereogenbench_data.samples.streams import StreamStats
 _ORDERED: Final = "or torch's own DataLoader over the dataset"
 _INSTEAD: Final = {
     "sampler": f"use seed= and order=, {_ORDERED}",
-    "lanes": "it is called shuffle_groups",
+    "lanes": "use shuffle_groups",
     "batch_sampler": f"use seed= and order=, {_ORDERED} with EpochBatches",
 }
 """Options that a loader does not take, and what to use instead."""
@@ -92,19 +92,18 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     It is a torch `DataLoader`. `state_dict` counts the batches that the loop has taken, not those
     that workers have read ahead, so that it can be saved after any batch and loaded under other
-    numbers of ranks and workers. A pass that gave its last batch is followed by one of the next
-    epoch, unless an epoch was set since: training loops need not call `set_epoch`, and a pass to
-    be repeated, as for validation on random frames, is asked for by ``set_epoch(0)`` before it.
+    numbers of ranks and workers. After a whole pass the next pass is of the next epoch, unless an
+    epoch was set since. So training loops need not call `set_epoch`. To repeat a pass, as for
+    validation on random frames, call ``set_epoch(0)`` before it.
 
-    A pass owns its workers and their memory: the loader can be iterated while another iteration of
-    it goes on. Workers that persist serve one pass at a time: a new one ends the one before, which
-    then raises `PassError`. Where a worker dies, the loop ends with `WorkerError`, or with torch's
-    own `RuntimeError` if it dies while the body of the loop runs: catch `RuntimeError`, of which
-    `WorkerError` is one. Threads that share a pass take turns.
+    A pass owns its workers and their memory, so several passes over one loader can run at a time.
+    Workers that persist serve one pass at a time: a new pass ends the previous one, which then
+    raises `PassError`. If a worker dies, the loop ends with `WorkerError`, or with torch's own
+    `RuntimeError` if it dies while the body of the loop runs: catch `RuntimeError`, the base of
+    `WorkerError`. Threads that share a pass take turns.
 
-    Its epoch is its own from the first `set_epoch` or `load_state_dict` on, and until then goes
-    with the dataset that it was made from; its open videos are its own. So loaders of one dataset,
-    one to train and one to validate, leave each other alone.
+    Its epoch follows that of its dataset until the first `set_epoch` or `load_state_dict`. Its open
+    videos are its own. So a loader to train and a loader to validate may share a dataset.
 
     ``accelerator.prepare(loader)`` of Accelerate returns the loader itself, as it shares batches
     among ranks already; from then on batches come on the accelerator's device, and
@@ -281,7 +280,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             self._unfinished.discard(by)
 
     def _ended(self, ended: "LoaderPass") -> None:
-        """Record that a pass is over. If it ran within another pass, the position is that one's."""
+        """Record that a pass is over; the position becomes that of a pass that it ran within."""
         self._running -= 1
         if self._running == 0:
             self._leave_loop()

@@ -83,7 +83,7 @@ class _MappedScenes(Dataset[Sample]):
     def set_epoch(self, epoch: int) -> None:
         """Draw random frames and transforms anew, in this process and in running workers.
 
-        Loaders that were made before, and were not told an epoch themselves, go with it.
+        Loaders that were made before follow, unless an epoch of their own was set.
 
         Args:
             epoch: Number of the epoch, from 0.
@@ -211,14 +211,14 @@ class _MappedScenes(Dataset[Sample]):
     def stats(self) -> StreamStats:
         """Return how many videos this process has open for this dataset, and may have.
 
-        A loader has its own, which its ``stats()`` tells.
+        A loader has its own videos: see its ``stats()``.
         """
         return self._loader.stats
 
     def close(self) -> None:
         """Close the videos that this process holds open; the dataset can be used again.
 
-        A loader has its own, which its ``close()`` closes.
+        A loader has its own videos, which its ``close()`` closes.
         """
         self._loader.close()
 

@@ -149,8 +149,8 @@ class StereoPairStream(IterableDataset[Sample]):
         if batches is None:
             if self._begun.any():
                 raise StateError(
-                    "worker processes iterate this stream, and read ahead: tell state_dict("
-                    "batches=...) how many batches the loop has taken, or use the loader of "
+                    "worker processes iterate this stream and read ahead: pass the number of "
+                    "batches the loop has taken, state_dict(batches=...), or use the loader of "
                     "StereoPairs or torchdata's StatefulDataLoader, which count them."
                 )
             batches = 0

@@ -1,4 +1,4 @@
-"""Stored depth: which streams keep it whole, its numbers untouched, and what they mean in metres.
+"""Stored depth: which streams keep it whole, its numbers as stored, and what they mean in metres.
 
 A depth picture is read in the pixel format in which it is stored. No conversion is ever asked of
 FFmpeg: its conversion to 8 bits drops the low byte, and one between 10, 12 and 16 bits rescales.
@@ -40,8 +40,8 @@ def resolve_encoding(
     """Return how a depth stream's numbers become metres: as the user says, else as it is tagged.
 
     A tag is one whose key contains "scale", in any case, of the container or of the stream; its
-    value is metres in a stored unit. Without one the release's default holds, 0.1 m. Beside a tag
-    that is a number, one that is none is taken to speak of something else.
+    value is metres in a stored unit. Without such a tag the release's default holds, 0.1 m. If one
+    such tag is a number, others that are not numbers are ignored.
 
     Args:
         facts: What `probe` found.
@@ -122,7 +122,7 @@ def require_depth_stream(
         accept = ", ".join(repr(risk) for risk in sorted({*encoding.accept, *refused}))
         raise MediaError(
             f"{stored} ({', '.join(refused)}), which does not keep depth whole. Store it as "
-            f"gray16le with FFV1; if it is meant so, pass "
+            f"gray16le with FFV1; if this is intended, pass "
             f"DepthEncoding(accept=frozenset({{{accept}}})), with unit_m=... if the file does not "
             f"tell its unit."
         )

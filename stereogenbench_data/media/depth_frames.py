@@ -37,7 +37,7 @@ PACKED_SUFFIX: Final = ".b2frame"
 LAYER: Final = "stereogenbench_depth"
 UNIT_BYTES: Final = 2
 FIXED_BYTES: Final = 4096
-"""What a header may have beside 64 bytes a frame; so much is read at first, too."""
+"""How much a header may have beside 64 bytes a frame; also how much is read at first."""
 
 _FORMAT: Final = 1
 _BYTES_A_FRAME: Final = 64
@@ -68,7 +68,7 @@ LARGEST_FRAME_BYTES: Final = 512 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class StoredClip:
-    """What a depth video was, so that it can be written again.
+    """Facts of a depth video, from which it can be written again.
 
     Attributes:
         width_px: Width of every frame.
@@ -103,7 +103,7 @@ class FrameHeader:
     """What a file's header says: the clip, and where each chunk lies.
 
     Attributes:
-        clip: What the depth video was.
+        clip: Facts of the depth video that was packed.
         offsets: The first byte of each chunk.
         sizes: How many bytes each has; 0 for a frame of zeros, which has none.
         crc32s: zlib's checksum of each.
@@ -194,7 +194,7 @@ def header_bytes(start: bytes, *, frames: int, name: str) -> int:
 
 
 def parse_header(header: bytes, *, file_bytes: int, name: str) -> FrameHeader:
-    """Return what a whole header says, once it is known to be one that was written here.
+    """Return what a whole header says, after checking that this module wrote it.
 
     Args:
         header: All bytes of the header.
@@ -202,7 +202,7 @@ def parse_header(header: bytes, *, file_bytes: int, name: str) -> FrameHeader:
         name: What messages call the file.
 
     Raises:
-        MediaError: If it was damaged, or is another's.
+        MediaError: If it is damaged, or was not written by this module.
     """
     _, size, frame_bytes, units, chunks, typesize, _, chunk_bytes, *_ = _FIXED.unpack_from(header)
     if frame_bytes != file_bytes:
@@ -282,7 +282,7 @@ def _clip(description: Mapping[str, Any]) -> StoredClip:
 
 
 def require_chunk(chunk: bytes, *, clip: StoredClip, crc32: int, name: str) -> None:
-    """Refuse a chunk before blosc2 sees it, unless it is one that was written here.
+    """Refuse a chunk that this module did not write, before blosc2 sees it.
 
     Raises:
         MediaError: If it was damaged, claims another size, or asks for another codec.
@@ -324,16 +324,13 @@ class DepthFrames(FrameReader):
         facts: What the header says, as of a video; the codec is "blosc2".
     """
 
-    def __init__(
-        self, file: VideoFile, *, name: str, frames: int | Literal["any"], threads: int = 1
-    ) -> None:
+    def __init__(self, file: VideoFile, *, name: str, frames: int | Literal["any"]) -> None:
         """Open a file that must hold so many frames.
 
         Args:
             file: A path, or a seekable binary file; the latter stays the caller's to close.
             name: What messages call the file.
             frames: How many frames it must have; "any" trusts the header.
-            threads: How many blocks of one frame to decompress at once.
 
         Raises:
             ExtraError: If blosc2 is not installed.
@@ -341,7 +338,6 @@ class DepthFrames(FrameReader):
             MediaError: If it is not such a file, is damaged or has another number of frames.
         """
         self.name = name
-        self._threads = threads
         self._blosc2: Any = blosc2_module()
         self._own = Path(file).open("rb", buffering=0) if isinstance(file, str | Path) else None  # noqa: SIM115
         self._file: BinaryFile = self._own if isinstance(file, str | Path) else file  # type: ignore[assignment]  # its own if a path
@@ -364,11 +360,11 @@ class DepthFrames(FrameReader):
 
     @property
     def clip(self) -> StoredClip:
-        """What the depth video was."""
+        """Facts of the depth video that was packed."""
         return self._header.clip
 
     def chunk(self, index: int) -> bytes:
-        """Return the compressed bytes of a frame, empty for one of zeros.
+        """Return the compressed bytes of a frame, empty for a frame of zeros.
 
         Raises:
             MediaError: If there is no such frame, or its bytes are not those that were packed.
@@ -399,7 +395,7 @@ class DepthFrames(FrameReader):
             return np.zeros(shape, dtype=np.uint16)
         units = np.empty(shape, dtype=np.uint16)
         try:
-            self._blosc2.decompress2(chunk, dst=units, nthreads=self._threads)
+            self._blosc2.decompress2(chunk, dst=units, nthreads=1)
         except (RuntimeError, ValueError) as error:
             raise MediaError(
                 f"{self.name}: frame {index} does not decompress ({error}). The file is damaged: "

@@ -1,7 +1,7 @@
 """Frames of a video by number, exact: frame i is the i-th in the order of presentation.
 
-Nothing is guessed: where the pictures of a file are not those that its header and its caller
-expect (a gap, a cut, a damaged packet), reading is an error, never a neighbouring frame.
+Nothing is guessed: a gap, a cut or a damaged packet is an error. A neighbouring frame is never
+returned instead.
 """
 
 from dataclasses import replace
@@ -54,7 +54,7 @@ NO_COLOUR: Final = (
 """How the refusal of a video that should hold colours ends."""
 
 _ASPECT_SHARE: Final = 0.01
-"""By how much a tagged shape of pixels, kept as a small fraction, may be off the rig's."""
+"""How far a tagged pixel aspect, which is stored as a small fraction, may be off the rig's."""
 
 _RED_GREEN_BLUE: Final = (2, 0, 1)
 """Where the planes of FFmpeg's gbrp are."""
@@ -66,15 +66,15 @@ def probe(
     """Return what a video file is, from its header where the header can be trusted.
 
     Frames are counted by the header of an MP4 file, and by duration and rate of a Matroska file
-    if its last frame is found where they place it. Else all packets are counted. The times of all
-    packets of an intra-only codec are held against their order, where a path is given.
+    if its last frame is found where they place it. Else all packets are counted. For an intra-only
+    codec and a path, the times of all packets are compared with their order.
 
     Args:
         file: A path, or a seekable binary file; the latter stays the caller's to close.
-        name: What messages call the file. One that ends in ``.b2frame`` is of depth that blosc2
-            packed.
-        pixel_format: "later" spares the decoding of a picture (tens of milliseconds of large
-            H.264), where only that would show the pixel format.
+        name: What messages call the file. A name that ends in ``.b2frame`` is of depth packed by
+            blosc2.
+        pixel_format: "later" decodes no picture where only that would show the pixel format (tens
+            of milliseconds for large H.264).
 
     Raises:
         StorageError: If the file cannot be read.
@@ -128,33 +128,30 @@ class VideoReader(FrameReader):
 
     Attributes:
         scaler: The scaler of pictures whose chroma lies where FFmpeg takes it to be.
-        converter: The scaler of all others; both keep their tables from frame to frame. Neither
-            has threads of its own: freed in a fork, FFmpeg would wait for them for ever.
+        converter: The scaler of all others. Both keep their tables from frame to frame. Neither
+            has threads: FFmpeg would wait for them for ever when a fork frees the scaler.
     """
 
-    def __init__(self, file: VideoFile, *, name: str, frames: int, threads: int = 1) -> None:
+    def __init__(self, file: VideoFile, *, name: str, frames: int) -> None:
         """Open a video that must hold so many frames.
 
         Args:
             file: A path, or a seekable binary file; the latter stays the caller's to close.
             name: What messages call the file.
             frames: How many frames the video must have.
-            threads: How many slices of one picture to decode at once.
 
         Raises:
             StorageError: If the file cannot be read.
             MediaError: If it is not a video, is cut short or has another number of frames, as far
                 as the header shows. Other faults are raised by the frames that they concern.
         """
-        for what, value in (("frames", frames), ("threads", threads)):
-            if value < 1:
-                raise MediaError(f"{name}: {what} must be at least 1, got {value}.")
+        if frames < 1:
+            raise MediaError(f"{name}: frames must be at least 1, got {frames}.")
         self.name = name
         self.frames = frames
         self.scaler = VideoReformatter()
         self.converter = Converter()
         self._file = file
-        self._threads = threads
         self._picture: tuple[str, int, int] | None = None
         self._current: tuple[int, VideoFrame] | None = None
         self._is_closed = False
@@ -182,7 +179,7 @@ class VideoReader(FrameReader):
         if steady is None:
             container.close()
         else:
-            self._decoder = Decoder(container, clock=steady, threads=threads)
+            self._decoder = Decoder(container, clock=steady)
 
     @property
     def facts(self) -> StreamFacts:
@@ -227,7 +224,7 @@ class VideoReader(FrameReader):
         return frame
 
     def siting(self, frame: VideoFrame) -> str:
-        """Return where the chroma of this video lies: as it is tagged, else "center"."""
+        """Return where the chroma of this video lies by its tag, "center" without a tag."""
         if self._siting is None:
             self._siting = picture_siting(frame) if is_subsampled(frame) else CENTRE
         return self._siting
@@ -265,7 +262,7 @@ class VideoReader(FrameReader):
 
     def _opened(self, *, pixel_format: Literal["needed", "later"]) -> Decoder:
         container = open_container(self._file, name=self.name, pixel_format=pixel_format)
-        return Decoder(container, clock=self._clock, threads=self._threads)
+        return Decoder(container, clock=self._clock)
 
     def _survey(self, container: InputContainer) -> TableClock:
         steady = steady_clock(container, frames=self.frames)
@@ -372,7 +369,7 @@ def read_rgb(
 
     At the stored size the numbers equal those of ``ffmpeg -pix_fmt rgb24``, bit for bit for
     progressive 8-bit video, its colour matrix and range as the file gives them. Chroma lies where
-    the file is tagged to have it, and in the middle of its pixels without a tag. At another size
+    the file's tag says, or in the middle of its pixels without a tag. At another size
     they are scaled before the conversion, antialiased, with pixel centres kept (u' = s u, where
     the first pixel's centre is 0.5): by area where the picture shrinks, else bicubic. The scaled
     conversion of yuv420p rounds, where ffmpeg's unscaled one cuts off: it is 1.1 grey levels

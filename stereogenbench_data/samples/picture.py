@@ -31,14 +31,12 @@ def coloured(
     *,
     measured: Bool[np.ndarray, "h w"],
     largest: float,
-    smallest: float = 0.0,
 ) -> Picture:
-    """Return the sizes of a map's values as colours, grey where not measured.
+    """Return the absolute values of a map as colours, grey where not measured.
 
-    From ``smallest`` (dark blue) to ``largest`` (red); what lies beyond has the colour of the end.
+    Colours run from 0 (dark blue) to ``largest`` (red), which also stands for larger values.
     """
-    span = max(largest - smallest, 1e-12)
-    place = np.clip((np.abs(values) - smallest) / span, 0, 1) * (len(COLOUR_STOPS) - 1)
+    place = np.clip(np.abs(values) / max(largest, 1e-12), 0, 1) * (len(COLOUR_STOPS) - 1)
     stops = np.arange(len(COLOUR_STOPS))
     channels = [np.interp(place, stops, colours) for colours in COLOUR_STOPS.T]
     picture = np.stack(channels, axis=-1).round().astype(np.uint8)

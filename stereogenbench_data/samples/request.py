@@ -1,4 +1,4 @@
-"""What a dataset requests of every sample, and the interface of transforms."""
+"""What a dataset asks of every sample, and the interface of transforms."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -36,8 +36,7 @@ class Request:
     Attributes:
         kind: "pairs" (fields of `PAIR_FIELDS`) or "views" (of `VIEW_FIELDS`).
         fields: The fields, in order.
-        layout: "single": what each target has stands for itself; "stacked": with an axis of
-            targets in front.
+        layout: "single": of one target; "stacked": with an axis of targets in front.
         size: (height, width) to which the decoder scales, None for the stored size.
         depth: A depth contract that overrides what the index says, or None.
         transform: What changes the views before fields are derived, or None.
@@ -57,7 +56,7 @@ class Request:
 
     @property
     def streams(self) -> frozenset[Stream]:
-        """The videos that the fields are made from, whichever way the transform turns."""
+        """The videos that the fields are made from, before or after a swap of the views."""
         none: frozenset[Stream] = frozenset()
         streams = none.union(*(self.known[name].streams for name in self.fields))
         if self.transform is not None and self.transform.swaps_views:

@@ -77,7 +77,7 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
             before = f" of those left by {', '.join(applied)}" if applied else ""
             raise SelectionError(
                 f"{name}={wanted!r} matches none of {counted(len(rows), 'scene')}{before}; "
-                f"{name} there is {there()}.{stale_note(index)}"
+                f"found {there()}.{stale_note(index)}"
             )
         rows = rows[keep]
         applied.append(f"{name}={wanted!r}")
@@ -103,7 +103,7 @@ def _apply(
         if nowhere and len(nowhere) < len(set(names)):
             raise SelectionError(
                 f"{name}={nowhere[0]!r} matches none of {counted(len(column), 'scene')} of the "
-                f"index; {name} there is {_listed(column, near=nowhere)}.{stale_note(index)}"
+                f"index; found {_listed(column, near=nowhere)}.{stale_note(index)}"
             )
         return np.isin(values.astype(str), names), lambda: _listed(values, near=names)
     if name in _RANGE_COLUMNS:
@@ -136,7 +136,7 @@ def _caption_filter(
     captions = [str(caption).lower() for caption in index.column("caption")[rows]]
     keep = np.array([all(word in caption for word in words) for caption in captions], dtype=bool)
     written = sum(map(bool, captions))
-    return keep, lambda: f"written for {written} scenes, without all of {words}"
+    return keep, lambda: f"captions of {counted(written, 'scene')}, none with all of {words}"
 
 
 def require_range(name: str, wanted: Any) -> Range:
@@ -164,7 +164,7 @@ def _texts(name: str, wanted: Any) -> list[str]:
 def _listed(values: Any, *, near: list[str]) -> str:
     found = sorted({str(value) for value in values if value is not None and str(value)})
     if not found:
-        return "not recorded for any"
+        return "no value"
     close = [match for name in near for match in difflib.get_close_matches(name, found, n=2)]
     first = list(dict.fromkeys([*close, *found]))[:_MOST_VALUES]
     more = f" and {len(found) - len(first)} more" if len(found) > len(first) else ""
