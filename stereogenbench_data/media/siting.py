@@ -301,19 +301,15 @@ def _skip_to_hevc_chroma(bits: _Bits) -> int:
     """Pass over all before chroma_format_idc; return how many layers there are beside the first."""
     bits.skip(16, 4)
     layers = bits.take(3)
-    _skip_profiles(bits, layers)
-    bits.skip(0)
-    return layers
-
-
-def _skip_profiles(bits: _Bits, layers: int) -> None:
-    """Pass over profile, tier and level, of the whole and of so many layers."""
+    # Profile, tier and level, of the whole and of each layer.
     bits.skip(1, _PROFILE_BITS, 8)
     present = [(bits.take(), bits.take()) for _ in range(layers)]
     if layers:
         bits.skip(2 * (8 - layers))
     for has_profile, has_level in present:
         bits.skip(*[_PROFILE_BITS] * has_profile, *[8] * has_level)
+    bits.skip(0)
+    return layers
 
 
 def _skip_hevc_scaling_lists(bits: _Bits) -> None:

@@ -131,21 +131,17 @@ class PairGeometry:
             np.multiply(disparity_from_depth(self.depth_m, **rig), np.float32(sign), out=out)
         else:
             shift_m = self._views.intrinsics.fx_px * self.baseline_m
+            measured = self.stored.measured
+            if 0 not in self._encoding.no_depth and self._encoding.form == "depth":
+                # By this contract a stored 0 was measured; its disparity is 0.
+                measured = measured & (self.stored.units != 0)
             write_disparity(
                 out,
                 self.stored.units,
-                measured=self._nonzero_measured,
+                measured=measured,
                 shift_units=sign * shift_m / self._encoding.known_unit_m,
                 form=self._encoding.form,
             )
-
-    @property
-    def _nonzero_measured(self) -> MapBool:
-        """Where disparity is not 0: a contract may say that a stored 0 was measured."""
-        if 0 in self._encoding.no_depth or self._encoding.form == "inverse":
-            return self.stored.measured
-        nonzero: MapBool = self.stored.measured & (self.stored.units != 0)
-        return nonzero
 
     @cached_property
     def projection(self) -> Projection:
