@@ -185,7 +185,7 @@ def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairLis
         bins = sorted({baseline_bin(value) for value in found[~np.isnan(found)]})
         raise SelectionError(
             f"baseline_cm={wanted!r} matches none of {counted(len(pairs), 'pair')}; "
-            f"baselines there are {np.nanmin(found):g} to {np.nanmax(found):g} cm, in the bins "
+            f"found {np.nanmin(found):g} to {np.nanmax(found):g} cm, in the bins "
             f"{', '.join(bins)}."
         )
     kept = PairList(pairs.row, pairs.source, _packed(pairs.targets, keep))
