@@ -15,6 +15,7 @@ from stereogenbench_data.cli.browse import browse
 from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
 from stereogenbench_data.cli.evaluate import controls, evaluate, export_inputs
+from stereogenbench_data.cli.export import app as export_app
 from stereogenbench_data.cli.index import index
 from stereogenbench_data.cli.outcome import ErrorsReported
 from stereogenbench_data.cli.pack import pack, unpack, verify
@@ -93,6 +94,13 @@ _command(unpack, panel=_PACK, example="unpack shards/ scenes/")
 _command(croissant, panel=_PACK, example="croissant shards/ -o croissant/sample.json")
 _command(card, panel=_PACK, example="card shards/ --repo ORG/NAME -o shards/")
 _command(upload, panel=_PACK, example="upload shards/ ORG/NAME")
+app.add_typer(
+    export_app,
+    name="export",
+    rich_help_panel=_PACK,
+    epilog="Example: `stereogenbench export clips shards/ clips/ --layout musubi --split train`",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 _command(stats, panel=_CHECK, example="stats shards/ --plots plots/")
 _command(doctor, panel=_CHECK, example="doctor scenes/ -o doctor.png")
 _command(audit, panel=_CHECK, example="audit shards/ --scenes 20 -o audit.md")
