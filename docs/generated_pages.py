@@ -1,7 +1,7 @@
 """Pages that are made from the code when the site is built: the commands, the tables of fields."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import typer
@@ -42,21 +42,18 @@ def commands_page() -> str:
     parts = ["# Commands", "", _plain(group.help or "")]
     if group.epilog:
         parts += ["", _plain(group.epilog)]
-    for name, command in _commands(group):
-        parts += ["", f"## stereogenbench {name}", "", _plain(command.help or "")]
-        if command.epilog:
-            parts += ["", _plain(command.epilog)]
-        parts += ["", *_parameters(command)]
+    for name, command in group.commands.items():
+        parts += _described(name, command, level=2)
+        for inner, each in getattr(command, "commands", {}).items():
+            parts += _described(f"{name} {inner}", each, level=3)
     return "\n".join(parts) + "\n"
 
 
-def _commands(group: Any) -> Iterator[tuple[str, Any]]:
-    """Yield each command by its words; of a group, those in it."""
-    for name, command in group.commands.items():
-        if hasattr(command, "commands"):
-            yield from ((f"{name} {inner}", each) for inner, each in _commands(command))
-        else:
-            yield name, command
+def _described(name: str, command: Any, *, level: int) -> list[str]:
+    parts = ["", f"{'#' * level} stereogenbench {name}", "", _plain(command.help or "")]
+    if command.epilog:
+        parts += ["", _plain(command.epilog)]
+    return parts if hasattr(command, "commands") else [*parts, "", *_parameters(command)]
 
 
 def _parameters(command: Any) -> list[str]:

@@ -47,7 +47,6 @@ from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.size import require_size
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.plan import Address, PairOptions, Plan
 from stereogenbench_data.selection.windows import FramesSpec, parse_frames
@@ -113,14 +112,11 @@ class ExportRun:
     """How clips are exported; it changes nothing in a file, but for the depth contract.
 
     Attributes:
-        evaluation_data: "export" to export scenes of the split eval, too: a model that was trained
-            on them cannot be evaluated on them.
         depth: A depth contract instead of the one that files and release state.
         workers: How many processes write, None for one a core.
         progress: Called with (frames written, frames in all).
     """
 
-    evaluation_data: Literal["refuse", "export"] = "refuse"
     depth: DepthEncoding | None = None
     workers: int | None = None
     progress: Progress | None = None
@@ -137,11 +133,15 @@ class ClipReport(NamedTuple):
         written: Names of the clips that were written now.
         kept: Names of those that were there before.
         manifests: The manifests that were written.
+        evaluation_scenes: How many scenes of the split eval were left out.
+        without_caption: How many clips have an empty caption.
     """
 
     written: tuple[str, ...]
     kept: tuple[str, ...]
     manifests: tuple[Path, ...]
+    evaluation_scenes: int
+    without_caption: int
 
 
 class ClipSelection(SceneFilters, PairOptions, total=False):
@@ -162,20 +162,22 @@ def export_clips(
     """Write clips and the manifests of a layout.
 
     Each video is written whole or not at all, and finished clips are kept, so that a stopped run
-    goes on if it is run again. The manifests are written when all clips are there.
+    goes on if it is run again. The manifests are written when all clips are there. Evaluation
+    scenes are exported only where ``split`` names them: a model that was trained on them cannot be
+    evaluated on them.
 
     Args:
         data: As for `StereoPairs`.
         out: A new or empty folder, or one that this export was begun in.
         layout: "diffsynth", "finetrainers", "musubi" or "stereocrafter".
         form: What a clip is.
-        run: How the export is run, and whether evaluation data may be exported.
+        run: How the export is run.
         **selection: Filters on scenes (`SceneFilters`), pairs, baseline_cm, balance and limit.
 
     Raises:
         SelectionError: If nothing matches; if there is no such layout or kind of video; if the
-            trainer would cut a clip of this length; or if scenes of the split eval are selected and
-            ``run`` does not allow them.
+            trainer would cut a clip of this length; or if all that match are evaluation scenes,
+            and ``split`` does not name them.
         StorageError: If the folder holds something else, another process exports into it, or
             something cannot be read or written.
         MediaError: If a video cannot be decoded, or not be encoded as asked.
@@ -185,12 +187,11 @@ def export_clips(
     kinds, control = _require_kinds(form, rules=rules, layout=layout)
     size = None if form.size is None else require_size(form.size)
     index = open_index(data)
-    chosen: Any = dict(selection)
+    chosen, evaluation_scenes = _training_selection(index, selection)
     chosen["frames"] = _windows(index, form, rules=rules, layout=layout, selection=chosen)
     fields = dict.fromkeys(name for kind in kinds for name in _FIELDS[kind])
     plan = StereoPairs(index, fields=fields, size=size, depth=run.depth, **chosen).plan
     _require_left_to_right(plan)
-    _require_training_data(index, plan, run)
     _warn_of_sizes(index, plan, size=size, rules=rules, layout=layout)
     settings = {
         "format": _FORMAT,
@@ -222,6 +223,8 @@ def export_clips(
         written=tuple(work.name for work in due),
         kept=tuple(work.name for work in works if work.name not in written),
         manifests=tuple(root / name for name in texts if "/" not in name),
+        evaluation_scenes=evaluation_scenes,
+        without_caption=sum(not clip["caption"] for clip in clips),
     )
 
 
@@ -251,6 +254,32 @@ def _require_kinds(
     return tuple(dict.fromkeys(kinds)), control
 
 
+def _training_selection(
+    index: SceneIndex, selection: Mapping[str, Any]
+) -> tuple[dict[str, Any], int]:
+    """Return a selection without evaluation scenes, unless its split names them, and their number.
+
+    Raises:
+        SelectionError: If there are no others.
+    """
+    if selection.get("split") is not None:
+        return dict(selection), 0
+    rows = filter_scenes(index, _filters(selection))
+    evaluation = int((index.column("split")[rows] == "eval").sum())
+    if evaluation == len(rows):
+        raise SelectionError(
+            f"{index.where}: all that match are evaluation scenes ({evaluation}), and training "
+            "data are made of these only if you say so: split='eval', on the command line "
+            "--split eval."
+        )
+    return {**selection, "split": "train"}, evaluation
+
+
+def _filters(selection: Mapping[str, Any]) -> SceneFilters:
+    names = SceneFilters.__annotations__
+    return cast("SceneFilters", {name: selection[name] for name in names if name in selection})
+
+
 def _windows(
     index: SceneIndex,
     form: ClipForm,
@@ -266,10 +295,8 @@ def _windows(
     length = form.length
     if length is None:
         parse_frames(("clips", 1, form.stride))
-        filters: Any = {
-            name: selection[name] for name in SceneFilters.__annotations__ if name in selection
-        }
-        shortest = int(index.column("frames")[filter_scenes(index, filters)].min())
+        rows = filter_scenes(index, _filters(selection))
+        shortest = int(index.column("frames")[rows].min())
         length = (shortest - 1) // form.stride // unit * unit + 1
     elif (length - 1) % unit:
         below = max(0, length - 1) // unit * unit + 1
@@ -289,18 +316,6 @@ def _require_left_to_right(plan: Plan) -> None:
         raise SelectionError(
             "a right view is generated from the view to its left: choose pairs='primary', "
             "'adjacent', 'all' or (left, right) numbers."
-        )
-
-
-def _require_training_data(index: SceneIndex, plan: Plan, run: ExportRun) -> None:
-    held_out = np.flatnonzero(index.column("split")[plan.scene_rows] == "eval")
-    if len(held_out) and run.evaluation_data != "export":
-        key = index.column("key")[plan.scene_rows[held_out[0]]]
-        raise SelectionError(
-            f"{counted(len(held_out), 'scene')} of {len(plan.scene_rows)} belong to the split "
-            f"eval, the first is {key}: a model that is trained on them cannot be evaluated on "
-            "them. Select split='train' (--split train), or ask for evaluation data explicitly "
-            "(evaluation_data='export', --evaluation-data)."
         )
 
 

@@ -160,7 +160,8 @@ def test_diffsynth_reads_videos_with_imageio(everything, expected):
 def test_a_caption_is_one_line_of_text_for_every_trainer(small_release, tmp_path, caption):
     index = described(small_release, caption)
     for layout in ("diffsynth", "finetrainers", "musubi"):
-        exported(index, tmp_path / layout, layout, family="IPD_Gaussian")
+        report = exported(index, tmp_path / layout, layout, family="IPD_Gaussian")
+        assert report.without_caption == (caption == "")
 
     line = " ".join(caption.split())
     read = pandas.read_csv(tmp_path / "diffsynth" / "metadata.csv")["prompt"][0]
@@ -385,18 +386,19 @@ def test_progress_tells_frames_and_begins_with_those_that_are_there(small_releas
 # Refusals.
 
 
-def test_evaluation_data_need_an_explicit_word(small_release, tmp_path):
-    said = r"1 scene of 4 belong.* split eval, the first is eval/.*evaluation_data='export'"
-    for split in (None, "eval"):
-        with pytest.raises(SelectionError, match=said.replace("of 4", r"of \d")):
-            exported(small_release, tmp_path / "out", split=split)
-        assert not (tmp_path / "out").exists()
+def test_evaluation_scenes_need_an_explicit_word(small_release, tmp_path):
+    plain = exported(small_release, tmp_path / "plain", split=None)
+    named = exported(small_release, tmp_path / "named", split="eval")
+    both = exported(small_release, tmp_path / "both", split=("train", "eval"))
 
-    run = ExportRun(workers=1, evaluation_data="export")
-    report = exported(small_release, tmp_path / "out", split=None, run=run)
-
-    assert len(report.written) == 4
-    assert [record["split"] for record in records(tmp_path / "out")].count("eval") == 1
+    assert [plain.evaluation_scenes, named.evaluation_scenes, both.evaluation_scenes] == [1, 0, 0]
+    assert [record["split"] for record in records(tmp_path / "plain")] == ["train"] * 3
+    assert [record["split"] for record in records(tmp_path / "named")] == ["eval"]
+    assert [record["split"] for record in records(tmp_path / "both")].count("eval") == 1
+    for selection in ({"subset": "seen_map"}, {"scenes": records(tmp_path / "named")[0]["scene"]}):
+        with pytest.raises(SelectionError, match=r"evaluation scenes \(1\).*--split eval"):
+            exported(small_release, tmp_path / "none", split=None, **selection)
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_folder_of_another_export_is_refused_by_what_differs(small_release, tmp_path):

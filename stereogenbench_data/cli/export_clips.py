@@ -1,6 +1,7 @@
-"""``stereogenbench export``: the data in the files that other programs read."""
+"""``stereogenbench export clips``: stereo video for the trainers of video models."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -25,16 +26,19 @@ if TYPE_CHECKING:
     from stereogenbench_data.bridges.clips import ClipForm
     from stereogenbench_data.media.encoder import Encoding
 
-_LAYOUTS: Final = ("diffsynth", "finetrainers", "musubi", "stereocrafter")
-_MAPS: Final = ("depth", "disparity")
-
-app = typer.Typer(no_args_is_help=True, help="Write the data as files that other programs read.")
-
 
 @dataclass(frozen=True, kw_only=True)
 class PairOptions(SceneOptions):
     """Which pairs of which scenes are exported."""
 
+    split: Annotated[
+        str | None,
+        typer.Option(
+            "--split",
+            help="train; eval only if you say so [train].",
+            autocompletion=complete_from(("train", "eval")),
+        ),
+    ] = None
     pairs: Annotated[
         str, typer.Option("--pairs", help="primary, adjacent, all, or pairs such as 0-1,0-5.")
     ] = "primary"
@@ -113,7 +117,7 @@ class ClipOptions(EncodingOptions):
         typer.Option(
             "--also",
             help="Another video: depth or disparity; may be given again.",
-            autocompletion=complete_from(_MAPS),
+            autocompletion=complete_from(("depth", "disparity")),
         ),
     ] = None
     control: Annotated[
@@ -151,14 +155,9 @@ class ClipOptions(EncodingOptions):
         )
 
 
-@app.command(
-    epilog="Example: `stereogenbench export clips shards/ clips/ --layout musubi --split train "
-    "--size 832x480`",
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
 @grouped
 @resumable()
-def clips(  # noqa: PLR0913 - one parameter an option
+def export_clips(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     out: Annotated[Path, typer.Argument(help="Folder to write into.")],
     *,
@@ -168,14 +167,6 @@ def clips(  # noqa: PLR0913 - one parameter an option
     ],
     chosen: PairOptions,
     clip: ClipOptions,
-    evaluation_data: Annotated[
-        bool,
-        typer.Option(
-            "--evaluation-data",
-            help="Export scenes of the split eval, too: what is trained on them cannot be "
-            "evaluated on them.",
-        ),
-    ] = False,
     depth_unit_m: DepthUnitOption = None,
     workers: Annotated[int | None, workers_option("Processes that write")] = None,
     as_json: JsonOption = False,
@@ -185,25 +176,30 @@ def clips(  # noqa: PLR0913 - one parameter an option
     Of each pair: the right view, the left one, the left one warped into the right, and a lossless
     mask of its holes. A stopped run goes on if it is run again; manifests are written last.
     """
-    from stereogenbench_data.bridges.clips import ExportRun, export_clips
+    from stereogenbench_data.bridges.clips import ExportRun
+    from stereogenbench_data.bridges.clips import export_clips as exported
     from stereogenbench_data.schema.text import counted
 
     form, selection = clip.form(), chosen.selection()
     index = source.open()
     with progress_bar("writing", unit="frames") as progress:
-        report = export_clips(
+        report = exported(
             index,
             out,
             layout=layout,
             form=form,
             run=ExportRun(
-                evaluation_data="export" if evaluation_data else "refuse",
                 depth=depth_of(depth_unit_m),
                 workers=workers,
                 progress=progress,
             ),
             **selection,
         )
+    if report.evaluation_scenes:
+        left_out = counted(report.evaluation_scenes, "evaluation scene")
+        typer.echo(f"{left_out} left out: --split eval exports them", err=True)
+    if report.without_caption:
+        typer.echo(f"{counted(report.without_caption, 'clip')} without a caption", err=True)
     names = [path.name for path in report.manifests]
     if as_json:
         clips_of = {"written": list(report.written), "kept": list(report.kept)}
@@ -214,3 +210,9 @@ def clips(  # noqa: PLR0913 - one parameter an option
         f"{out}: {counted(len(report.written), 'clip')} written, {len(report.kept)} {were} there "
         f"before; {', '.join(names)}"
     )
+
+
+EXPORTS: Final[tuple[tuple[str, Callable[..., None], str], ...]] = (
+    ("clips", export_clips, "export clips shards/ clips/ --layout musubi --size 832x480"),
+)
+"""Name, function and example of each command of the group ``export``."""

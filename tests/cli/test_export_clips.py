@@ -56,17 +56,22 @@ def test_every_option_reaches_the_export(small_release, tmp_path):
     assert "unit_m=0.2" in settings["depth"]
 
 
-def test_evaluation_data_are_refused_with_the_option_that_allows_them(small_release, tmp_path):
-    words = [small_release, tmp_path / "out", "--layout", "stereocrafter", "--subset", "seen_map"]
-    words += ["--workers", "1", "--preset", "ultrafast"]
+def test_evaluation_scenes_are_left_out_unless_their_split_is_named(small_release, tmp_path):
+    words = [small_release, tmp_path / "out", "--layout", "stereocrafter", "--workers", "1"]
+    words += ["--preset", "ultrafast"]
 
-    refused = run(*words)
-    allowed = run(*words, "--evaluation-data")
+    plain = run(*words)
+    refused = run(*words, "--subset", "seen_map")
+    words[1] = tmp_path / "eval"
+    named = run(*words, "--subset", "seen_map", "--split", "eval")
 
+    assert "1 evaluation scene left out: --split eval exports them" in plain.stderr
+    assert {record["split"] for record in records(tmp_path / "out")} == {"train"}
     assert refused.exit_code == 2
-    assert "SelectionError: 1 scene of 1 belong to the split eval" in refused.stderr
-    assert "--evaluation-data" in refused.stderr
-    assert allowed.exit_code == 0, allowed.output
+    assert "SelectionError" in refused.stderr
+    assert "--split eval" in refused.stderr
+    assert named.exit_code == 0, named.output
+    assert [record["split"] for record in records(tmp_path / "eval")] == ["eval"]
 
 
 @pytest.mark.parametrize(
