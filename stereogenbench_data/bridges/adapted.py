@@ -64,11 +64,16 @@ class AdaptedPairs(Dataset[Item], Generic[Item]):
         Raises:
             SelectionError: If nothing matches; or if the samples are sweeps, or clips where single
                 frames are needed, or the reverse.
-            FieldError: If ``fields`` is among the options.
+            FieldError: If ``fields`` is among the options, or the data are a dataset.
         """
         name = type(self).__name__
         if "fields" in options:
             raise FieldError(f"{name} takes no fields: its items have what the project reads.")
+        if isinstance(data, Dataset):
+            raise FieldError(
+                f"{name} takes what {type(data).__name__} takes, not the dataset itself: give the "
+                "data and the options that it was made with."
+            )
         self.pairs = StereoPairs(data, fields=fields, **options)
         self.adapt = adapt
         plan = self.pairs.plan

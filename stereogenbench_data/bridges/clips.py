@@ -46,6 +46,7 @@ from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.size import require_size
+from stereogenbench_data.samples.transforms import Crop
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.plan import Address, PairOptions, Plan
@@ -71,6 +72,9 @@ _FIELDS: Final[Mapping[Kind, tuple[str, ...]]] = {
 _FACTS: Final = ("scene", "split", "pair", "caption", "baseline_m", "frame_rate_hz")
 
 
+Fit = Literal["stretch", "crop"]
+
+
 class ClipSizeWarning(UserWarning):
     """Pictures of this size are cut or scaled by the trainer."""
 
@@ -84,6 +88,8 @@ class ClipForm:
         stride: Every so many frames of the video is one of the clip.
         step: Frames of the video from one clip's first to the next one's; None for no overlap.
         size: (height, width) in pixels, or a text "WIDTHxHEIGHT"; None for the stored size.
+        fit: What becomes of pictures of another shape than the size: "stretch", or "crop" to scale
+            them until they cover it and cut to the middle.
         rate_hz: The rate that the files state; None for the video's own, divided by the stride. No
             frame is dropped or repeated for it.
         length_rule: "layout" for lengths that the trainer takes whole (4N+1, of StereoCrafter
@@ -99,6 +105,7 @@ class ClipForm:
     stride: int = 1
     step: int | None = None
     size: tuple[int, int] | str | None = None
+    fit: Fit = "stretch"
     rate_hz: float | None = None
     length_rule: Literal["layout", "any"] = "layout"
     also: tuple[Kind, ...] = ()
@@ -190,7 +197,8 @@ def export_clips(
     chosen, evaluation_scenes = _training_selection(index, selection)
     chosen["frames"] = _windows(index, form, rules=rules, layout=layout, selection=chosen)
     fields = dict.fromkeys(name for kind in kinds for name in _FIELDS[kind])
-    plan = StereoPairs(index, fields=fields, size=size, depth=run.depth, **chosen).plan
+    stretched = size if form.fit == "stretch" else None
+    plan = StereoPairs(index, fields=fields, size=stretched, depth=run.depth, **chosen).plan
     _require_left_to_right(plan)
     _warn_of_sizes(index, plan, size=size, rules=rules, layout=layout)
     settings = {
@@ -242,6 +250,8 @@ def _require_kinds(
 ) -> tuple[tuple[Kind, ...], Kind | None]:
     """Return the kinds of videos of each clip, and which of them is the control."""
     known = [kind for kind in get_args(Kind) if kind != "grid"]
+    if form.fit not in get_args(Fit):
+        raise SelectionError(f"fit must be one of {get_args(Fit)}, got {form.fit!r}.")
     for kind in form.also:
         if kind not in known:
             raise SelectionError(f"also: videos are {', '.join(known)}; got {kind!r}.")
@@ -302,7 +312,7 @@ def _windows(
         below = max(0, length - 1) // unit * unit + 1
         raise SelectionError(
             f"length={length}: {layout} takes clips of {unit}N+1 frames and cuts others: give "
-            f"{below} or {below + unit}, or length_rule='any'."
+            f"{below} or {below + unit}, or length_rule='any' (--any-length)."
         )
     step = () if form.step is None else (form.step,)
     spec = cast("FramesSpec", ("clips", length, form.stride, *step))
@@ -433,7 +443,19 @@ class _ClipWork:
 
     def request(self, fields: Sequence[str]) -> Request:
         """Return what is read of every frame."""
-        return Request("pairs", tuple(fields), "single", size=self.size, depth=self.depth)
+        size, transform = self.size, None
+        if size is not None and self.form.fit == "crop":
+            rig, (height, width) = self.index.scene(0).rig, size
+            scale = max(height / rig.image_height_px, width / rig.image_width_px)
+            size = (
+                max(height, round(rig.image_height_px * scale)),
+                max(width, round(rig.image_width_px * scale)),
+            )
+            top, left = (size[0] - height) // 2, (size[1] - width) // 2
+            transform = Crop(top, left, height, width)
+        return Request(
+            "pairs", tuple(fields), "single", size=size, depth=self.depth, transform=transform
+        )
 
 
 def _works(

@@ -108,6 +108,10 @@ class ClipOptions(EncodingOptions):
     size: Annotated[
         str | None, typer.Option("--size", help="WIDTHxHEIGHT of pictures [as stored].")
     ] = None
+    fit: Annotated[
+        Literal["stretch", "crop"],
+        typer.Option(help="crop: scale until the size is covered, and cut to the middle."),
+    ] = "stretch"
     rate_hz: Annotated[
         float | None,
         typer.Option(help="Frames a second that files state [the video's, by the stride]."),
@@ -146,6 +150,7 @@ class ClipOptions(EncodingOptions):
             stride=self.stride,
             step=self.step,
             size=None if self.size is None else parse_picture_size(self.size),
+            fit=self.fit,
             rate_hz=self.rate_hz,
             length_rule="any" if self.any_length else "layout",
             also=also,

@@ -16,7 +16,7 @@ import numpy as np
 import pandas
 import pytest
 
-from stereogenbench_data import SelectionError, StereoPairs
+from stereogenbench_data import Crop, SelectionError, StereoPairs
 from stereogenbench_data.bridges.clip_layouts import LAYOUTS
 from stereogenbench_data.bridges.clips import (
     ClipForm,
@@ -271,6 +271,26 @@ def test_stereocrafter_gets_grids_of_four(small_release, tmp_path):
         assert difference(decoded(tmp_path / record["videos"]["right"]), sample["right"]) < 1.5
 
 
+@pytest.mark.parametrize(("size", "top", "left"), [((32, 64), 16, 0), ((64, 32), 0, 16)])
+def test_pictures_are_cut_to_the_middle_instead_of_stretched(
+    small_release, tmp_path, size, top, left
+):
+    form = ClipForm(size=size, fit="crop", also=("depth",), encoding=SHARP)
+    exported(small_release, tmp_path, form=form, family="IPD_Gaussian")
+    options = {"split": "train", "family": "IPD_Gaussian", "frames": ("clips", 5)}
+    sample = StereoPairs(small_release, transform=Crop(top, left, *size), fields=FIELDS, **options)[
+        0
+    ]
+
+    (record,) = records(tmp_path)
+    videos = {kind: decoded(tmp_path / path) for kind, path in record["videos"].items()}
+
+    assert (record["height"], record["width"]) == size
+    assert difference(videos["right"], sample["right"]) < 1.5
+    assert difference(videos["warped"], sample["warped_right"]) < 1.5
+    assert np.array_equal(videos["mask"][:, :1] > 0, sample["hole"])
+
+
 def test_the_same_export_is_the_same_bytes_with_more_processes(small_release, tmp_path):
     first = exported(small_release, tmp_path / "one")
     second = exported(small_release, tmp_path / "two", run=ExportRun(workers=2))
@@ -476,6 +496,7 @@ def test_a_size_that_the_trainer_cuts_is_warned_of(small_release, tmp_path, layo
         (ClipForm(length=0), SelectionError, r"give 1 or 5"),
         (ClipForm(stride=0), SelectionError, r"at least 1, got 0"),
         (ClipForm(step=0), SelectionError, r"at least 1, got 0"),
+        (ClipForm(fit="pad"), SelectionError, r"fit must be one of .*'crop'.*, got 'pad'"),
         (ClipForm(rate_hz=0), MediaError, r"rate is 0 frames a second: give rate_hz"),
         (ClipForm(also=("sound",)), SelectionError, r"also: videos are right, .*; got 'sound'"),
         (ClipForm(control="right"), SelectionError, r"control='right': the layout .* takes left"),

@@ -237,6 +237,8 @@ def test_what_the_project_cannot_take_is_refused(small_release, adapter, options
         adapter(small_release, pairs="sweep", **options)
     with pytest.raises(FieldError, match=f"{name} takes no fields"):
         adapter(small_release, fields=("left",), **options)
+    with pytest.raises(FieldError, match=f"{name} takes what StereoPairs takes, not the dataset"):
+        adapter(StereoPairs(small_release), **options)
     with pytest.raises(SelectionError, match=f"tail='wrap'.*{name}.*tail='drop'"):
         adapter(small_release, **options).loader(2, tail="wrap")
 

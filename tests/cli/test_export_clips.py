@@ -35,7 +35,8 @@ def test_every_option_reaches_the_export(small_release, tmp_path):
     shown = run(
         small_release, tmp_path / "out", "--layout", "diffsynth", "--family", "Uniform",
         "--split", "train", "--pairs", "0-1,1-2", "--baseline-cm", "0", "500", "--length", "3",
-        "--stride", "2", "--step", "1", "--any-length", "--size", "48x32", "--rate-hz", "16",
+        "--stride", "2", "--step", "1", "--any-length", "--size", "48x32", "--fit", "crop",
+        "--rate-hz", "16",
         "--also", "depth", "--also", "disparity", "--control", "left", "--baseline-in-caption",
         "--crf", "20", "--preset", "ultrafast", "--pixel-format", "yuv444p",
         "--key-frame-every", "2", "--depth-unit-m", "0.2", "--workers", "1",
@@ -49,7 +50,7 @@ def test_every_option_reaches_the_export(small_release, tmp_path):
     assert found[0]["caption"].endswith(" cm.")
     assert {"depth", "disparity"} < found[0]["videos"].keys()
     settings = json.loads((tmp_path / "out" / "export.json").read_text())
-    assert settings["control"] == "left"
+    assert (settings["control"], settings["form"]["fit"]) == ("left", "crop")
     assert settings["form"]["encoding"] == {
         "crf": 20, "preset": "ultrafast", "pixel_format": "yuv444p", "key_frame_every": 2,
     }  # fmt: skip
