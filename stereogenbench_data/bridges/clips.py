@@ -32,7 +32,7 @@ from stereogenbench_data.bridges.clip_layouts import (
     lines,
 )
 from stereogenbench_data.bridges.generation import Captions, describe_pair
-from stereogenbench_data.datasets.mapped import Data, StereoPairs, open_index
+from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
 from stereogenbench_data.errors import (
     MediaError,
@@ -193,7 +193,7 @@ def export_clips(
     rules = _require_layout(layout)
     kinds, control = _require_kinds(form, rules=rules, layout=layout)
     size = None if form.size is None else require_size(form.size)
-    index = open_index(data)
+    index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
     chosen, evaluation_scenes = _training_selection(index, selection)
     chosen["frames"] = _windows(index, form, rules=rules, layout=layout, selection=chosen)
     fields = dict.fromkeys(name for kind in kinds for name in _FIELDS[kind])

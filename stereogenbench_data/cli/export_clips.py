@@ -14,10 +14,10 @@ from stereogenbench_data.cli.options import (
     DepthUnitOption,
     JsonOption,
     SceneOptions,
+    WorkersOption,
     complete_from,
     depth_of,
     grouped,
-    workers_option,
 )
 from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
@@ -173,7 +173,7 @@ def export_clips(  # noqa: PLR0913 - one parameter an option
     chosen: PairOptions,
     clip: ClipOptions,
     depth_unit_m: DepthUnitOption = None,
-    workers: Annotated[int | None, workers_option("Processes that write")] = None,
+    workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write stereo clips as MP4 with captions and the manifest that a video trainer reads.
