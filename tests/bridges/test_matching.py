@@ -133,6 +133,19 @@ def test_the_loop_of_unimatch_takes_normalised_tensors(small_release):
     assert torch.equal(mask[0], plain["valid"][0])
 
 
+@pytest.mark.parametrize("transform", FLIPPED)
+def test_the_right_picture_of_unimatch_fetched_by_its_disparity_is_the_left_one(
+    detailed_release, transform
+):
+    item = UniMatch(detailed_release, transform=transform)[0]
+    visible = visible_pixels(detailed_release, transform=transform)[0]
+    mean, std = (torch.tensor(each)[:, None, None] for each in (IMAGENET_MEAN, IMAGENET_STD))
+    left, right = ((item[name] * std + mean) * 255 for name in ("left", "right"))
+
+    assert psnr(fetched(right, -item["disp"]), left, visible) > 27
+    assert psnr(right, left, visible) < 22
+
+
 def test_transforms_of_unimatch_get_arrays_of_height_width_channels(small_release):
     plain = StereoPairs(small_release)[0]
 
