@@ -23,6 +23,7 @@ from stereogenbench_data.cli.options import (
 )
 from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, require_metrics
 from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
@@ -137,9 +138,9 @@ class ProtocolOptions:
     metrics: Annotated[
         str,
         typer.Option(
-            help="Of psnr, ssim, lpips, e_match, p_psnr, sd, fid, fvd, fd-colour, fd-motion.",
+            help=f"Of {', '.join(METRICS)}.",
         ),
-    ] = "psnr,ssim,e_match,p_psnr,sd"
+    ] = ",".join(OFFLINE_METRICS)
     keypoint_matcher: Annotated[
         str, typer.Option(help="For E_match: sift, or dedode (the paper's).")
     ] = "sift"
@@ -173,7 +174,6 @@ class ProtocolOptions:
             typer.BadParameter: If the size is not WIDTHxHEIGHT.
             EvaluationError: If a metric, a matcher or a fit is unknown.
         """
-        from stereogenbench_data.evaluation.columns import require_metrics
         from stereogenbench_data.evaluation.models.registry import ModelOptions
         from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 

@@ -126,11 +126,14 @@ def _draw_bins(
 
 
 def _draw_reference(axes: Any, results: Sequence[Scores], metric: str) -> list[float]:
-    """Draw the paper's bins of the tier if Uniform scenes were scored; return their numbers."""
+    """Draw the paper's bins of the tier if Uniform scenes were scored; return their numbers.
+
+    A metric that the paper does not report has none.
+    """
     families = results[0].index.column("family")
     if not any(families[pair.row] == "Uniform" for one in results for pair in one.pairs):
         return []
-    rows = reference_rows("bins", tier=results[0].tier)
+    rows = [row for row in reference_rows("bins", tier=results[0].tier) if row.get(metric)]
     for number, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
         found = [row for row in rows if row["method"] == method]
         middles = [sum(BASELINE_BINS[row["baseline_bin_cm"]]) / 2 for row in found]

@@ -477,6 +477,14 @@ def test_a_retry_policy_without_an_end_is_refused(name, value):
 
 
 @pytest.mark.parametrize(
+    "name", ["longest_retry_after_s", "longest_wait_s", "first_wait_s", "least_rate_bytes_s"]
+)
+def test_a_retry_policy_with_a_negative_limit_is_refused(name):
+    with pytest.raises(StorageError, match=rf"RetryPolicy: {name} must be 0 or more, got -1"):
+        RetryPolicy(**{name: -1})
+
+
+@pytest.mark.parametrize(
     "told", ["\u00b2", "9" * 5000, "Fri, 21 Oct 99999 07:28:00 GMT", ",", "-1"]
 )
 def test_a_retry_after_that_is_none_is_no_error_of_its_own(clock, told):
