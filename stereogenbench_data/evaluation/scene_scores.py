@@ -17,7 +17,7 @@ from av.video.reformatter import VideoReformatter
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.frame_metrics import (
-    OF_FRAME,
+    FRAME_METRIC_ROWS,
     CachedKeypoints,
     MetricModels,
     TargetFrame,
@@ -224,8 +224,8 @@ class PairScorer:
             targets.append(frame if has_size else frame.scaled_from_stored)
             pictures.append(scaled_rgb(picture, size=frame.right.shape[1:], scaler=scaler))
             for metric in models.protocol.metrics:
-                if metric in OF_FRAME:
-                    numbers = OF_FRAME[metric].score(pictures[-1], targets[-1], models)
+                if metric in FRAME_METRIC_ROWS:
+                    numbers = FRAME_METRIC_ROWS[metric].score(pictures[-1], targets[-1], models)
                     for name, number in numbers.items():
                         columns[name].append(float(number))
         rendered = [target.right for target in targets]

@@ -105,6 +105,13 @@ class WebTransport:
             )
         return int(stated)
 
+    def entries(self, attempt: Attempt) -> dict[str, int | None]:
+        """Refuse to list a folder: plain web servers have no listings."""
+        raise StorageError(
+            f"{self._where}: a web server does not list its folders. Pass a folder with an "
+            f"index.parquet, or an index that names this URL as its root."
+        )
+
     def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
         response = self._get(start, stop, attempt)
