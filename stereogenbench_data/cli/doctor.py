@@ -136,7 +136,7 @@ def _lines(report: "DoctorReport") -> list[str]:
 def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
     from stereogenbench_data.audit.contract.verdict import encoding_line
 
-    lines = [f"WRONG: {fault}." for fault in verdict.faults]
+    lines = [f"WRONG: {problem}." for problem in verdict.problems]
     if any(answer.status == "wrong" for answer in verdict.answers):
         lines.append(
             f"Another contract is {_gain_words(verdict.gain)} better than the declared one."

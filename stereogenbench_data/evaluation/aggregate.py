@@ -51,7 +51,7 @@ class PairMeans:
         baseline_cm: The recorded baseline.
         frames: How many frames are scored.
         tallies: For each column.
-        fault: "", or why there are no scores.
+        problem: "", or why there are no scores.
     """
 
     row: int
@@ -61,7 +61,7 @@ class PairMeans:
     baseline_cm: float
     frames: int
     tallies: Mapping[str, Tally]
-    fault: str = ""
+    problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,6 +42,10 @@ class MetricModels:
         """Take the protocol; nothing is loaded yet."""
         self.protocol = protocol
 
+    def __repr__(self) -> str:
+        """Return a summary."""
+        return f"MetricModels({', '.join(self.protocol.metrics)})"
+
     @cached_property
     def keypoint_matcher(self) -> interfaces.KeypointMatcher:
         """What finds the matches of E_match."""

@@ -26,7 +26,7 @@ from stereogenbench_data.audit.contract.verdict import (
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.audit.corruption import (
     as_inverse,
@@ -335,12 +335,12 @@ def test_nothing_is_pasted_and_nothing_fits_while_a_camera_does_not(check, words
     assert sound.encoding == DepthEncoding(kind="ray")
     assert verdict.encoding is None
     assert not verdict.fits
-    assert verdict.is_wrong == bool(words or not (verdict.faults or verdict.unexplained_cameras))
-    assert words in " ".join(verdict.faults)
+    assert verdict.is_wrong == bool(words or not (verdict.problems or verdict.unexplained_cameras))
+    assert words in " ".join(verdict.problems)
 
 
 def test_a_scene_with_a_faulty_camera_gets_a_verdict_of_its_own():
-    faulty = replace(FITTING, faults=("depth of camera 2 is 0.5 x that of the others",))
+    faulty = replace(FITTING, problems=("depth of camera 2 is 0.5 x that of the others",))
     scenes = [diagnosed(key="a"), diagnosed(key="b", check=faulty), diagnosed(key="c")]
 
     groups = group_by_contract(scenes)
@@ -490,8 +490,8 @@ def test_files_numbered_one_too_high_are_seen_and_nothing_is_pasted(verdict_on):
 def test_depth_of_one_camera_that_is_wrong_is_named(verdict_on, camera, change, words):
     verdict = verdict_on(lambda folder: rewrite_one_depth(folder, camera, change), frames=3)
 
-    (fault,) = verdict.faults
-    assert re.fullmatch(f"depth of camera {camera} {words}", fault)
+    (problem,) = verdict.problems
+    assert re.fullmatch(f"depth of camera {camera} {words}", problem)
     assert verdict.is_wrong
     assert not verdict.fits
     assert verdict.encoding is None
@@ -503,14 +503,14 @@ def test_a_tag_of_one_camera_that_is_wrong_is_named(verdict_on):
         lambda folder: rewrite_one_depth(folder, 3, lambda units: units, unit_factor=10.0)
     )
 
-    (fault,) = verdict.faults
-    assert re.fullmatch(r"depth of camera 3 is (10|9\.99\d*) x that of the others", fault)
+    (problem,) = verdict.problems
+    assert re.fullmatch(r"depth of camera 3 is (10|9\.99\d*) x that of the others", problem)
 
 
 def test_inverse_depth_of_one_camera_is_named(verdict_on):
     verdict = verdict_on(lambda folder: rewrite_one_depth(folder, 4, as_inverse(folder)))
 
-    assert verdict.faults == ("depth of camera 4 fits better as inverse depth",)
+    assert verdict.problems == ("depth of camera 4 fits better as inverse depth",)
 
 
 @pytest.mark.parametrize(
@@ -526,8 +526,8 @@ def test_inverse_depth_of_one_camera_is_named(verdict_on):
 def test_pictures_of_one_camera_that_are_wrong_are_named(verdict_on, camera, change, words):
     verdict = verdict_on(lambda folder: rewrite_rgb(folder, camera, change), frames=3)
 
-    (fault,) = verdict.faults
-    assert re.fullmatch(f"pictures of camera {camera} {words}", fault)
+    (problem,) = verdict.problems
+    assert re.fullmatch(f"pictures of camera {camera} {words}", problem)
     assert not verdict.fits
     assert verdict.encoding is None
 
@@ -535,8 +535,8 @@ def test_pictures_of_one_camera_that_are_wrong_are_named(verdict_on, camera, cha
 def test_a_camera_that_is_recorded_elsewhere_is_named(verdict_on):
     verdict = verdict_on(lambda folder: place_cameras(folder, {3: 1.2}))
 
-    (fault,) = verdict.faults
-    assert "camera 3 is not at its recorded position" in fault
+    (problem,) = verdict.problems
+    assert "camera 3 is not at its recorded position" in problem
     assert verdict.choices == ()
 
 
@@ -547,7 +547,7 @@ def test_two_cameras_that_differ_are_both_named(verdict_on):
 
     verdict = verdict_on(corrupt)
 
-    assert [fault.split(" is ")[0] for fault in verdict.faults] == [
+    assert [problem.split(" is ")[0] for problem in verdict.problems] == [
         "depth of camera 1", "depth of camera 4",
     ]  # fmt: skip
 

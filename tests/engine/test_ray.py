@@ -25,7 +25,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.unpack import unpack
 from stereogenbench_data.shards.verify import verify
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.evaluation.conftest import write_pngs
 from tests.servers.tools import require_module

@@ -205,7 +205,7 @@ def test_a_gap_is_a_column_of_the_table(scores):
     whole = scores()
     gap = PairMeans(
         row=1, scene=whole.pairs[1].scene, pair=(0, 1), is_primary=True, baseline_cm=20.0,
-        frames=2, tallies={}, fault="has no prediction",
+        frames=2, tallies={}, problem="has no prediction",
     )  # fmt: skip
     holed = Scores("ours", "G0", PAPERS, {}, whole.index, (whole.pairs[0], gap, *whole.pairs[2:]))
     table = branch_table([holed])

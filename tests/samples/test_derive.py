@@ -17,7 +17,7 @@ from stereogenbench_data.schema.records import (
     Trajectory,
 )
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
 GAP_CM = 20.0

@@ -449,10 +449,13 @@ def _checked(
     """
     check = search.cameras(best, depth_step=depth_step)
     plain = search.simplest()
-    if not (check.faults or check.unexplained) or best is plain:
+    if not (check.problems or check.unexplained) or best is plain:
         return best, check
     other = search.cameras(plain, depth_step=depth_step)
-    if len(other.faults) <= max(len(check.faults), 2) and not other.agreement < check.agreement / 2:
+    if (
+        len(other.problems) <= max(len(check.problems), 2)
+        and not other.agreement < check.agreement / 2
+    ):
         return plain, other
     return best, check
 

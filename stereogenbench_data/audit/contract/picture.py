@@ -58,7 +58,7 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     diagnosis = max(
         report.scenes,
         key=lambda each: (
-            not each.problem, bool(each.check.faults), each.gain.mean_db, each.matches
+            not each.problem, bool(each.check.problems), each.gain.mean_db, each.matches
         ),
     )  # fmt: skip
     (row,) = filter_scenes(index, {"scenes": diagnosis.key})
@@ -81,8 +81,8 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
 def _title(diagnosis: SceneDiagnosis) -> str:
     if diagnosis.problem:
         return f"cannot tell ({diagnosis.problem})"
-    if diagnosis.check.faults:
-        return "; ".join(diagnosis.check.faults)
+    if diagnosis.check.problems:
+        return "; ".join(diagnosis.check.problems)
     changes = [
         f"{question} {getattr(diagnosis.best, question)}"
         for question in diagnosis.best.changes_from(diagnosis.declared)
