@@ -14,7 +14,7 @@ StereoGenBenchError
 ├── SynthesisError (ValueError)   a scene that cannot be drawn as asked
 ├── DescriptorError (ValueError)  a Croissant descriptor or dataset card that does not fit its data
 ├── EvaluationError (ValueError)  predictions, metrics or a protocol that cannot be scored
-│   └── PredictionError           a right view is missing, or is not what it must be
+│   └── PredictionError           a predicted right view is missing or invalid
 └── ExtraError     (ImportError)  an optional dependency or its weights are not installed
 
 Warnings, each a `UserWarning`, stand beside the code that gives them:
@@ -192,7 +192,7 @@ class EvaluationError(StereoGenBenchError, ValueError):
 
 
 class PredictionError(EvaluationError):
-    """A predicted right view is missing, or is not what it must be."""
+    """A predicted right view is missing or invalid."""
 
 
 class ExtraError(StereoGenBenchError, ImportError):

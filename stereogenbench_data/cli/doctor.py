@@ -31,7 +31,7 @@ QUOTIENT_MEANS = (
     "Disparity shows only the quotient unit / (focal length x baseline). No picture tells which of "
     "the three is wrong, or whether two of them cancel out."
 )
-NOT_ASKED = (
+NOT_TESTED = (
     "Not tested here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
     "beside the poses, colours, depth that is off by a pixel or lies where there is no texture, "
     "and all other frames."
@@ -179,7 +179,7 @@ def _tested_lines(verdict: "Verdict") -> list[str]:
             f"NOT TESTED, too few matches: {_cameras(verdict.untested_cameras)}. "
             "Run `stereogenbench audit`."
         )
-    return [*lines, NOT_ASKED]
+    return [*lines, NOT_TESTED]
 
 
 def _cameras(cameras: Sequence[int]) -> str:
@@ -217,7 +217,7 @@ def _json(report: "DoctorReport") -> str:
         "data": report.data,
         "is_wrong": report.is_wrong,
         "quotient_means": QUOTIENT_MEANS,
-        "not_asked": NOT_ASKED,
+        "not_tested": NOT_TESTED,
         "verdicts": verdicts,
         "scenes": scenes,
         "left_out": report.left_out,

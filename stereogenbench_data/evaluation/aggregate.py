@@ -180,7 +180,9 @@ def strata(values: Sequence[Any], *, name: str, edges: Sequence[float] = ()) -> 
             f"`stereogenbench index ROOT --valid-depth`), or stratify by another column."
         )
     if list(edges) != sorted(set(edges)) or len(edges) == 1:
-        raise EvaluationError(f"edges of {name} must be two or more that ascend, got {edges}.")
+        raise EvaluationError(
+            f"edges of {name} must be at least two ascending numbers, got {edges}."
+        )
     if not edges:
         if len(set(known)) <= _DISTINCT_VALUES:
             return [f"{number:g}" if math.isfinite(number) else "not known" for number in values]

@@ -189,7 +189,7 @@ class Relation:
 
     Attributes:
         what: The relation, in words.
-        holds: Whether it does; None where it cannot be told.
+        holds: Whether it does; None if undecided.
         found: The numbers that it was judged by.
     """
 

@@ -51,8 +51,8 @@ class PartialResults:
             if theirs is None:
                 if any((folder / _SCENES).iterdir()):
                     raise EvaluationError(
-                        f"{folder}: holds scenes without {STATE_JSON}, which tells what they are "
-                        f"of. Remove the folder, or choose another."
+                        f"{folder}: holds scenes without {STATE_JSON}, which says what they "
+                        f"belong to. Remove the folder, or choose another."
                     )
                 write_atomic(folder / STATE_JSON, json.dumps(ours, indent=1).encode())
                 return

@@ -161,7 +161,7 @@ def find_prediction(root: Path, wanted: PairFrames) -> Path:
 def stamp_prediction(path: Path) -> str:
     """Return a text that changes when the files of a prediction do: names, sizes, times.
 
-    A broken link is stamped as it is; reading it is the problem.
+    A broken link gets a stamp; the error comes when it is read.
     """
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     digest = hashlib.sha256()

@@ -227,7 +227,7 @@ class HorizontalFlip:
             source=views.targets[0],
             targets=(views.source,),
             intrinsics=views.intrinsics.flipped(),
-            world="mirrored" if views.world == "as filmed" else "as filmed",
+            world="mirrored" if views.world == "as recorded" else "as recorded",
             padded=None if views.padded is None else mirrored(views.padded),
         )
 

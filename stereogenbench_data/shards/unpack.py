@@ -56,7 +56,7 @@ class _UnpackTask:
         return Path(self.out, self.scene.id.key)
 
     @property
-    def unfinished(self) -> Path:
+    def temporary(self) -> Path:
         """Its name until it is whole; walks of a tree ignore such names."""
         return self.folder.with_name(f".{self.folder.name}.unpacking")
 
@@ -177,12 +177,12 @@ def unpack_scene(
         _require_unpacked(task)
         after_bytes(sum(member.size for member in scene.members.values()))
         return scene.id.key, "kept"
-    shutil.rmtree(task.unfinished, ignore_errors=True)
-    task.unfinished.mkdir(parents=True)
+    shutil.rmtree(task.temporary, ignore_errors=True)
+    task.temporary.mkdir(parents=True)
     try:
         for name, member in sorted(scene.members.items(), key=lambda item: item[1].offset):
             where = f"{Path(task.root, member.path)}: {scene.id.key}.{name}"
-            target = task.unfinished / _RELEASED_NAMES.get(name, name)
+            target = task.temporary / _RELEASED_NAMES.get(name, name)
             opened = open_local(task.root, member, shard=task.shards[member.path])
             with opened.open("rb") if isinstance(opened, Path) else opened as file:
                 if name in _RELEASED_NAMES:
@@ -195,9 +195,9 @@ def unpack_scene(
                 with target.open("xb") as output:
                     crc32 = copy_with_crc32(chunks, output.write)
                 require_crc32(crc32, expected=member.crc32, name=where)
-        task.unfinished.rename(task.folder)
+        task.temporary.rename(task.folder)
     finally:
-        shutil.rmtree(task.unfinished, ignore_errors=True)
+        shutil.rmtree(task.temporary, ignore_errors=True)
     return scene.id.key, "unpacked"
 
 

@@ -168,7 +168,7 @@ class WebTransport:
             raise TransientError(str(error)) from None
         except (LocationValueError, UnicodeError):
             sent = "" if url == self._url else f"is redirected to {shown(url)[:200]}, which "
-            raise StorageError(f"{self._where}: {sent}is not a URL: correct it.") from None
+            raise StorageError(f"{self._where}: {sent}is not a valid URL: correct it.") from None
         except HTTPError as error:
             raise TransientError(_reason(error)) from None
         finally:

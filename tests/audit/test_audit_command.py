@@ -29,7 +29,7 @@ def run(tmp_path, monkeypatch):
     return invoke
 
 
-def test_data_that_are_right_are_told_as_a_table_with_exit_code_0(small_shards, run):
+def test_data_that_are_right_are_reported_as_a_table_with_exit_code_0(small_shards, run):
     result = run(small_shards, *FEW)
 
     assert result.exit_code == 0

@@ -134,14 +134,16 @@ def test_a_wrong_focal_length_is_not_called_a_wrong_unit(verdict_on):
     assert float(told.split(" of ")[1].split(" x ")[0]) == pytest.approx(1 / 0.95, rel=0.005)
 
 
-def test_ray_depth_is_told_from_planar(verdict_on):
+def test_ray_depth_is_distinguished_from_planar(verdict_on):
     verdict = verdict_on(lambda folder: rewrite_depth(folder, as_ray(folder)))
 
     assert wrong_topics(verdict) == {"depth along"}
     assert verdict.encoding == DepthEncoding(kind="ray")
 
 
-def test_ray_depth_behind_a_long_lens_is_told_from_a_unit_that_is_a_little_off(long_lens, tmp_path):
+def test_ray_depth_behind_a_long_lens_is_distinguished_from_a_unit_that_is_a_little_off(
+    long_lens, tmp_path
+):
     folder = copied(long_lens, tmp_path)
     rewrite_depth(folder, as_ray(folder))
 
@@ -366,7 +368,7 @@ def test_an_offset_that_fits_and_is_not_clearly_better_is_left_open(offset_px, s
     assert answer(verdict, "disparity offset").status == status
 
 
-def test_a_shifted_picture_is_not_told_from_depth_of_the_other_camera():
+def test_a_shifted_picture_is_not_distinguished_from_depth_of_the_other_camera():
     swapped = "depth of cameras 0 and 1 exchanged"
     rivals = tuple(
         Rival("order", each.order, Evidence(9.0, 0.1))
@@ -703,7 +705,7 @@ def test_a_scene_in_which_nothing_moves_does_not_tell_the_lag(verdict_on):
     assert answer(verdict, QUOTIENT).status == "confirmed"
 
 
-def test_the_contract_asked_about_may_be_given(verdict_on):
+def test_the_contract_requested_about_may_be_given(verdict_on):
     verdict = verdict_on(lambda folder: None, depth=DepthEncoding(unit_m=0.1, kind="ray"))
 
     assert wrong_topics(verdict) == {QUOTIENT, "depth along"}
@@ -761,7 +763,7 @@ def test_an_exchange_of_files_pairs_each_picture_with_the_depth_of_its_camera(or
         assert order.camera_of(depth, content="depth") == camera
 
 
-def test_every_exchange_of_two_cameras_is_asked_about():
+def test_every_exchange_of_two_cameras_is_requested_about():
     orders = {order.order for order in Hypothesis().alternatives("order")}
 
     for a, b in CAMERA_PAIRS:

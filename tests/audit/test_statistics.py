@@ -101,7 +101,7 @@ def test_filters_choose_what_is_counted(three):
         statistics(three, split="eval")
 
 
-def test_what_is_not_of_the_releases_size_is_not_compared_unless_asked_for(three):
+def test_what_is_not_of_the_releases_size_is_not_compared_unless_requested(three):
     found = statistics(three)
 
     assert release_sized_splits(found) == ()
@@ -222,7 +222,7 @@ def test_the_command_compares_a_release_by_itself(written_release, run):
     assert "## Against the paper: 154 of 154 figures agree" in result.stdout
 
 
-def test_the_command_compares_other_data_only_if_asked_to(small_shards, run):
+def test_the_command_compares_other_data_only_if_requested_to(small_shards, run):
     plain, asked = run(small_shards), run(small_shards, "--compare", "always")
 
     assert (plain.exit_code, asked.exit_code) == (0, 1)

@@ -163,7 +163,7 @@ def test_random_access_gives_what_reading_in_order_gives(small_release):
         assert all(same(again[int(number)], forwards[int(number)]) for number in order)
 
 
-def test_a_batch_comes_in_the_order_asked_though_it_is_read_forwards(small_release):
+def test_a_batch_comes_in_the_order_requested_though_it_is_read_forwards(small_release):
     pairs = StereoPairs(small_release, frames="all", fields=("frame_index", "__key__"))
     numbers = [9, 2, 20, 2, 0]
 
@@ -338,7 +338,7 @@ def test_a_dataset_goes_on_after_a_change_of_folder(small_release, monkeypatch, 
 
 
 @pytest.mark.parametrize("number", [2.7, "0", slice(0, 2), [0, 1], None])
-def test_a_sample_is_asked_for_by_a_whole_number(small_release, number):
+def test_a_sample_is_requested_by_a_whole_number(small_release, number):
     with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
         StereoPairs(small_release)[number]
 

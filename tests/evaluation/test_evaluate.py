@@ -20,7 +20,7 @@ from stereogenbench_data.evaluation.predictions import frame_name, item_name
 from stereogenbench_data.schema.release import rgb_name
 from stereogenbench_data.shards.pack import pack
 from tests.evaluation.conftest import FRAMES, SIZE, numbers, rendered, scored, write_pngs
-from tests.servers.fault import serving
+from tests.servers.failing_server import serving
 from tests.servers.tools import require_module
 
 
@@ -186,7 +186,9 @@ def test_a_missing_prediction_is_an_error_before_anything_is_scored(scored_index
     assert done == []
 
 
-def test_two_predictions_of_one_pair_are_told_not_taken_for_none(scored_index, copied, protocol):
+def test_two_predictions_of_one_pair_are_reported_not_taken_for_none(
+    scored_index, copied, protocol
+):
     scene = keys(scored_index)[1]
     (copied / f"{item_name(scene, (0, 1))}.mp4").touch()
 

@@ -104,7 +104,7 @@ def test_pictures_of_the_stored_size_are_read_as_they_are_and_scaled_by_area(ite
     assert view[:, :, 9:].min() == 200
 
 
-def test_a_missing_prediction_is_told_with_both_places(tmp_path):
+def test_a_missing_prediction_is_reported_with_both_places(tmp_path):
     with pytest.raises(
         PredictionError,
         match=rf"{SCENE}, cameras 00-01: has no prediction in .*{SCENE}/00-01 or "

@@ -155,7 +155,7 @@ def test_the_papers_sd_stands_in_the_filtered_column_alone(scores, fit):
     assert cells["SD least squares↓ [median]"] == "-"
 
 
-def test_theil_sens_sd_is_a_third_column_where_it_is_asked_for(scores):
+def test_theil_sens_sd_is_a_third_column_where_it_is_requested(scores):
     asked = branch_table([scores(protocol=EvaluationProtocol(fit="theil_sen"))])
     plain = branch_table([scores()])
 

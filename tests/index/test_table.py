@@ -600,11 +600,11 @@ def test_broken_scenes_of_a_tree_are_an_error_that_lists_them(make_scene, root):
 def test_a_tree_of_unfinished_scenes_is_an_error(make_scene, root):
     (make_scene() / "_scene_complete.json").unlink()
 
-    with pytest.raises(StorageError, match="no scene is finished: 1 scene cannot be used"):
+    with pytest.raises(StorageError, match="no scene is complete: 1 scene cannot be used"):
         SceneIndex.open(root)
 
 
-def test_what_was_left_out_is_told_when_the_index_is_opened(scenes, tmp_path):
+def test_what_was_left_out_is_reported_when_the_index_is_opened(scenes, tmp_path):
     index = SceneIndex.from_scenes(scenes, tmp_path)
     index.incomplete = {"train/a/b/c": "is empty"}
     index.broken = {"train/a/b/d": "has no baseline.json"}

@@ -366,7 +366,7 @@ def test_a_view_that_is_padding_alone_still_has_colours():
 
 
 @pytest.mark.parametrize("first", [Letterbox(40, 90), Eraser(1.0)], ids=["padded", "erased"])
-def test_a_transform_that_forgets_what_is_not_of_the_scene_is_told(first):
+def test_a_transform_that_forgets_what_is_not_of_the_scene_is_reported(first):
     views = first(made_views(), np.random.default_rng(0))
     width_px = views.intrinsics.width_px
     smaller = views.intrinsics.resized(width_px=20, height_px=20)

@@ -16,7 +16,7 @@ from stereogenbench_data.errors import StorageError
 from stereogenbench_data.shards import download as download_module
 from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
-from tests.servers.fault import Answer
+from tests.servers.failing_server import Answer
 
 
 @pytest.fixture

@@ -222,7 +222,7 @@ def test_a_finished_shard_that_was_only_touched_is_read_and_kept(packed, release
 
     assert report.packed == ()
     assert {(out / name).stat().st_mtime for name in NAMES} == {1}
-    assert prepare(release, out, target_bytes=ONE_EACH, part=(1, 1)).unfinished() == []
+    assert prepare(release, out, target_bytes=ONE_EACH, part=(1, 1)).remaining() == []
 
 
 def focal_changed(folder):
@@ -622,7 +622,7 @@ def test_a_shard_that_came_from_elsewhere_meanwhile_is_refused(release, tmp_path
     (tmp_path / NAMES[0]).write_text("mine")
 
     with pytest.raises(ShardError, match=f"{NAMES[0]}: already exists and was not packed"):
-        pack_task(job.unfinished()[0], no_advance)
+        pack_task(job.remaining()[0], no_advance)
 
 
 def test_a_foreign_shard_among_ours_is_named(release, packed, tmp_path):

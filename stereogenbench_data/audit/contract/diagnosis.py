@@ -498,14 +498,15 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         return SceneDiagnosis(**basics, best=declared, problem=problem)
     search = Search(views, matches, least_log_scale=allowed_log_scale(step))
     best, check = _checked(search, search.best(), depth_step=step)
-    share_told = agreement(views, matches, best.score)
+    share_explained = agreement(views, matches, best.score)
     parallax = search.without_parallax(best)
-    if math.isnan(share_told) or not parallax.is_clear():
+    if math.isnan(share_explained) or not parallax.is_clear():
         problem = (
             "no depth: none of the pixels that were found in both pictures has any"
-            if math.isnan(share_told)
+            if math.isnan(share_explained)
             else f"nothing fits: of disparities of {basics['disparity_px']:.1f} px the best "
-            f"contract explains {share_told:.0%} to a pixel, and pictures no better than none does"
+            f"contract explains {share_explained:.0%} to a pixel, and pictures no better than none "
+            f"does"
         )
         return SceneDiagnosis(**basics, best=declared, parallax=parallax, problem=problem)
     (other_kind,) = best.hypothesis.alternatives("kind")

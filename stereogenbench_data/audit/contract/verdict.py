@@ -476,7 +476,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     explains = not (first.problem or unexplained) and all(
         scene.check.agreement >= LEAST_SHARE for scene in scenes
     )
-    is_told = bool(quotient.found)
+    is_measured = bool(quotient.found)
     pasted = _pasted(first, declared, unit_m=declared.unit_m)
     is_sure = (
         bool(wrong)
@@ -487,7 +487,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
         and pasted != declared
     )
     choices: tuple[str, ...] = ()
-    if is_told and quotient.status != "confirmed" and explains and not problems:
+    if is_measured and quotient.status != "confirmed" and explains and not problems:
         with_unit = _pasted(first, declared, unit_m=unit.rounded_m)
         choices = _length_choices(scenes, unit, encoding_line(with_unit))
     return Verdict(
@@ -498,8 +498,8 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
         if not first.problem
         else math.nan,
         encoding=pasted if is_sure else None,
-        quotient=unit.metres / first.unit_m if is_told else math.nan,
-        quotient_error=unit.uncertainty if is_told else math.nan,
+        quotient=unit.metres / first.unit_m if is_measured else math.nan,
+        quotient_error=unit.uncertainty if is_measured else math.nan,
         choices=choices,
         problems=problems,
         tested_cameras=tuple(c for c in range(CAMERA_COUNT) if c not in untested),
