@@ -364,8 +364,7 @@ def test_an_index_elsewhere_opens_once_the_user_says_where_its_data_are(scenes, 
 
     with pytest.raises(
         StorageError,
-        match=rf"{kept}: .*root as {tmp_path}/data.*\(it is outside the index's own folder\).* "
-        rf"SceneIndex.open\('{kept}', root=...\), or --root",
+        match=rf"{kept}: .*{tmp_path}/data.* SceneIndex.open\('{kept}', root=...\), or --root",
     ):
         SceneIndex.open(kept)
     for root in (tmp_path / "data", str(tmp_path / "data"), (tmp_path / "data").as_uri()):

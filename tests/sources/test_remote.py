@@ -1,5 +1,6 @@
 """Bytes from a server that fails: had all the same, each once, or an error that says why not."""
 
+import re
 import threading
 
 import pytest
@@ -172,7 +173,7 @@ def test_another_part_than_the_one_requested_is_refused(served, told, message):
 
 
 def test_a_file_that_ends_before_the_range_is_reported(served):
-    with pytest.raises(StorageError, match=r"x.tar: has 256000 bytes, and byte 256009 is asked"):
+    with pytest.raises(StorageError, match=r"x.tar: .* 256000 bytes.* 256009 .*use the index"):
         read_range(f"{served.url}/x.tar", 256_000, 256_010)
 
 
@@ -222,14 +223,13 @@ def test_a_login_in_the_url_is_sent_and_never_shown(served):
 
     assert served.asked[0].headers["authorization"] == "Basic bWU6cGFzcyB3b3Jk"
     served.always["x.tar"] = Answer(status=404)
-    with pytest.raises(StorageError) as caught:
+    with pytest.raises(StorageError, match=re.escape(f"{served.url}/x.tar: ") + ".* 404"):
         read_range(f"{url}/x.tar?key=secret", 0, 9)
-    assert f"{served.url}/x.tar: the server answers 404" in str(caught.value)
 
 
 def test_a_query_is_neither_shown_nor_chained(clock):
     remote = RemoteObject("http://127.0.0.1:1/x.tar?key=secret", retry=clock.policy(attempts=1))
-    with pytest.raises(StorageError) as caught:
+    with pytest.raises(StorageError, match=r"http://127\.0\.0\.1:1/x\.tar: .*try again") as caught:
         remote.read(0, 9)
 
     error: BaseException | None = caught.value
