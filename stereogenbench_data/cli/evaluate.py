@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from stereogenbench_data.evaluation.tables import Table
 
 
-def parse_pairs(text: str) -> Any:
+def pairs_option(text: str) -> Any:
     """Return the pairs of ``--pairs`` as `StereoPairs` takes them."""
     if text in ("primary", "adjacent", "all"):
         return text
@@ -46,7 +46,7 @@ def parse_pairs(text: str) -> Any:
     return [(int(left), int(right)) for left, right in pairs]
 
 
-def parse_frames(text: str) -> Any:
+def frames_option(text: str) -> Any:
     """Return the frames of ``--frames`` as `StereoPairs` takes them."""
     if text in ("all", "first"):
         return text
@@ -119,7 +119,7 @@ class PairsOptions(SceneOptions):
             typer.BadParameter: If the text of the pairs or of the frames cannot be parsed.
         """
         baseline = {} if self.baseline_cm is None else {"baseline_cm": self.baseline_cm}
-        chosen = {"pairs": parse_pairs(self.pairs), "frames": parse_frames(self.frames)}
+        chosen = {"pairs": pairs_option(self.pairs), "frames": frames_option(self.frames)}
         return self.filters() | baseline | chosen
 
 

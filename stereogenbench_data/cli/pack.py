@@ -55,14 +55,14 @@ def pack(  # noqa: PLR0913 - one parameter an option
     once for each I; the last one to finish writes the index.
     """
     from stereogenbench_data.shards.pack import pack as packed_by
-    from stereogenbench_data.shards.plan import parse_size
+    from stereogenbench_data.shards.plan import parse_bytes
 
     number, _, count = part.partition("/")
     if not (number.isdecimal() and count.isdecimal()):
         raise typer.BadParameter(
             f"{part!r} is not a part: write I/N, such as 1/4.", param_hint="--part"
         )
-    target_bytes = parse_size(shard_size)
+    target_bytes = parse_bytes(shard_size)
     index = open_index(root, root=data_root)
     with progress_bar("packing", unit="MB") as progress:
         report = packed_by(

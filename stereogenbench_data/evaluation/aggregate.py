@@ -108,7 +108,7 @@ def cell(pairs: Sequence[PairMeans], column: str) -> Cell:
         ExtraError: If scipy, which knows Student's t, is not installed.
     """
     tallies = [each.tallies[column] for each in pairs]
-    scenes = grouped((each for each in pairs if each.tallies[column].finite), lambda p: p.scene)
+    scenes = group_by((each for each in pairs if each.tallies[column].finite), lambda p: p.scene)
     means = [
         math.fsum(each.tallies[column].mean for each in found) / len(found)
         for found in scenes.values()
@@ -149,7 +149,7 @@ def half_interval(means: Sequence[float]) -> float | None:
     return quantile * math.sqrt(variance / count)
 
 
-def grouped(
+def group_by(
     pairs: Iterable[PairMeans], group_of: Callable[[PairMeans], Group]
 ) -> dict[Group, list[PairMeans]]:
     """Return pairs by group, in order of first appearance."""

@@ -13,7 +13,7 @@ from typing import Any, Final, TypedDict, Unpack
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import EvaluationError, PredictionError
-from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, grouped, tally
+from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, group_by, tally
 from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
 from stereogenbench_data.evaluation.frame_metrics import fields_of, models_of
 from stereogenbench_data.evaluation.metrics.frechet import (
@@ -396,7 +396,7 @@ def _distances(
 
     distances = {}
     scored_pairs = (pair for pair in pairs if pair.is_primary and not pair.problem)
-    for labels, group in grouped(scored_pairs, branch_of).items():
+    for labels, group in group_by(scored_pairs, branch_of).items():
         sides: dict[tuple[str, str], FeatureStatistics] = {}
         for pair in group:
             found = partial.read(pair.scene, [(name, pair.pair)])[name, pair.pair]

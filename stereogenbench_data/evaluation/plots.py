@@ -14,7 +14,7 @@ from stereogenbench_data.evaluation.aggregate import (
     PairMeans,
     Scores,
     cell,
-    grouped,
+    group_by,
     require_comparable,
 )
 from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS, HEAVY_TAILED
@@ -77,7 +77,7 @@ def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
             axes.plot([], [], color=colour, label=f"{one.name}: no finite number")
             continue
         # Lines join the pairs of a scene that share their left view: same content, wider baseline.
-        for sweep in grouped(pairs, lambda pair: (pair.scene, pair.pair[0])).values():
+        for sweep in group_by(pairs, lambda pair: (pair.scene, pair.pair[0])).values():
             if len(sweep) > 1:
                 sweep.sort(key=lambda pair: pair.baseline_cm)
                 axes.plot(*_points(sweep, column), color=colour, linewidth=0.6, alpha=0.35)
@@ -111,7 +111,7 @@ def _points(pairs: Sequence[PairMeans], column: str) -> tuple[list[float], list[
 def _draw_bins(
     axes: Any, pairs: Sequence[PairMeans], column: str, colour: str, *, name: str
 ) -> None:
-    groups = grouped(pairs, lambda pair: baseline_bin(pair.baseline_cm))
+    groups = group_by(pairs, lambda pair: baseline_bin(pair.baseline_cm))
     places, means, intervals = [], [], []
     for bin_name in (each for each in BASELINE_BINS if each in groups):
         found = cell(groups[bin_name], column)

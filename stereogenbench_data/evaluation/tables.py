@@ -15,7 +15,7 @@ from stereogenbench_data.evaluation.aggregate import (
     PairMeans,
     Scores,
     cell,
-    grouped,
+    group_by,
     require_comparable,
     strata,
 )
@@ -216,7 +216,7 @@ def _rows(
     by_method = [
         (
             one,
-            grouped(
+            group_by(
                 (pair for pair in one.pairs if pairs == "all" or pair.is_primary),
                 lambda pair: tuple(label_of(pair, key) for key in keys),
             ),
