@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
     DataOptions,
     JsonOption,
@@ -16,7 +17,6 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     grouped,
 )
-from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
 from stereogenbench_data.schema.text import counted

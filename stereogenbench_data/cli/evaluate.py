@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
@@ -21,7 +22,6 @@ from stereogenbench_data.cli.options import (
     depth_of,
     grouped,
 )
-from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, require_metrics
 from stereogenbench_data.schema.text import counted

@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from stereogenbench_data.cli.opening import open_index
+from stereogenbench_data.cli.data import open_index
+from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.options import (
     JsonOption,
     RootOption,
@@ -15,7 +16,6 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     grouped,
 )
-from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted, plain_line
 

@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from torch.utils.data import get_worker_info
 
-from stereogenbench_data.datasets.shared import shared_full
+from stereogenbench_data.datasets.shared_epoch import shared_full
 from stereogenbench_data.datasets.tensors import collate
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.fields import Sample

@@ -11,7 +11,7 @@ import torch.distributed
 from torch.utils.data import Sampler
 
 from stereogenbench_data.datasets.open_videos import scenes_at_once
-from stereogenbench_data.datasets.shared import SharedEpoch
+from stereogenbench_data.datasets.shared_epoch import SharedEpoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.order import (

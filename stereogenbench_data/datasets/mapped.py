@@ -20,7 +20,7 @@ from stereogenbench_data.datasets.loader import (
     split_options,
 )
 from stereogenbench_data.datasets.open_videos import videos_to_keep
-from stereogenbench_data.datasets.shared import SharedEpoch
+from stereogenbench_data.datasets.shared_epoch import SharedEpoch
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex

@@ -15,7 +15,7 @@ from stereogenbench_data.datasets.batches import (
 )
 from stereogenbench_data.datasets.loader import split_options
 from stereogenbench_data.datasets.mapped import Check, Data, StereoPairs
-from stereogenbench_data.datasets.shared import shared_full
+from stereogenbench_data.datasets.shared_epoch import shared_full
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.request import Transform

@@ -6,7 +6,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from stereogenbench_data.audit import geometry_audit
+from stereogenbench_data.audit.geometry import audit as geometry_audit
 from stereogenbench_data.cli.audit import audit
 from stereogenbench_data.errors import StorageError
 from tests.audit.corruption import copied, rewrite_rgb

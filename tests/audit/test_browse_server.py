@@ -17,7 +17,7 @@ from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.audit.browser.catalogue import Catalogue
 from stereogenbench_data.audit.browser.server import PageServer
 from stereogenbench_data.audit.browser.service import STATIC, Service
-from stereogenbench_data.audit.scene_reader import SceneReader
+from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from tests.audit.browsing import serving
 
 SCENE = "train/Uniform/SynthStage/scene_000001"

@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from stereogenbench_data.audit.audit_records import At
-from stereogenbench_data.audit.picture_check import (
+from stereogenbench_data.audit.geometry.picture_check import (
     LightCheck,
     PayloadCheck,
     border_occluder,
@@ -14,6 +13,7 @@ from stereogenbench_data.audit.picture_check import (
     stored_step,
     subject_m,
 )
+from stereogenbench_data.audit.geometry.records import At
 
 
 def grey(level, *, size=(24, 32)):

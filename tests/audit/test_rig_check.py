@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereogenbench_data.audit.rig_check import motion_px, recorded_px, rig_audit
+from stereogenbench_data.audit.geometry.rig_check import motion_px, recorded_px, rig_audit
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.schema.records import Rig

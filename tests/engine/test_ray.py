@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from stereogenbench_data.audit.contract.doctor import diagnose
-from stereogenbench_data.audit.geometry_audit import AuditRequest, audit
+from stereogenbench_data.audit.geometry.audit import AuditRequest, audit
 from stereogenbench_data.engine import Engine, RayCluster
 from stereogenbench_data.errors import ExtraError, ShardError, StorageError
 from stereogenbench_data.evaluation.evaluate import evaluate

@@ -20,7 +20,7 @@ from stereogenbench_data.audit.contract.fitting import voted_scale
 from stereogenbench_data.audit.contract.hypotheses import Hypothesis, Question
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames, match_rows
 from stereogenbench_data.audit.contract.scoring import Pair, ScoredContract, sample_along_rows
-from stereogenbench_data.audit.picture_check import Luma
+from stereogenbench_data.audit.geometry.picture_check import Luma
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 LEAST_SHARE: Final = 0.5

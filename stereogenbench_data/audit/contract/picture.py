@@ -13,7 +13,7 @@ from stereogenbench_data.audit.contract.doctor import DiagnosisTask, DoctorRepor
 from stereogenbench_data.audit.contract.hypotheses import Hypothesis
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
 from stereogenbench_data.audit.contract.scoring import score_hypothesis
-from stereogenbench_data.audit.drawing import figure_class
+from stereogenbench_data.audit.pictures.drawing import figure_class
 from stereogenbench_data.audit.scene_access import SceneAccess
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex

@@ -11,17 +11,17 @@ from typing import Any, Final, Unpack
 import numpy as np
 from jaxtyping import Int64
 
-from stereogenbench_data.audit.audit_records import (
+from stereogenbench_data.audit.geometry.findings import broken_finding, findings_of, untested_of
+from stereogenbench_data.audit.geometry.records import (
     AuditLimits,
     AuditReport,
     SceneAudit,
     plain,
     revived,
 )
-from stereogenbench_data.audit.audit_table import table_rows
-from stereogenbench_data.audit.findings import broken_finding, findings_of, untested_of
+from stereogenbench_data.audit.geometry.scene_audit import AuditTask, audit_scene, spread_frames
+from stereogenbench_data.audit.geometry.table import table_rows
 from stereogenbench_data.audit.scene_access import SceneAccess
-from stereogenbench_data.audit.scene_audit import AuditTask, audit_scene, spread_frames
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import Journal, walk

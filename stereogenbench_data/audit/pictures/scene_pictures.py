@@ -10,7 +10,7 @@ import av
 import numpy as np
 from PIL import Image
 
-from stereogenbench_data.audit.drawing import (
+from stereogenbench_data.audit.pictures.drawing import (
     FAINT,
     FRAME,
     GREY,
@@ -24,7 +24,7 @@ from stereogenbench_data.audit.drawing import (
     scale_of,
     scale_rows,
 )
-from stereogenbench_data.audit.scene_reader import SceneReader
+from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from stereogenbench_data.engine import Progress, advance_of
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
