@@ -14,17 +14,14 @@ from typing import Final, Literal
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, describe_os_error
 from stereogenbench_data.index.open import warn_if_stale
-from stereogenbench_data.index.parquet import INDEX_NAME
-from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
+from stereogenbench_data.shards.open import open_shards
 from stereogenbench_data.shards.tar import read_chunks
-from stereogenbench_data.shards.writer import PARTS
 from stereogenbench_data.sources.files import copy_with_crc32, try_locked
-from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.members import open_local
 from stereogenbench_data.sources.ranged_file import require_crc32
 
@@ -135,33 +132,6 @@ def unpack(
         tuple(sorted(key for key, work in found.items() if work == "unpacked")),
         tuple(sorted(key for key, work in found.items() if work == "kept")),
     )
-
-
-def open_shards(data: str | Path, root: str | Path | None) -> SceneIndex:
-    """Return the index of shards on this machine.
-
-    Args:
-        data: The folder of the shards, or its index file.
-        root: The folder of the shards, if the index file is elsewhere.
-
-    Raises:
-        StorageError: If there is no index of shards, or it cannot be opened.
-    """
-    if "://" in str(data):
-        raise ShardError(f"{shown(data)}: is remote. Download the shards, and pass their folder.")
-    path = Path(data)
-    if path.is_dir() and not (path / INDEX_NAME).is_file():
-        cure = "Pass a folder that `stereogenbench pack` made."
-        if (path / PARTS).is_dir():
-            cure = "Packing was not finished: run `stereogenbench pack` again."
-        raise ShardError(f"{path}: holds no {INDEX_NAME}. {cure}")
-    index = SceneIndex.open(path, root=root)
-    if not index.shards:
-        raise ShardError(
-            f"{path}: is the index of a released folder, not of shards. Pack it with "
-            f"`stereogenbench pack`, or pass a folder of shards."
-        )
-    return index
 
 
 def unpack_scene(

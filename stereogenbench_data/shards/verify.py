@@ -29,8 +29,8 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.companion_files import companion_files
+from stereogenbench_data.shards.open import open_shards
 from stereogenbench_data.shards.tar import FETCH_AGAIN, TarMember, read_checksums, read_members
-from stereogenbench_data.shards.unpack import open_shards
 from stereogenbench_data.shards.writer import TEMPORARY_SUFFIX
 
 _WRONG_INDEX: Final = "Put the index beside the shards that it was packed with."
