@@ -56,7 +56,7 @@ _current_attempt: Final[ContextVar[Attempt | None]] = ContextVar("_current_attem
 
 @dataclass(frozen=True, slots=True)
 class _Version:
-    """What a server states of an object that changes with its content; "" where it is silent."""
+    """What a server states of an object that changes with its content; "" if it sends none."""
 
     etag: str
     modified: str
