@@ -32,7 +32,7 @@ from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.members import MemberSource
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 LIMIT = 3.0

@@ -25,7 +25,7 @@ from stereogenbench_data.schema.records import Member, Scene, SceneId
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, IMAGE_SIZE_PX, SEEN_MAP_FOLDER
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.plan import DepthCodec
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 FAMILIES: Final = (("IPD_Gaussian", 11), ("Uniform", 12))

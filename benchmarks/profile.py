@@ -32,8 +32,7 @@ LABELS: Final = (
 
 
 def _decoding(decoder: Any, *_: Any) -> str:
-    is_depth = decoder._context.codec.canonical_name == "ffv1"
-    return "decoding depth" if is_depth else "decoding colour"
+    return "decoding depth" if decoder.codec == "ffv1" else "decoding colour"
 
 
 def _depth(reader: Any, *_: Any) -> str:

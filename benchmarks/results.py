@@ -153,7 +153,7 @@ def machine() -> dict[str, Any]:
         "cpu": model[1] if model else platform.processor(),
         "cores": os.cpu_count(),
         "memory_gb": round(int(memory[1]) / 1e6, 1) if memory else None,
-        "system": platform.platform(),
+        "system": f"{platform.system()} {'.'.join(platform.release().split('.')[:2])}",
         "python": platform.python_version(),
         "ffmpeg of PyAV": av.ffmpeg_version_info,
         "load before": os.getloadavg()[0],

@@ -7,7 +7,7 @@ from torch import nn
 
 from stereogenbench_data import Compose, HorizontalFlip, RandomCrop, StereoPairs
 from stereogenbench_data.samples.picture import contact_sheet, write_png
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 DEMO, SHARDS = Path("demo"), Path(__file__).parents[1] / "shards"

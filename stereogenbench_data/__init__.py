@@ -1,7 +1,7 @@
 """Train and evaluate on StereoGenBench: every stereo pair of six-camera scenes, right to the pixel.
 
 Public names are imported when they are first used: what does not need torch starts without it.
-Which names there are, and where from, stands in `__init__.pyi`. Nothing is imported at first, not
+The names and their modules are listed in `__init__.pyi`. Nothing is imported at first, not
 even `typing`: the command takes care of Ctrl-C only after this module.
 """
 

@@ -6,6 +6,10 @@ from stereogenbench_data.datasets.batches import EpochBatches as EpochBatches
 from stereogenbench_data.datasets.loader import PairsLoader as PairsLoader
 from stereogenbench_data.datasets.mapped import SceneViews as SceneViews
 from stereogenbench_data.datasets.mapped import StereoPairs as StereoPairs
+from stereogenbench_data.datasets.open_videos import OpenVideosWarning as OpenVideosWarning
+from stereogenbench_data.datasets.open_videos import (
+    RepeatedDecodingWarning as RepeatedDecodingWarning,
+)
 from stereogenbench_data.datasets.streamed import StereoPairStream as StereoPairStream
 from stereogenbench_data.datasets.tensors import collate as collate
 from stereogenbench_data.errors import DescriptorError as DescriptorError
@@ -15,8 +19,10 @@ from stereogenbench_data.errors import FieldError as FieldError
 from stereogenbench_data.errors import GeometryError as GeometryError
 from stereogenbench_data.errors import MediaError as MediaError
 from stereogenbench_data.errors import PassError as PassError
+from stereogenbench_data.errors import PredictionError as PredictionError
 from stereogenbench_data.errors import SchemaError as SchemaError
 from stereogenbench_data.errors import SelectionError as SelectionError
+from stereogenbench_data.errors import ShardError as ShardError
 from stereogenbench_data.errors import StateError as StateError
 from stereogenbench_data.errors import StereoGenBenchError as StereoGenBenchError
 from stereogenbench_data.errors import StorageError as StorageError
@@ -25,12 +31,17 @@ from stereogenbench_data.errors import WorkerError as WorkerError
 from stereogenbench_data.evaluation.controls import score_controls as score_controls
 from stereogenbench_data.evaluation.evaluate import evaluate as evaluate
 from stereogenbench_data.evaluation.inputs import export_inputs as export_inputs
+from stereogenbench_data.evaluation.models.registry import ModelOptions as ModelOptions
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol as EvaluationProtocol
 from stereogenbench_data.evaluation.report import write_report as write_report
 from stereogenbench_data.evaluation.tables import tables_of as tables_of
+from stereogenbench_data.index.open import IncompleteSceneWarning as IncompleteSceneWarning
+from stereogenbench_data.index.stale import StaleIndexWarning as StaleIndexWarning
 from stereogenbench_data.index.table import SceneIndex as SceneIndex
+from stereogenbench_data.samples.checks import OddSceneWarning as OddSceneWarning
 from stereogenbench_data.samples.fields import PAIR_FIELDS as PAIR_FIELDS
 from stereogenbench_data.samples.fields import VIEW_FIELDS as VIEW_FIELDS
+from stereogenbench_data.samples.size import SwappedSizeWarning as SwappedSizeWarning
 from stereogenbench_data.samples.transforms import ColorJitter as ColorJitter
 from stereogenbench_data.samples.transforms import Compose as Compose
 from stereogenbench_data.samples.transforms import Crop as Crop
@@ -42,6 +53,7 @@ from stereogenbench_data.samples.transforms import RandomScale as RandomScale
 from stereogenbench_data.samples.transforms import Resize as Resize
 from stereogenbench_data.schema.records import DepthEncoding as DepthEncoding
 from stereogenbench_data.selection.order import order_quality as order_quality
+from stereogenbench_data.shards.pack import OversizedSceneWarning as OversizedSceneWarning
 from stereogenbench_data.sources.cache import ShardCache as ShardCache
 from stereogenbench_data.sources.retry import RetryPolicy as RetryPolicy
 

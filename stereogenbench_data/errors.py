@@ -2,22 +2,33 @@
 
 StereoGenBenchError
 ├── SchemaError    (ValueError)   a metadata file does not follow the format
-├── GeometryError  (ValueError)   a camera, a pose or a map that no formula holds for
+├── GeometryError  (ValueError)   a camera, pose or map that geometry cannot handle
 ├── MediaError     (ValueError)   a video or a depth map does not decode to what its metadata says
 ├── StorageError   (OSError)      a folder, a file or an index is missing, unreadable or altered
 │   └── ShardError                a shard is missing, cut short or altered
 ├── SelectionError (LookupError)  a filter, a pair or a window that no sample can satisfy
-├── FieldError     (ValueError)   fields or transforms that cannot be had together
+├── FieldError     (ValueError)   fields or transforms that cannot be combined
 ├── StateError     (ValueError)   a saved position of other samples or of another order
-├── PassError      (RuntimeError) a pass over a loader that cannot go on as it is used
+├── PassError      (RuntimeError) a pass over a loader that cannot continue
 │   └── WorkerError               a worker process died in the middle of a pass
 ├── SynthesisError (ValueError)   a scene that cannot be drawn as asked
 ├── DescriptorError (ValueError)  a Croissant descriptor or dataset card that does not fit its data
 ├── EvaluationError (ValueError)  predictions, metrics or a protocol that cannot be scored
+│   └── PredictionError           a predicted right view is missing or invalid
 └── ExtraError     (ImportError)  an optional dependency or its weights are not installed
 
-Each takes one message, so the error of a DataLoader worker is raised again as the same class in the
-main process. Messages show URLs without logins and queries.
+Warnings, each a `UserWarning`, stand beside the code that gives them:
+
+StaleIndexWarning        index.stale          a folder differs from its index
+IncompleteSceneWarning   index.open           some scenes of the data cannot be used
+OddSceneWarning          samples.checks       selected scenes differ from what the release promises
+SwappedSizeWarning       samples.size         a size looks like (width, height)
+OversizedSceneWarning    shards.pack          some scenes alone exceed the size of a shard
+OpenVideosWarning        datasets.open_videos more videos are needed than may be open
+RepeatedDecodingWarning  datasets.open_videos several processes decode the same videos
+
+Each error takes one message, so the error of a DataLoader worker is raised again as the same class
+in the main process. Messages show URLs without logins and queries.
 
 An `OSError` has one cure, wherever it occurs: `cure_of` looks it up by its number,
 `describe_os_error` makes the message, and `explain_os_errors` raises ours instead.
@@ -133,7 +144,7 @@ class SchemaError(StereoGenBenchError, ValueError):
 
 
 class GeometryError(StereoGenBenchError, ValueError):
-    """A camera, a pose or a map that no formula holds for."""
+    """A camera, pose or map that geometry cannot handle."""
 
 
 class MediaError(StereoGenBenchError, ValueError):
@@ -153,7 +164,7 @@ class SelectionError(StereoGenBenchError, LookupError):
 
 
 class FieldError(StereoGenBenchError, ValueError):
-    """Fields or transforms that cannot be had together."""
+    """Fields or transforms that cannot be combined."""
 
 
 class StateError(StereoGenBenchError, ValueError):
@@ -161,7 +172,7 @@ class StateError(StereoGenBenchError, ValueError):
 
 
 class PassError(StereoGenBenchError, RuntimeError):
-    """A pass over a loader or a stream that would give wrong batches the way it is used."""
+    """A pass over a loader or a stream that cannot continue without giving wrong batches."""
 
 
 class WorkerError(PassError):
@@ -178,6 +189,10 @@ class DescriptorError(StereoGenBenchError, ValueError):
 
 class EvaluationError(StereoGenBenchError, ValueError):
     """Predictions, metrics or a protocol that cannot be scored as asked."""
+
+
+class PredictionError(EvaluationError):
+    """A predicted right view is missing or invalid."""
 
 
 class ExtraError(StereoGenBenchError, ImportError):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 pytest_plugins = ("tests.servers.fixtures", "tests.servers.scene_fixtures")

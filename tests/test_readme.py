@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from stereogenbench_data import PAIR_FIELDS
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 README = Path(__file__).resolve().parents[1] / "README.md"

@@ -9,7 +9,7 @@ import pytest
 
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards.pack import pack
-from stereogenbench_data.shards.plan import parse_size
+from stereogenbench_data.shards.plan import parse_bytes
 from stereogenbench_data.shards.verify import verify
 from tests.servers.tools import require_tool
 
@@ -61,7 +61,7 @@ def test_the_sample_unpacked_and_packed_again_is_the_same(commands, tmp_path):
                 target.write_bytes(tar.extractfile(member).read())
 
     again = tmp_path / "again"
-    pack(tmp_path / "release", again, target_bytes=parse_size(commands[-1].split()[-1]), workers=1)
+    pack(tmp_path / "release", again, target_bytes=parse_bytes(commands[-1].split()[-1]), workers=1)
 
     assert {path.name: path.read_bytes() for path in again.glob("*.tar")} == {
         path.name: path.read_bytes() for path in SAMPLE.glob("*.tar")

@@ -7,8 +7,8 @@ from typing import Any, Final, Unpack
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from stereogenbench_data.audit.audit_records import plain
-from stereogenbench_data.audit.paper_figures import SHORT_PAIRS
+from stereogenbench_data.audit.geometry.records import plain
+from stereogenbench_data.audit.paper_numbers import SHORT_PAIRS
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,

@@ -9,8 +9,7 @@ from typing import Any, Final, Unpack
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.audit.drawing import figure_class
-from stereogenbench_data.audit.paper_figures import (
+from stereogenbench_data.audit.paper_numbers import (
     ADJACENT,
     ADJACENT_TABLE,
     ALL_PAIRS,
@@ -28,6 +27,7 @@ from stereogenbench_data.audit.paper_figures import (
     TRAIN_MAPS_TABLE,
     map_counts,
 )
+from stereogenbench_data.audit.pictures.drawing import figure_class
 from stereogenbench_data.audit.statistics import (
     ADJACENT_COLUMNS,
     FOCAL_EDGES_MM,

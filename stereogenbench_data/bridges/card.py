@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from stereogenbench_data.bridges import about
+from stereogenbench_data.bridges import dataset_facts
 from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
@@ -78,13 +78,13 @@ def _head(index: SceneIndex, configs: _Configs) -> list[str]:
     """Return the YAML head; JSON texts are YAML too."""
     lines = [
         "---",
-        f"pretty_name: {about.TITLE}",
+        f"pretty_name: {dataset_facts.TITLE}",
         "license: cc-by-4.0",
         "task_categories:",
         "- depth-estimation",
         "- image-to-image",
         "tags:",
-        *(f"- {tag}" for tag in (*about.KEYWORDS, "webdataset", "croissant")),
+        *(f"- {tag}" for tag in (*dataset_facts.KEYWORDS, "webdataset", "croissant")),
         "size_categories:",
         f"- {next((name for most, name in _SIZES if len(index) < most), '100K<n<1M')}",
         "configs:",
@@ -141,12 +141,12 @@ def _patterns(paths: set[str], index: SceneIndex) -> list[str]:
 def _body(index: SceneIndex, configs: _Configs, repository: str) -> list[str]:
     config = next(name for name in configs if name != "all")
     split = next(iter(configs[config]))
-    rules: dict[str, Any] = about.RESPONSIBLE_USE
+    rules: dict[str, Any] = dataset_facts.RESPONSIBLE_USE
     sections = ("dataUseCases", "dataLimitations", "dataBiases", "personalSensitiveInformation")
     return [
-        f"# {about.TITLE}",
+        f"# {dataset_facts.TITLE}",
         "",
-        about.DESCRIPTION,
+        dataset_facts.DESCRIPTION,
         "",
         "## How to load",
         "",
@@ -184,7 +184,7 @@ def _body(index: SceneIndex, configs: _Configs, repository: str) -> list[str]:
         "",
         "## Licence",
         "",
-        about.LICENCE_NOTE,
+        dataset_facts.LICENCE_NOTE,
         "",
         "## Responsible use",
         "",
@@ -193,7 +193,7 @@ def _body(index: SceneIndex, configs: _Configs, repository: str) -> list[str]:
         "## Citation",
         "",
         "```bibtex",
-        about.CITATION,
+        dataset_facts.CITATION,
         "```",
     ]
 

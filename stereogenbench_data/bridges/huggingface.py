@@ -106,6 +106,10 @@ class _RowDecoder:
         self._fields = fields
         self._options = options
 
+    def __repr__(self) -> str:
+        chosen = "".join(f", {name}={value!r}" for name, value in self._options.items())
+        return f"decode({self._fields!r}{chosen})"
+
     def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
         if isinstance(row["__key__"], str):
             samples = self._samples(row)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.bridges import about
+from stereogenbench_data.bridges import dataset_facts
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
@@ -78,7 +78,7 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
             folder_path=folder,
             revision=branch,
             allow_patterns=patterns,
-            commit_message=f"{about.TITLE}: {counted(len(index), 'scene')} in "
+            commit_message=f"{dataset_facts.TITLE}: {counted(len(index), 'scene')} in "
             f"{counted(len(index.shards), 'shard')}",
         )
         revision = str(api.dataset_info(repository, revision=branch).sha)

@@ -23,6 +23,11 @@ class SceneDecoder:
         self._options = options
         self._epoch = 0
 
+    def __repr__(self) -> str:
+        """Return a summary."""
+        chosen = "".join(f", {name}={value!r}" for name, value in self._options.items())
+        return f"SceneDecoder({self._fields!r}{chosen})"
+
     def set_epoch(self, epoch: int) -> None:
         """Draw new random frames and transforms in iterations that start after this call.
 

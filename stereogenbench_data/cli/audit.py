@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from stereogenbench_data.cli.opening import full_place
+from stereogenbench_data.cli.data import full_place
+from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.options import (
     DataOptions,
     JsonOption,
@@ -18,18 +19,17 @@ from stereogenbench_data.cli.options import (
     complete_from,
     grouped,
 )
-from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import write_report, writing
 
 if TYPE_CHECKING:
-    from stereogenbench_data.audit.geometry_audit import AuditRequest
+    from stereogenbench_data.audit.geometry.audit import AuditRequest
 
 _ALL = "all"
 
 
 def _complete_limit(incomplete: str) -> list[str]:
-    from stereogenbench_data.audit.audit_records import AuditLimits
+    from stereogenbench_data.audit.geometry.records import AuditLimits
 
     return complete_from(f"{limit.name}=" for limit in fields(AuditLimits))(incomplete)
 
@@ -88,9 +88,9 @@ def audit(  # noqa: PLR0913 - one parameter an option
     writes it to a file (as JSON if the name ends with .json). To continue a stopped audit, run it
     again. The exit status is 1 if anything exceeds its limit.
     """
-    from stereogenbench_data.audit import geometry_audit
-    from stereogenbench_data.audit.audit_records import AuditLimits
-    from stereogenbench_data.audit.audit_table import audit_markdown
+    from stereogenbench_data.audit.geometry import audit as geometry_audit
+    from stereogenbench_data.audit.geometry.records import AuditLimits
+    from stereogenbench_data.audit.geometry.table import audit_markdown
     from stereogenbench_data.schema.records import DepthEncoding
 
     if out is not None and out.is_dir():

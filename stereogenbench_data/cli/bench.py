@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stereogenbench_data.cli.stopping import STOPPED
+from stereogenbench_data.cli.signals import STOPPED
 from stereogenbench_data.errors import StorageError
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from stereogenbench_data.cli.opening import full_place
+from stereogenbench_data.cli.data import full_place
 from stereogenbench_data.cli.options import DataOptions, DepthUnitOption, depth_of, grouped
 from stereogenbench_data.schema.text import counted
 
@@ -29,7 +29,7 @@ def browse(
     from stereogenbench_data.audit.browser.catalogue import Catalogue
     from stereogenbench_data.audit.browser.server import PageServer
     from stereogenbench_data.audit.browser.service import Service
-    from stereogenbench_data.audit.scene_reader import SceneReader
+    from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 
     index, depth, shown_data = source.open(), depth_of(depth_unit_m), full_place(source.data)
     reader = SceneReader(index, depth=depth)

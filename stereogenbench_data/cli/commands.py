@@ -15,15 +15,15 @@ from stereogenbench_data.cli.bench import bench
 from stereogenbench_data.cli.browse import browse
 from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
+from stereogenbench_data.cli.errors import ErrorsReported
 from stereogenbench_data.cli.evaluate import controls, evaluate, export_inputs
 from stereogenbench_data.cli.export_clips import EXPORTS
 from stereogenbench_data.cli.index import index
-from stereogenbench_data.cli.outcome import ErrorsReported
 from stereogenbench_data.cli.pack import pack, unpack, verify
 from stereogenbench_data.cli.publish import card, croissant, upload
 from stereogenbench_data.cli.show import show
+from stereogenbench_data.cli.signals import stop_by_exception
 from stereogenbench_data.cli.stats import stats
-from stereogenbench_data.cli.stopping import stop_by_exception
 from stereogenbench_data.cli.synth import synth
 
 _COMMANDS: Final[dict[str, dict[Callable[..., None], str]]] = {

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
     DataOptions,
     JsonOption,
@@ -16,7 +17,6 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     grouped,
 )
-from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
 from stereogenbench_data.schema.text import counted
@@ -31,7 +31,7 @@ QUOTIENT_MEANS = (
     "Disparity shows only the quotient unit / (focal length x baseline). No picture tells which of "
     "the three is wrong, or whether two of them cancel out."
 )
-NOT_ASKED = (
+NOT_TESTED = (
     "Not tested here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
     "beside the poses, colours, depth that is off by a pixel or lies where there is no texture, "
     "and all other frames."
@@ -136,7 +136,7 @@ def _lines(report: "DoctorReport") -> list[str]:
 def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
     from stereogenbench_data.audit.contract.verdict import encoding_line
 
-    lines = [f"WRONG: {fault}." for fault in verdict.faults]
+    lines = [f"WRONG: {problem}." for problem in verdict.problems]
     if any(answer.status == "wrong" for answer in verdict.answers):
         lines.append(
             f"Another contract is {_gain_words(verdict.gain)} better than the declared one."
@@ -179,7 +179,7 @@ def _tested_lines(verdict: "Verdict") -> list[str]:
             f"NOT TESTED, too few matches: {_cameras(verdict.untested_cameras)}. "
             "Run `stereogenbench audit`."
         )
-    return [*lines, NOT_ASKED]
+    return [*lines, NOT_TESTED]
 
 
 def _cameras(cameras: Sequence[int]) -> str:
@@ -217,7 +217,7 @@ def _json(report: "DoctorReport") -> str:
         "data": report.data,
         "is_wrong": report.is_wrong,
         "quotient_means": QUOTIENT_MEANS,
-        "not_asked": NOT_ASKED,
+        "not_tested": NOT_TESTED,
         "verdicts": verdicts,
         "scenes": scenes,
         "left_out": report.left_out,

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from stereogenbench_data.cli.errors import resumable
 from stereogenbench_data.cli.options import DataOptions, JsonOption, SceneOptions, grouped
-from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
@@ -21,8 +22,8 @@ from stereogenbench_data.cli.options import (
     depth_of,
     grouped,
 )
-from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, require_metrics
 from stereogenbench_data.schema.text import counted
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from stereogenbench_data.evaluation.tables import Table
 
 
-def parse_pairs(text: str) -> Any:
+def pairs_option(text: str) -> Any:
     """Return the pairs of ``--pairs`` as `StereoPairs` takes them."""
     if text in ("primary", "adjacent", "all"):
         return text
@@ -45,7 +46,7 @@ def parse_pairs(text: str) -> Any:
     return [(int(left), int(right)) for left, right in pairs]
 
 
-def parse_frames(text: str) -> Any:
+def frames_option(text: str) -> Any:
     """Return the frames of ``--frames`` as `StereoPairs` takes them."""
     if text in ("all", "first"):
         return text
@@ -118,7 +119,7 @@ class PairsOptions(SceneOptions):
             typer.BadParameter: If the text of the pairs or of the frames cannot be parsed.
         """
         baseline = {} if self.baseline_cm is None else {"baseline_cm": self.baseline_cm}
-        chosen = {"pairs": parse_pairs(self.pairs), "frames": parse_frames(self.frames)}
+        chosen = {"pairs": pairs_option(self.pairs), "frames": frames_option(self.frames)}
         return self.filters() | baseline | chosen
 
 
@@ -137,9 +138,9 @@ class ProtocolOptions:
     metrics: Annotated[
         str,
         typer.Option(
-            help="Of psnr, ssim, lpips, e_match, p_psnr, sd, fid, fvd, fd-colour, fd-motion.",
+            help=f"Of {', '.join(METRICS)}.",
         ),
-    ] = "psnr,ssim,e_match,p_psnr,sd"
+    ] = ",".join(OFFLINE_METRICS)
     keypoint_matcher: Annotated[
         str, typer.Option(help="For E_match: sift, or dedode (the paper's).")
     ] = "sift"
@@ -173,7 +174,6 @@ class ProtocolOptions:
             typer.BadParameter: If the size is not WIDTHxHEIGHT.
             EvaluationError: If a metric, a matcher or a fit is unknown.
         """
-        from stereogenbench_data.evaluation.columns import require_metrics
         from stereogenbench_data.evaluation.models.registry import ModelOptions
         from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.console import Console
 
-from stereogenbench_data.cli.opening import full_place
+from stereogenbench_data.cli.data import full_place
+from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.options import (
     FamilyOption,
     JsonOption,
@@ -17,7 +18,6 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     grouped,
 )
-from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
 from stereogenbench_data.schema.text import counted, plain_line

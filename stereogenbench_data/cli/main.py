@@ -1,6 +1,6 @@
 """Entry point of the command ``stereogenbench``: sets up Ctrl-C before the long imports."""
 
-from stereogenbench_data.cli.stopping import stop_at_once
+from stereogenbench_data.cli.signals import stop_at_once
 
 
 def main() -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-from stereogenbench_data.cli.opening import open_data
+from stereogenbench_data.cli.data import open_data
 from stereogenbench_data.schema.release import FAMILIES, TRAIN_MAPS, UNSEEN_MAPS, Split, Subset
 
 if TYPE_CHECKING:

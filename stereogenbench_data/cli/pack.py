@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from stereogenbench_data.cli.opening import open_index
+from stereogenbench_data.cli.data import open_index
+from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.options import (
     JsonOption,
     RootOption,
@@ -15,7 +16,6 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     grouped,
 )
-from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted, plain_line
 
@@ -55,14 +55,14 @@ def pack(  # noqa: PLR0913 - one parameter an option
     once for each I; the last one to finish writes the index.
     """
     from stereogenbench_data.shards.pack import pack as packed_by
-    from stereogenbench_data.shards.plan import parse_size
+    from stereogenbench_data.shards.plan import parse_bytes
 
     number, _, count = part.partition("/")
     if not (number.isdecimal() and count.isdecimal()):
         raise typer.BadParameter(
             f"{part!r} is not a part: write I/N, such as 1/4.", param_hint="--part"
         )
-    target_bytes = parse_size(shard_size)
+    target_bytes = parse_bytes(shard_size)
     index = open_index(root, root=data_root)
     with progress_bar("packing", unit="MB") as progress:
         report = packed_by(

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
+from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import DataOptions, JsonOption, RootOption, grouped
-from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.schema.text import counted
 
 
@@ -69,14 +69,14 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         raise typer.BadParameter(
             "no file for the descriptor: name it with -o FILE.", param_hint="--out"
         )
-    from stereogenbench_data.bridges import about
+    from stereogenbench_data.bridges import dataset_facts
     from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
     from stereogenbench_data.index.table import SceneIndex
 
     index = None if data is None else SceneIndex.open(data, root=data_root)
     publication = Publication(
-        name=name or about.TITLE,
-        version=release or about.VERSION,
+        name=name or dataset_facts.TITLE,
+        version=release or dataset_facts.VERSION,
         published=None if published is None else published.date(),
         data_url=None if base_url is None else base_url.rstrip("/"),
         tables_url=None if tables_url is None else tables_url.rstrip("/"),

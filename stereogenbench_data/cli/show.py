@@ -53,8 +53,8 @@ def show(  # noqa: PLR0913 - one parameter an option
     The bar of disparity shows pixels and metres, of the stored pictures. A clip shows left, right,
     disparity and anaglyph over time.
     """
-    from stereogenbench_data.audit import scene_pictures
-    from stereogenbench_data.audit.scene_reader import SceneReader
+    from stereogenbench_data.audit.pictures import scene_pictures
+    from stereogenbench_data.audit.pictures.scene_reader import SceneReader
     from stereogenbench_data.samples.picture import write_png
     from stereogenbench_data.selection.filters import find_scene
 

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
     DataOptions,
     JsonOption,
@@ -14,7 +15,6 @@ from stereogenbench_data.cli.options import (
     SceneOptions,
     grouped,
 )
-from stereogenbench_data.cli.outcome import FINDINGS
 from stereogenbench_data.cli.writing import write_report, writing
 
 
@@ -40,7 +40,7 @@ def stats(
     It reads only the index. With --compare always, the exit status is 1 if a figure differs from
     the paper's.
     """
-    from stereogenbench_data.audit.paper_figures import SPLITS
+    from stereogenbench_data.audit.paper_numbers import SPLITS
     from stereogenbench_data.audit.statistics import statistics
     from stereogenbench_data.audit.statistics_report import (
         compared,

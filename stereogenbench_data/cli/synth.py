@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 
 import typer
 
+from stereogenbench_data.cli.errors import resumable
 from stereogenbench_data.cli.options import (
     JsonOption,
     WorkOptions,
     complete_from,
     grouped,
 )
-from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.release import (
     FAMILIES,

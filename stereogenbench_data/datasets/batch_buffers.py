@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from torch.utils.data import get_worker_info
 
-from stereogenbench_data.datasets.shared import shared_full
+from stereogenbench_data.datasets.shared_epoch import shared_full
 from stereogenbench_data.datasets.tensors import collate
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.fields import Sample
@@ -50,7 +50,7 @@ KEPT_BUFFERS: Final = 3
 _ALIGNED: Final = 64
 
 _WORKERS, _SENT, _RETIRED = 0, 1, 2
-"""Whose a slot is: the worker's, the process's that trains, or for good a held batch's."""
+"""State of a slot: free for the worker, in use by the training process, or retired."""
 
 
 class BatchArrays:
@@ -137,7 +137,7 @@ class BatchBuffers:
         return self._slots is not None
 
     def collate(self, samples: Sequence[Sample]) -> Any:
-        """Return samples as a batch; in a worker, as what is unpickled as one where it can be.
+        """Return samples as a batch; in a worker, as a handle if they lie in a slot.
 
         Raises:
             FieldError: If a field has another shape in one sample than in the first.
@@ -196,7 +196,7 @@ class BufferSpec(NamedTuple):
 
 
 class SlotOwner(NamedTuple):
-    """A worker process: its number, and bytes of its own, as numbers of processes are reused."""
+    """A worker process: its pid and a random token, because pids are reused."""
 
     pid: int
     token: bytes
@@ -259,7 +259,7 @@ class _WorkerSlots:
         batch = collate(samples)
         slot, self._slot = self._slot, None
         if slot is None or not self._holds(slot, batch):
-            self._layout = self._layout or _laid_out(batch)
+            self._layout = self._layout or _layout_of(batch)
             return batch
         new = not self._is_known[slot]
         self._is_known[slot] = True
@@ -299,7 +299,7 @@ class _WorkerSlots:
         )
 
 
-def _laid_out(batch: dict[str, Any]) -> dict[str, BufferSpec]:
+def _layout_of(batch: dict[str, Any]) -> dict[str, BufferSpec]:
     """Return a place for each tensor of a batch, one after another."""
     layout: dict[str, BufferSpec] = {}
     end = 0

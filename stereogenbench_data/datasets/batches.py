@@ -11,7 +11,7 @@ import torch.distributed
 from torch.utils.data import Sampler
 
 from stereogenbench_data.datasets.open_videos import scenes_at_once
-from stereogenbench_data.datasets.shared import SharedEpoch
+from stereogenbench_data.datasets.shared_epoch import SharedEpoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.order import (
@@ -198,7 +198,7 @@ class EpochBatches(Sampler[list[int]]):
         return len(self._share(0))
 
     def __repr__(self) -> str:
-        """Say what batches they are."""
+        """Return a summary."""
         kind = "sequential" if self.rule.kind == "sequential" else f"seed {self.rule.seed}"
         return (
             f"<{type(self).__name__}: {self.rule.batch_size} of {self.samples_of_epoch} samples a "
@@ -443,7 +443,7 @@ class BatchPass(Iterator[list[int]]):
         return self._batches.batch(number, epoch=self._epoch)
 
     def __repr__(self) -> str:
-        """Say how far it is."""
+        """Return a summary."""
         return f"<BatchPass: {self._given} of {self._count} batches of epoch {self._epoch}>"
 
     @property

@@ -67,16 +67,16 @@ class Loadable(Numbered, Protocol):
 
 
 class LoaderStats(NamedTuple):
-    """What a loader has and holds, in the process that asks.
+    """A loader's state in the calling process.
 
     Attributes:
         epoch: The current epoch.
         batches_taken: How many global batches of it the loop has taken, of all ranks.
         workers: How many worker processes run for it.
         videos_open: How many videos this process has open for it; each worker has its own.
-        videos_limit: How many videos a process opens for it at the most.
+        videos_limit: How many videos a process opens for it at most.
         batches_held: How many batches of its workers are open in shared slots: the loop holds a
-            part of them, or they arrived ahead of their turn.
+            part of them, or they arrived early.
     """
 
     epoch: int
@@ -220,7 +220,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         )
 
     def __repr__(self) -> str:
-        """Say what it loads, and how."""
+        """Return a summary."""
         return (
             f"<{type(self).__name__}: epoch {self.epoch} of {self.dataset!r} by "
             f"{self.num_workers} workers, {self.batches!r}>"
@@ -354,7 +354,7 @@ class LoaderPass(Iterator[Any]):
         return len(self._share)
 
     def __repr__(self) -> str:
-        """Say how far it is."""
+        """Return a summary."""
         if self._share is None:
             return "<LoaderPass: not begun>"
         return f"<LoaderPass: {self.taken} of {len(self._share)} batches of epoch {self.epoch}>"
@@ -428,7 +428,7 @@ class LoaderPass(Iterator[Any]):
             workers.end()
 
     def __del__(self) -> None:
-        """End the pass when nobody refers to it."""
+        """End the pass when no reference is left."""
         self.close()
 
 
@@ -485,7 +485,7 @@ class _Workers:
         return None if self._context is None else self._context.error(noticed)
 
     def __del__(self) -> None:
-        """End the workers when nobody refers to them."""
+        """End the workers when no reference is left."""
         self.end()
 
     def end(self) -> None:

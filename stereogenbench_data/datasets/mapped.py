@@ -20,7 +20,7 @@ from stereogenbench_data.datasets.loader import (
     split_options,
 )
 from stereogenbench_data.datasets.open_videos import videos_to_keep
-from stereogenbench_data.datasets.shared import SharedEpoch
+from stereogenbench_data.datasets.shared_epoch import SharedEpoch
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
@@ -47,7 +47,7 @@ Check = Literal["read", "opened", "metadata"]
 
 
 class _MappedScenes(Dataset[Sample]):
-    """Samples of a plan by number, loaded in whatever process asks."""
+    """Samples of a plan by number, loaded in the calling process."""
 
     def __init__(
         self,
@@ -165,7 +165,7 @@ class _MappedScenes(Dataset[Sample]):
     def loader(
         self, batch_size: int, *, num_workers: int = 0, **options: Unpack[LoaderOptions]
     ) -> PairsLoader:
-        """Return a torch `DataLoader` whose order is the same whatever ranks and workers there are.
+        """Return a torch `DataLoader` whose order is the same for any number of ranks and workers.
 
         Args:
             batch_size: Samples in a batch of one rank.
@@ -223,7 +223,7 @@ class _MappedScenes(Dataset[Sample]):
         self._loader.close()
 
     def __repr__(self) -> str:
-        """Say what it holds."""
+        """Return a summary."""
         scenes = len(self.plan.scene_rows)
         return (
             f"<{type(self).__name__}: {len(self)} samples of {scenes} scenes, {self.index.where}>"
@@ -256,7 +256,7 @@ class StereoPairs(_MappedScenes):
         buffers: Buffers = "reused",
         **selection: Unpack[Selection],
     ) -> None:
-        """Select the samples; no video is opened before the first sample is asked for.
+        """Select the samples; no video is opened before the first sample is read.
 
         Args:
             data: A folder in the released layout; a folder of shards, or its URL; an index of
@@ -327,7 +327,7 @@ class SceneViews(_MappedScenes):
         buffers: Buffers = "reused",
         **filters: Unpack[SceneFilters],
     ) -> None:
-        """Select the samples; no video is opened before the first sample is asked for.
+        """Select the samples; no video is opened before the first sample is read.
 
         Args:
             data: As for `StereoPairs`.

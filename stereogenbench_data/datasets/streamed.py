@@ -15,7 +15,7 @@ from stereogenbench_data.datasets.batches import (
 )
 from stereogenbench_data.datasets.loader import split_options
 from stereogenbench_data.datasets.mapped import Check, Data, StereoPairs
-from stereogenbench_data.datasets.shared import shared_full
+from stereogenbench_data.datasets.shared_epoch import shared_full
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.request import Transform
@@ -55,7 +55,7 @@ class StereoPairStream(IterableDataset[Sample]):
     """
 
     def __init__(self, data: Data, batch_size: int, **options: Unpack[StreamOptions]) -> None:
-        """Select the samples; no video is opened before the first sample is asked for.
+        """Select the samples; no video is opened before the first sample is read.
 
         Args:
             data: As for `StereoPairs`.
@@ -82,8 +82,8 @@ class StereoPairStream(IterableDataset[Sample]):
         """Make a batch of samples: `DataLoader`'s ``collate_fn``, where speed matters.
 
         Worker processes then write samples where their batch will be, in shared memory that is
-        used again once the training loop has let go of it. A worker must not keep samples for
-        itself. Any other ``collate_fn`` does too, and costs the copies that torch makes.
+        used again once the loop drops the batch. Do not keep samples in a worker. Any other
+        ``collate_fn`` works too, and costs the copies that torch makes.
 
         Raises:
             FieldError: If a field has another shape in one sample than in the first.
@@ -112,7 +112,7 @@ class StereoPairStream(IterableDataset[Sample]):
         return len(share) * size - (size - short if has_short else 0)
 
     def __repr__(self) -> str:
-        """Say what it streams, and how."""
+        """Return a summary."""
         return f"<{type(self).__name__}: epoch {self.epoch} of {self.pairs!r}, {self.batches!r}>"
 
     def __iter__(self) -> "SamplePass":
@@ -133,7 +133,7 @@ class StereoPairStream(IterableDataset[Sample]):
         return self._latest
 
     def state_dict(self, *, batches: int | None = None) -> State:
-        """Return a position, to be loaded under whatever ranks and workers.
+        """Return a position that any number of ranks and workers can load.
 
         Args:
             batches: How many batches of this rank the training loop has taken in this epoch, since

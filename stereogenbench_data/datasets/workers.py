@@ -26,7 +26,7 @@ _NOTICED_AFTER_S = 2.0
 
 
 class WorkerContext:
-    """What starts the workers of a pass: a `multiprocessing` context of the kind that is asked for.
+    """What starts the workers of a pass: a `multiprocessing` context of the requested start method.
 
     Attributes:
         context: To be passed to `DataLoader`.
@@ -88,8 +88,8 @@ class WorkerContext:
             how = f"was killed by {signal.Signals(-code).name}"
         return WorkerError(
             f"a DataLoader worker (pid {self.dead.pid}) {how} in the middle of a pass "
-            f"({type(noticed).__name__}: {noticed}). If the system killed it for want of memory, "
-            "use fewer workers or open_scenes. Load the last state_dict() to go on."
+            f"({type(noticed).__name__}: {noticed}). If the system killed it because memory ran "
+            "out, use fewer workers or open_scenes. Load the last state_dict() to go on."
         )
 
     def _wait(self) -> None:
@@ -130,7 +130,7 @@ class _ClosableQueue(Queue):  # type: ignore[type-arg]  # no generic at run time
     _is_ended = False
 
     def end(self) -> None:
-        """Let whoever reads find nothing, and never wait for what a dead process did not write."""
+        """Make readers see an empty queue, without waiting for a dead writer."""
         self._is_ended = True
         self._writer.close()  # type: ignore[attr-defined]  # without it a reader sees no end
 

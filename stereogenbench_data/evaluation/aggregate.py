@@ -51,7 +51,7 @@ class PairMeans:
         baseline_cm: The recorded baseline.
         frames: How many frames are scored.
         tallies: For each column.
-        fault: "", or why there are no scores.
+        problem: "", or why there are no scores.
     """
 
     row: int
@@ -61,7 +61,7 @@ class PairMeans:
     baseline_cm: float
     frames: int
     tallies: Mapping[str, Tally]
-    fault: str = ""
+    problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ def cell(pairs: Sequence[PairMeans], column: str) -> Cell:
         ExtraError: If scipy, which knows Student's t, is not installed.
     """
     tallies = [each.tallies[column] for each in pairs]
-    scenes = grouped((each for each in pairs if each.tallies[column].finite), lambda p: p.scene)
+    scenes = group_by((each for each in pairs if each.tallies[column].finite), lambda p: p.scene)
     means = [
         math.fsum(each.tallies[column].mean for each in found) / len(found)
         for found in scenes.values()
@@ -149,7 +149,7 @@ def half_interval(means: Sequence[float]) -> float | None:
     return quantile * math.sqrt(variance / count)
 
 
-def grouped(
+def group_by(
     pairs: Iterable[PairMeans], group_of: Callable[[PairMeans], Group]
 ) -> dict[Group, list[PairMeans]]:
     """Return pairs by group, in order of first appearance."""
@@ -180,7 +180,9 @@ def strata(values: Sequence[Any], *, name: str, edges: Sequence[float] = ()) -> 
             f"`stereogenbench index ROOT --valid-depth`), or stratify by another column."
         )
     if list(edges) != sorted(set(edges)) or len(edges) == 1:
-        raise EvaluationError(f"edges of {name} must be two or more that ascend, got {edges}.")
+        raise EvaluationError(
+            f"edges of {name} must be at least two ascending numbers, got {edges}."
+        )
     if not edges:
         if len(set(known)) <= _DISTINCT_VALUES:
             return [f"{number:g}" if math.isfinite(number) else "not known" for number in values]

@@ -106,6 +106,9 @@ the paper leaves outliers out, though it does not state by which rule.
 HEAVY_TAILED: Final = frozenset(f"sd_{fit}" for fit in _SD_FITS)
 """Columns whose mean a few scenes can dominate: their median is shown and judged."""
 
+PAIR_METRICS: Final[dict[str, str]] = {"lpips": "lpips"}
+"""Learned metrics of pairs of pictures, and the models that they are computed with."""
+
 IMAGE_DISTANCES: Final[dict[str, str]] = {"fid": "inception", "fd-colour": "colour-statistics"}
 """Distances between sets of frames, and the features that each is of."""
 

@@ -129,8 +129,8 @@ def derangement(keys: Sequence[str], *, seed: int) -> dict[str, str]:
     """
     if len(keys) < 2:
         raise EvaluationError(
-            f"the control '{RANDOM_RIGHT}' takes its views from another scene, and {len(keys)} is "
-            f"selected: select two or more."
+            f"the control '{RANDOM_RIGHT}' needs at least two scenes, {len(keys)} is selected. "
+            f"Select more."
         )
     generator = np.random.default_rng(np.random.SeedSequence(seed))
     donors = sorted(keys)
@@ -189,7 +189,7 @@ class Relation:
 
     Attributes:
         what: The relation, in words.
-        holds: Whether it does; None where it cannot be told.
+        holds: Whether it does; None if undecided.
         found: The numbers that it was judged by.
     """
 

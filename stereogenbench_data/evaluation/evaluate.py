@@ -12,8 +12,8 @@ from typing import Any, Final, TypedDict, Unpack
 
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
-from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, grouped, tally
+from stereogenbench_data.errors import EvaluationError, PredictionError
+from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, group_by, tally
 from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
 from stereogenbench_data.evaluation.frame_metrics import fields_of, models_of
 from stereogenbench_data.evaluation.metrics.frechet import (
@@ -26,7 +26,6 @@ from stereogenbench_data.evaluation.predictions import (
     CalledMethod,
     Method,
     PairFrames,
-    PredictionFault,
     PredictionFolder,
     PredictionSource,
 )
@@ -37,7 +36,7 @@ from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.selection.windows import Random
 
-_FAULTS_SHOWN: Final = 2
+_PROBLEMS_SHOWN: Final = 2
 _BRANCH: Final = ("subset", "family")
 
 
@@ -107,7 +106,10 @@ def evaluate(
     else:
         root = Path(predictions)
         if not root.is_dir():
-            raise EvaluationError(f"{root}: not a predictions folder.")
+            raise EvaluationError(
+                f"{root}: is not a folder. Pass the folder that holds the predicted right views, "
+                f"ITEM/000.png ... or ITEM.mp4."
+            )
         source = PredictionFolder(name or root.resolve().name, root.resolve())
     workload = select_workload(data, protocol, inputs=source.inputs, options=options)
     (scores,) = score_workload(workload, Run(protocol, (source,), known.name), options)
@@ -178,13 +180,15 @@ def select_workload(
     chosen, windows = plan.pairs, plan.windows
     if windows.is_clip or isinstance(windows, Random):
         raise EvaluationError(
-            "frames must be 'all', 'first', numbers of frames or ('every', k): the same single "
-            "frames for every method."
+            f"frames must be 'all', 'first', numbers of frames or ('every', k), so that every "
+            f"method is scored on the same single frames; got {selection['frames']!r}."
         )
     if chosen.targets.shape[1] != 1 or (chosen.source > chosen.targets[:, 0]).any():
         raise EvaluationError(
-            "a right view is generated from the view to its left: choose pairs='primary', "
-            "'adjacent', 'all' or (left, right) numbers."
+            f"a right view is generated from the view to its left; got pairs "
+            f"{selection.get('pairs', 'primary')!r}, direction "
+            f"{selection.get('direction', 'left to right')!r}: choose pairs='primary', 'adjacent', "
+            f"'all' or (left, right) numbers."
         )
     rows = tuple(int(row) for row in plan.scene_rows)
     pairs = []
@@ -234,7 +238,7 @@ def score_workload(
     """Return the scores of every source; scenes that ``out`` holds scores of are not scored again.
 
     Raises:
-        PredictionFault: If a right view is missing or is not what it must be, and is not allowed.
+        PredictionError: If a right view is missing or is not what it must be, and is not allowed.
         EvaluationError: If more are than are allowed, if ``out`` holds results of other settings,
             or if right views that were scored before have changed since.
         StorageError: If data or results cannot be read or written.
@@ -290,7 +294,7 @@ def _score_missing_scenes(
     stamps: dict[str, dict[tuple[str, tuple[int, int]], str]] = {}
     works: list[SceneWork] = []
     missing: list[str] = []
-    faults: list[str] = []
+    problems: list[str] = []
     done_frames = 0
     rows = {str(key): row for row, key in enumerate(workload.index.column("key"))}
     for row, pairs in zip(workload.rows, workload.pairs, strict=True):
@@ -300,14 +304,14 @@ def _score_missing_scenes(
             for pair in pairs:
                 try:
                     stamp = source.stamp(pair)
-                except PredictionFault as fault:
+                except PredictionError as problem:
                     stamp = ""
-                    missing.append(str(fault))
+                    missing.append(str(problem))
                 stamps[scene][source.name, pair.pair] = stamp
-        known = partial.faults(scene, stamps=stamps[scene], columns=run.protocol.columns)
+        known = partial.problems(scene, stamps=stamps[scene], columns=run.protocol.columns)
         if known is not None:
             done_frames += sum(len(pair.frames) for pair in pairs)
-            faults.extend(known)
+            problems.extend(known)
             continue
         works.append(
             SceneWork(
@@ -315,14 +319,14 @@ def _score_missing_scenes(
                 pairs=pairs,
                 protocol=run.protocol,
                 sources=run.sources,
-                faults="count" if allowed else "raise",
+                on_problem="count" if allowed else "raise",
             )
         )
     _require_few(missing, allowed=allowed)
     total = workload.frames
     advance = advance_of(options.get("progress"), done=done_frames, total=total)
     advance(0)
-    _require_few(faults, allowed=allowed)
+    _require_few(problems, allowed=allowed)
     with closing(
         options.get("engine", LOCAL).map(
             score_scene,
@@ -334,18 +338,20 @@ def _score_missing_scenes(
     ) as results:
         for scene, scores in results:
             partial.write(scene, scores, stamps=stamps[scene])
-            faults.extend(found.fault for found in scores.values() if found.fault)
-            _require_few(faults, allowed=allowed)
+            problems.extend(found.problem for found in scores.values() if found.problem)
+            _require_few(problems, allowed=allowed)
     advance(total)  # never more than all is reported
 
 
-def _require_few(faults: Sequence[str], *, allowed: int) -> None:
-    if len(faults) <= allowed:
+def _require_few(problems: Sequence[str], *, allowed: int) -> None:
+    if len(problems) <= allowed:
         return
-    shown = "; ".join(each.rstrip(".") for each in faults[:_FAULTS_SHOWN])
-    more = f"; and {len(faults) - _FAULTS_SHOWN} more" if len(faults) > _FAULTS_SHOWN else ""
+    shown = "; ".join(each.rstrip(".") for each in problems[:_PROBLEMS_SHOWN])
+    more = (
+        f"; and {len(problems) - _PROBLEMS_SHOWN} more" if len(problems) > _PROBLEMS_SHOWN else ""
+    )
     raise EvaluationError(
-        f"{counted(len(faults), 'prediction')} missing or unusable, and {allowed} allowed "
+        f"{counted(len(problems), 'prediction')} missing or unusable, and {allowed} allowed "
         f"(--allow-missing): {shown}{more}."
     )
 
@@ -367,7 +373,7 @@ def _pair_means(workload: Workload, partial: PartialResults, name: str) -> tuple
                     baseline_cm=scene.rig.baseline_cm(*each.pair),
                     frames=len(each.frames),
                     tallies={column: tally(numbers) for column, numbers in scores.columns.items()},
-                    fault=scores.fault,
+                    problem=scores.problem,
                 )
             )
     return tuple(means)
@@ -389,8 +395,8 @@ def _distances(
         return tuple(str(index.column(key)[pair.row] or "") for key in _BRANCH)
 
     distances = {}
-    scored_pairs = (pair for pair in pairs if pair.is_primary and not pair.fault)
-    for labels, group in grouped(scored_pairs, branch_of).items():
+    scored_pairs = (pair for pair in pairs if pair.is_primary and not pair.problem)
+    for labels, group in group_by(scored_pairs, branch_of).items():
         sides: dict[tuple[str, str], FeatureStatistics] = {}
         for pair in group:
             found = partial.read(pair.scene, [(name, pair.pair)])[name, pair.pair]

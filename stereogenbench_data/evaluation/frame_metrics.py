@@ -1,7 +1,7 @@
 """The metrics of one frame: the one table that says how each is computed, and what it needs.
 
-A new metric is a new row of `OF_FRAME`, and its columns in `columns`. Beside the table stands what
-its rows are computed from: the models of a protocol, and a frame of the target.
+A new metric is a new row of `FRAME_METRIC_ROWS`, and its columns in `columns`. Beside the table
+stands what its rows are computed from: the models of a protocol, and a frame of the target.
 """
 
 from collections.abc import Callable, Mapping
@@ -13,7 +13,11 @@ from typing import Any, Final
 
 from av.video.reformatter import VideoReformatter
 
-from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
+from stereogenbench_data.evaluation.columns import (
+    IMAGE_DISTANCES,
+    PAIR_METRICS,
+    VIDEO_DISTANCES,
+)
 from stereogenbench_data.evaluation.metrics import matching, pixels, scale
 from stereogenbench_data.evaluation.models import interfaces
 from stereogenbench_data.evaluation.models.registry import ModelKind, load_model
@@ -38,6 +42,10 @@ class MetricModels:
         """Take the protocol; nothing is loaded yet."""
         self.protocol = protocol
 
+    def __repr__(self) -> str:
+        """Return a summary."""
+        return f"MetricModels({', '.join(self.protocol.metrics)})"
+
     @cached_property
     def keypoint_matcher(self) -> interfaces.KeypointMatcher:
         """What finds the matches of E_match."""
@@ -57,7 +65,7 @@ class MetricModels:
     @cached_property
     def pair_metrics(self) -> dict[str, interfaces.PairMetric]:
         """The learned metrics of pairs of pictures, by column."""
-        return self._load_metrics("pair metric", {"lpips": "lpips"})
+        return self._load_metrics("pair metric", PAIR_METRICS)
 
     @cached_property
     def image_features(self) -> dict[str, interfaces.ImageFeatures]:
@@ -100,7 +108,11 @@ class MetricModels:
                 settings["versions"][package] = version(package)
         learned: Mapping[str, Any] = self.pair_metrics | self.image_features | self.video_features
         for name in protocol.metrics:
-            found = OF_FRAME[name].settings(self) if name in OF_FRAME else learned[name].settings
+            found = (
+                FRAME_METRIC_ROWS[name].settings(self)
+                if name in FRAME_METRIC_ROWS
+                else learned[name].settings
+            )
             settings[name] = dict(found)
         return settings
 
@@ -242,7 +254,7 @@ class FrameMetric:
     fields: tuple[str, ...] = ()
 
 
-OF_FRAME: Final[dict[str, FrameMetric]] = {
+FRAME_METRIC_ROWS: Final[dict[str, FrameMetric]] = {
     "psnr": FrameMetric(
         lambda picture, target, models: {"psnr": pixels.psnr_db(picture, target.right)},
         lambda models: pixels.PSNR_SETTINGS,
@@ -266,5 +278,7 @@ OF_FRAME: Final[dict[str, FrameMetric]] = {
 
 def fields_of(protocol: EvaluationProtocol) -> tuple[str, ...]:
     """Return the fields of a sample that a protocol's metrics need."""
-    needed = [OF_FRAME[name].fields for name in protocol.metrics if name in OF_FRAME]
+    needed = [
+        FRAME_METRIC_ROWS[name].fields for name in protocol.metrics if name in FRAME_METRIC_ROWS
+    ]
     return tuple(dict.fromkeys(("left", "right", "frame_index", *sum(needed, ()))))

@@ -158,24 +158,24 @@ def _begin(root: Path, content: Mapping[str, Any]) -> None:
 
 def _write_item(work: _ItemWork, after_frames: Advance) -> None:
     """Write one item, whole or not at all."""
-    unfinished = work.folder.with_name(f".{work.folder.name}")
+    temporary = work.folder.with_name(f".{work.folder.name}")
     fields, wanted = (*work.tier.inputs, "frame_index"), work.wanted
     try:
-        shutil.rmtree(unfinished, ignore_errors=True)
-        unfinished.mkdir()
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir()
         with open_frames(work.index, fields, size=wanted.size, depth=work.depth) as load:
             for frame in wanted.frames:
                 inputs = work.tier.inputs_of(load(0, wanted.pair, frame))
-                _write_frame(unfinished, inputs, name=frame_name(frame))
+                _write_frame(temporary, inputs, name=frame_name(frame))
                 after_frames(1)
-        unfinished.replace(work.folder)
+        temporary.replace(work.folder)
     except OSError as error:
         if isinstance(error, StorageError):
             raise
         what = f"{work.folder}: cannot be written"
         raise StorageError(describe_os_error(what, error, _ELSEWHERE)) from error
     finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _write_frame(folder: Path, inputs: Mapping[str, Any], *, name: str) -> None:

@@ -51,8 +51,8 @@ class PartialResults:
             if theirs is None:
                 if any((folder / _SCENES).iterdir()):
                     raise EvaluationError(
-                        f"{folder}: holds scenes without {STATE_JSON}, which tells what they are "
-                        f"of. Remove the folder, or choose another."
+                        f"{folder}: holds scenes without {STATE_JSON}, which says what they "
+                        f"belong to. Remove the folder, or choose another."
                     )
                 write_atomic(folder / STATE_JSON, json.dumps(ours, indent=1).encode())
                 return
@@ -91,7 +91,7 @@ class PartialResults:
                 for name, numbers in found.columns.items()
             }
             pairs[_place_name(place)] = {
-                "stamp": stamps[place], "fault": found.fault, "columns": columns
+                "stamp": stamps[place], "fault": found.problem, "columns": columns
             }  # fmt: skip
             for side, statistics in (("predicted", found.predicted), ("target", found.target)):
                 for name, each in statistics.items():
@@ -109,7 +109,7 @@ class PartialResults:
             what = f"{path}: the scores of {scene} cannot be written"
             raise StorageError(describe_os_error(what, error, _OTHER_OUT)) from error
 
-    def faults(self, scene: str, *, stamps: Stamps, columns: Collection[str]) -> list[str] | None:
+    def problems(self, scene: str, *, stamps: Stamps, columns: Collection[str]) -> list[str] | None:
         """Return why pairs of a scene have no scores, if it was scored with these right views.
 
         Args:
@@ -181,7 +181,7 @@ class PartialResults:
 def _pair_scores(pairs: Mapping[str, Any], arrays: Mapping[str, Any], place: str) -> PairScores:
     entry = pairs[place]
     columns = {name: list(map(float, numbers)) for name, numbers in entry["columns"].items()}
-    scores = PairScores(columns, fault=entry["fault"])
+    scores = PairScores(columns, problem=entry["fault"])
     for side, statistics in (("predicted", scores.predicted), ("target", scores.target)):
         start = f"{place}/{side}/"
         for key in arrays:

@@ -14,7 +14,7 @@ from stereogenbench_data.evaluation.aggregate import (
     PairMeans,
     Scores,
     cell,
-    grouped,
+    group_by,
     require_comparable,
 )
 from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS, HEAVY_TAILED
@@ -77,7 +77,7 @@ def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
             axes.plot([], [], color=colour, label=f"{one.name}: no finite number")
             continue
         # Lines join the pairs of a scene that share their left view: same content, wider baseline.
-        for sweep in grouped(pairs, lambda pair: (pair.scene, pair.pair[0])).values():
+        for sweep in group_by(pairs, lambda pair: (pair.scene, pair.pair[0])).values():
             if len(sweep) > 1:
                 sweep.sort(key=lambda pair: pair.baseline_cm)
                 axes.plot(*_points(sweep, column), color=colour, linewidth=0.6, alpha=0.35)
@@ -111,7 +111,7 @@ def _points(pairs: Sequence[PairMeans], column: str) -> tuple[list[float], list[
 def _draw_bins(
     axes: Any, pairs: Sequence[PairMeans], column: str, colour: str, *, name: str
 ) -> None:
-    groups = grouped(pairs, lambda pair: baseline_bin(pair.baseline_cm))
+    groups = group_by(pairs, lambda pair: baseline_bin(pair.baseline_cm))
     places, means, intervals = [], [], []
     for bin_name in (each for each in BASELINE_BINS if each in groups):
         found = cell(groups[bin_name], column)
@@ -126,11 +126,14 @@ def _draw_bins(
 
 
 def _draw_reference(axes: Any, results: Sequence[Scores], metric: str) -> list[float]:
-    """Draw the paper's bins of the tier if Uniform scenes were scored; return their numbers."""
+    """Draw the paper's bins of the tier if Uniform scenes were scored; return their numbers.
+
+    A metric that the paper does not report has none.
+    """
     families = results[0].index.column("family")
     if not any(families[pair.row] == "Uniform" for one in results for pair in one.pairs):
         return []
-    rows = reference_rows("bins", tier=results[0].tier)
+    rows = [row for row in reference_rows("bins", tier=results[0].tier) if row.get(metric)]
     for number, method in enumerate(dict.fromkeys(row["method"] for row in rows)):
         found = [row for row in rows if row["method"] == method]
         middles = [sum(BASELINE_BINS[row["baseline_bin_cm"]]) / 2 for row in found]

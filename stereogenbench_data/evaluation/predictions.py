@@ -25,8 +25,8 @@ from av.video.reformatter import Interpolation, VideoReformatter
 from PIL import Image
 
 from stereogenbench_data.errors import (
-    EvaluationError,
     MediaError,
+    PredictionError,
     StorageError,
     cure_of,
     describe_os_error,
@@ -49,10 +49,6 @@ _PNG_BITS_AT: Final = 24
 """Where a PNG's header has the bits of a channel, which Pillow reduces from 16 to 8 unasked."""
 _RED_GREEN_BLUE: Final = (2, 0, 1)
 """Where the planes of FFmpeg's gbrp are."""
-
-
-class PredictionFault(EvaluationError):
-    """A prediction that is missing, or is not what it must be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +137,7 @@ def find_prediction(root: Path, wanted: PairFrames) -> Path:
     """Return the folder of pictures or the video that holds a pair's prediction.
 
     Raises:
-        PredictionFault: If there is none, or more than one.
+        PredictionError: If there is none, or more than one.
     """
     places = [root / wanted.scene / pair_name(wanted.pair), root / wanted.item]
     named = [
@@ -153,10 +149,10 @@ def find_prediction(root: Path, wanted: PairFrames) -> Path:
     if len(found) == 1:
         return found[0]
     if found:
-        raise PredictionFault(
+        raise PredictionError(
             f"{wanted.label}: has several predictions, {found[0]} and {found[1]}: keep one."
         )
-    raise PredictionFault(
+    raise PredictionError(
         f"{wanted.label}: has no prediction in {root}; expected a folder or video "
         f"{places[0].relative_to(root)} or {places[1].name}."
     )
@@ -165,7 +161,7 @@ def find_prediction(root: Path, wanted: PairFrames) -> Path:
 def stamp_prediction(path: Path) -> str:
     """Return a text that changes when the files of a prediction do: names, sizes, times.
 
-    A broken link is stamped as it is; reading it is the fault.
+    A broken link gets a stamp; the error comes when it is read.
     """
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     digest = hashlib.sha256()
@@ -179,21 +175,21 @@ def stamp_prediction(path: Path) -> str:
 def open_prediction(path: Path, wanted: PairFrames) -> Iterator[Callable[[int], Any]]:
     """Yield a function that reads frames of a prediction that `find_prediction` found.
 
-    It returns uint8 (3, h, w), of the evaluated size or the scene's own, and raises PredictionFault
+    It returns uint8 (3, h, w), of the evaluated size or the scene's own, and raises PredictionError
     at a frame that is not.
 
     Raises:
-        PredictionFault: If the prediction has another number of frames, or is not a video.
+        PredictionError: If the prediction has another number of frames, or is not a video.
     """
     if path.is_dir():
         _require_pngs(path, wanted)
         yield lambda frame: _read_png(path / frame_name(frame), wanted)
         return
-    with _faults(wanted):
+    with _problems_named(wanted):
         facts = probe(path, name=str(path))
         _require_size((facts.height_px, facts.width_px), path, wanted)
         if facts.frames not in (wanted.scene_frames, len(wanted.frames)):
-            raise PredictionFault(
+            raise PredictionError(
                 f"{wanted.label}: {path} holds {facts.frames} frames; expected "
                 f"{wanted.scene_frames} (the scene's) or {len(wanted.frames)} (those evaluated)."
             )
@@ -202,7 +198,7 @@ def open_prediction(path: Path, wanted: PairFrames) -> Iterator[Callable[[int], 
     places = {frame: frame if whole else n for n, frame in enumerate(wanted.frames)}
 
     def read(frame: int) -> Any:
-        with _faults(wanted):
+        with _problems_named(wanted):
             return read_rgb(reader, places[frame])
 
     with closing(reader):
@@ -210,12 +206,12 @@ def open_prediction(path: Path, wanted: PairFrames) -> Iterator[Callable[[int], 
 
 
 @contextmanager
-def _faults(wanted: PairFrames) -> Iterator[None]:
+def _problems_named(wanted: PairFrames) -> Iterator[None]:
     """Turn errors of a video into the prediction's."""
     try:
         yield
     except (MediaError, StorageError) as error:
-        raise PredictionFault(f"{wanted.label}: {error}") from error
+        raise PredictionError(f"{wanted.label}: {error}") from error
 
 
 def _require_pngs(folder: Path, wanted: PairFrames) -> None:
@@ -223,14 +219,14 @@ def _require_pngs(folder: Path, wanted: PairFrames) -> None:
     there = {file.name for file in folder.iterdir()}
     missing = [frame for frame in wanted.frames if frame_name(frame) not in there]
     if missing:
-        raise PredictionFault(
+        raise PredictionError(
             f"{wanted.label}: {folder} lacks {len(missing)} of {len(wanted.frames)} frames, "
             f"the first is {frame_name(missing[0])}."
         )
     known = {frame_name(frame) for frame in range(wanted.scene_frames)}
     odd = sorted(name for name in there - known if name.endswith(".png"))
     if odd:
-        raise PredictionFault(
+        raise PredictionError(
             f"{wanted.label}: {folder} holds {odd[0]}, and the scene has {wanted.scene_frames} "
             f"frames, {frame_name(0)} to {frame_name(wanted.scene_frames - 1)}."
         )
@@ -243,28 +239,28 @@ def _read_png(path: Path, wanted: PairFrames) -> Any:
             with Image.open(file, formats=["PNG"]) as image:
                 if image.mode != "RGB" or bits != b"\x08":
                     depth = f" of {bits[0]} bits" if bits else ""
-                    raise PredictionFault(
+                    raise PredictionError(
                         f"{wanted.label}: {path} has pixels of mode {image.mode}{depth}: write "
                         f"8-bit RGB."
                     )
                 _require_size((image.height, image.width), path, wanted)
                 pixels = np.asarray(image)
     except (OSError, SyntaxError, ValueError, zlib.error) as error:
-        if isinstance(error, PredictionFault):
+        if isinstance(error, PredictionError):
             raise
         if isinstance(error, OSError) and cure_of(error):
             raise StorageError(describe_os_error(f"{path}: cannot be read", error)) from error
-        raise PredictionFault(
+        raise PredictionError(
             f"{wanted.label}: {path} cannot be read as a picture ({error})."
         ) from error
     except Image.DecompressionBombError as error:
-        raise PredictionFault(f"{wanted.label}: {path} is too large ({error}).") from error
+        raise PredictionError(f"{wanted.label}: {path} is too large ({error}).") from error
     return np.ascontiguousarray(pixels.transpose(2, 0, 1))
 
 
 def _require_size(found: Size, path: Path, wanted: PairFrames) -> None:
     if found not in (wanted.size, wanted.stored_size):
-        raise PredictionFault(
+        raise PredictionError(
             f"{wanted.label}: {path} is {found[1]}x{found[0]}; expected "
             f"{wanted.size[1]}x{wanted.size[0]}, or the scene's own "
             f"{wanted.stored_size[1]}x{wanted.stored_size[0]}."
@@ -316,7 +312,7 @@ class PredictionSource(Protocol):
         """Return a text that changes when the right views of a pair do.
 
         Raises:
-            PredictionFault: If there are none, or several that could be meant.
+            PredictionError: If there are none, or several that could be meant.
         """
 
     def open(self, index: SceneIndex) -> AbstractContextManager[Read]:
@@ -401,24 +397,24 @@ class CalledMethod:
         try:
             array = np.asarray(given)
         except (RuntimeError, TypeError, ValueError) as error:
-            raise PredictionFault(
+            raise PredictionError(
                 f"{where} returned a {type(given).__name__} that is not one array ({error}); "
                 f"expected {(count, *expected)}."
             ) from error
         if array.ndim != 4 or len(array) != count or array.size == 0:
-            raise PredictionFault(
+            raise PredictionError(
                 f"{where} was given {count} frames and returned {array.dtype} {array.shape}; "
                 f"expected {(count, *expected)}."
             )
         if array.dtype.kind == "f":
             if not (np.isfinite(array).all() and array.min() >= 0 and array.max() <= 1):
-                raise PredictionFault(
+                raise PredictionError(
                     f"{where} returned floats of {array.min():g} to {array.max():g}; "
                     f"expected 0 to 1, or uint8."
                 )
             array = (array * 255).round().astype(np.uint8)
         if array.shape[1:] != expected or array.dtype != np.uint8:
-            raise PredictionFault(
+            raise PredictionError(
                 f"{where} gave {array.dtype} {array.shape[1:]} for a frame; "
                 f"expected uint8 {expected}."
             )

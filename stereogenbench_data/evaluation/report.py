@@ -152,7 +152,7 @@ def pairs_csv(results: Sequence[Scores]) -> str:
     lines = (
         [
             one.name, pair.scene, pair_name(pair.pair), int(pair.is_primary),
-            repr(pair.baseline_cm), pair.frames, pair.fault,
+            repr(pair.baseline_cm), pair.frames, pair.problem,
             *(_mean_text(pair, name) for name in columns),
         ]
         for one in results
@@ -169,13 +169,13 @@ def _mean_text(pair: PairMeans, column: str) -> str:
 
 
 def _coverage(one: Scores) -> dict[str, Any]:
-    scored = [pair for pair in one.pairs if not pair.fault]
+    scored = [pair for pair in one.pairs if not pair.problem]
     return {
         "method": one.name,
         "scenes": len({pair.scene for pair in scored}),
         "pairs": len(scored),
         "frames": sum(pair.frames for pair in scored),
-        "missing": [pair.fault for pair in one.pairs if pair.fault],
+        "missing": [pair.problem for pair in one.pairs if pair.problem],
     }
 
 

@@ -15,9 +15,9 @@ import torch
 from av.video.reformatter import VideoReformatter
 
 from stereogenbench_data.engine import Advance
-from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.errors import EvaluationError, PredictionError
 from stereogenbench_data.evaluation.frame_metrics import (
-    OF_FRAME,
+    FRAME_METRIC_ROWS,
     CachedKeypoints,
     MetricModels,
     TargetFrame,
@@ -29,7 +29,6 @@ from stereogenbench_data.evaluation.models.opencv import require_opencv
 from stereogenbench_data.evaluation.predictions import (
     Pair,
     PairFrames,
-    PredictionFault,
     PredictionSource,
     Read,
     open_frames,
@@ -39,7 +38,7 @@ from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import PAIR_FIELDS, Sample
 
-Faults = Literal["raise", "count"]
+OnProblem = Literal["raise", "count"]
 
 
 @dataclass(slots=True)
@@ -50,13 +49,13 @@ class PairScores:
         columns: For each column, a number for each frame; nan where there is none.
         predicted: For each distance, the statistics of the features of the right views.
         target: The same of the rendered views.
-        fault: "", or why there are no scores.
+        problem: "", or why there are no scores.
     """
 
     columns: dict[str, list[float]] = field(default_factory=dict)
     predicted: dict[str, FeatureStatistics] = field(default_factory=dict)
     target: dict[str, FeatureStatistics] = field(default_factory=dict)
-    fault: str = ""
+    problem: str = ""
 
 
 SceneScores = dict[tuple[str, Pair], PairScores]
@@ -72,14 +71,14 @@ class SceneWork:
         pairs: What is scored of each pair, the same frames for all.
         protocol: How.
         sources: Whose right views are scored.
-        faults: "raise" at a prediction that is not what it must be, or "count" it.
+        on_problem: "raise" at a prediction that is not what it must be, or "count" it.
     """
 
     index: SceneIndex
     pairs: tuple[PairFrames, ...]
     protocol: EvaluationProtocol
     sources: tuple[PredictionSource, ...]
-    faults: Faults = "raise"
+    on_problem: OnProblem = "raise"
 
     @property
     def scene(self) -> str:
@@ -99,7 +98,7 @@ def score_scene(
         models: What the metrics are computed with, where they were loaded before.
 
     Raises:
-        PredictionFault: If a prediction is not what it must be, and faults are not counted.
+        PredictionError: If a prediction is not what it must be, and problems are not counted.
         StorageError: If a file of the data is missing or altered.
         MediaError: If a video of the data does not decode.
         ExtraError: If a package or weights that a metric needs are not there.
@@ -112,7 +111,7 @@ def score_scene(
             read = stack.enter_context(source.open(work.index))
             for wanted in work.pairs:
                 scorers[source.name, wanted.pair] = PairScorer(
-                    models, read, wanted, faults=work.faults
+                    models, read, wanted, on_problem=work.on_problem
                 )
         load_stored = stack.enter_context(open_frames(work.index, ("right",)))
         for samples in _batches(work, row):
@@ -177,7 +176,12 @@ class PairScorer:
     """Gathers the scores of one source's right views of one pair."""
 
     def __init__(
-        self, models: MetricModels, read: Read, wanted: PairFrames, *, faults: Faults = "raise"
+        self,
+        models: MetricModels,
+        read: Read,
+        wanted: PairFrames,
+        *,
+        on_problem: OnProblem = "raise",
     ) -> None:
         """Begin with no frame.
 
@@ -185,12 +189,12 @@ class PairScorer:
             models: What the metrics are computed with.
             read: Reads the source's right views of the scene.
             wanted: The pair.
-            faults: "raise" at a prediction that is not what it must be, or "count" it.
+            on_problem: "raise" at a prediction that is not what it must be, or "count" it.
         """
         self._models = models
         self._read = read
         self._wanted = wanted
-        self._faults = faults
+        self._on_problem = on_problem
         self._scores = PairScores({name: [] for name in models.protocol.columns})
         self._clip: list[tuple[Any, Any]] = []
 
@@ -198,19 +202,19 @@ class PairScorer:
         """Read the right views of some frames, in order, and score them.
 
         A view of the stored size is scaled, and compared with the rendered one scaled likewise.
-        After a fault that is counted, the pair's other frames are skipped.
+        After a problem that is counted, the pair's other frames are skipped.
 
         Raises:
-            PredictionFault: If a prediction is not what it must be, and faults are not counted.
+            PredictionError: If a prediction is not what it must be, and problems are not counted.
         """
-        if self._scores.fault:
+        if self._scores.problem:
             return
         try:
             given = self._read(self._wanted, [frame.sample for frame in frames])
-        except PredictionFault as fault:
-            if self._faults == "raise":
+        except PredictionError as problem:
+            if self._on_problem == "raise":
                 raise
-            self._scores = PairScores(fault=str(fault))
+            self._scores = PairScores(problem=str(problem))
             return
         with one_thread():
             self._score(given, frames)
@@ -224,8 +228,8 @@ class PairScorer:
             targets.append(frame if has_size else frame.scaled_from_stored)
             pictures.append(scaled_rgb(picture, size=frame.right.shape[1:], scaler=scaler))
             for metric in models.protocol.metrics:
-                if metric in OF_FRAME:
-                    numbers = OF_FRAME[metric].score(pictures[-1], targets[-1], models)
+                if metric in FRAME_METRIC_ROWS:
+                    numbers = FRAME_METRIC_ROWS[metric].score(pictures[-1], targets[-1], models)
                     for name, number in numbers.items():
                         columns[name].append(float(number))
         rendered = [target.right for target in targets]
@@ -248,7 +252,7 @@ class PairScorer:
         Raises:
             EvaluationError: If a clip has fewer frames than its features need.
         """
-        if not self._scores.fault:
+        if not self._scores.problem:
             for name, features in self._models.video_features.items():
                 if len(self._clip) < features.min_frames:
                     raise EvaluationError(

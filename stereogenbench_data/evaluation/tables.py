@@ -15,7 +15,7 @@ from stereogenbench_data.evaluation.aggregate import (
     PairMeans,
     Scores,
     cell,
-    grouped,
+    group_by,
     require_comparable,
     strata,
 )
@@ -216,7 +216,7 @@ def _rows(
     by_method = [
         (
             one,
-            grouped(
+            group_by(
                 (pair for pair in one.pairs if pairs == "all" or pair.is_primary),
                 lambda pair: tuple(label_of(pair, key) for key in keys),
             ),
@@ -255,7 +255,7 @@ def _row(
     *,
     distances: Mapping[str, FrechetDistance] | None = None,
 ) -> TableRow:
-    scored = [pair for pair in pairs if not pair.fault]
+    scored = [pair for pair in pairs if not pair.problem]
     columns = scored[0].tallies if scored else {}
     return TableRow(
         method=one.name,
@@ -335,7 +335,7 @@ def _notes(
                 f"The paper scores at {PAPER_SIZE[1]}x{PAPER_SIZE[0]}, this at "
                 f"{protocol.size[1]}x{protocol.size[0]}: not comparable."
             )
-        frames = {pair.frames for one in results for pair in one.pairs if not pair.fault}
+        frames = {pair.frames for one in results for pair in one.pairs if not pair.problem}
         if frames - {FRAME_COUNT}:
             ours = ", ".join(map(str, sorted(frames)))
             notes.append(f"The paper scores {FRAME_COUNT} frames a scene, this {ours}.")

@@ -148,7 +148,7 @@ def require_positive(value: float, *, name: str) -> None:
         )
 
 
-def require_size(shape: tuple[int, ...], intrinsics: Intrinsics, *, name: str) -> None:
+def require_picture_size(shape: tuple[int, ...], intrinsics: Intrinsics, *, name: str) -> None:
     """Raise GeometryError unless a map (..., h, w) has the image size of the intrinsics."""
     height_px, width_px = shape[-2:]
     if (height_px, width_px) != (intrinsics.height_px, intrinsics.width_px):

@@ -21,7 +21,7 @@ from stereogenbench_data.geometry.arrays import (
     pixel_centres,
     quotient,
 )
-from stereogenbench_data.geometry.camera import Intrinsics, require_positive, require_size
+from stereogenbench_data.geometry.camera import Intrinsics, require_picture_size, require_positive
 from stereogenbench_data.schema.records import DepthForm
 
 _EXACT_FACTORS: Final = np.arange(128.0, 256.0)
@@ -254,7 +254,7 @@ def ray_from_planar(
 
 def _ray_per_planar(like: Float[Any, "*batch h w"], intrinsics: Intrinsics) -> Float[Any, "h w"]:
     """Return |(x, y, 1)| of the ray through each pixel's centre, in the dtype of ``like``."""
-    require_size(like.shape, intrinsics, name="the depth map")
+    require_picture_size(like.shape, intrinsics, name="the depth map")
     xp = array_namespace(like)
     u_px, v_px = pixel_centres(like, dtype=xp.float64)
     x = (u_px - intrinsics.cx_px) / intrinsics.fx_px

@@ -20,7 +20,7 @@ from stereogenbench_data.geometry.arrays import (
     pixel_centres,
     whole_where,
 )
-from stereogenbench_data.geometry.camera import Intrinsics, require_size
+from stereogenbench_data.geometry.camera import Intrinsics, require_picture_size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +88,7 @@ def project_through_poses(
 
     Source: Hartley and Zisserman, Multiple View Geometry, 2nd ed., ch. 6.
     """
-    require_size(depth_m.shape, intrinsics, name="the depth map")
+    require_picture_size(depth_m.shape, intrinsics, name="the depth map")
     xp = array_namespace(depth_m)
     dtype = depth_m.dtype
     camera_matrix = target_intrinsics.matrix()

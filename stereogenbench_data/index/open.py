@@ -144,7 +144,7 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
-            f"{size:,}. It was not read: pass the index."
+            f"{size:,}. It was not read. Check that the URL is that of an {INDEX_NAME}."
         )
     content = pa.BufferReader(remote.read(0, size))
     table, head = read_index_file(content, where=remote.where)
@@ -163,7 +163,7 @@ def _open_tree(root: str | Path) -> Opened:
             f"purpose: `stereogenbench index {where}` makes an index without them."
         )
     if not report.scenes:
-        raise StorageError(f"{where}: no scene is finished: {_listed(report.incomplete)}")
+        raise StorageError(f"{where}: no scene is complete: {_listed(report.incomplete)}")
     head = IndexHead(root=report.root, incomplete=report.incomplete, is_part=report.is_part)
     return table_of_scenes(report.scenes, where=where), head, ""
 

@@ -159,7 +159,7 @@ def open_container(
             container.close()
             container = _open(file, options=_OPTIONS)
     except PermissionError as error:
-        raise StorageError(f"{name}: may not be read: give read permission.") from error
+        raise StorageError(f"{name}: permission denied: give read permission.") from error
     except av.FFmpegError as error:
         if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
             raise StorageError(

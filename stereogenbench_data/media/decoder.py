@@ -54,6 +54,9 @@ class Decoder:
 
     Damage is an error (``err_detect=explode``), never concealed. There is one thread: frame threads
     would run ahead of the frame asked for, and blur which one failed.
+
+    Attributes:
+        codec: FFmpeg's name of the codec.
     """
 
     def __init__(self, container: InputContainer, *, clock: Clock) -> None:
@@ -64,11 +67,11 @@ class Decoder:
         self._context = self._stream.codec_context
         self._context.options = {"err_detect": "explode"}
         self._context.thread_count = 1
-        self._can_skip = self._context.codec.canonical_name in _SKIPS_EXACTLY
+        self.codec: str = self._context.codec.canonical_name
+        self._can_skip = self.codec in _SKIPS_EXACTLY
         # FFV1 before version 3 keeps no record beside its packets, and no checksums in them.
-        is_ffv1 = self._context.codec.canonical_name == "ffv1"
-        self._has_checksums = is_ffv1 and bool(self._context.extradata)
-        self._is_intra_only = self._context.codec.canonical_name in INTRA_ONLY
+        self._has_checksums = self.codec == "ffv1" and bool(self._context.extradata)
+        self._is_intra_only = self.codec in INTRA_ONLY
         self._knows_key_frames = self._stream.frames > 0
         self._packets: Iterator[VideoPacket] = container.demux(self._stream)
         self._pending: deque[tuple[int, VideoFrame]] = deque()

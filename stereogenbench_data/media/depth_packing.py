@@ -186,6 +186,6 @@ def _require_same_video(packed: DepthFrames, target: Path) -> None:
 
 def _not_unpacked(name: str, why: str) -> MediaError:
     return MediaError(
-        f"{name}: was not written as a video as it is: {why}. Check the version of PyAV; the "
+        f"{name}: the rewritten video differs: {why}. Check the version of PyAV; the "
         f"packed file is unharmed."
     )

@@ -306,7 +306,7 @@ class VideoReader(FrameReader):
             raise MediaError(
                 f"{self.name}: frame {index} is tagged to be turned or mirrored when it is shown "
                 f"(rotation {frame.rotation} degrees), and the cameras are those of the stored "
-                f"picture: store it as it is to be seen, without the tag."
+                f"picture: store the upright picture, without the tag."
             )
 
     def _drop_decoder(self) -> None:

@@ -17,7 +17,7 @@ from stereogenbench_data.selection.plan import Plan
 
 
 class OddSceneWarning(UserWarning):
-    """Selected scenes are not what the release promises: the message says how and which."""
+    """Selected scenes differ from what the release promises: the message says how and which."""
 
 
 def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
@@ -67,9 +67,9 @@ def _require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:
 
 def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None:
     encoding = request.depth or DepthEncoding()
-    units_told = index.column("depth_unit_source") != "unreadable"
+    units_known = index.column("depth_unit_source") != "unreadable"
     stored = np.stack([index.column("depth_codec"), index.column("depth_pixel_format")], axis=-1)
-    whole = np.zeros(units_told.shape, dtype=bool)
+    whole = np.zeros(units_known.shape, dtype=bool)
     for codec, pixel_format in set(map(tuple, stored.reshape(-1, 2))):
         try:
             require_depth_stream(
@@ -78,7 +78,7 @@ def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> Non
         except MediaError:
             continue
         whole |= (stored == (codec, pixel_format)).all(axis=-1)
-    usable = whole & (units_told | (encoding.unit_m is not None))
+    usable = whole & (units_known | (encoding.unit_m is not None))
     if usable.all():
         return
     pairs = plan.pairs

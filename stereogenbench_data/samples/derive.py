@@ -40,7 +40,7 @@ Motions = Float64[np.ndarray, "t 4 4"]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneFacts:
-    """What is known of a sample apart from its pictures.
+    """A sample's scene, depth contracts, poses and place.
 
     Attributes:
         scene: The row of the index.
@@ -69,7 +69,7 @@ class SceneFacts:
 
 
 class PairGeometry:
-    """What follows from the depth of one camera (the source) for another (the target).
+    """Geometry from a source camera's depth to a target camera.
 
     Maps are (t, h, w). Disparity is u_source - u_target in pixels.
     """
@@ -248,7 +248,7 @@ class PairGeometry:
 
 def _as_seen(transforms: Motions, views: Views) -> Motions:
     """Return motions in the world that the views show, which a flip has mirrored."""
-    if views.world == "as filmed":
+    if views.world == "as recorded":
         return transforms
     mirrored: Motions = MIRROR_X @ transforms @ MIRROR_X
     return mirrored
@@ -256,19 +256,19 @@ def _as_seen(transforms: Motions, views: Views) -> Motions:
 
 @dataclass(eq=False)
 class PairSample:
-    """One source and one target of a sample, with the way there and the way back."""
+    """One source and one target of a sample, with the geometry of both directions."""
 
     views: Views
     facts: SceneFacts
     target: int
 
     @cached_property
-    def ahead(self) -> PairGeometry:
+    def forward(self) -> PairGeometry:
         """From the source to the target."""
         return PairGeometry(self.views, self.facts, source=self.views.source, target=self.target)
 
     @cached_property
-    def back(self) -> PairGeometry:
+    def backward(self) -> PairGeometry:
         """From the target to the source."""
         return PairGeometry(self.views, self.facts, source=self.target, target=self.views.source)
 

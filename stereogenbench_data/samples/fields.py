@@ -40,7 +40,8 @@ class Field:
         needs_poses: "always", "unless rectified" (only where the rig is not), or "never".
         per_target: Whether a sweep has one for each target.
         per_frame: Whether a clip has one for each frame.
-        shows: Whose picture it is, exactly as decoded, so that it can be decoded into the field.
+        picture_of: Whose picture it is, exactly as decoded, so that the decoder can write the
+            field.
     """
 
     name: str
@@ -53,7 +54,7 @@ class Field:
     needs_poses: Literal["always", "unless rectified", "never"] = "never"
     per_target: bool = False
     per_frame: bool = True
-    shows: Literal["source", "target"] | None = None
+    picture_of: Literal["source", "target"] | None = None
 
 
 def _table(*fields: Field) -> dict[str, Field]:
@@ -64,77 +65,77 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
     Field(
         "left", "uint8", "(3,H,W)", "RGB of the first view",
         make=lambda s: s.views.pictures[s.views.source],
-        streams=SOURCE_RGB, shows="source",
+        streams=SOURCE_RGB, picture_of="source",
     ),
     Field(
         "right", "uint8", "(3,H,W)", "RGB of the second view",
         make=lambda s: s.views.pictures[s.target],
-        streams=TARGET_RGB, per_target=True, shows="target",
+        streams=TARGET_RGB, per_target=True, picture_of="target",
     ),
     Field(
         "disparity", "float32", "(1,H,W)",
         "px at this resolution, x_right = x_left - d; 0 where not valid",
-        write=lambda s, out: s.ahead.write_disparity(out),
+        write=lambda s, out: s.forward.write_disparity(out),
         streams=SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
         "valid", "bool", "(1,H,W)", "depth was measured there",
-        make=lambda s: s.ahead.stored.measured[:, None],
+        make=lambda s: s.forward.stored.measured[:, None],
         streams=SOURCE_DEPTH,
     ),
     Field(
         "visible", "bool", "(1,H,W)",
         "valid, inside the second view and not hidden there, by the second view's own depth",
-        make=lambda s: s.ahead.visible(s.back)[:, None],
+        make=lambda s: s.forward.visible(s.backward)[:, None],
         streams=SOURCE_DEPTH | TARGET_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
         "visible_from_left", "bool", "(1,H,W)",
-        "the same by the first view's depth alone: blind to what only the second view sees",
-        make=lambda s: s.ahead.visible_from_source[:, None],
+        "the same by the first view's depth alone: misses occluders that only the second view sees",
+        make=lambda s: s.forward.visible_from_source[:, None],
         streams=SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
         "disparity_error", "float32", "(1,H,W)",
         "bound on the error of disparity from the depth's quantum, px",
-        make=lambda s: s.ahead.disparity_error[:, None],
+        make=lambda s: s.forward.disparity_error[:, None],
         streams=SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
         "depth", "float32", "(1,H,W)", "m along the optical axis; 0 where not valid",
-        make=lambda s: s.ahead.depth_m[:, None],
+        make=lambda s: s.forward.depth_m[:, None],
         streams=SOURCE_DEPTH,
     ),
     Field(
         "depth_right", "float32", "(1,H,W)", "depth of the second view",
-        make=lambda s: s.back.depth_m[:, None],
+        make=lambda s: s.backward.depth_m[:, None],
         streams=TARGET_DEPTH, per_target=True,
     ),
     Field(
         "disparity_right", "float32", "(1,H,W)",
         "of the second view's pixels, x_left = x_right + d",
-        write=lambda s, out: s.back.write_disparity(out, sign=-1),
+        write=lambda s, out: s.backward.write_disparity(out, sign=-1),
         streams=TARGET_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
         "valid_right", "bool", "(1,H,W)", "depth of the second view was measured there",
-        make=lambda s: s.back.stored.measured[:, None],
+        make=lambda s: s.backward.stored.measured[:, None],
         streams=TARGET_DEPTH, per_target=True,
     ),
     Field(
         "visible_right", "bool", "(1,H,W)", "pixels of the second view that the first one sees",
-        make=lambda s: s.back.visible(s.ahead)[:, None],
+        make=lambda s: s.backward.visible(s.forward)[:, None],
         streams=SOURCE_DEPTH | TARGET_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
         "warped_right", "uint8", "(3,H,W)",
         "the first view splatted into the second, nearest wins; 0 in holes",
-        make=lambda s: s.ahead.splatted[0],
+        make=lambda s: s.forward.splatted[0],
         streams=SOURCE_RGB | SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
         "hole", "bool", "(1,H,W)", "pixels of warped_right on which nothing landed",
-        make=lambda s: s.ahead.hole[:, None],
+        make=lambda s: s.forward.hole[:, None],
         streams=SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
@@ -144,13 +145,13 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
     ),
     Field(
         "baseline_m", "float64", "()", "m; negative if the second view is to the left",
-        make=lambda s: np.float64(s.ahead.baseline_m),
+        make=lambda s: np.float64(s.forward.baseline_m),
         per_target=True, per_frame=False,
     ),
     Field(
         "right_from_left", "float64", "(4,4)",
         "first camera's coordinates to the second's, m, x right y down z ahead",
-        make=lambda s: s.ahead.target_from_source,
+        make=lambda s: s.forward.target_from_source,
         needs_poses="always", per_target=True,
     ),
     Field(
@@ -207,16 +208,16 @@ VIEW_FIELDS: Final[dict[str, Field]] = _table(
     Field(
         "image", "uint8", "(3,H,W)", "RGB",
         make=lambda s: s.views.pictures[s.target],
-        streams=SOURCE_RGB | TARGET_RGB, per_target=True, shows="target",
+        streams=SOURCE_RGB | TARGET_RGB, per_target=True, picture_of="target",
     ),
     Field(
         "depth", "float32", "(1,H,W)", "m along the optical axis; 0 where not valid",
-        make=lambda s: s.back.depth_m[:, None],
+        make=lambda s: s.backward.depth_m[:, None],
         streams=SOURCE_DEPTH | TARGET_DEPTH, per_target=True,
     ),
     Field(
         "valid", "bool", "(1,H,W)", "depth was measured there",
-        make=lambda s: s.back.stored.measured[:, None],
+        make=lambda s: s.backward.stored.measured[:, None],
         streams=SOURCE_DEPTH | TARGET_DEPTH, per_target=True,
     ),
     PAIR_FIELDS["intrinsics"],
@@ -231,7 +232,7 @@ VIEW_FIELDS: Final[dict[str, Field]] = _table(
     ),
     Field(
         "first_from_cam", "float64", "(4,4)", "camera's coordinates to the first camera's, m",
-        make=lambda s: s.back.target_from_source,
+        make=lambda s: s.backward.target_from_source,
         needs_poses="always", per_target=True,
     ),
     Field(

@@ -65,7 +65,8 @@ def contact_sheet(samples: Sequence[Sample]) -> Picture:
     """
     rows = [_row(sample) for sample in samples]
     if not rows or not rows[0]:
-        raise FieldError(f"a contact sheet needs one of the fields {', '.join(_TILES)}.")
+        got = f"fields {', '.join(samples[0])}" if rows else "no sample"
+        raise FieldError(f"a contact sheet needs one of the fields {', '.join(_TILES)}; got {got}.")
     width = max(tile.shape[1] for row in rows for _, tile in row) + _GAP_PX
     heights = [_CAPTION_PX + _GAP_PX + max(tile.shape[0] for _, tile in row) for row in rows]
     sheet = Image.new("RGB", (max(map(len, rows)) * width, sum(heights)), (255, 255, 255))

@@ -113,4 +113,7 @@ def _require_transform(transform: Any, *, kind: Kind) -> None:
             f"or False; got {transform!r}."
         )
     if kind == "views" and transform.swaps_views:
-        raise FieldError("SceneViews takes no flip: it swaps the two views of a pair.")
+        raise FieldError(
+            f"SceneViews takes no transform that swaps the two views of a pair, got "
+            f"{transform!r}: leave it out."
+        )

@@ -13,7 +13,7 @@ _TEXT: Final = re.compile(r"(\d+)x(\d+)", re.ASCII | re.IGNORECASE)
 
 
 class SwappedSizeWarning(UserWarning):
-    """A size looks like (width, height), where (height, width) is asked for."""
+    """A size looks like (width, height), but (height, width) is expected."""
 
 
 def parse_size(text: str) -> tuple[int, int]:

@@ -43,8 +43,8 @@ class Compose:
         for transform in self._steps():
             if erased and transform.swaps_views:
                 raise FieldError(
-                    "Eraser stands before a flip, which would carry its patches into the first "
-                    "view: put Eraser last."
+                    f"Eraser stands before {transform!r}, which would carry its patches into the "
+                    f"first view: put Eraser last."
                 )
             erased = erased or isinstance(transform, Eraser)
 
@@ -227,7 +227,7 @@ class HorizontalFlip:
             source=views.targets[0],
             targets=(views.source,),
             intrinsics=views.intrinsics.flipped(),
-            world="mirrored" if views.world == "as filmed" else "as filmed",
+            world="mirrored" if views.world == "as recorded" else "as recorded",
             padded=None if views.padded is None else mirrored(views.padded),
         )
 

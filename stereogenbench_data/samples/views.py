@@ -42,7 +42,7 @@ class Views:
         pictures: (t, 3, h, w) uint8 for each camera whose picture is wanted.
         depths: Stored depth for each camera whose depth is wanted.
         intrinsics: Of every camera, after what was done to the pictures.
-        world: "as filmed", or "mirrored" (x negated) after a horizontal flip.
+        world: "as recorded", or "mirrored" (x negated) after a horizontal flip.
         padded: (h, w) bool, pixels of every view that are padding or were averaged with padding.
             They are never `measured`. None where there are none.
         erased: (h, w) bool for each camera whose picture was painted over: where.
@@ -57,7 +57,7 @@ class Views:
     pictures: dict[int, Any]
     depths: dict[int, StoredDepth]
     intrinsics: Intrinsics
-    world: Literal["as filmed", "mirrored"] = "as filmed"
+    world: Literal["as recorded", "mirrored"] = "as recorded"
     padded: Bool[np.ndarray, "h w"] | None = None
     erased: dict[int, Bool[np.ndarray, "h w"]] = field(default_factory=dict)
 

@@ -60,10 +60,12 @@ class SampleWriter:
         shape = (len(self._address.frames[frames]), 3, *size)
         found: dict[int, Any] = {}
         for field in self._fields:
-            if field.shows is None:
+            if field.picture_of is None:
                 continue
             source, targets = self._address.source, self._address.targets
-            shown = (source,) if field.shows == "source" else self._target_cameras(source, targets)
+            shown = (
+                (source,) if field.picture_of == "source" else self._target_cameras(source, targets)
+            )
             for number, camera in enumerate(shown):
                 found[camera] = self._part(field, number, frames, shape=shape, dtype="u1")
         return found

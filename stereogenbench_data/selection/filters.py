@@ -15,7 +15,7 @@ Range = tuple[float, float]
 
 
 class SceneFilters(TypedDict, total=False):
-    """What a scene must be. A filter that is left out, or None, lets every scene pass.
+    """Conditions on scenes. A filter that is left out, or None, lets every scene pass.
 
     Text filters take one value or several, of which one must match exactly. Ranges are closed:
     both ends belong to them.

@@ -25,7 +25,7 @@ from stereogenbench_data.shards.plan import DEFAULT_SHARD_BYTES, DepthCodec, Sha
 from stereogenbench_data.shards.tar import CHUNK_BYTES, read_members
 from stereogenbench_data.shards.writer import (
     PARTS,
-    UNFINISHED,
+    TEMPORARY_SUFFIX,
     ShardManifest,
     ShardTask,
     SourceStamp,
@@ -79,7 +79,7 @@ class PackJob:
     tasks: tuple[ShardTask, ...]
     part: tuple[ShardTask, ...]
 
-    def unfinished(self) -> list[ShardTask]:
+    def remaining(self) -> list[ShardTask]:
         """Return the shards of this part that are not finished."""
         return [task for task in self.part if find_packed(task) is None]
 
@@ -122,7 +122,7 @@ def pack(  # noqa: PLR0913 - each is an option of the command
             plan, other shards, or shards that were packed from other files.
     """
     job = prepare(data, out, target_bytes=target_bytes, depth_codec=depth_codec, part=part)
-    tasks = job.unfinished()
+    tasks = job.remaining()
     total = sum(task.shard.source_bytes for task in job.part)
     left = sum(task.shard.source_bytes for task in tasks)
     advance = advance_of(progress, done=total - left, total=total)
@@ -332,7 +332,7 @@ def _require_no_others(plan: ShardPlan, out: Path) -> None:
     """Refuse a folder that holds a shard of another plan."""
     known = {shard.name for shard in plan.shards}
     for path in sorted(out.iterdir()) if out.exists() else []:
-        name = path.name.removesuffix(UNFINISHED)
+        name = path.name.removesuffix(TEMPORARY_SUFFIX)
         if name.endswith(".tar") and name not in known:
             raise not_of_plan(path)
 

@@ -133,13 +133,13 @@ def plan_shards(
     return ShardPlan(index.root, target_bytes, shards, digest, depth_codec)
 
 
-def parse_size(text: str) -> int:
+def parse_bytes(text: str) -> int:
     """Return a size in bytes: ``500MB`` is in powers of 1000, ``2GiB`` in powers of 1024.
 
     Raises:
         ShardError: If the text is not a size, or less than a byte.
 
-    >>> parse_size("2GB"), parse_size("1.5 GiB"), parse_size("4096")
+    >>> parse_bytes("2GB"), parse_bytes("1.5 GiB"), parse_bytes("4096")
     (2000000000, 1610612736, 4096)
     """
     match = _SIZE.fullmatch(text.strip())

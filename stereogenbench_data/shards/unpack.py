@@ -14,17 +14,14 @@ from typing import Final, Literal
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, describe_os_error
 from stereogenbench_data.index.open import warn_if_stale
-from stereogenbench_data.index.parquet import INDEX_NAME
-from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
+from stereogenbench_data.shards.open import open_shards
 from stereogenbench_data.shards.tar import read_chunks
-from stereogenbench_data.shards.writer import PARTS
 from stereogenbench_data.sources.files import copy_with_crc32, try_locked
-from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.members import open_local
 from stereogenbench_data.sources.ranged_file import require_crc32
 
@@ -56,7 +53,7 @@ class _UnpackTask:
         return Path(self.out, self.scene.id.key)
 
     @property
-    def unfinished(self) -> Path:
+    def temporary(self) -> Path:
         """Its name until it is whole; walks of a tree ignore such names."""
         return self.folder.with_name(f".{self.folder.name}.unpacking")
 
@@ -137,33 +134,6 @@ def unpack(
     )
 
 
-def open_shards(data: str | Path, root: str | Path | None) -> SceneIndex:
-    """Return the index of shards on this machine.
-
-    Args:
-        data: The folder of the shards, or its index file.
-        root: The folder of the shards, if the index file is elsewhere.
-
-    Raises:
-        StorageError: If there is no index of shards, or it cannot be opened.
-    """
-    if "://" in str(data):
-        raise ShardError(f"{shown(data)}: is remote. Download the shards, and pass their folder.")
-    path = Path(data)
-    if path.is_dir() and not (path / INDEX_NAME).is_file():
-        cure = "Pass a folder that `stereogenbench pack` made."
-        if (path / PARTS).is_dir():
-            cure = "Packing was not finished: run `stereogenbench pack` again."
-        raise ShardError(f"{path}: holds no {INDEX_NAME}. {cure}")
-    index = SceneIndex.open(path, root=root)
-    if not index.shards:
-        raise ShardError(
-            f"{path}: is the index of a released folder, not of shards. Pack it with "
-            f"`stereogenbench pack`, or pass a folder of shards."
-        )
-    return index
-
-
 def unpack_scene(
     task: _UnpackTask, after_bytes: Advance
 ) -> tuple[str, Literal["unpacked", "kept"]]:
@@ -177,12 +147,12 @@ def unpack_scene(
         _require_unpacked(task)
         after_bytes(sum(member.size for member in scene.members.values()))
         return scene.id.key, "kept"
-    shutil.rmtree(task.unfinished, ignore_errors=True)
-    task.unfinished.mkdir(parents=True)
+    shutil.rmtree(task.temporary, ignore_errors=True)
+    task.temporary.mkdir(parents=True)
     try:
         for name, member in sorted(scene.members.items(), key=lambda item: item[1].offset):
             where = f"{Path(task.root, member.path)}: {scene.id.key}.{name}"
-            target = task.unfinished / _RELEASED_NAMES.get(name, name)
+            target = task.temporary / _RELEASED_NAMES.get(name, name)
             opened = open_local(task.root, member, shard=task.shards[member.path])
             with opened.open("rb") if isinstance(opened, Path) else opened as file:
                 if name in _RELEASED_NAMES:
@@ -195,9 +165,9 @@ def unpack_scene(
                 with target.open("xb") as output:
                     crc32 = copy_with_crc32(chunks, output.write)
                 require_crc32(crc32, expected=member.crc32, name=where)
-        task.unfinished.rename(task.folder)
+        task.temporary.rename(task.folder)
     finally:
-        shutil.rmtree(task.unfinished, ignore_errors=True)
+        shutil.rmtree(task.temporary, ignore_errors=True)
     return scene.id.key, "unpacked"
 
 

@@ -29,9 +29,9 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.companion_files import companion_files
+from stereogenbench_data.shards.open import open_shards
 from stereogenbench_data.shards.tar import FETCH_AGAIN, TarMember, read_checksums, read_members
-from stereogenbench_data.shards.unpack import open_shards
-from stereogenbench_data.shards.writer import UNFINISHED
+from stereogenbench_data.shards.writer import TEMPORARY_SUFFIX
 
 _WRONG_INDEX: Final = "Put the index beside the shards that it was packed with."
 _FETCH_BOTH: Final = "Fetch the shard and its index again, or pack them again."
@@ -188,7 +188,7 @@ def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> 
     for name in sorted(there - expected.keys()):
         if name.endswith(".tar"):
             yield Problem(name, "", "", "is not in the index", _WRONG_INDEX)
-        elif name.endswith(f".tar{UNFINISHED}"):
+        elif name.endswith(f".tar{TEMPORARY_SUFFIX}"):
             cure = "Run `stereogenbench pack` again, or remove it."
             yield Problem(name, "", "", "is an unfinished shard", cure)
     for name, content in companion_files(index).items():

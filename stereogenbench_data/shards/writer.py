@@ -39,7 +39,7 @@ from stereogenbench_data.shards.tar import (
 )
 from stereogenbench_data.sources.files import copy_with_crc32, try_locked, write_atomic
 
-UNFINISHED: Final = ".tmp"
+TEMPORARY_SUFFIX: Final = ".tmp"
 
 PARTS: Final = ".parts"
 """The folder beside the shards that holds their manifests and locks."""
@@ -60,9 +60,9 @@ class ShardTask:
         return Path(self.out, self.shard.name)
 
     @property
-    def unfinished(self) -> Path:
+    def temporary(self) -> Path:
         """The path of the shard until it is finished."""
-        return self.target.with_name(self.target.name + UNFINISHED)
+        return self.target.with_name(self.target.name + TEMPORARY_SUFFIX)
 
     @property
     def manifest(self) -> Path:
@@ -194,7 +194,7 @@ def pack_task(
     if done is not None:
         return done, "kept"
     try:
-        with _open_exclusive(task.unfinished) as file:
+        with _open_exclusive(task.temporary) as file:
             done = find_packed(task) or find_touched(task, after_bytes)
             return (done, "kept") if done is not None else _pack(task, file, after_bytes)
     except OSError as error:
@@ -249,7 +249,7 @@ def _pack(
         _write_manifest(task, same)
         return same, "kept"
     _write_manifest(task, manifest)
-    task.unfinished.replace(task.target)
+    task.temporary.replace(task.target)
     # The rename outlives a power cut where folders can be synchronised.
     folder = os.open(task.target.parent, os.O_RDONLY)
     try:

@@ -158,7 +158,7 @@ class FilesystemTransport:
             ) from None
         except PermissionError as error:
             raise StorageError(
-                f"{self._where}: may not be read ({_reason(error)}). Log in to its store, or ask "
+                f"{self._where}: permission denied ({_reason(error)}). Log in to its store, or ask "
                 f"for access."
             ) from None
         except ImportError as error:
@@ -180,7 +180,7 @@ class FilesystemTransport:
             raise TransientError(_reason(error)) from None
         except _loaded(_SETUP_ERRORS) as error:
             raise StorageError(
-                f"{self._where}: may not be read ({_reason(error)}). Log in to its store, or set "
+                f"{self._where}: permission denied ({_reason(error)}). Log in to its store, or set "
                 f"up its file system."
             ) from None
 

@@ -56,7 +56,7 @@ _current_attempt: Final[ContextVar[Attempt | None]] = ContextVar("_current_attem
 
 @dataclass(frozen=True, slots=True)
 class _Version:
-    """What a server states of an object that changes with its content; "" where it is silent."""
+    """What a server states of an object that changes with its content; "" if it sends none."""
 
     etag: str
     modified: str
@@ -104,6 +104,13 @@ class WebTransport:
                 f"data and pass the folder."
             )
         return int(stated)
+
+    def entries(self, attempt: Attempt) -> dict[str, int | None]:
+        """Refuse to list a folder: plain web servers have no listings."""
+        raise StorageError(
+            f"{self._where}: a web server does not list its folders. Pass a folder with an "
+            f"index.parquet, or an index that names this URL as its root."
+        )
 
     def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop, or the first of them."""
@@ -161,7 +168,7 @@ class WebTransport:
             raise TransientError(str(error)) from None
         except (LocationValueError, UnicodeError):
             sent = "" if url == self._url else f"is redirected to {shown(url)[:200]}, which "
-            raise StorageError(f"{self._where}: {sent}is not a URL: correct it.") from None
+            raise StorageError(f"{self._where}: {sent}is not a valid URL: correct it.") from None
         except HTTPError as error:
             raise TransientError(_reason(error)) from None
         finally:

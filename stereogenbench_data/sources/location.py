@@ -60,7 +60,7 @@ def split_url(url: str) -> SplitResult:
         if is_web(url):
             _ = parts.port
     except ValueError:
-        raise StorageError(f"{shown(url)}: not a URL: correct it.") from None
+        raise StorageError(f"{shown(url)}: not a valid URL: correct it.") from None
     return parts
 
 

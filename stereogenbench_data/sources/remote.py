@@ -1,11 +1,11 @@
 """Files behind URLs: any range of their bytes, resumed where a connection broke off.
 
-A transport makes the requests: `http` for http and https, `filesystems` for everything else. Its
-methods raise `TransientError` where another attempt may help, else `StorageError`.
+A `Transport` makes the requests: that of `http` for http and https, that of `filesystems` for
+everything else.
 """
 
-from collections.abc import Callable, Iterator
-from typing import TypeVar
+from collections.abc import Callable, Generator, Iterator
+from typing import Protocol, TypeVar
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources.filesystems import FilesystemTransport
@@ -14,6 +14,22 @@ from stereogenbench_data.sources.location import is_web, shown
 from stereogenbench_data.sources.retry import Attempt, RetryPolicy, RetryState, TransientError
 
 _T = TypeVar("_T")
+
+
+class Transport(Protocol):
+    """The requests for one object of one protocol, each in one attempt.
+
+    A method raises `TransientError` where another attempt may help, else `StorageError`.
+    """
+
+    def size(self, attempt: Attempt) -> int:
+        """Return the size of the object in bytes."""
+
+    def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
+        """Yield the bytes from start to stop, or the first of them."""
+
+    def entries(self, attempt: Attempt) -> dict[str, int | None]:
+        """List a folder: name to size in bytes, None for a folder."""
 
 
 class RemoteObject:
@@ -40,7 +56,7 @@ class RemoteObject:
         self._expected_size = expected_size
         self._is_checked = expected_size is None
         self._policy = retry or RetryPolicy()
-        self._transport = WebTransport(url) if is_web(url) else FilesystemTransport(url)
+        self._transport: Transport = WebTransport(url) if is_web(url) else FilesystemTransport(url)
 
     def __repr__(self) -> str:
         """Return the URL, without login and query."""
@@ -52,7 +68,7 @@ class RemoteObject:
         Raises:
             StorageError: If it cannot be fetched.
         """
-        return self._retried(self._transport.size)
+        return self._retried(self._transport.size, doing="requesting its size")
 
     def read(self, start: int, stop: int) -> bytes:
         """Return the bytes from start to stop.
@@ -104,12 +120,7 @@ class RemoteObject:
         Raises:
             StorageError: If it cannot be listed; plain web servers have no listings.
         """
-        if not isinstance(self._transport, FilesystemTransport):
-            raise StorageError(
-                f"{self.where}: a web server does not list its folders. Pass a folder with an "
-                "index.parquet, or an index that names this URL as its root."
-            )
-        return self._retried(self._transport.entries)
+        return self._retried(self._transport.entries, doing="requesting its entries")
 
     def _require_expected_size(self) -> None:
         if self._is_checked:
@@ -123,14 +134,14 @@ class RemoteObject:
             )
         self._is_checked = True
 
-    def _retried(self, request: Callable[[Attempt], _T]) -> _T:
+    def _retried(self, request: Callable[[Attempt], _T], *, doing: str) -> _T:
         state = RetryState(self._policy)
         while True:
             try:
                 with state.timed():
                     return request(state.attempt())
             except TransientError as error:
-                self._wait(state, error, received=0, doing="asked for its size")
+                self._wait(state, error, received=0, doing=doing)
 
     def _wait(self, state: RetryState, error: TransientError, *, received: int, doing: str) -> None:
         policy = self._policy

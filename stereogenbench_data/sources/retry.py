@@ -41,8 +41,8 @@ class RetryPolicy:
         first_wait_s: Seconds before the second attempt. The wait doubles with each attempt and is
             shortened at random by up to a half, so that many workers do not retry at once.
         longest_wait_s: The longest wait in seconds, unless the server asks for more.
-        longest_asked_s: The longest wait in seconds that a server may ask for; beyond it reading
-            gives up.
+        longest_retry_after_s: The longest wait in seconds that a server may request (Retry-After);
+            beyond it reading gives up.
         timeout_s: Seconds until a connection is made, and seconds until a response begins,
             redirects included.
         least_rate_bytes_s: Bytes per second that a response must deliver once it has begun. Fewer
@@ -58,7 +58,7 @@ class RetryPolicy:
     attempts: int = 6
     first_wait_s: float | int = 0.5
     longest_wait_s: float | int = 30.0
-    longest_asked_s: float | int = 300.0
+    longest_retry_after_s: float | int = 300.0
     timeout_s: float | int = 30.0
     least_rate_bytes_s: float | int = 4096.0
     window_s: float | int = 10.0
@@ -74,7 +74,8 @@ class RetryPolicy:
             StorageError: If there is no attempt, or a limit is negative or not a number.
         """
         above_zero = ("attempts", "timeout_s", "window_s", "longest_read_s")
-        for name in (*above_zero, "least_rate_bytes_s", "first_wait_s", "longest_wait_s"):
+        waits = ("first_wait_s", "longest_wait_s", "longest_retry_after_s")
+        for name in (*above_zero, "least_rate_bytes_s", *waits):
             value = getattr(self, name)
             if not value >= 0 or (name in above_zero and value == 0):
                 least = "above 0" if name in above_zero else "0 or more"
@@ -87,7 +88,7 @@ class RetryPolicy:
             False, at once, to give up: after the last attempt, or if the wait would take as long
             as ``left_s``.
         """
-        if failures >= self.attempts or error.wait_s > self.longest_asked_s:
+        if failures >= self.attempts or error.wait_s > self.longest_retry_after_s:
             return False
         backoff_s = min(self.longest_wait_s, self.first_wait_s * 2.0 ** min(failures - 1, 60))
         wait_s = max(error.wait_s, backoff_s * (1 - self.chance() / 2))

@@ -23,7 +23,7 @@ from stereogenbench_data.synthesis.export import completion_text, metadata_texts
 from stereogenbench_data.synthesis.plan import ScenePlan, plan_scene
 from stereogenbench_data.synthesis.request import SynthRequest
 
-_UNFINISHED: Final = ".unfinished"
+_TEMPORARY: Final = ".unfinished"
 _CURE: Final = "Check that the disk has free space and may be written to."
 _AGAIN: Final = "Then run the same request again: complete scenes are kept."
 
@@ -115,7 +115,7 @@ def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
 def _camera_tasks(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[_CameraTask]:
     """Yield the cameras of all missing scenes, whose folders are made empty."""
     for index in missing:
-        folder = out / _UNFINISHED / request.key(index)
+        folder = out / _TEMPORARY / request.key(index)
         try:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
@@ -165,8 +165,8 @@ def _finish(out: Path, plan: ScenePlan, *, rendered_in: Path) -> None:
 def _clear(out: Path, request: SynthRequest, *, missing: list[int]) -> None:
     """Remove incomplete scenes, and the folders that are then empty."""
     for index in missing:
-        shutil.rmtree(out / _UNFINISHED / request.key(index), ignore_errors=True)
-    folder = out / _UNFINISHED / request.folder
+        shutil.rmtree(out / _TEMPORARY / request.key(index), ignore_errors=True)
+    folder = out / _TEMPORARY / request.folder
     while folder != out:
         with suppress(OSError):
             folder.rmdir()

@@ -18,7 +18,7 @@ import typer
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.audit import audit
-from stereogenbench_data.synthesis import SynthRequest
+from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import (
     as_inverse,
     as_ray,

@@ -9,7 +9,7 @@ from stereogenbench_data import SceneIndex
 from stereogenbench_data.audit.browser.catalogue import Catalogue
 from stereogenbench_data.audit.browser.server import PageServer
 from stereogenbench_data.audit.browser.service import Service
-from stereogenbench_data.audit.scene_reader import SceneReader
+from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 
 
 @contextmanager

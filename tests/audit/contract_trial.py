@@ -16,7 +16,7 @@ import numpy as np
 
 from stereogenbench_data.audit.contract.doctor import diagnose
 from stereogenbench_data.audit.contract.verdict import Verdict, encoding_line
-from stereogenbench_data.synthesis import ExportContract, SynthRequest
+from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.audit.corruption import (
     as_inverse,
     as_ray,
@@ -47,7 +47,7 @@ class Case:
     Attributes:
         sort: The row of the table.
         corrupt: Rewrites the files.
-        named: A regular expression that a right name of the fault matches; empty if there is none.
+        named: A regular expression that a right name of the problem matches; empty for none.
         paste: The one line that may be pasted; None where nothing may.
         false: Topics that are not as declared, and may not be confirmed.
         blamed: Topics that may be called wrong.
@@ -301,13 +301,13 @@ def outcome(case: Case, verdict: Verdict) -> tuple[str, str]:
     blamed = {a.topic for a in verdict.answers if a.status == "wrong"}
     if blamed - case.blamed:
         return "WRONG", f"blamed {sorted(blamed - case.blamed)}"
-    named = {int(c) for words in verdict.faults for c in re.findall(r"camera (\d)", words)}
-    if named - case.cameras or (verdict.faults and not named and not case.cameras):
-        return "WRONG", f"faults {verdict.faults}"
+    named = {int(c) for words in verdict.problems for c in re.findall(r"camera (\d)", words)}
+    if named - case.cameras or (verdict.problems and not named and not case.cameras):
+        return "WRONG", f"problems {verdict.problems}"
     if not verdict.is_wrong:
         return ("right" if untouched and verdict.fits else "cannot tell"), ""
     found = [a.found for a in verdict.answers if a.status == "wrong"]
-    words = [*found, *verdict.faults, *verdict.choices]
+    words = [*found, *verdict.problems, *verdict.choices]
     return ("named" if any(re.search(case.named, w) for w in words) else "seen"), ""
 
 
@@ -336,7 +336,7 @@ def recorded(case: Case, verdict: Verdict) -> dict:
         "outcome": word,
         "why": why,
         "answers": {a.topic: [a.status, a.found, a.note] for a in verdict.answers},
-        "faults": verdict.faults,
+        "problems": verdict.problems,
         "paste": verdict.encoding and encoding_line(verdict.encoding),
         "choices": verdict.choices,
         "agreement": verdict.agreement,

@@ -6,7 +6,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from stereogenbench_data.audit import geometry_audit
+from stereogenbench_data.audit.geometry import audit as geometry_audit
 from stereogenbench_data.cli.audit import audit
 from stereogenbench_data.errors import StorageError
 from tests.audit.corruption import copied, rewrite_rgb
@@ -29,7 +29,7 @@ def run(tmp_path, monkeypatch):
     return invoke
 
 
-def test_data_that_are_right_are_told_as_a_table_with_exit_code_0(small_shards, run):
+def test_data_that_are_right_are_reported_as_a_table_with_exit_code_0(small_shards, run):
     result = run(small_shards, *FEW)
 
     assert result.exit_code == 0

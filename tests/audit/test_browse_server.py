@@ -17,7 +17,7 @@ from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.audit.browser.catalogue import Catalogue
 from stereogenbench_data.audit.browser.server import PageServer
 from stereogenbench_data.audit.browser.service import STATIC, Service
-from stereogenbench_data.audit.scene_reader import SceneReader
+from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from tests.audit.browsing import serving
 
 SCENE = "train/Uniform/SynthStage/scene_000001"
@@ -122,7 +122,7 @@ def test_every_file_of_the_page_is_served_and_scripts_import_only_such(server):
 
 
 @pytest.mark.parametrize("key", ["../../etc/passwd", "/etc/passwd", "", "train", SCENE + "/"])
-def test_a_scene_is_asked_for_by_its_key_alone(server, key):
+def test_a_scene_is_requested_by_its_key_alone(server, key):
     moment = urlencode({"key": key, "left": 0, "right": 1, "frame": 0})
 
     status, content, _ = ask(server, f"/left.jpg?{moment}")
@@ -203,7 +203,7 @@ def test_only_the_loopback_interface_listens(server):
         assert other.connect_ex(("127.0.0.2", server.server_address[1])) != 0
 
 
-def test_a_broken_scene_is_told_by_name(small_release, tmp_path):
+def test_a_broken_scene_is_reported_by_name(small_release, tmp_path):
     import shutil
 
     shutil.copytree(small_release, tmp_path / "data")

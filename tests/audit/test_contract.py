@@ -26,7 +26,7 @@ from stereogenbench_data.audit.contract.verdict import (
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.audit.corruption import (
     as_inverse,
@@ -134,14 +134,16 @@ def test_a_wrong_focal_length_is_not_called_a_wrong_unit(verdict_on):
     assert float(told.split(" of ")[1].split(" x ")[0]) == pytest.approx(1 / 0.95, rel=0.005)
 
 
-def test_ray_depth_is_told_from_planar(verdict_on):
+def test_ray_depth_is_distinguished_from_planar(verdict_on):
     verdict = verdict_on(lambda folder: rewrite_depth(folder, as_ray(folder)))
 
     assert wrong_topics(verdict) == {"depth along"}
     assert verdict.encoding == DepthEncoding(kind="ray")
 
 
-def test_ray_depth_behind_a_long_lens_is_told_from_a_unit_that_is_a_little_off(long_lens, tmp_path):
+def test_ray_depth_behind_a_long_lens_is_distinguished_from_a_unit_that_is_a_little_off(
+    long_lens, tmp_path
+):
     folder = copied(long_lens, tmp_path)
     rewrite_depth(folder, as_ray(folder))
 
@@ -335,12 +337,12 @@ def test_nothing_is_pasted_and_nothing_fits_while_a_camera_does_not(check, words
     assert sound.encoding == DepthEncoding(kind="ray")
     assert verdict.encoding is None
     assert not verdict.fits
-    assert verdict.is_wrong == bool(words or not (verdict.faults or verdict.unexplained_cameras))
-    assert words in " ".join(verdict.faults)
+    assert verdict.is_wrong == bool(words or not (verdict.problems or verdict.unexplained_cameras))
+    assert words in " ".join(verdict.problems)
 
 
 def test_a_scene_with_a_faulty_camera_gets_a_verdict_of_its_own():
-    faulty = replace(FITTING, faults=("depth of camera 2 is 0.5 x that of the others",))
+    faulty = replace(FITTING, problems=("depth of camera 2 is 0.5 x that of the others",))
     scenes = [diagnosed(key="a"), diagnosed(key="b", check=faulty), diagnosed(key="c")]
 
     groups = group_by_contract(scenes)
@@ -366,7 +368,7 @@ def test_an_offset_that_fits_and_is_not_clearly_better_is_left_open(offset_px, s
     assert answer(verdict, "disparity offset").status == status
 
 
-def test_a_shifted_picture_is_not_told_from_depth_of_the_other_camera():
+def test_a_shifted_picture_is_not_distinguished_from_depth_of_the_other_camera():
     swapped = "depth of cameras 0 and 1 exchanged"
     rivals = tuple(
         Rival("order", each.order, Evidence(9.0, 0.1))
@@ -490,8 +492,8 @@ def test_files_numbered_one_too_high_are_seen_and_nothing_is_pasted(verdict_on):
 def test_depth_of_one_camera_that_is_wrong_is_named(verdict_on, camera, change, words):
     verdict = verdict_on(lambda folder: rewrite_one_depth(folder, camera, change), frames=3)
 
-    (fault,) = verdict.faults
-    assert re.fullmatch(f"depth of camera {camera} {words}", fault)
+    (problem,) = verdict.problems
+    assert re.fullmatch(f"depth of camera {camera} {words}", problem)
     assert verdict.is_wrong
     assert not verdict.fits
     assert verdict.encoding is None
@@ -503,14 +505,14 @@ def test_a_tag_of_one_camera_that_is_wrong_is_named(verdict_on):
         lambda folder: rewrite_one_depth(folder, 3, lambda units: units, unit_factor=10.0)
     )
 
-    (fault,) = verdict.faults
-    assert re.fullmatch(r"depth of camera 3 is (10|9\.99\d*) x that of the others", fault)
+    (problem,) = verdict.problems
+    assert re.fullmatch(r"depth of camera 3 is (10|9\.99\d*) x that of the others", problem)
 
 
 def test_inverse_depth_of_one_camera_is_named(verdict_on):
     verdict = verdict_on(lambda folder: rewrite_one_depth(folder, 4, as_inverse(folder)))
 
-    assert verdict.faults == ("depth of camera 4 fits better as inverse depth",)
+    assert verdict.problems == ("depth of camera 4 fits better as inverse depth",)
 
 
 @pytest.mark.parametrize(
@@ -526,8 +528,8 @@ def test_inverse_depth_of_one_camera_is_named(verdict_on):
 def test_pictures_of_one_camera_that_are_wrong_are_named(verdict_on, camera, change, words):
     verdict = verdict_on(lambda folder: rewrite_rgb(folder, camera, change), frames=3)
 
-    (fault,) = verdict.faults
-    assert re.fullmatch(f"pictures of camera {camera} {words}", fault)
+    (problem,) = verdict.problems
+    assert re.fullmatch(f"pictures of camera {camera} {words}", problem)
     assert not verdict.fits
     assert verdict.encoding is None
 
@@ -535,8 +537,8 @@ def test_pictures_of_one_camera_that_are_wrong_are_named(verdict_on, camera, cha
 def test_a_camera_that_is_recorded_elsewhere_is_named(verdict_on):
     verdict = verdict_on(lambda folder: place_cameras(folder, {3: 1.2}))
 
-    (fault,) = verdict.faults
-    assert "camera 3 is not at its recorded position" in fault
+    (problem,) = verdict.problems
+    assert "camera 3 is not at its recorded position" in problem
     assert verdict.choices == ()
 
 
@@ -547,7 +549,7 @@ def test_two_cameras_that_differ_are_both_named(verdict_on):
 
     verdict = verdict_on(corrupt)
 
-    assert [fault.split(" is ")[0] for fault in verdict.faults] == [
+    assert [problem.split(" is ")[0] for problem in verdict.problems] == [
         "depth of camera 1", "depth of camera 4",
     ]  # fmt: skip
 
@@ -703,7 +705,7 @@ def test_a_scene_in_which_nothing_moves_does_not_tell_the_lag(verdict_on):
     assert answer(verdict, QUOTIENT).status == "confirmed"
 
 
-def test_the_contract_asked_about_may_be_given(verdict_on):
+def test_the_contract_requested_about_may_be_given(verdict_on):
     verdict = verdict_on(lambda folder: None, depth=DepthEncoding(unit_m=0.1, kind="ray"))
 
     assert wrong_topics(verdict) == {QUOTIENT, "depth along"}
@@ -761,7 +763,7 @@ def test_an_exchange_of_files_pairs_each_picture_with_the_depth_of_its_camera(or
         assert order.camera_of(depth, content="depth") == camera
 
 
-def test_every_exchange_of_two_cameras_is_asked_about():
+def test_every_exchange_of_two_cameras_is_requested_about():
     orders = {order.order for order in Hypothesis().alternatives("order")}
 
     for a, b in CAMERA_PAIRS:

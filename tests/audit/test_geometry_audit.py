@@ -9,22 +9,22 @@ import fsspec
 import numpy as np
 import pytest
 
-from stereogenbench_data.audit import geometry_audit as audit_module
-from stereogenbench_data.audit.audit_records import (
+from stereogenbench_data.audit.geometry import audit as audit_module
+from stereogenbench_data.audit.geometry.audit import (
+    AuditRequest,
+    audit,
+    audit_journal,
+    open_for_audit,
+)
+from stereogenbench_data.audit.geometry.records import (
     AuditLimits,
     SceneAudit,
     ToleranceAudit,
     plain,
     revived,
 )
-from stereogenbench_data.audit.audit_table import audit_markdown, pooled_px
-from stereogenbench_data.audit.geometry_audit import (
-    AuditRequest,
-    audit,
-    audit_journal,
-    open_for_audit,
-)
-from stereogenbench_data.audit.scene_audit import spread_frames
+from stereogenbench_data.audit.geometry.scene_audit import spread_frames
+from stereogenbench_data.audit.geometry.table import audit_markdown, pooled_px
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.shards.pack import pack

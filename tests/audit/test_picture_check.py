@@ -5,8 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from stereogenbench_data.audit.audit_records import At
-from stereogenbench_data.audit.picture_check import (
+from stereogenbench_data.audit.geometry.picture_check import (
     LightCheck,
     PayloadCheck,
     border_occluder,
@@ -14,6 +13,7 @@ from stereogenbench_data.audit.picture_check import (
     stored_step,
     subject_m,
 )
+from stereogenbench_data.audit.geometry.records import At
 
 
 def grey(level, *, size=(24, 32)):
@@ -26,7 +26,7 @@ def stripes(low, high):
     return picture
 
 
-def test_the_darkest_and_the_flattest_picture_are_told_with_their_frames():
+def test_the_darkest_and_the_flattest_picture_are_reported_with_their_frames():
     check = LightCheck()
     check.take(stripes(20, 200), 0, moved=False)
     check.take(stripes(0, 10), 7, moved=True)
@@ -118,7 +118,7 @@ def test_the_subject_is_as_far_as_the_nearer_part_of_the_middle_of_most_cameras(
         pytest.param((slice(0, 95), slice(None)), 0.95, "all", id="everywhere"),
     ],
 )
-def test_what_hides_a_border_is_told_with_its_share_and_side(where, share, side):
+def test_what_hides_a_border_is_reported_with_its_share_and_side(where, share, side):
     depth_m, measured = scene()
     depth_m[where] = 1.0
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stereogenbench_data.audit.audit_records import QUANTILES
-from stereogenbench_data.audit.reprojection import (
+from stereogenbench_data.audit.geometry.records import QUANTILES
+from stereogenbench_data.audit.geometry.reprojection import (
     TOLERANCES,
     MeasuredDepth,
     pair_audit,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereogenbench_data.audit.rig_check import motion_px, recorded_px, rig_audit
+from stereogenbench_data.audit.geometry.rig_check import motion_px, recorded_px, rig_audit
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.schema.records import Rig
@@ -46,7 +46,7 @@ def test_a_rig_that_agrees_with_itself_deviates_by_nothing():
     assert max(found.rotation_px, found.lateral_px) < 1e-9
 
 
-def test_a_baseline_that_is_off_is_told_by_its_mean_and_its_largest():
+def test_a_baseline_that_is_off_is_reported_by_its_mean_and_its_largest():
     baselines = list(RIG.baselines_cm)
     baselines[0] += 0.3
     baselines[CAMERA_PAIRS.index((0, 5))] -= 0.6
@@ -59,7 +59,7 @@ def test_a_baseline_that_is_off_is_told_by_its_mean_and_its_largest():
     assert found.pairs_max_cm == pytest.approx(0.6)
 
 
-def test_a_turned_camera_is_told_in_degrees_and_in_pixels():
+def test_a_turned_camera_is_reported_in_degrees_and_in_pixels():
     found = rig_audit(RIG, poses(turned=Rotation.from_euler("z", 1.0, degrees=True)), [])
 
     assert found.rotation_deg == pytest.approx(1.0)

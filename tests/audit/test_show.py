@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from stereogenbench_data import SceneIndex, SelectionError, StereoPairs
-from stereogenbench_data.audit.drawing import (
+from stereogenbench_data.audit.pictures.drawing import (
     ColourScale,
     Page,
     disparity_rows,
@@ -15,7 +15,7 @@ from stereogenbench_data.audit.drawing import (
     scale_of,
     scale_rows,
 )
-from stereogenbench_data.audit.scene_pictures import (
+from stereogenbench_data.audit.pictures.scene_pictures import (
     HIDDEN,
     LEFT,
     RIGHT,
@@ -24,7 +24,7 @@ from stereogenbench_data.audit.scene_pictures import (
     tile_width,
     write_clip,
 )
-from stereogenbench_data.audit.scene_reader import SceneReader
+from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED, anaglyph
 
 SCENE = "train/Uniform/SynthStage/scene_000001"

@@ -12,7 +12,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from stereogenbench_data import SceneIndex
-from stereogenbench_data.audit import paper_figures
+from stereogenbench_data.audit import paper_numbers
 from stereogenbench_data.audit.statistics import FOCAL_EDGES_MM, statistics
 from stereogenbench_data.audit.statistics_report import (
     compared,
@@ -101,7 +101,7 @@ def test_filters_choose_what_is_counted(three):
         statistics(three, split="eval")
 
 
-def test_what_is_not_of_the_releases_size_is_not_compared_unless_asked_for(three):
+def test_what_is_not_of_the_releases_size_is_not_compared_unless_requested(three):
     found = statistics(three)
 
     assert release_sized_splits(found) == ()
@@ -117,12 +117,12 @@ def test_an_index_with_the_papers_counts_agrees_with_the_paper_in_every_figure(r
     assert [line for line in lines if not line.agrees] == []
     assert len(lines) == 154
     assert {line.table for line in lines} >= {
-        paper_figures.COUNTS_TABLE,
-        paper_figures.ADJACENT_TABLE,
-        paper_figures.ALL_PAIRS_TABLE,
-        paper_figures.BINS_TABLE,
-        paper_figures.TRAIN_MAPS_TABLE,
-        paper_figures.EVAL_MAPS_TABLE,
+        paper_numbers.COUNTS_TABLE,
+        paper_numbers.ADJACENT_TABLE,
+        paper_numbers.ALL_PAIRS_TABLE,
+        paper_numbers.BINS_TABLE,
+        paper_numbers.TRAIN_MAPS_TABLE,
+        paper_numbers.EVAL_MAPS_TABLE,
     }
 
 
@@ -154,25 +154,25 @@ def test_a_split_by_itself_is_compared_by_itself(release):
 
 
 def test_the_papers_tables_close():
-    counts, maps = paper_figures.COUNTS, paper_figures.map_counts()
+    counts, maps = paper_numbers.COUNTS, paper_numbers.map_counts()
 
     assert sum(counts.values()) == 8493
-    for split, total in paper_figures.SPLITS.items():
+    for split, total in paper_numbers.SPLITS.items():
         assert sum(count for (of, _, _), count in counts.items() if of == split) == total
         for family in FAMILIES:
             of_maps = sum(n for (of, by, _), n in maps.items() if (of, by) == (split, family))
             assert of_maps == sum(
                 n for (of, _, by), n in counts.items() if (of, by) == (split, family)
             )
-    assert set(paper_figures.TRAIN_MAPS) == TRAIN_MAPS
-    assert {name for name, (subset, _, _) in paper_figures.EVAL_MAPS.items()
+    assert set(paper_numbers.TRAIN_MAPS) == TRAIN_MAPS
+    assert {name for name, (subset, _, _) in paper_numbers.EVAL_MAPS.items()
             if subset == "unseen_map"} == UNSEEN_MAPS  # fmt: skip
-    assert sum(paper_figures.BINS.values()) == counts["eval", "seen_map", "Uniform"]
-    for (split, family), told in paper_figures.ADJACENT.items():
+    assert sum(paper_numbers.BINS.values()) == counts["eval", "seen_map", "Uniform"]
+    for (split, family), told in paper_numbers.ADJACENT.items():
         scenes = sum(n for (of, _, by), n in counts.items() if (of, by) == (split, family))
         assert int(told["count"]) == 5 * scenes
-    assert int(paper_figures.ALL_PAIRS["train", "Pairwise_Uniform"]["count"]) == 15 * 3691
-    assert paper_figures.SHORT_PAIRS["baselines"] == 5 * paper_figures.SHORT_PAIRS["scenes"]
+    assert int(paper_numbers.ALL_PAIRS["train", "Pairwise_Uniform"]["count"]) == 15 * 3691
+    assert paper_numbers.SHORT_PAIRS["baselines"] == 5 * paper_numbers.SHORT_PAIRS["scenes"]
 
 
 def test_markdown_has_the_papers_tables(release):
@@ -222,7 +222,7 @@ def test_the_command_compares_a_release_by_itself(written_release, run):
     assert "## Against the paper: 154 of 154 figures agree" in result.stdout
 
 
-def test_the_command_compares_other_data_only_if_asked_to(small_shards, run):
+def test_the_command_compares_other_data_only_if_requested_to(small_shards, run):
     plain, asked = run(small_shards), run(small_shards, "--compare", "always")
 
     assert (plain.exit_code, asked.exit_code) == (0, 1)

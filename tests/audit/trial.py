@@ -9,7 +9,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from stereogenbench_data.synthesis import SynthRequest, synthesise
+from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import copied
 
 FAMILIES = ("IPD_Gaussian", "Uniform", "Pairwise_Uniform")

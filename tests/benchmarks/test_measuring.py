@@ -193,7 +193,7 @@ def test_the_slice_of_those_that_start_anew_is_spread_over_the_places_in_a_video
     assert [wanted.frames[0] for wanted in job.wanted] == [0, 1, 3, 2]
 
 
-def test_a_step_that_fails_is_told_and_the_others_are_measured(material, tmp_path, monkeypatch):
+def test_a_step_that_fails_is_reported_and_the_others_are_measured(material, tmp_path, monkeypatch):
     def fail(*_, **__):
         raise ValueError("no such thing")
 

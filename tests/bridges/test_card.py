@@ -14,7 +14,7 @@ from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import MARK, card, write_card
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.shards.pack import pack
-from tests.servers.fault import serving
+from tests.servers.failing_server import serving
 from tests.servers.hub import REPOSITORY, HubHandler
 from tests.servers.tools import require_module
 

@@ -10,7 +10,7 @@ from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import MARK
 from stereogenbench_data.bridges.croissant.check import check_descriptor
 from tests.cli.command import run
-from tests.servers.fault import serving
+from tests.servers.failing_server import serving
 from tests.servers.hub import REPOSITORY
 from tests.servers.hub_upload import TOKEN, UploadHubHandler
 from tests.servers.tools import require_module

@@ -10,7 +10,7 @@ from stereogenbench_data import SceneIndex, StereoGenBenchError, StereoPairs
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.shards.pack import pack
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.media.test_altered_times import flipped, matroska_times
 

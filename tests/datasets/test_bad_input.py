@@ -20,7 +20,7 @@ from stereogenbench_data import (
 )
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.samples.checks import OddSceneWarning
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
 FIELDS = ("left", "right", "disparity", "visible", "right_from_left")

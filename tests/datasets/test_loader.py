@@ -97,7 +97,7 @@ def test_loaders_of_one_dataset_leave_each_other_alone(keyed, workers):
     assert keys_of(validating) == keys_of(keyed.loader(9, tail="uneven"))[2:]
 
 
-def test_a_loader_that_was_told_no_epoch_goes_with_its_dataset(keyed):
+def test_a_loader_without_an_epoch_of_its_own_follows_its_dataset(keyed):
     follows, told = keyed.loader(9), keyed.loader(9)
     told.set_epoch(0)
     keyed.set_epoch(2)
@@ -223,7 +223,7 @@ def test_a_pass_broken_off_is_followed_by_its_epoch_anew(keyed):
     assert keys_of(loader) == first
 
 
-def test_a_loader_that_advances_goes_with_its_dataset_again_when_that_is_told_an_epoch(keyed):
+def test_a_loader_that_advances_goes_with_its_dataset_again_when_that_is_reported_an_epoch(keyed):
     loader = keyed.loader(9)
     list(loader)
     list(loader)

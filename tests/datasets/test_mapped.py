@@ -91,7 +91,10 @@ def test_clips_have_a_time_axis_and_sweeps_an_axis_of_targets(small_release, nam
 
 
 def test_a_clip_holds_the_frames_that_single_samples_hold(small_release):
-    options = {"fields": EVERY_FIELD[:-2], "pairs": [(1, 4)]}
+    options = {
+        "fields": [name for name in EVERY_FIELD if not name.startswith("__")],
+        "pairs": [(1, 4)],
+    }
     clip = StereoPairs(small_release, frames=("clips", 3, 2), **options)[0]
     singles = [StereoPairs(small_release, frames=frame, **options)[0] for frame in (0, 2, 4)]
 
@@ -160,7 +163,7 @@ def test_random_access_gives_what_reading_in_order_gives(small_release):
         assert all(same(again[int(number)], forwards[int(number)]) for number in order)
 
 
-def test_a_batch_comes_in_the_order_asked_though_it_is_read_forwards(small_release):
+def test_a_batch_comes_in_the_order_requested_though_it_is_read_forwards(small_release):
     pairs = StereoPairs(small_release, frames="all", fields=("frame_index", "__key__"))
     numbers = [9, 2, 20, 2, 0]
 
@@ -292,7 +295,7 @@ def test_views_of_cameras_that_do_not_exist_are_refused(small_release, cameras):
 
 
 def test_views_refuse_a_flip(small_release):
-    with pytest.raises(FieldError, match="SceneViews takes no flip"):
+    with pytest.raises(FieldError, match=r"SceneViews .*got HorizontalFlip"):
         SceneViews(small_release, transform=HorizontalFlip())
 
 
@@ -335,7 +338,7 @@ def test_a_dataset_goes_on_after_a_change_of_folder(small_release, monkeypatch, 
 
 
 @pytest.mark.parametrize("number", [2.7, "0", slice(0, 2), [0, 1], None])
-def test_a_sample_is_asked_for_by_a_whole_number(small_release, number):
+def test_a_sample_is_requested_by_a_whole_number(small_release, number):
     with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
         StereoPairs(small_release)[number]
 

@@ -14,7 +14,7 @@ from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.verify import verify
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 FRAMES = 17

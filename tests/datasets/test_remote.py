@@ -14,7 +14,7 @@ from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources import remote
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.retry import RetryPolicy
-from tests.servers.fault import Answer, serving
+from tests.servers.failing_server import Answer, serving
 from tests.servers.hub import REPOSITORY
 from tests.servers.nginx import nginx_serving
 from tests.servers.tools import require_tool
@@ -170,7 +170,7 @@ def test_a_server_that_fails_now_and_then_changes_nothing(shards_served, small_r
     expected.close()
 
 
-def test_a_server_that_dies_in_the_middle_is_told(large_shards, impatient):
+def test_a_server_that_dies_in_the_middle_is_reported(large_shards, impatient):
     with serving(large_shards) as web:
         pairs = StereoPairs(web.url, frames="all")
         assert "disparity" in pairs[0]
@@ -203,7 +203,7 @@ def test_bytes_that_never_come_are_no_damaged_video(video, shards_served, impati
     pairs.close()
 
 
-def test_an_index_of_another_pack_is_told(shards_served):
+def test_an_index_of_another_pack_is_reported(shards_served):
     shard = shards_served.folder / "train-IPD_Gaussian-000000.tar"
     with shard.open("ab") as file:
         file.write(bytes(512))
@@ -215,7 +215,7 @@ def test_an_index_of_another_pack_is_told(shards_served):
         pairs[0]
 
 
-def test_a_shard_that_is_missing_is_told(shards_served):
+def test_a_shard_that_is_missing_is_reported(shards_served):
     (shards_served.folder / "train-IPD_Gaussian-000000.tar").unlink()
     pairs = StereoPairs(shards_served.url, family="IPD_Gaussian")
 
@@ -269,7 +269,7 @@ def test_a_cache_that_was_damaged_on_disk_is_filled_again(shards_served, small_r
     expected.close()
 
 
-def test_a_shard_that_is_damaged_itself_is_told_with_its_checksum(shards_served, tmp_path):
+def test_a_shard_that_is_damaged_itself_is_reported_with_its_checksum(shards_served, tmp_path):
     cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
     pairs = StereoPairs(shards_served.url, family="IPD_Gaussian", cache=cache)
     shard = shards_served.folder / "train-IPD_Gaussian-000000.tar"
@@ -291,7 +291,7 @@ def test_patience_is_set_where_data_are_opened_and_goes_to_the_workers(shards_se
         list(DataLoader(pairs, num_workers=1))
 
 
-def test_a_shard_that_is_replaced_between_two_frames_is_told(shards_served):
+def test_a_shard_that_is_replaced_between_two_frames_is_reported(shards_served):
     name = "train-IPD_Gaussian-000000.tar"
     shards_served.validators = {"ETag": '"a"'}
     pairs = StereoPairs(

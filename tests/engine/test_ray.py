@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from stereogenbench_data.audit.contract.doctor import diagnose
-from stereogenbench_data.audit.geometry_audit import AuditRequest, audit
+from stereogenbench_data.audit.geometry.audit import AuditRequest, audit
 from stereogenbench_data.engine import Engine, RayCluster
 from stereogenbench_data.errors import ExtraError, ShardError, StorageError
 from stereogenbench_data.evaluation.evaluate import evaluate
@@ -25,7 +25,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.unpack import unpack
 from stereogenbench_data.shards.verify import verify
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.evaluation.conftest import write_pngs
 from tests.servers.tools import require_module

@@ -11,7 +11,7 @@ from stereogenbench_data.evaluation.aggregate import Scores
 from stereogenbench_data.evaluation.predictions import frame_name, item_name, open_frames
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 FRAMES = 4
@@ -67,7 +67,7 @@ def scored(index, predictions, protocol, **options) -> Scores:
 def numbers(scores):
     """Return all that was scored as text that is equal only for equal last digits."""
     return [
-        (pair.scene, pair.pair, pair.fault, repr(sorted(pair.tallies.items())))
+        (pair.scene, pair.pair, pair.problem, repr(sorted(pair.tallies.items())))
         for pair in scores.pairs
     ]
 

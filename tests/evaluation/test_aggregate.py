@@ -124,5 +124,7 @@ def test_a_column_that_is_not_known_is_refused():
 
 @pytest.mark.parametrize("edges", [(3, 2), (1,), (1, 1)])
 def test_edges_that_do_not_ascend_are_refused(edges):
-    with pytest.raises(EvaluationError, match="edges of focal_mm must be two or more that ascend"):
+    with pytest.raises(
+        EvaluationError, match="edges of focal_mm must be at least two ascending numbers"
+    ):
         strata([1.0], name="focal_mm", edges=edges)

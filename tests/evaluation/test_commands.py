@@ -73,7 +73,7 @@ def test_a_missing_prediction_ends_with_2_and_is_named(scenes, tmp_path):
         ("--tier", "G9", "there is no tier 'G9'"),
     ],
 )
-def test_an_option_that_is_off_is_told(
+def test_an_option_that_is_off_is_reported(
     scenes,
     right_views,
     tmp_path,

@@ -44,7 +44,7 @@ def test_derangements_of_other_seeds_differ():
 
 
 def test_one_scene_has_no_derangement():
-    with pytest.raises(EvaluationError, match=r"'random right'.* 1 is selected: select two"):
+    with pytest.raises(EvaluationError, match=r"'random right'.* 1 is selected. Select more"):
         derangement(["alone"], seed=0)
 
 

@@ -265,7 +265,7 @@ def test_without_a_checkout_the_repository_weights_and_licence_are_named(place, 
         assert told in str(caught.value)
 
 
-def test_a_checkout_without_weights_configuration_or_requirements_is_told_what_is_missing(
+def test_a_checkout_without_weights_configuration_or_requirements_is_reported_what_is_missing(
     checkout, monkeypatch
 ):
     folder = checkout / "pretrained_models" / "23-51-11"

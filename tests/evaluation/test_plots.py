@@ -10,6 +10,7 @@ from PIL import Image
 from stereogenbench_data import EvaluationError, EvaluationProtocol, score_controls
 from stereogenbench_data.evaluation import plots
 from stereogenbench_data.evaluation.aggregate import tally
+from stereogenbench_data.evaluation.columns import Column
 from stereogenbench_data.evaluation.plots import write_plots
 from tests.evaluation.conftest import SIZE, scored
 
@@ -63,6 +64,22 @@ def test_the_papers_sd_is_drawn_beside_the_filtered_fit_alone(results, tmp_path,
         "sd_filtered_by_baseline.png", "sd_least_squares_by_baseline.png",
     ]  # fmt: skip
     assert asked == ["bins"]
+
+
+def test_a_metric_that_the_paper_does_not_report_is_drawn_alone(results, tmp_path, monkeypatch):
+    column = Column("MAE", "lower", 2, "grey levels; mean absolute difference")
+    monkeypatch.setitem(plots.COLUMNS, "mae", column)
+    monkeypatch.setitem(plots.FRAME_METRICS, "mae", ("mae",))
+    with_mae = [
+        replace(
+            one, pairs=tuple(replace(pair, tallies={"mae": tally([3.0])}) for pair in one.pairs)
+        )
+        for one in results
+    ]
+
+    files = write_plots(tmp_path, with_mae)
+
+    assert [path.name for path in files] == ["mae_by_baseline.png"]
 
 
 def test_methods_of_two_tiers_are_not_drawn_together(scored_index, tmp_path, protocol):

@@ -7,9 +7,9 @@ import pytest
 from av.video.reformatter import VideoReformatter
 from PIL import Image
 
+from stereogenbench_data.errors import PredictionError
 from stereogenbench_data.evaluation.predictions import (
     PairFrames,
-    PredictionFault,
     find_prediction,
     frame_name,
     item_name,
@@ -104,9 +104,9 @@ def test_pictures_of_the_stored_size_are_read_as_they_are_and_scaled_by_area(ite
     assert view[:, :, 9:].min() == 200
 
 
-def test_a_missing_prediction_is_told_with_both_places(tmp_path):
+def test_a_missing_prediction_is_reported_with_both_places(tmp_path):
     with pytest.raises(
-        PredictionFault,
+        PredictionError,
         match=rf"{SCENE}, cameras 00-01: has no prediction in .*{SCENE}/00-01 or "
         rf"{item_name(SCENE, (0, 1))}\.",
     ):
@@ -117,14 +117,14 @@ def test_two_predictions_of_one_pair_are_refused(item, tmp_path):
     write_png(item, 0, picture(1))
     write_video(tmp_path / SCENE / "00-01.mkv", [1])
 
-    with pytest.raises(PredictionFault, match=r"has several predictions, .*: keep one"):
+    with pytest.raises(PredictionError, match=r"has several predictions, .*: keep one"):
         find_prediction(tmp_path, WANTED)
 
 
 def test_a_missing_frame_is_named(item):
     write_png(item, 0, picture(1))
 
-    with pytest.raises(PredictionFault, match=r"lacks 1 of 2 frames, the first is 002\.png"):
+    with pytest.raises(PredictionError, match=r"lacks 1 of 2 frames, the first is 002\.png"):
         read(item)
 
 
@@ -132,7 +132,7 @@ def test_a_frame_beyond_the_scene_is_named(item):
     for frame in (0, 1, 2, 3):
         write_png(item, frame, picture(1))
 
-    with pytest.raises(PredictionFault, match=r"holds 003\.png, and the scene has 3 frames"):
+    with pytest.raises(PredictionError, match=r"holds 003\.png, and the scene has 3 frames"):
         read(item)
 
 
@@ -141,7 +141,7 @@ def test_a_picture_of_another_size_is_named_with_those_that_would_do(item):
         write_png(item, frame, picture(1, size=(9, 16)))
 
     with pytest.raises(
-        PredictionFault, match=r"000\.png is 16x9; expected 16x8, or the scene's own 32x32"
+        PredictionError, match=r"000\.png is 16x9; expected 16x8, or the scene's own 32x32"
     ):
         read(item)
 
@@ -151,7 +151,7 @@ def test_pictures_without_three_channels_are_refused(item, mode, shape):
     for frame in (0, 2):
         write_png(item, frame, np.zeros(shape, dtype=np.uint8))
 
-    with pytest.raises(PredictionFault, match=rf"pixels of mode {mode} of 8 bits: write 8-bit RGB"):
+    with pytest.raises(PredictionError, match=rf"pixels of mode {mode} of 8 bits: write 8-bit RGB"):
         read(item)
 
 
@@ -160,7 +160,7 @@ def test_pictures_of_16_bits_are_refused_not_halved(item):
     for frame in (0, 2):
         cv2.imwrite(str(item / frame_name(frame)), np.full((8, 16, 3), 300, dtype=np.uint16))
 
-    with pytest.raises(PredictionFault, match=r"000\.png has pixels of mode RGB of 16 bits"):
+    with pytest.raises(PredictionError, match=r"000\.png has pixels of mode RGB of 16 bits"):
         read(item)
 
 
@@ -169,7 +169,7 @@ def test_a_link_to_nowhere_is_a_picture_that_cannot_be_read(item):
     (item / frame_name(2)).symlink_to(item / "gone.png")
 
     assert stamp_prediction(item)
-    with pytest.raises(PredictionFault, match=r"002\.png cannot be read as a picture"):
+    with pytest.raises(PredictionError, match=r"002\.png cannot be read as a picture"):
         read(item, 2)
 
 
@@ -187,7 +187,7 @@ def test_a_damaged_picture_is_named(item, damage):
     }
     path.write_bytes(changed[damage])
 
-    with pytest.raises(PredictionFault, match=r"00-01: .*002\.png cannot be read as a picture"):
+    with pytest.raises(PredictionError, match=r"00-01: .*002\.png cannot be read as a picture"):
         read(item, 2)
 
 
@@ -195,7 +195,7 @@ def test_a_video_of_another_number_of_frames_is_named_with_those_that_would_do(i
     path = write_video(item.with_name(f"{item.name}.mkv"), [1, 2, 3, 4])
 
     with pytest.raises(
-        PredictionFault, match=r"holds 4 frames; expected 3 \(the scene's\) or 2 \(those evaluated"
+        PredictionError, match=r"holds 4 frames; expected 3 \(the scene's\) or 2 \(those evaluated"
     ):
         read(path)
 
@@ -203,7 +203,7 @@ def test_a_video_of_another_number_of_frames_is_named_with_those_that_would_do(i
 def test_a_video_of_another_size_is_named(item):
     path = write_video(item.with_name(f"{item.name}.mkv"), [1, 2], size=(16, 16))
 
-    with pytest.raises(PredictionFault, match=r"is 16x16; expected 16x8"):
+    with pytest.raises(PredictionError, match=r"is 16x16; expected 16x8"):
         read(path)
 
 
@@ -211,7 +211,7 @@ def test_a_cut_video_is_named(item):
     path = write_video(item.with_name(f"{item.name}.mkv"), [1, 2])
     path.write_bytes(path.read_bytes()[:200])
 
-    with pytest.raises(PredictionFault, match=rf"{SCENE}, cameras 00-01: .*\.mkv"):
+    with pytest.raises(PredictionError, match=rf"{SCENE}, cameras 00-01: .*\.mkv"):
         levels(path)
 
 

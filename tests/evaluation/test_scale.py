@@ -44,7 +44,7 @@ def test_a_disparity_that_is_scaled_drifts_by_its_inverse(truth, method, factor,
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_an_offset_is_told_from_a_scale(truth, method):
+def test_an_offset_is_distinguished_from_a_scale(truth, method):
     fit = fit_scale(truth / 2 + 1000, truth, scored=EVERYWHERE, method=method)
 
     assert fit.slope == pytest.approx(2, abs=1e-4)

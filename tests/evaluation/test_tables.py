@@ -155,7 +155,7 @@ def test_the_papers_sd_stands_in_the_filtered_column_alone(scores, fit):
     assert cells["SD least squares↓ [median]"] == "-"
 
 
-def test_theil_sens_sd_is_a_third_column_where_it_is_asked_for(scores):
+def test_theil_sens_sd_is_a_third_column_where_it_is_requested(scores):
     asked = branch_table([scores(protocol=EvaluationProtocol(fit="theil_sen"))])
     plain = branch_table([scores()])
 
@@ -205,7 +205,7 @@ def test_a_gap_is_a_column_of_the_table(scores):
     whole = scores()
     gap = PairMeans(
         row=1, scene=whole.pairs[1].scene, pair=(0, 1), is_primary=True, baseline_cm=20.0,
-        frames=2, tallies={}, fault="has no prediction",
+        frames=2, tallies={}, problem="has no prediction",
     )  # fmt: skip
     holed = Scores("ours", "G0", PAPERS, {}, whole.index, (whole.pairs[0], gap, *whole.pairs[2:]))
     table = branch_table([holed])

@@ -67,7 +67,7 @@ def test_a_worker_that_dies_is_an_error_and_no_hang(linked_scenes, root, monkeyp
         walk(root, workers=2, progress=kill)
 
 
-def test_progress_is_told_after_each_scene(linked_scenes, root):
+def test_progress_is_reported_after_each_scene(linked_scenes, root):
     linked_scenes(3)
     told = []
 
@@ -179,7 +179,7 @@ def test_a_journal_that_cannot_be_read_is_named(tmp_path):
         ("Other", "STF_TestMap", "unseen_map", 1),
     ],
 )
-def test_an_eval_subset_is_told_by_its_folder_else_by_its_map(
+def test_an_eval_subset_is_reported_by_its_folder_else_by_its_map(
     make_scene, root, rewrite, folder, map_name, subset, notes
 ):
     rewrite(

@@ -113,7 +113,7 @@ def test_a_folder_without_scenes_is_an_error_without_a_trace(tmp_path, run):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_contradiction_that_is_not_fatal_is_told(make_scene, root, run):
+def test_a_contradiction_that_is_not_fatal_is_reported(make_scene, root, run):
     make_scene("train/Uniform/Downtown_West/scene_000000")
 
     result = run(root)

@@ -80,7 +80,7 @@ def test_a_snapshot_of_the_hubs_cache_is_passed_on(small_release, tmp_path):
     assert pack(snapshot, tmp_path / "out", workers=1).index is not None
 
 
-def test_a_circle_of_links_is_told_and_not_followed(tree, tmp_path):
+def test_a_circle_of_links_is_reported_and_not_followed(tree, tmp_path):
     text = tree / SCENE / DESCRIPTION_TXT
     index = SceneIndex.open(tree)
     text.unlink()

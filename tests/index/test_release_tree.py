@@ -80,12 +80,12 @@ def test_a_dot_in_a_folders_name_is_listed(tree):
 @pytest.mark.parametrize(
     "below", ["train", "train/Uniform", "eval/MapSeenInTrain", KEYS[0], KEYS[3]]
 )
-def test_a_root_inside_the_release_is_told_the_right_one(tree, below):
+def test_a_root_inside_the_release_is_reported_the_right_one(tree, below):
     with pytest.raises(StorageError, match=f"holds no scene; .* Point at {tree} instead"):
         find_scene_folders(tree / below)
 
 
-def test_a_root_above_the_release_is_told_the_right_one(tree):
+def test_a_root_above_the_release_is_reported_the_right_one(tree):
     with pytest.raises(StorageError, match=f"Point at {tree} instead"):
         find_scene_folders(tree.parent)
 
@@ -100,7 +100,7 @@ def test_a_folder_without_scenes_says_what_was_looked_for(tmp_path):
         find_scene_folders(tmp_path)
 
 
-def test_scenes_of_no_release_are_told_with_an_example(tmp_path):
+def test_scenes_of_no_release_are_reported_with_an_example(tmp_path):
     add(tmp_path, "mine/scene_000000")
 
     with pytest.raises(StorageError, match="found 1 elsewhere, such as mine/scene_000000: "):

@@ -63,7 +63,7 @@ def test_any_common_number_of_frames_is_recorded(make_scene, root):
     assert describe_scene(root, KEY).frames == 7
 
 
-def test_the_share_of_measured_depth_is_known_where_it_is_asked_for(make_scene, root):
+def test_the_share_of_measured_depth_is_known_where_it_is_requested(make_scene, root):
     make_scene()
 
     scene = describe_scene(root, KEY, valid_depth="sample")
@@ -151,7 +151,9 @@ def test_where_no_size_is_recorded_the_rig_is_for_the_videos(make_scene, root, r
     assert (rig.image_width_px, rig.image_height_px) == (32, 24)
 
 
-def test_a_baseline_that_the_poses_contradict_is_told_with_both_numbers(make_scene, root, rewrite):
+def test_a_baseline_that_the_poses_contradict_is_reported_with_both_numbers(
+    make_scene, root, rewrite
+):
     def widen(document):
         document["pairwise_pairs"][7]["baseline_cm"] = 51.0
 

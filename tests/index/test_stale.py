@@ -20,7 +20,7 @@ from stereogenbench_data.schema.release import COMPLETE_JSON
 from stereogenbench_data.selection.filters import filter_scenes, find_scene
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.unpack import unpack
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 MAP = "train/Uniform/SynthStage"

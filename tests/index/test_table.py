@@ -364,8 +364,7 @@ def test_an_index_elsewhere_opens_once_the_user_says_where_its_data_are(scenes, 
 
     with pytest.raises(
         StorageError,
-        match=rf"{kept}: .*root as {tmp_path}/data.*\(it is outside the index's own folder\).* "
-        rf"SceneIndex.open\('{kept}', root=...\), or --root",
+        match=rf"{kept}: .*{tmp_path}/data.* SceneIndex.open\('{kept}', root=...\), or --root",
     ):
         SceneIndex.open(kept)
     for root in (tmp_path / "data", str(tmp_path / "data"), (tmp_path / "data").as_uri()):
@@ -600,11 +599,11 @@ def test_broken_scenes_of_a_tree_are_an_error_that_lists_them(make_scene, root):
 def test_a_tree_of_unfinished_scenes_is_an_error(make_scene, root):
     (make_scene() / "_scene_complete.json").unlink()
 
-    with pytest.raises(StorageError, match="no scene is finished: 1 scene cannot be used"):
+    with pytest.raises(StorageError, match="no scene is complete: 1 scene cannot be used"):
         SceneIndex.open(root)
 
 
-def test_what_was_left_out_is_told_when_the_index_is_opened(scenes, tmp_path):
+def test_what_was_left_out_is_reported_when_the_index_is_opened(scenes, tmp_path):
     index = SceneIndex.from_scenes(scenes, tmp_path)
     index.incomplete = {"train/a/b/c": "is empty"}
     index.broken = {"train/a/b/d": "has no baseline.json"}

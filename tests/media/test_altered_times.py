@@ -95,7 +95,7 @@ def test_no_flipped_bit_of_a_depth_videos_times_brings_another_frame(depth):
     assert wrong == []
 
 
-def test_an_altered_time_is_told_with_frame_and_ticks(depth):
+def test_an_altered_time_is_reported_with_frame_and_ticks(depth):
     block = matroska_times(depth)[-1]
 
     with (

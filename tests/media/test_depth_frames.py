@@ -172,7 +172,7 @@ def opened_clip():
 
 
 @pytest.mark.parametrize("index", [0, 2, 5])
-def test_a_flipped_byte_of_a_frame_is_told_with_its_number_and_others_are_read(packed, index):
+def test_a_flipped_byte_of_a_frame_is_reported_with_its_number_and_others_are_read(packed, index):
     with opened(packed) as depth:
         place = packed.index(depth.chunk(index))
     content = bytearray(packed)
@@ -268,7 +268,7 @@ def test_a_chunk_shorter_than_its_header_is_refused():
         require_chunk(b"abc", clip=opened_clip(), crc32=zlib.crc32(b"abc"), name="frame 3")
 
 
-def test_a_chunk_that_does_not_decompress_is_told(packed, monkeypatch):
+def test_a_chunk_that_does_not_decompress_is_reported(packed, monkeypatch):
     with opened(packed) as depth:
         whole = depth.chunk(4)
     monkeypatch.setattr(depth_frames, "require_chunk", lambda chunk, **how: None)

@@ -108,16 +108,15 @@ def test_a_stream_that_may_have_lost_depth_is_refused_by_name(clips, case):
 
     with (
         VideoReader(path, name="a/cam_01_depth.mkv", frames=3) as reader,
-        pytest.raises(MediaError) as refusal,
+        pytest.raises(
+            MediaError, match=r"a/cam_01_depth\.mkv: .*Store it as gray16le with FFV1"
+        ) as refusal,
     ):
         read_depth_units(reader, 0, encoding=DepthEncoding(unit_m=0.5))
 
-    assert str(refusal.value) == (
-        f"a/cam_01_depth.mkv: depth is stored by codec {stored} ({', '.join(risks)}), which does "
-        f"not keep depth whole. Store it as gray16le with FFV1; if this is intended, pass "
-        f"DepthEncoding(accept=frozenset({{{accept}}})), with unit_m=... if the file does not tell "
-        f"its unit."
-    )
+    message = str(refusal.value)
+    assert f"codec {stored} ({', '.join(risks)})" in message
+    assert f"DepthEncoding(accept=frozenset({{{accept}}}))" in message
 
 
 @pytest.mark.parametrize("case", REFUSED)

@@ -21,7 +21,7 @@ def depth_clip(clips):
     )  # fmt: skip
 
 
-def test_an_mp4_is_told_by_its_header(clips):
+def test_an_mp4_is_reported_by_its_header(clips):
     facts = probe(clips.rgb("groups of 12.mp4", *GROUPS_OF_12), name="clip")
 
     assert (facts.codec, facts.pixel_format, facts.width_px, facts.height_px) == (
@@ -30,7 +30,7 @@ def test_an_mp4_is_told_by_its_header(clips):
     assert (facts.frames, facts.frame_rate_hz) == (48, 15.0)
 
 
-def test_a_matroska_file_is_told_by_its_header_and_its_tags(depth_clip):
+def test_a_matroska_file_is_reported_by_its_header_and_its_tags(depth_clip):
     facts = probe(depth_clip, name="clip")
 
     assert (facts.codec, facts.pixel_format, facts.frames) == ("ffv1", "gray16le", 48)
@@ -133,7 +133,7 @@ def test_an_mp4_without_its_header_is_named_as_cut(clips):
         probe(path, name="clip")
 
 
-def test_the_pixel_format_may_wait_and_all_else_is_told(clips):
+def test_the_pixel_format_may_wait_and_all_else_is_reported(clips):
     path = clips.rgb("groups of 12.mp4", *GROUPS_OF_12)
 
     asked, waiting = (probe(path, name="clip", pixel_format=when) for when in ("needed", "later"))

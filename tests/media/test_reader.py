@@ -75,7 +75,7 @@ def test_opening_decodes_no_picture(clip):
         assert container.streams.video[0].codec_context.pix_fmt is None
 
 
-def test_facts_can_be_asked_for_between_two_frames_of_an_open_file(clips, clip):
+def test_facts_can_be_requested_between_two_frames_of_an_open_file(clips, clip):
     file = io.BytesIO(clip.read_bytes())
 
     with VideoReader(file, name="clip", frames=clips.frames) as reader:

@@ -134,7 +134,7 @@ def test_scaling_by_whole_factors_averages_areas(texture):
     assert difference.std() < 0.7
 
 
-def test_the_stored_size_asked_for_is_no_scaling(texture):
+def test_the_stored_size_requested_is_no_scaling(texture):
     path, stored = texture
 
     with VideoReader(path, name="clip", frames=1) as reader:

@@ -17,7 +17,7 @@ from stereogenbench_data.schema.records import (
     Trajectory,
 )
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
 GAP_CM = 20.0
@@ -55,7 +55,7 @@ def facts(encoding, *, residual_px=0.0, order=1.0, yaw_deg=(0.0,) * 6):
     return SceneFacts(scene, dict.fromkeys(range(6), encoding), poses, "url", (0,))
 
 
-def geometry(units, encoding, *, source=0, target=1, world="as filmed", padded=None, **scene):
+def geometry(units, encoding, *, source=0, target=1, world="as recorded", padded=None, **scene):
     units = np.asarray(units, dtype=np.uint16)[None]
     stored = StoredDepth(units, units > 0)
     views = Views(

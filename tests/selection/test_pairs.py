@@ -24,7 +24,7 @@ def test_the_primary_pair_is_the_one_that_each_scene_records(index):
 
 
 @pytest.mark.parametrize(("pairs", "each"), [("adjacent", 5), ("all", 15), ([(0, 5), (1, 3)], 2)])
-def test_every_scene_gives_as_many_pairs_as_asked(index, pairs, each):
+def test_every_scene_gives_as_many_pairs_as_requested(index, pairs, each):
     assert len(chosen(index, pairs=pairs)) == each * len(index)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.shards.pack import pack
-from tests.servers.fault import FaultServer, serving
+from tests.servers.failing_server import FailingServer, serving
 from tests.servers.hub import hub_serving
 from tests.servers.nginx import Nginx, nginx_serving
 from tests.servers.tools import require_module, require_tool
@@ -69,7 +69,7 @@ def large_shards(large_release: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture
-def web(tmp_path: Path) -> Iterator[FaultServer]:
+def web(tmp_path: Path) -> Iterator[FailingServer]:
     """A web server that serves ``tmp_path / "web"``, counts, and fails as it is told."""
     folder = tmp_path / "web"
     folder.mkdir()
@@ -86,7 +86,7 @@ def nginx(tmp_path: Path, small_shards: Path) -> Iterator[Nginx]:
 
 
 @pytest.fixture
-def hub(small_shards: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultServer]:
+def hub(small_shards: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FailingServer]:
     """A Hub whose data set is `small_shards`."""
     with hub_serving(small_shards, monkeypatch) as server:
         yield server

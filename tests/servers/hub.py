@@ -17,7 +17,7 @@ from urllib.parse import unquote, urlsplit
 import fsspec
 import pytest
 
-from tests.servers.fault import FaultServer, FileHandler, serving
+from tests.servers.failing_server import FailingServer, FileHandler, serving
 from tests.servers.tools import require_module
 
 REPOSITORY: Final = "some-group/some-data"
@@ -115,7 +115,7 @@ class HubHandler(FileHandler):
 
 
 @contextmanager
-def hub_serving(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultServer]:
+def hub_serving(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FailingServer]:
     """Serve a folder as the data set of a Hub, to which the file system of ``hf://`` is pointed."""
     require_module("huggingface_hub")
     with serving(folder, handler=HubHandler) as server:

@@ -13,10 +13,9 @@ from typer.testing import CliRunner
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.shards import download as download_module
 from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
-from tests.servers.fault import Answer
+from tests.servers.failing_server import Answer
 
 
 @pytest.fixture
@@ -96,7 +95,8 @@ def test_a_damaged_file_is_refused_and_leaves_nothing_behind(shards_on_the_web, 
 def test_a_full_disk_is_reported_before_anything_is_fetched(
     shards_on_the_web, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(download_module, "_SPARE_BYTES", 10**18)
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=0))
 
     with pytest.raises(StorageError, match=r"part: needs \d+ bytes, and the disk has \d+ left"):
         fetched(shards_on_the_web, tmp_path / "part")

@@ -7,7 +7,7 @@ import pytest
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member
-from stereogenbench_data.shards.plan import MEMBER_ORDER, parse_size, plan_shards
+from stereogenbench_data.shards.plan import MEMBER_ORDER, parse_bytes, plan_shards
 
 
 @pytest.fixture(scope="module")
@@ -156,10 +156,10 @@ def test_a_target_of_nothing_is_refused(index_of):
      ("1TB", 10**12)],
 )  # fmt: skip
 def test_a_size_is_read_as_it_is_written(text, size):
-    assert parse_size(text) == size
+    assert parse_bytes(text) == size
 
 
 @pytest.mark.parametrize("text", ["", "GB", "-2GB", "2 parsecs", "0", "0.1", "1e9", "2GBB"])
 def test_what_is_no_size_is_refused(text):
     with pytest.raises(ShardError, match=f"{text!r} is not a size: write one such as 500MB"):
-        parse_size(text)
+        parse_bytes(text)

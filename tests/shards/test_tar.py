@@ -317,7 +317,7 @@ def test_ten_gigabytes_are_not_believed_in_binary():
     refused(header + END_OF_ARCHIVE, "'a.mp4'", "not an octal number")
 
 
-def test_checksums_are_of_the_whole_and_of_the_parts_asked_for():
+def test_checksums_are_of_the_whole_and_of_the_parts_requested():
     content = tar_of(TWO)
     seen = []
 

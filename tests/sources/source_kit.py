@@ -117,7 +117,7 @@ class SourceTests:
     def test_a_metadata_file_is_read_whole(self, make_source, scene, released):
         assert make_source().read(scene, BASELINE_JSON) == released(BASELINE_JSON)
 
-    def test_a_range_and_the_size_of_a_file_are_those_asked_for(self, root, scene, released):
+    def test_a_range_and_the_size_of_a_file_are_those_requested(self, root, scene, released):
         member, url = scene.members[VIDEO], joined(str(root), scene.members[VIDEO].path)
 
         assert read_range(url, member.offset + 5, member.offset + 25) == released(VIDEO)[5:25]

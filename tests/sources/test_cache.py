@@ -18,7 +18,7 @@ from stereogenbench_data.schema.records import Member
 from stereogenbench_data.sources import cache as cache_module
 from stereogenbench_data.sources.cache import FOLDER_NAME, ShardCache, require_limit
 from stereogenbench_data.sources.remote import RemoteObject
-from tests.servers.fault import Answer
+from tests.servers.failing_server import Answer
 from tests.servers.tools import small_disk
 
 DATA = bytes(number * 7 % 256 for number in range(100_000))
@@ -246,7 +246,7 @@ def test_a_folder_of_that_name_that_is_no_cache_is_refused(tmp_path):
         ShardCache(tmp_path, limit_bytes=1)
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+def test_a_folder_that_cannot_be_made_is_reported(tmp_path):
     (tmp_path / "file").touch()
 
     with pytest.raises(
@@ -278,7 +278,7 @@ def test_a_folder_of_shards_is_refused_and_left_as_it_is(tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_full_disk_is_told_and_leaves_nothing(cache, shard, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_leaves_nothing(cache, shard, tmp_path, monkeypatch):
     def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -18,7 +18,7 @@ from stereogenbench_data.schema.records import Member, ShardFacts
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.sources.location import is_remote, joined, local_path, shown, split_name
 from stereogenbench_data.sources.members import MemberSource, member_path, open_local
-from tests.servers.fault import Answer
+from tests.servers.failing_server import Answer
 
 TEXT = b"12345"
 
@@ -68,7 +68,7 @@ def test_a_member_of_a_shard_is_an_open_file_of_its_bytes(root, in_shard):
     assert source.url(scene, "b.json") == f"{root}/x.tar"
 
 
-def test_a_member_whose_checksum_differs_is_told(root, in_shard):
+def test_a_member_whose_checksum_differs_is_reported(root, in_shard):
     scene, shards = in_shard
     (root / "x.tar").write_bytes(b"before12344behind")
 
@@ -246,7 +246,7 @@ def test_every_error_is_made_of_one_text_that_shows_no_login():
      "http://u:PW@h..h/x"],
 )  # fmt: skip
 def test_a_url_that_is_none_is_named_without_its_login(url):
-    with pytest.raises(StorageError, match=r"not a URL: correct it") as caught:
+    with pytest.raises(StorageError, match=r"not a valid URL: correct it") as caught:
         SceneIndex.open(url)
     assert "PW" not in str(caught.value)
 
@@ -284,7 +284,7 @@ for opens in (lambda: pairs[len(pairs) - 1], lambda: StereoPairs(sys.argv[1])):
 
 
 @pytest.mark.parametrize("kind", ["tree", "shards", "packed depth"])
-def test_too_many_open_files_are_told_as_such(kind, small_release, tmp_path):
+def test_too_many_open_files_are_reported_as_such(kind, small_release, tmp_path):
     data = small_release
     if kind == "tree":
         data = shutil.copytree(small_release, tmp_path / "tree")

@@ -135,7 +135,7 @@ def test_what_is_kept_is_bounded():
     assert store.asked[-1] == (0, FIRST_BLOCK)
 
 
-def test_a_failure_is_told_again_without_being_fetched_again():
+def test_a_failure_is_reported_again_without_being_fetched_again():
     """FFmpeg may take an error for the end of the file."""
     tries = []
 

@@ -1,5 +1,6 @@
 """Bytes from a server that fails: had all the same, each once, or an error that says why not."""
 
+import re
 import threading
 
 import pytest
@@ -9,7 +10,7 @@ from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources import http as web_transport
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy, TransientError
-from tests.servers.fault import Answer, serving
+from tests.servers.failing_server import Answer, serving
 from tests.servers.raw import raw_serving
 from tests.sources.source_kit import read_range, size_of
 
@@ -41,7 +42,7 @@ def ranges(server):
     return [(asked.start, asked.stop) for asked in server.asked]
 
 
-def test_a_range_is_asked_for_alone(served):
+def test_a_range_is_requested_alone(served):
     assert read_range(f"{served.url}/x.tar", 1000, 3000) == DATA[1000:3000]
     assert ranges(served) == [(1000, 3000)]
     assert served.sent == 2000
@@ -112,7 +113,7 @@ def test_silence_is_retried(served, clock):
     assert len(clock.waits_s) == 1
 
 
-def test_a_server_that_is_not_there_is_told_after_some_tries(served, clock):
+def test_a_server_that_is_not_there_is_reported_after_some_tries(served, clock):
     remote = RemoteObject("http://127.0.0.1:1/x.tar", retry=clock.policy(attempts=3))
 
     with pytest.raises(StorageError, match=r"Connection refused.*; 3 tries\)"):
@@ -129,7 +130,7 @@ def test_a_server_that_is_not_there_is_told_after_some_tries(served, clock):
         (400, "Check the URL and the server"),
     ],
 )
-def test_what_will_not_pass_is_told_at_once(served, clock, status, cure):
+def test_what_will_not_pass_is_reported_at_once(served, clock, status, cure):
     served.always["x.tar"] = Answer(status=status)
     remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
 
@@ -149,7 +150,7 @@ def test_a_server_that_ignores_ranges_is_refused_before_it_has_sent_all(served):
         read_range(f"{served.url}/x.tar", 5, 9)
 
 
-def test_the_whole_may_be_sent_where_the_whole_is_asked_for(served):
+def test_the_whole_may_be_sent_where_the_whole_is_requested(served):
     served.always["x.tar"] = Answer(whole=True)
 
     assert size_of(f"{served.url}/x.tar") == len(DATA)
@@ -164,26 +165,26 @@ def test_the_whole_may_be_sent_where_the_whole_is_asked_for(served):
         ("pages 5-8/256000", r"does not state which part it sends \(Content-Range: 'pages 5-8/256"),
     ],
 )
-def test_another_part_than_the_one_asked_for_is_refused(served, told, message):
+def test_another_part_than_the_one_requested_is_refused(served, told, message):
     served.always["x.tar"] = Answer(content_range=told)
 
     with pytest.raises(StorageError, match=message):
         read_range(f"{served.url}/x.tar", 5, 9)
 
 
-def test_a_file_that_ends_before_the_range_is_told(served):
-    with pytest.raises(StorageError, match=r"x.tar: has 256000 bytes, and byte 256009 is asked"):
+def test_a_file_that_ends_before_the_range_is_reported(served):
+    with pytest.raises(StorageError, match=r"x.tar: .* 256000 bytes.* 256009 .*use the index"):
         read_range(f"{served.url}/x.tar", 256_000, 256_010)
 
 
-def test_a_size_that_is_not_told_is_an_error(served):
+def test_a_size_that_is_not_stated_is_an_error(served):
     served.always["x.tar"] = Answer(content_range="bytes 0-0/*")
 
     with pytest.raises(StorageError, match="its server does not state its size"):
         size_of(f"{served.url}/x.tar")
 
 
-def test_a_file_of_another_size_than_the_index_says_is_told_before_it_is_read(served):
+def test_a_file_of_another_size_than_the_index_says_is_reported_before_it_is_read(served):
     remote = RemoteObject(f"{served.url}/x.tar", expected_size=255_999)
 
     with pytest.raises(
@@ -209,7 +210,7 @@ def test_redirects_are_followed(served):
     assert read_range(f"{served.url}/old/x.tar", 5, 9) == DATA[5:9]
 
 
-def test_redirects_in_a_circle_are_told(served):
+def test_redirects_in_a_circle_are_reported(served):
     served.always["x.tar"] = Answer(status=302, headers={"Location": f"{served.url}/x.tar"})
 
     with pytest.raises(StorageError, match=r"x.tar: is redirected more than 5 times"):
@@ -222,14 +223,13 @@ def test_a_login_in_the_url_is_sent_and_never_shown(served):
 
     assert served.asked[0].headers["authorization"] == "Basic bWU6cGFzcyB3b3Jk"
     served.always["x.tar"] = Answer(status=404)
-    with pytest.raises(StorageError) as caught:
+    with pytest.raises(StorageError, match=re.escape(f"{served.url}/x.tar: ") + ".* 404"):
         read_range(f"{url}/x.tar?key=secret", 0, 9)
-    assert f"{served.url}/x.tar: the server answers 404" in str(caught.value)
 
 
 def test_a_query_is_neither_shown_nor_chained(clock):
     remote = RemoteObject("http://127.0.0.1:1/x.tar?key=secret", retry=clock.policy(attempts=1))
-    with pytest.raises(StorageError) as caught:
+    with pytest.raises(StorageError, match=r"http://127\.0\.0\.1:1/x\.tar: .*try again") as caught:
         remote.read(0, 9)
 
     error: BaseException | None = caught.value
@@ -238,8 +238,8 @@ def test_a_query_is_neither_shown_nor_chained(clock):
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
 
 
-def test_a_url_that_is_none_is_told(clock):
-    with pytest.raises(StorageError, match="not a URL: correct it"):
+def test_a_url_that_is_none_is_reported(clock):
+    with pytest.raises(StorageError, match="not a valid URL: correct it"):
         RemoteObject("http://a:b:c/x", retry=clock.policy()).read(0, 9)
 
 
@@ -290,7 +290,7 @@ MONDAY, TUESDAY = "Mon, 02 Feb 2026 07:28:00 GMT", "Tue, 03 Feb 2026 07:28:00 GM
         ),
     ],
 )
-def test_a_file_that_is_replaced_between_two_ranges_is_told(
+def test_a_file_that_is_replaced_between_two_ranges_is_reported(
     served, before, after, message, honours_if_range
 ):
     served.validators, served.honours_if_range = before, honours_if_range
@@ -306,7 +306,7 @@ def test_a_file_that_is_replaced_between_two_ranges_is_told(
             remote.read(9, 18)
 
 
-def test_a_file_that_is_replaced_within_one_read_is_told(served, clock):
+def test_a_file_that_is_replaced_within_one_read_is_reported(served, clock):
     served.validators = {"ETag": '"a"'}
     served.answers = [Answer(stop_after=30_000)]
     remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
@@ -318,7 +318,7 @@ def test_a_file_that_is_replaced_within_one_read_is_told(served, clock):
         list(chunks)
 
 
-def test_a_file_of_another_size_is_told_as_replaced_without_any_validator(served):
+def test_a_file_of_another_size_is_reported_as_replaced_without_any_validator(served):
     remote = RemoteObject(f"{served.url}/x.tar")
     remote.read(0, 9)
     (served.folder / "x.tar").write_bytes(DATA[:-1])
@@ -337,7 +337,7 @@ def test_a_file_of_another_size_is_told_as_replaced_without_any_validator(served
         ({}, None),
     ],
 )
-def test_later_ranges_are_asked_for_on_condition(served, validators, condition):
+def test_later_ranges_are_requested_on_condition(served, validators, condition):
     served.validators = validators
     remote = RemoteObject(f"{served.url}/x.tar")
 
@@ -477,6 +477,14 @@ def test_a_retry_policy_without_an_end_is_refused(name, value):
 
 
 @pytest.mark.parametrize(
+    "name", ["longest_retry_after_s", "longest_wait_s", "first_wait_s", "least_rate_bytes_s"]
+)
+def test_a_retry_policy_with_a_negative_limit_is_refused(name):
+    with pytest.raises(StorageError, match=rf"RetryPolicy: {name} must be 0 or more, got -1"):
+        RetryPolicy(**{name: -1})
+
+
+@pytest.mark.parametrize(
     "told", ["\u00b2", "9" * 5000, "Fri, 21 Oct 99999 07:28:00 GMT", ",", "-1"]
 )
 def test_a_retry_after_that_is_none_is_no_error_of_its_own(clock, told):
@@ -529,7 +537,7 @@ def test_a_content_range_that_is_none_is_named(told, status):
         ("file:///etc/passwd", "redirects to 'file:///etc/passwd', which is not a URL"),
         ("ftp://me:word@h/x", "redirects to 'ftp://h/x', which is not a URL of a web server"),
         ("http://h:99999/", "redirects to 'http://h:99999/', which is not a URL of a web server"),
-        ("http://a..b/", "is redirected to http://a..b/, which is not a URL"),
+        ("http://a..b/", "is redirected to http://a..b/, which is not a valid URL"),
     ],
 )
 def test_a_redirect_to_no_place_is_named(served, location, message):

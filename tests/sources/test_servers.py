@@ -14,7 +14,7 @@ from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
-from tests.servers.fault import Answer
+from tests.servers.failing_server import Answer
 from tests.servers.fixtures import BUCKET
 from tests.servers.hub import COMMIT, REPOSITORY, HubHandler
 from tests.servers.tools import require_module
@@ -30,7 +30,7 @@ def same_index(root, folder):
     return index.root == root and index.digest == SceneIndex.open(folder).digest
 
 
-def test_nginx_sends_the_range_asked_for(nginx, small_shards):
+def test_nginx_sends_the_range_requested(nginx, small_shards):
     shard = shard_of(small_shards)
     url = f"{nginx.url}/{shard.name}"
 
@@ -47,7 +47,7 @@ def test_nginx_redirects(nginx, small_shards):
     assert nginx.statuses(requests=2) == [302, 206]
 
 
-def test_what_nginx_refuses_is_told(nginx, small_shards):
+def test_what_nginx_refuses_is_reported(nginx, small_shards):
     size = shard_of(small_shards).stat().st_size
     with pytest.raises(StorageError, match=r"none.tar: the server answers 404 Not Found. Check"):
         read_range(f"{nginx.url}/none.tar", 0, 9)
@@ -64,7 +64,7 @@ def test_an_index_behind_a_url_may_be_named_itself(nginx, small_shards):
     assert index.digest == SceneIndex.open(small_shards).digest
 
 
-def test_the_hub_sends_the_range_asked_for(hub, small_shards):
+def test_the_hub_sends_the_range_requested(hub, small_shards):
     shard = shard_of(small_shards)
     for revision in ("", "@main", f"@{COMMIT}"):
         root = f"hf://datasets/{REPOSITORY}{revision}"
@@ -84,12 +84,12 @@ def test_the_hub_sends_the_range_asked_for(hub, small_shards):
         "hf://datasets/nobody/nothing/x.tar",
     ],
 )
-def test_what_the_hub_does_not_have_is_told_at_once(hub, url):
+def test_what_the_hub_does_not_have_is_reported_at_once(hub, url):
     with pytest.raises(StorageError, match=rf"{url}: does not exist, or is private. Check the URL"):
         read_range(url, 0, 9)
 
 
-def test_a_private_data_set_is_told_without_the_token(hub, small_shards, monkeypatch):
+def test_a_private_data_set_is_reported_without_the_token(hub, small_shards, monkeypatch):
     conf = fsspec.config.conf["hf"] | {"token": "hf_expired"}
     monkeypatch.setitem(fsspec.config.conf, "hf", conf)
     url = f"hf://datasets/{REPOSITORY}/{shard_of(small_shards).name}"
@@ -99,7 +99,7 @@ def test_a_private_data_set_is_told_without_the_token(hub, small_shards, monkeyp
     assert "expired" not in str(caught.value)
 
 
-def test_a_hub_that_is_busy_is_asked_again_by_its_own_client(hub, small_shards):
+def test_a_hub_that_is_busy_is_requested_again_by_its_own_client(hub, small_shards):
     shard = shard_of(small_shards)
     url = f"hf://datasets/{REPOSITORY}/{shard.name}"
     hub.answers = [Answer(status=503)]
@@ -116,14 +116,14 @@ def test_a_hub_that_sends_too_much_is_refused(hub, small_shards):
         read_range(url, 0, 9)
 
 
-def test_what_s3_does_not_have_is_told_at_once(s3):
+def test_what_s3_does_not_have_is_reported_at_once(s3):
     with pytest.raises(StorageError, match=rf"{s3}/none.tar: does not exist, or is private"):
         read_range(f"{s3}/none.tar", 0, 9)
     with pytest.raises(StorageError, match=r"s3://no-bucket/x.tar: does not exist, or is private"):
         size_of("s3://no-bucket/x.tar")
 
 
-def test_s3_without_a_login_is_told_at_once(s3, monkeypatch):
+def test_s3_without_a_login_is_reported_at_once(s3, monkeypatch):
     conf = {"endpoint_url": fsspec.config.conf["s3"]["endpoint_url"]}
     monkeypatch.setitem(fsspec.config.conf, "s3", conf)
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_PROFILE"):
@@ -132,11 +132,11 @@ def test_s3_without_a_login_is_told_at_once(s3, monkeypatch):
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", os.devnull)
     monkeypatch.setenv("AWS_CONFIG_FILE", os.devnull)
 
-    with pytest.raises(StorageError, match=r"may not be read \(NoCredentialsError\). Log in to"):
+    with pytest.raises(StorageError, match=r"permission denied \(NoCredentialsError\). Log in to"):
         read_range(f"{s3}/x.tar", 0, 9)
 
 
-def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_told(s3):
+def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_reported(s3):
     boto = require_module("boto3")
     store = boto.client(
         "s3", endpoint_url=fsspec.config.conf["s3"]["endpoint_url"], region_name="us-east-1",
@@ -186,7 +186,7 @@ def test_a_file_system_that_does_not_come_back_is_left(monkeypatch):
     files.rm("/shard.tar")
 
 
-def test_a_file_that_a_file_system_tells_otherwise_is_told_as_replaced(monkeypatch):
+def test_a_file_that_a_file_system_tells_otherwise_is_reported_as_replaced(monkeypatch):
     files = fsspec.filesystem("memory")
     files.pipe_file("/shard.tar", b"0123456789")
     tags = iter("aab")
@@ -208,7 +208,7 @@ def test_a_file_that_a_file_system_tells_otherwise_is_told_as_replaced(monkeypat
     files.rm("/shard.tar")
 
 
-def test_a_file_system_that_fails_is_asked_again(monkeypatch):
+def test_a_file_system_that_fails_is_requested_again(monkeypatch):
     waits_s: list[float] = []
     files = fsspec.filesystem("memory")
     files.pipe_file("/shard.tar", b"0123456789")
@@ -229,7 +229,7 @@ def test_a_file_system_that_fails_is_asked_again(monkeypatch):
     files.rm("/shard.tar")
 
 
-def test_a_url_that_no_file_system_opens_is_told():
+def test_a_url_that_no_file_system_opens_is_reported():
     with pytest.raises(StorageError, match=r"nope://a/b: not a URL that fsspec can open. Correct"):
         read_range("nope://a/b", 0, 9)
 

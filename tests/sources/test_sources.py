@@ -5,7 +5,7 @@ import pytest
 
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.cache import ShardCache
-from tests.servers.fault import Answer, serving
+from tests.servers.failing_server import Answer, serving
 from tests.servers.hub import COMMIT, REPOSITORY
 from tests.sources.source_kit import BASELINE_JSON, SourceTests, read_range
 
@@ -39,7 +39,7 @@ class TestHttp(SourceTests):
     def root(self, server):
         return server.url
 
-    def test_no_byte_is_sent_but_those_asked_for(self, server, index, make_source, scene):
+    def test_no_byte_is_sent_but_those_requested(self, server, index, make_source, scene):
         member = scene.members[BASELINE_JSON]
         make_source().read(scene, BASELINE_JSON)
 

@@ -6,7 +6,7 @@ import av
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
 UNIT_M = 0.001

@@ -7,8 +7,9 @@ import os
 import pytest
 
 from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.synthesis import SynthRequest, synthesise
 from stereogenbench_data.synthesis.camera_writer import VideoWriter
+from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
 
 SMALL = {"size_px": 32, "frames": 2, "seed": 9}
 

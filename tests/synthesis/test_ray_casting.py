@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis import SynthRequest
 from stereogenbench_data.synthesis.plan import plan_scene
 from stereogenbench_data.synthesis.ray_casting import GROUND, SKY, View, first_hits, pixel_rays
 from stereogenbench_data.synthesis.render import (
@@ -12,6 +11,7 @@ from stereogenbench_data.synthesis.render import (
     render_frame,
     static_light,
 )
+from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.scene import Material, Shape
 
 LEVEL = np.zeros(2)

@@ -73,7 +73,10 @@ def parse_choice(query: Mapping[str, list[str]]) -> Choice:
     unknown = [name for name in bins if name not in BASELINE_BINS]
     pairs: Any = query.get("pairs", ["all"])[0]
     if unknown or pairs not in get_args(PairKind):
-        raise SelectionError(f"there is no choice {(unknown or [pairs])[0]!r}.")
+        known = BASELINE_BINS if unknown else get_args(PairKind)
+        raise SelectionError(
+            f"there is no choice {(unknown or [pairs])[0]!r}: choose among {', '.join(known)}."
+        )
     return Choice(
         texts=texts,
         focal_mm=_range(query, "focal"),

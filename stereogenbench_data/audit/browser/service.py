@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.audit.browser.catalogue import Catalogue, parse_choice
-from stereogenbench_data.audit.scene_pictures import HIDDEN
-from stereogenbench_data.audit.scene_reader import SceneReader
+from stereogenbench_data.audit.pictures.scene_pictures import HIDDEN
+from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED
 

@@ -2,7 +2,7 @@
 
 A match of two pictures is judged twice, by the depth of either camera. In correct data both explain
 as many matches; wrong depth of one camera explains fewer, or differs in scale from the other. A
-fault of a picture (its rows do not align, it shows another moment) appears in all pairs of its
+problem of a picture (its rows do not align, it shows another moment) appears in all pairs of its
 camera, by either depth.
 
 The reference is the largest group of cameras that agree with one another, if it is the majority.
@@ -20,7 +20,7 @@ from stereogenbench_data.audit.contract.fitting import voted_scale
 from stereogenbench_data.audit.contract.hypotheses import Hypothesis, Question
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames, match_rows
 from stereogenbench_data.audit.contract.scoring import Pair, ScoredContract, sample_along_rows
-from stereogenbench_data.audit.picture_check import Luma
+from stereogenbench_data.audit.geometry.picture_check import Luma
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 LEAST_SHARE: Final = 0.5
@@ -76,11 +76,11 @@ class CameraCheck:
 
     Attributes:
         cameras: Figures of all six cameras; empty if no pair has enough matches.
-        faults: What is wrong with single cameras, in words; each names its camera.
+        problems: What is wrong with single cameras, in words; each names its camera.
     """
 
     cameras: tuple[CameraFigures, ...] = ()
-    faults: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
 
     @property
     def agreement(self) -> float:
@@ -153,14 +153,14 @@ class CameraComparison:
         self._pairs = {pair: beside for pair, beside in found.items() if beside is not None}
 
     def check(self) -> CameraCheck:
-        """Return every camera's figures and faults."""
+        """Return every camera's figures and problems."""
         if not self._pairs:
             return CameraCheck()
-        scales, scale_faults = self._scales()
-        rows_px, row_faults = self._shifts(
+        scales, scale_problems = self._scales()
+        rows_px, row_problems = self._shifts(
             {p: b.row_px for p, b in self._pairs.items()}, MOST_ROWS_PX, ("lower", "higher")
         )
-        columns_px, column_faults = self._shifts(
+        columns_px, column_problems = self._shifts(
             {p: b.column_px for p, b in self._pairs.items()},
             MOST_COLUMNS_PX,
             ("to the right", "to the left"),
@@ -172,11 +172,13 @@ class CameraComparison:
             explained = sum(beside.count * beside.near[camera] for beside in nearest)
             share = explained / count if count else math.nan
             figures.append(CameraFigures(camera, count, share, *shifts))
-        faults = dict(column_faults)
-        for camera in sorted({*row_faults, *self._behind()}):
-            faults[camera] = self._picture_fault(camera, rows_px[camera], row_faults.get(camera))
-        faults |= self._depth_faults(scales, scale_faults, beside=set(faults))
-        found = [faults[camera] for camera in sorted(faults)] or self._width_faults()
+        problems = dict(column_problems)
+        for camera in sorted({*row_problems, *self._behind()}):
+            problems[camera] = self._picture_problem(
+                camera, rows_px[camera], row_problems.get(camera)
+            )
+        problems |= self._depth_problems(scales, scale_problems, beside=set(problems))
+        found = [problems[camera] for camera in sorted(problems)] or self._width_problems()
         return CameraCheck(tuple(figures), tuple(found))
 
     def _beside(self, pair: Pair, both: Sequence[tuple[FrameMatch, FrameMatch]]) -> _Beside | None:
@@ -274,7 +276,7 @@ class CameraComparison:
             if len(deficits) >= _NARROWEST and min(deficits) > _LEAST_DEFICIT:
                 yield camera
 
-    def _picture_fault(self, camera: int, row_px: float, row_fault: str | None) -> str:
+    def _picture_problem(self, camera: int, row_px: float, row_problem: str | None) -> str:
         """Return what is wrong with a camera's pictures, by the reading that fits best."""
         behind = set(self._behind()) - {camera}
         own = self._of(camera)
@@ -288,7 +290,7 @@ class CameraComparison:
         readings = [
             (self._share([(middle, turned(as_it_is))]), words) for words, turned in _TURNED.items()
         ]
-        if row_fault is not None:
+        if row_problem is not None:
             rows = int(np.rint(row_px)) or int(np.sign(row_px))
             readings.append((self._share([(middle, np.roll(as_it_is, -rows, axis=0))]), ""))
         for lag in range(-_FARTHEST_FRAMES, _FARTHEST_FRAMES + 1):
@@ -299,7 +301,7 @@ class CameraComparison:
                 readings.append((share, _lateness(lag)))
         share, words = max(readings, default=(0.0, ""))
         elsewhere = self._share_elsewhere(matches)
-        # With small disparities another place also explains a fault of rows.
+        # With small disparities another place also explains a problem of rows.
         if elsewhere > share + _LEAST_DEFICIT:
             share, words = elsewhere, _ELSEWHERE
         wanted = max(
@@ -307,14 +309,14 @@ class CameraComparison:
             default=1.0,
         )
         if share < max(0.7 * wanted, now + _LEAST_DEFICIT / 2):
-            found = f", perhaps {row_fault.split(' are ')[1]}" if row_fault else ""
+            found = f", perhaps {row_problem.split(' are ')[1]}" if row_problem else ""
             return (
                 f"pictures of camera {camera} do not fit those of the others, by the depth of "
                 f"either: other rows, another moment or another place{found}"
             )
         if words == _ELSEWHERE:
             return f"camera {camera} {words}"
-        return f"pictures of camera {camera} are {words}" if words else row_fault or ""
+        return f"pictures of camera {camera} are {words}" if words else row_problem or ""
 
     def _share_elsewhere(self, matches: Sequence[FrameMatch]) -> float:
         """Return the share of matches that depth explains if the cameras stand elsewhere."""
@@ -352,11 +354,11 @@ class CameraComparison:
             count += len(found.rows)
         return near / count if count else 0.0
 
-    def _depth_faults(
-        self, scales: Sequence[float], scale_faults: dict[int, str], *, beside: set[int]
+    def _depth_problems(
+        self, scales: Sequence[float], scale_problems: dict[int, str], *, beside: set[int]
     ) -> dict[int, str]:
         """Return cameras whose depth explains too little, and what would explain more."""
-        faults = {}
+        problems = {}
         offsets_px = self._contract.offsets_px
         for camera in sorted(set(range(CAMERA_COUNT)) - beside):
             pairs = self._of(camera)
@@ -367,7 +369,7 @@ class CameraComparison:
                 continue
             own = [
                 each for each in pairs
-                if not (set(each.pair) - {camera}) & (beside | set(scale_faults))
+                if not (set(each.pair) - {camera}) & (beside | set(scale_problems))
             ] or pairs  # fmt: skip
             behind = [
                 each.near[camera] - next(n for c, n in each.near.items() if c != camera)
@@ -375,15 +377,15 @@ class CameraComparison:
             ]
             better = self._better_depth(camera, scale=scales[camera])
             if better:
-                faults[camera] = better
-            elif camera in scale_faults:
-                faults[camera] = scale_faults[camera]
+                problems[camera] = better
+            elif camera in scale_problems:
+                problems[camera] = scale_problems[camera]
             elif float(np.median(behind)) < -_LEAST_ASYMMETRY:
-                faults[camera] = (
+                problems[camera] = (
                     f"depth of camera {camera} explains {own[0].near[camera]:.0%} of the matches "
                     f"of which that of its neighbour explains {own[0].share:.0%}"
                 )
-        return faults
+        return problems
 
     def _better_depth(self, camera: int, *, scale: float) -> str:
         """Return, in words, another reading of a camera's depth that explains clearly more."""
@@ -482,7 +484,7 @@ class CameraComparison:
                 shares[place] = float((np.abs(away) < allowed).mean()) if known.any() else np.nan
         return shares
 
-    def _width_faults(self) -> list[str]:
+    def _width_problems(self) -> list[str]:
         """Return which pairs disagree with the others on their width, and their common camera."""
         wide = {
             pair: beside for pair, beside in self._pairs.items()

@@ -449,10 +449,13 @@ def _checked(
     """
     check = search.cameras(best, depth_step=depth_step)
     plain = search.simplest()
-    if not (check.faults or check.unexplained) or best is plain:
+    if not (check.problems or check.unexplained) or best is plain:
         return best, check
     other = search.cameras(plain, depth_step=depth_step)
-    if len(other.faults) <= max(len(check.faults), 2) and not other.agreement < check.agreement / 2:
+    if (
+        len(other.problems) <= max(len(check.problems), 2)
+        and not other.agreement < check.agreement / 2
+    ):
         return plain, other
     return best, check
 
@@ -495,14 +498,15 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         return SceneDiagnosis(**basics, best=declared, problem=problem)
     search = Search(views, matches, least_log_scale=allowed_log_scale(step))
     best, check = _checked(search, search.best(), depth_step=step)
-    share_told = agreement(views, matches, best.score)
+    share_explained = agreement(views, matches, best.score)
     parallax = search.without_parallax(best)
-    if math.isnan(share_told) or not parallax.is_clear():
+    if math.isnan(share_explained) or not parallax.is_clear():
         problem = (
             "no depth: none of the pixels that were found in both pictures has any"
-            if math.isnan(share_told)
+            if math.isnan(share_explained)
             else f"nothing fits: of disparities of {basics['disparity_px']:.1f} px the best "
-            f"contract explains {share_told:.0%} to a pixel, and pictures no better than none does"
+            f"contract explains {share_explained:.0%} to a pixel, and pictures no better than none "
+            f"does"
         )
         return SceneDiagnosis(**basics, best=declared, parallax=parallax, problem=problem)
     (other_kind,) = best.hypothesis.alternatives("kind")

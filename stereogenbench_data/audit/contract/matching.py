@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16
 from numpy.lib.stride_tricks import sliding_window_view
 
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Flip, Hypothesis
-from stereogenbench_data.audit.picture_check import Luma, luma_of
+from stereogenbench_data.audit.geometry.picture_check import Luma, luma_of
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.samples.streams import Streams

@@ -13,7 +13,7 @@ from stereogenbench_data.audit.contract.doctor import DiagnosisTask, DoctorRepor
 from stereogenbench_data.audit.contract.hypotheses import Hypothesis
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
 from stereogenbench_data.audit.contract.scoring import score_hypothesis
-from stereogenbench_data.audit.drawing import figure_class
+from stereogenbench_data.audit.pictures.drawing import figure_class
 from stereogenbench_data.audit.scene_access import SceneAccess
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
@@ -58,7 +58,7 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     diagnosis = max(
         report.scenes,
         key=lambda each: (
-            not each.problem, bool(each.check.faults), each.gain.mean_db, each.matches
+            not each.problem, bool(each.check.problems), each.gain.mean_db, each.matches
         ),
     )  # fmt: skip
     (row,) = filter_scenes(index, {"scenes": diagnosis.key})
@@ -81,8 +81,8 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
 def _title(diagnosis: SceneDiagnosis) -> str:
     if diagnosis.problem:
         return f"cannot tell ({diagnosis.problem})"
-    if diagnosis.check.faults:
-        return "; ".join(diagnosis.check.faults)
+    if diagnosis.check.problems:
+        return "; ".join(diagnosis.check.problems)
     changes = [
         f"{question} {getattr(diagnosis.best, question)}"
         for question in diagnosis.best.changes_from(diagnosis.declared)

@@ -19,7 +19,7 @@ from stereogenbench_data.audit.contract.matching import (
     Points,
     SceneFrames,
 )
-from stereogenbench_data.audit.picture_check import Luma
+from stereogenbench_data.audit.geometry.picture_check import Luma
 
 LEAST_DB: Final = 0.15
 """Smaller mean differences, which interpolation and codecs cause, are not believed."""

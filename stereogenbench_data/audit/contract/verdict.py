@@ -73,14 +73,14 @@ class Answer:
     is_sure: bool = False
 
 
-def has_camera_faults(scenes: Sequence[SceneDiagnosis]) -> bool:
+def has_camera_problems(scenes: Sequence[SceneDiagnosis]) -> bool:
     """Tell whether some camera of some scene does not fit, so that no contract is reported."""
-    return any(scene.check.faults or scene.check.unexplained for scene in scenes)
+    return any(scene.check.problems or scene.check.unexplained for scene in scenes)
 
 
 def _no_answer(scenes: Sequence[SceneDiagnosis], topic: str, declared: str) -> Answer:
     """Return the answer "cannot tell", with a note if no question can be answered."""
-    note = scenes[0].problem or (CAMERAS_DIFFER if has_camera_faults(scenes) else "")
+    note = scenes[0].problem or (CAMERAS_DIFFER if has_camera_problems(scenes) else "")
     return Answer(topic, declared, "", "cannot tell", note=note)
 
 
@@ -426,7 +426,7 @@ class Verdict:
         quotient: Unit / (focal length x baseline) over the declared one; nan if not known.
         quotient_error: Half its 95 % interval, as a share.
         choices: The lengths that would explain that quotient, each by itself, in words.
-        faults: What is wrong with single cameras, in words.
+        problems: What is wrong with single cameras, in words.
         tested_cameras: Cameras whose depth was tested in every scene.
         untested_cameras: Cameras whose depth was not tested in some scene.
         unexplained_cameras: Cameras whose depth explains less than half of their matches in some
@@ -444,7 +444,7 @@ class Verdict:
     quotient: float
     quotient_error: float
     choices: tuple[str, ...]
-    faults: tuple[str, ...]
+    problems: tuple[str, ...]
     tested_cameras: tuple[int, ...]
     untested_cameras: tuple[int, ...]
     unexplained_cameras: tuple[int, ...]
@@ -465,10 +465,10 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     hypothesis = [_question_answer(scenes, question) for question in QUESTIONS]
     quotient, *lengths = _length_answers(scenes, unit)
     answers = (quotient, *lengths, *hypothesis, _offset_answer(scenes))
-    faults = tuple(
-        f"{scene.key}: {fault}" if len(scenes) > 1 else fault
+    problems = tuple(
+        f"{scene.key}: {problem}" if len(scenes) > 1 else problem
         for scene in scenes
-        for fault in scene.check.faults
+        for problem in scene.check.problems
     )
     untested = {camera for scene in scenes for camera in scene.check.untested}
     unexplained = {camera for scene in scenes for camera in scene.check.unexplained}
@@ -476,18 +476,18 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     explains = not (first.problem or unexplained) and all(
         scene.check.agreement >= LEAST_SHARE for scene in scenes
     )
-    is_told = bool(quotient.found)
+    is_measured = bool(quotient.found)
     pasted = _pasted(first, declared, unit_m=declared.unit_m)
     is_sure = (
         bool(wrong)
         and explains
-        and not (faults or untested)
+        and not (problems or untested)
         and all(answer.is_sure for answer in wrong)
         and quotient.status == "confirmed"
         and pasted != declared
     )
     choices: tuple[str, ...] = ()
-    if is_told and quotient.status != "confirmed" and explains and not faults:
+    if is_measured and quotient.status != "confirmed" and explains and not problems:
         with_unit = _pasted(first, declared, unit_m=unit.rounded_m)
         choices = _length_choices(scenes, unit, encoding_line(with_unit))
     return Verdict(
@@ -498,16 +498,16 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
         if not first.problem
         else math.nan,
         encoding=pasted if is_sure else None,
-        quotient=unit.metres / first.unit_m if is_told else math.nan,
-        quotient_error=unit.uncertainty if is_told else math.nan,
+        quotient=unit.metres / first.unit_m if is_measured else math.nan,
+        quotient_error=unit.uncertainty if is_measured else math.nan,
         choices=choices,
-        faults=faults,
+        problems=problems,
         tested_cameras=tuple(c for c in range(CAMERA_COUNT) if c not in untested),
         untested_cameras=tuple(sorted(untested)),
         unexplained_cameras=tuple(sorted(unexplained)),
         beside=tuple(_beside(scenes, answers)),
-        is_wrong=bool(wrong or faults),
-        fits=explains and not (wrong or faults or untested)
+        is_wrong=bool(wrong or problems),
+        fits=explains and not (wrong or problems or untested)
         and all(answer.status != "cannot tell" for answer in (quotient, *hypothesis)),
     )  # fmt: skip
 
@@ -557,7 +557,7 @@ def _beside(scenes: Sequence[SceneDiagnosis], answers: Sequence[Answer]) -> list
     if _kind_explains_scale(scenes):
         (other,) = first.best.alternatives("kind")
         lines.append(f"Fits alike: depth along {describe(other.kind)}, the unit as declared.")
-    if has_camera_faults(scenes):
+    if has_camera_problems(scenes):
         return lines
     for equal in dict.fromkeys(first.equals):
         lines.append(f"Fits alike: {_contract_words(*equal, declared=first.declared)}.")
@@ -606,8 +606,8 @@ def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
     """Tell whether a scene may have the contract of another."""
     if scene.declared != leader.declared:
         return False
-    if has_camera_faults([scene, leader]):
-        # Faults of single cameras are the scene's own.
+    if has_camera_problems([scene, leader]):
+        # Problems of single cameras are the scene's own.
         return False
     error = allowed_log_scale(max(scene.depth_step, leader.depth_step))
     error += LEAST_ERRORS * min(scene.scale_error, 1.0)

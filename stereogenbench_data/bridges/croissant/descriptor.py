@@ -14,7 +14,7 @@ from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
 
-from stereogenbench_data.bridges import about
+from stereogenbench_data.bridges import dataset_facts
 from stereogenbench_data.bridges.croissant.folders import folder_nodes
 from stereogenbench_data.bridges.croissant.nodes import CONTEXT, CROISSANT, RAI, Node
 from stereogenbench_data.bridges.croissant.shards import packed_nodes, write_tables
@@ -39,8 +39,8 @@ class Publication:
             of the descriptor, or for paths relative to the descriptor.
     """
 
-    name: str = about.TITLE
-    version: str = about.VERSION
+    name: str = dataset_facts.TITLE
+    version: str = dataset_facts.VERSION
     published: date | None = None
     data_url: str | None = None
     tables_url: str | None = None
@@ -84,7 +84,7 @@ def write_descriptor(
             tables_url=publication.tables_url or beside,
         )
     else:
-        data_url = publication.data_url or about.HOME
+        data_url = publication.data_url or dataset_facts.HOME
         files, records = folder_nodes(index, repository_url=data_url)
     descriptor = _head(publication, url=data_url) | {"distribution": files, "recordSet": records}
     try:
@@ -112,25 +112,25 @@ def _relative(root: str, *, to: Path) -> str:
 def _head(publication: Publication, *, url: str) -> Node:
     """Return the properties of the dataset as a whole."""
     published = publication.published or datetime.now(UTC).date()
-    organisation = {"@type": "sc:Organization", "name": about.AFFILIATION}
+    organisation = {"@type": "sc:Organization", "name": dataset_facts.AFFILIATION}
     return {
         "@context": CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": [CROISSANT, RAI],
         "name": publication.name,
-        "description": about.DESCRIPTION,
-        "url": url if "://" in url else about.HOME,
-        "license": about.DATA_LICENCE,
-        "usageInfo": about.LICENCE_NOTE,
+        "description": dataset_facts.DESCRIPTION,
+        "url": url if "://" in url else dataset_facts.HOME,
+        "license": dataset_facts.DATA_LICENCE,
+        "usageInfo": dataset_facts.LICENCE_NOTE,
         "version": publication.version,
         "datePublished": published.isoformat(),
-        "citeAs": about.CITATION,
-        "keywords": list(about.KEYWORDS),
+        "citeAs": dataset_facts.CITATION,
+        "keywords": list(dataset_facts.KEYWORDS),
         "creator": [
             {"@type": "sc:Person", "name": author, "affiliation": organisation}
-            for author in about.AUTHORS
+            for author in dataset_facts.AUTHORS
         ],
         "inLanguage": "en",
-        **about.RESPONSIBLE_USE,
-        **about.PROVENANCE,
+        **dataset_facts.RESPONSIBLE_USE,
+        **dataset_facts.PROVENANCE,
     }

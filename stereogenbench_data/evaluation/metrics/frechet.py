@@ -45,7 +45,9 @@ class FeatureStatistics:
             EvaluationError: If they are not a table of finite numbers.
         """
         if features.ndim != 2:
-            raise EvaluationError(f"features must be of shape (n, dim), got {features.shape}.")
+            raise EvaluationError(
+                f"features must be of shape (n, dim), got {features.shape}: pass one row a sample."
+            )
         samples = features.astype(np.float64)
         if not np.isfinite(samples).all():
             bad = np.flatnonzero(~np.isfinite(samples).all(axis=1))

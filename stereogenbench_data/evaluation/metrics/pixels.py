@@ -212,7 +212,8 @@ def outside_window(disparity_px: Float[np.ndarray, "h w"], valid: Bool[np.ndarra
     """
     if disparity_px.shape != valid.shape:
         raise EvaluationError(
-            f"disparity is of shape {disparity_px.shape}, but its valid map of {valid.shape}."
+            f"disparity is of shape {disparity_px.shape}, but its valid map of {valid.shape}: pass "
+            f"maps of one size."
         )
     known = disparity_px[valid]
     if len(known) == 0:

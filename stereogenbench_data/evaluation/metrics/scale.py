@@ -107,7 +107,7 @@ def fit_scale(
     require_fit(method)
     if not estimated_px.shape == true_px.shape == scored.shape:
         raise EvaluationError(
-            "estimated disparity, true disparity and where to score must be of one size, "
+            "estimated disparity, true disparity and where to score must have the same size, "
             f"got {estimated_px.shape}, {true_px.shape} and {scored.shape}."
         )
     answered = np.flatnonzero(scored & np.isfinite(estimated_px) & np.isfinite(true_px))

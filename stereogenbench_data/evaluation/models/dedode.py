@@ -15,6 +15,7 @@ from stereogenbench_data.errors import ExtraError
 from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
 from stereogenbench_data.evaluation.models.interfaces import (
     Keypoints,
+    NamedModel,
     Picture,
     Settings,
     require_pictures,
@@ -38,7 +39,7 @@ DESCRIPTOR: Final = Weights(
 )
 
 
-class DeDoDeMatcher:
+class DeDoDeMatcher(NamedModel):
     """DeDoDe keypoints, matched as mutual nearest neighbours; a `KeypointMatcher`."""
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:

@@ -14,7 +14,12 @@ import torch
 from jaxtyping import Float32
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
-from stereogenbench_data.evaluation.models.interfaces import Picture, Settings, require_pictures
+from stereogenbench_data.evaluation.models.interfaces import (
+    NamedModel,
+    Picture,
+    Settings,
+    require_pictures,
+)
 from stereogenbench_data.evaluation.models.weights import (
     Weights,
     fingerprint,
@@ -36,7 +41,7 @@ _ITERATIONS: Final = 32
 _SIDE_MULTIPLE: Final = 32
 
 
-class FoundationStereoMatcher:
+class FoundationStereoMatcher(NamedModel):
     """FoundationStereo's disparity at the pictures' own size; a `StereoMatcher`."""
 
     def __init__(

@@ -12,7 +12,12 @@ from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.evaluation.models.interfaces import Clips, Settings, require_clips
+from stereogenbench_data.evaluation.models.interfaces import (
+    Clips,
+    NamedModel,
+    Settings,
+    require_clips,
+)
 from stereogenbench_data.evaluation.models.weights import Weights, load_weights
 
 I3D: Final = Weights(
@@ -27,7 +32,7 @@ _CLASSES: Final = 400
 Size = tuple[int, int, int]
 
 
-class I3dFeatures:
+class I3dFeatures(NamedModel):
     """FVD's features of clips; `VideoFeatures`."""
 
     name = "I3D (Kinetics-400)"

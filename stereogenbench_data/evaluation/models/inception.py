@@ -20,7 +20,12 @@ from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings, require_batch
+from stereogenbench_data.evaluation.models.interfaces import (
+    NamedModel,
+    Pictures,
+    Settings,
+    require_batch,
+)
 from stereogenbench_data.evaluation.models.weights import Weights, load_weights
 
 INCEPTION: Final = Weights(
@@ -36,7 +41,7 @@ _CLASSES: Final = 1008
 _BATCH: Final = 8
 
 
-class InceptionFeatures:
+class InceptionFeatures(NamedModel):
     """FID's features of pictures; `ImageFeatures`."""
 
     name = "Inception-v3 (TensorFlow, 2015-12-05)"

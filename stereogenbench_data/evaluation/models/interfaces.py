@@ -43,6 +43,16 @@ class Model(Protocol):
         """Every choice that its answers depend on, so that scores of other choices differ."""
 
 
+class NamedModel:
+    """The base of this package's models: it only gives them a repr."""
+
+    name: str
+
+    def __repr__(self) -> str:
+        """Return the class and what tables call the model."""
+        return f"<{type(self).__name__}: {self.name}>"
+
+
 @runtime_checkable
 class KeypointMatcher(Model, Protocol):
     """Finds keypoints in one picture, and the same keypoints in another."""

@@ -16,7 +16,12 @@ from torch import nn
 from torch.nn import functional
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
-from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings, require_batch
+from stereogenbench_data.evaluation.models.interfaces import (
+    NamedModel,
+    Pictures,
+    Settings,
+    require_batch,
+)
 from stereogenbench_data.evaluation.models.weights import (
     Weights,
     fingerprint,
@@ -39,7 +44,7 @@ _CHANNELS: Final = (64, 192, 384, 256, 256)
 _BATCH: Final = 8
 
 
-class Lpips:
+class Lpips(NamedModel):
     """LPIPS of pictures against their targets; a `PairMetric`."""
 
     name = "LPIPS"
@@ -91,7 +96,8 @@ class Lpips:
         require_batch(target)
         if predicted.shape != target.shape:
             raise EvaluationError(
-                f"LPIPS compares pictures one by one: {predicted.shape} against {target.shape}."
+                f"LPIPS compares pictures one by one: {predicted.shape} against {target.shape}. "
+                f"Pass as many predicted pictures as targets, of one size."
             )
         scores = np.empty(len(predicted))
         with torch.inference_mode():

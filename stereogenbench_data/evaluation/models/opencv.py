@@ -10,6 +10,7 @@ from stereogenbench_data.errors import EvaluationError, ExtraError
 from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
 from stereogenbench_data.evaluation.models.interfaces import (
     Keypoints,
+    NamedModel,
     Picture,
     Settings,
     require_pictures,
@@ -33,7 +34,7 @@ def require_opencv() -> ModuleType:
     return cv2
 
 
-class Sift:
+class Sift(NamedModel):
     """SIFT keypoints of the luma, described upright, as rectified views are not turned.
 
     Points that SIFT finds in several orientations are kept once, and of all points those with the
@@ -98,7 +99,7 @@ _LEAST_PX: Final = -16
 _BLOCK_PX: Final = 5
 
 
-class Sgbm:
+class Sgbm(NamedModel):
     """Semi-global matching with left-right check, disparities from -16 up to 175 px.
 
     The negative ones distinguish a view that is shifted the wrong way, or not at all, from one that

@@ -12,6 +12,7 @@ from jaxtyping import Float64
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.models.interfaces import (
     Clips,
+    NamedModel,
     Picture,
     Pictures,
     Settings,
@@ -26,7 +27,7 @@ _EDGES: Final = 3 * 2 * len(_STEPS_PX)
 _LEAST_SIDE_PX: Final = 8
 
 
-class ColourStatistics:
+class ColourStatistics(NamedModel):
     """Mean colours of a grid of tiles, and mean differences of near pixels; `ImageFeatures`."""
 
     name = "colour statistics (stand-in)"
@@ -48,7 +49,7 @@ class ColourStatistics:
         return np.array(features, dtype=np.float64).reshape(len(pictures), _TILES + _EDGES)
 
 
-class MotionStatistics:
+class MotionStatistics(NamedModel):
     """Colour statistics, mean over a clip, and mean changes from frame to frame of its tiles.
 
     They are `VideoFeatures`.

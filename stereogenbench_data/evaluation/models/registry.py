@@ -56,7 +56,7 @@ MODELS: Final[dict[ModelKind, dict[str, str]]] = {
 
 
 def load_model(kind: ModelKind, name: str, options: ModelOptions | None = None) -> Any:
-    """Return a model of a kind, with the members that `interfaces` says.
+    """Return a model of a kind, as defined in `interfaces`.
 
     Raises:
         EvaluationError: If there is none of this name, or its weights are damaged.

@@ -10,7 +10,7 @@ import av
 import numpy as np
 from PIL import Image
 
-from stereogenbench_data.audit.drawing import (
+from stereogenbench_data.audit.pictures.drawing import (
     FAINT,
     FRAME,
     GREY,
@@ -24,7 +24,7 @@ from stereogenbench_data.audit.drawing import (
     scale_of,
     scale_rows,
 )
-from stereogenbench_data.audit.scene_reader import SceneReader
+from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from stereogenbench_data.engine import Progress, advance_of
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
@@ -98,7 +98,7 @@ def scene_sheet(
     views = reader.views(row, frame=frame)
     width = tile_width(scene, tile_px)
     rows = [_view_tiles(scene, views, pair), _pair_tiles(scene, sample)]
-    return _laid_out(_title(scene, sample, pair=pair, frame=frame), rows, width_px=width)
+    return _contact_sheet(_title(scene, sample, pair=pair, frame=frame), rows, width_px=width)
 
 
 def _text_sizes(width_px: int) -> tuple[int, int]:
@@ -107,7 +107,7 @@ def _text_sizes(width_px: int) -> tuple[int, int]:
     return font_px, line_height(font_px)
 
 
-def _laid_out(title: list[str], rows: list[list[_Tile]], *, width_px: int) -> Picture:
+def _contact_sheet(title: list[str], rows: list[list[_Tile]], *, width_px: int) -> Picture:
     gap, line = _text_sizes(width_px)
     shape = rows[0][0].picture.shape
     height_px = max(1, round(shape[0] * width_px / shape[1]))

@@ -22,7 +22,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from stereogenbench_data.audit.audit_records import QUANTILES, PairAudit, ToleranceAudit
+from stereogenbench_data.audit.geometry.records import QUANTILES, PairAudit, ToleranceAudit
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.projection import Projection
 from stereogenbench_data.geometry.visibility import visible_from_source

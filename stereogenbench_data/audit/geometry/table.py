@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from stereogenbench_data.audit.alignment import CERTAIN
-from stereogenbench_data.audit.audit_records import (
+from stereogenbench_data.audit.geometry.alignment import CERTAIN
+from stereogenbench_data.audit.geometry.records import (
     QUANTILES,
     QUANTITIES,
     AuditLimits,
@@ -20,9 +20,9 @@ from stereogenbench_data.audit.audit_records import (
     ToleranceAudit,
     Untested,
 )
-from stereogenbench_data.audit.paper_figures import AUDIT, AUDIT_TABLE, FRAMES_A_SCENE
-from stereogenbench_data.audit.reprojection import TOLERANCES
-from stereogenbench_data.audit.scene_audit import LONG_PAIR
+from stereogenbench_data.audit.geometry.reprojection import TOLERANCES
+from stereogenbench_data.audit.geometry.scene_audit import LONG_PAIR
+from stereogenbench_data.audit.paper_numbers import AUDIT, AUDIT_TABLE, FRAMES_A_SCENE
 from stereogenbench_data.schema.release import ADJACENT_PAIRS
 from stereogenbench_data.schema.text import counted, markdown_text
 

@@ -5,8 +5,9 @@ from collections.abc import Iterator
 from statistics import median
 from typing import Final
 
-from stereogenbench_data.audit.alignment import CERTAIN
-from stereogenbench_data.audit.audit_records import (
+from stereogenbench_data.audit.geometry.alignment import CERTAIN
+from stereogenbench_data.audit.geometry.picture_check import ENOUGH_LEVELS
+from stereogenbench_data.audit.geometry.records import (
     QUANTITIES,
     AuditLimits,
     CameraAudit,
@@ -16,7 +17,6 @@ from stereogenbench_data.audit.audit_records import (
     SceneAudit,
     Untested,
 )
-from stereogenbench_data.audit.picture_check import ENOUGH_LEVELS
 from stereogenbench_data.schema.release import ADJACENT_PAIRS, CAMERA_COUNT, depth_name, rgb_name
 
 

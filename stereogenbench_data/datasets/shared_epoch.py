@@ -58,7 +58,7 @@ class SharedEpoch:
         return int(self._own[1]), int(self._followed[1])
 
     def set(self, epoch: int) -> None:
-        """Go to an epoch because the user says so.
+        """Go to an epoch at the user's request.
 
         Raises:
             SelectionError: If it is not a whole number from 0.

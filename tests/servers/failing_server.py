@@ -42,7 +42,7 @@ class Answer:
     change: Callable[[bytes], bytes] | None = None
 
 
-class FaultServer(ThreadingHTTPServer):
+class FailingServer(ThreadingHTTPServer):
     """Serves ``folder``; ``answers`` are used up in order, one a request, then all goes well.
 
     ``always`` is used for every request whose path it is given for. ``validators`` are sent with
@@ -99,7 +99,7 @@ class FileHandler(BaseHTTPRequestHandler):
     """Answers with files of the server's folder."""
 
     protocol_version = "HTTP/1.1"
-    server: FaultServer
+    server: FailingServer
 
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing."""
@@ -162,9 +162,9 @@ class FileHandler(BaseHTTPRequestHandler):
 
 
 @contextmanager
-def serving(folder: Path, *, handler: type[FileHandler] | None = None) -> Iterator[FaultServer]:
+def serving(folder: Path, *, handler: type[FileHandler] | None = None) -> Iterator[FailingServer]:
     """Serve a folder on a free port of this machine."""
-    server = FaultServer(folder, handler=handler)
+    server = FailingServer(folder, handler=handler)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
     thread.start()
     try:

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from stereogenbench_data.audit.audit_records import RigAudit
+from stereogenbench_data.audit.geometry.records import RigAudit
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses, rotation_angle_rad
 from stereogenbench_data.geometry.rig import rectification_residual_px

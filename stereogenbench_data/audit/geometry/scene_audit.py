@@ -11,9 +11,8 @@ from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 
-from stereogenbench_data.audit.alignment import AlignmentCheck, band
-from stereogenbench_data.audit.audit_records import At, CameraAudit, RigAudit, SceneAudit
-from stereogenbench_data.audit.picture_check import (
+from stereogenbench_data.audit.geometry.alignment import AlignmentCheck, band
+from stereogenbench_data.audit.geometry.picture_check import (
     MOVED_SHARE,
     LightCheck,
     PayloadCheck,
@@ -21,7 +20,8 @@ from stereogenbench_data.audit.picture_check import (
     reduced_size,
     subject_m,
 )
-from stereogenbench_data.audit.reprojection import (
+from stereogenbench_data.audit.geometry.records import At, CameraAudit, RigAudit, SceneAudit
+from stereogenbench_data.audit.geometry.reprojection import (
     FEWER_PIXELS,
     MOST_PIXELS,
     MeasuredDepth,
@@ -29,7 +29,7 @@ from stereogenbench_data.audit.reprojection import (
     pair_audit,
     reproject,
 )
-from stereogenbench_data.audit.rig_check import motion_px, rig_audit
+from stereogenbench_data.audit.geometry.rig_check import motion_px, rig_audit
 from stereogenbench_data.audit.scene_access import SceneAccess
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError

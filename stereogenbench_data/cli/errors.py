@@ -11,7 +11,7 @@ from typing import Final, TextIO
 
 import typer
 
-from stereogenbench_data.cli.stopping import STOPPED
+from stereogenbench_data.cli.signals import STOPPED
 from stereogenbench_data.errors import StereoGenBenchError, describe_os_error
 from stereogenbench_data.schema.text import plain_line
 

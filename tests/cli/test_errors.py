@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from stereogenbench_data.cli.outcome import ErrorsReported
+from stereogenbench_data.cli.errors import ErrorsReported
 from stereogenbench_data.errors import ExtraError, SelectionError
 from tests.cli.command import COMMAND, invoke, run
 

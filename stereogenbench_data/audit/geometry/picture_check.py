@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 
-from stereogenbench_data.audit.audit_records import At
+from stereogenbench_data.audit.geometry.records import At
 
 NEAR_SHARE: Final = 0.3
 """An occluder is nearer than this share of the distance of the subject, see `subject_m`."""

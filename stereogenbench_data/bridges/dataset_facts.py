@@ -66,11 +66,11 @@ RESPONSIBLE_USE: Final[dict[str, str | list[str] | bool]] = {
     "rai:dataLimitations": [
         "Synthetic: results are no evidence of performance on real pictures without a separate "
         "study of how the two relate.",
-        "The checks passed tell that no failure was detected; they certify neither that all views "
+        "Passed checks mean only that no failure was detected; they certify neither that all views "
         "are free of artefacts, nor exact physics of motion, nor unambiguous depth of all "
         "materials.",
-        "How stored depth numbers become metres is told by a scale tag, else 0.1 m a unit: measure "
-        "it against the pictures before relying on it.",
+        "How stored depth numbers become metres is given by a scale tag, else 0.1 m a unit: "
+        "measure it against the pictures before relying on it.",
     ],
     "rai:dataBiases": [
         "A finite pool of Unreal maps (some stylised), 15 characters and 30 animations; lighting "

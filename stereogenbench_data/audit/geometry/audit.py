@@ -11,20 +11,21 @@ from typing import Any, Final, Unpack
 import numpy as np
 from jaxtyping import Int64
 
-from stereogenbench_data.audit.audit_records import (
+from stereogenbench_data.audit.geometry.findings import broken_finding, findings_of, untested_of
+from stereogenbench_data.audit.geometry.records import (
     AuditLimits,
     AuditReport,
     SceneAudit,
     plain,
     revived,
 )
-from stereogenbench_data.audit.audit_table import table_rows
-from stereogenbench_data.audit.findings import broken_finding, findings_of, untested_of
+from stereogenbench_data.audit.geometry.scene_audit import AuditTask, audit_scene, spread_frames
+from stereogenbench_data.audit.geometry.table import table_rows
 from stereogenbench_data.audit.scene_access import SceneAccess
-from stereogenbench_data.audit.scene_audit import AuditTask, audit_scene, spread_frames
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
-from stereogenbench_data.index.build import Journal, walk
+from stereogenbench_data.index.build import walk
+from stereogenbench_data.index.journal import Journal
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
@@ -185,7 +186,7 @@ def audit(
     ):
         found[each.key] = each
         if journal is not None:
-            journal.note(each.key, plain(asdict(each)), stamp=stamps[each.key])
+            journal.record(each.key, plain(asdict(each)), stamp=stamps[each.key])
     audited = [found[scene.id.key] for scene in scenes]
     findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
     for scene in audited:

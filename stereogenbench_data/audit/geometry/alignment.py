@@ -25,9 +25,9 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float, Float64
 
-from stereogenbench_data.audit.audit_records import Alignment, Estimate, PairFit
-from stereogenbench_data.audit.picture_check import luma_of
-from stereogenbench_data.audit.reprojection import MeasuredDepth
+from stereogenbench_data.audit.geometry.picture_check import luma_of
+from stereogenbench_data.audit.geometry.records import Alignment, Estimate, PairFit
+from stereogenbench_data.audit.geometry.reprojection import MeasuredDepth
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.schema.release import CAMERA_COUNT

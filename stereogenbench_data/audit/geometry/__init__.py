@@ -1,0 +1,1 @@
+"""The audit of geometry and pictures, scene by scene, against the paper's."""

@@ -1,0 +1,1 @@
+"""Pictures of scenes: read, drawn, written as sheets and clips."""
