@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
+from stereogenbench_data.cli.errors import resumable
 from stereogenbench_data.cli.evaluate import parse_pairs, parse_picture_size
 from stereogenbench_data.cli.options import (
     DataOptions,
@@ -19,7 +20,6 @@ from stereogenbench_data.cli.options import (
     depth_of,
     grouped,
 )
-from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from stereogenbench_data.bridges.matching import (
     RaftStereo,
     UniMatch,
 )
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 ADAPTERS = [
