@@ -206,9 +206,7 @@ def compared(codec: Codec, pictures: Pictures, *, rounds: int) -> dict[str, Any]
         "material": pictures.name,
         "bytes_a_frame": sum(map(len, files[0])) / count,
         "released_bytes": pictures.released_bytes,
-        "ms": cpu_ms(
-            lambda: decoded(codec, files[0], frames=every, count=count), rounds=rounds
-        )
+        "ms": cpu_ms(lambda: decoded(codec, files[0], frames=every, count=count), rounds=rounds)
         / count,
         "random_ms": cpu_ms(
             lambda: [decoded(codec, files[0], frames=[frame], count=count) for frame in draw],
@@ -361,7 +359,12 @@ def _depth_ways(shape: tuple[int, ...]) -> dict[str, tuple[Write, Read]]:
     blosc2 = blosc2_module()
     ways: dict[str, tuple[Write, Read]] = {}
     for codec_name, level in (("LZ4", 5), ("LZ4", 9), ("ZSTD", 1), ("ZSTD", 5), ("ZSTD", 9)):
-        for filters in (["SHUFFLE"], ["BITSHUFFLE"], ["DELTA", "SHUFFLE"], ["SHUFFLE", "BYTEDELTA"]):
+        for filters in (
+            ["SHUFFLE"],
+            ["BITSHUFFLE"],
+            ["DELTA", "SHUFFLE"],
+            ["SHUFFLE", "BYTEDELTA"],
+        ):
             options = {
                 "codec": getattr(blosc2.Codec, codec_name),
                 "clevel": level,
@@ -387,8 +390,11 @@ def _depth_ways(shape: tuple[int, ...]) -> dict[str, tuple[Write, Read]]:
             lambda units, codec=codec: _grey_video(codec, units),
             _grey_frames,
         )
-    ways["PNG, 16 bits"] = _grey_png, lambda files: np.stack(
-        [np.asarray(Image.open(io.BytesIO(file))).astype(np.uint16) for file in files]
+    ways["PNG, 16 bits"] = (
+        _grey_png,
+        lambda files: np.stack(
+            [np.asarray(Image.open(io.BytesIO(file))).astype(np.uint16) for file in files]
+        ),
     )
     return ways
 
@@ -443,9 +449,7 @@ def main() -> None:
                 rows.append(compared(codec, pictures, rounds=options.rounds))
                 print(json.dumps(rows[-1]), flush=True)
     depth = [
-        row
-        for data in options.scenes
-        for row in depth_rows(data, size=size, rounds=options.rounds)
+        row for data in options.scenes for row in depth_rows(data, size=size, rounds=options.rounds)
     ]
     options.out.mkdir(parents=True, exist_ok=True)
     content = {"machine": machine(), "size": options.size, "pictures": rows, "depth": depth}

@@ -69,7 +69,10 @@ _OPTIONAL: Final = {
     "principal_x_px": pa.float64(),
     "principal_y_px": pa.float64(),
     "valid_depth_ratio": pa.float64(),
+    "key_frames": pa.list_(pa.field("item", pa.int32(), nullable=False)),
 }
+ADDED: Final = ("key_frames",)
+"""Columns that indexes of earlier versions lack: null means what these knew."""
 SCHEMA: Final = pa.schema(
     [pa.field(name, kind, nullable=False) for name, kind in _REQUIRED.items()]
     + [pa.field(name, kind) for name, kind in _OPTIONAL.items()]
@@ -115,6 +118,7 @@ def row_of(scene: Scene) -> dict[str, Any]:
         "depth_codec": list(scene.depth_codec),
         "depth_pixel_format": list(scene.depth_pixel_format),
         "valid_depth_ratio": scene.valid_depth_ratio,
+        "key_frames": None if scene.key_frames == (0,) else list(scene.key_frames),
         "members": [
             {"name": name, **asdict(member)} for name, member in sorted(scene.members.items())
         ],
@@ -156,6 +160,7 @@ def scene_of(row: Mapping[str, Any]) -> Scene:
         depth_codec=tuple(row["depth_codec"]),
         depth_pixel_format=tuple(row["depth_pixel_format"]),
         valid_depth_ratio=row["valid_depth_ratio"],
+        key_frames=tuple(row["key_frames"] or (0,)),
         members={
             item["name"]: Member(item["path"], item["offset"], item["size"], item["crc32"])
             for item in row["members"]

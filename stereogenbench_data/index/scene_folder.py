@@ -244,6 +244,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         depth_codec=tuple(facts[name].codec for name in depth_names),
         depth_pixel_format=tuple(facts[name].pixel_format for name in depth_names),
         valid_depth_ratio=ratio,
+        key_frames=_common_key_frames(facts, frames=frames),
         members={name: Member(f"{key}/{name}", 0, size) for name, (size, _) in files.items()},
     )
 
@@ -317,6 +318,13 @@ def _common_frames(key: str, facts: Mapping[str, StreamFacts], trajectory: Traje
     common = Counter(counts.values()).most_common(1)[0][0]
     _require_equal(key, counts, common, what="number of frames", unit="frames")
     return common
+
+
+def _common_key_frames(facts: Mapping[str, StreamFacts], *, frames: int) -> tuple[int, ...]:
+    """Return the frames at which all videos of pictures have a key frame."""
+    listed = [set(fact.key_frames) for name, fact in facts.items() if name.endswith(".mp4")]
+    common = set(range(frames)).intersection(*listed) if listed else set()
+    return tuple(sorted(common | {0}))
 
 
 def _require_equal(

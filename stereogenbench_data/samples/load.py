@@ -104,13 +104,13 @@ class SampleLoader:
         twin._decoder = self._decoder.copy()
         return twin
 
-    def keep_open(self, videos: int) -> None:
-        """Keep up to so many videos open, in this process and in copies of this loader."""
-        self._decoder.keep_open(videos)
+    def keep_open(self, videos: int, *, frames: int = 1) -> None:
+        """Keep up to so many videos open, and so many frames of each, as `SampleDecoder` does."""
+        self._decoder.keep_open(videos, frames=frames)
 
-    def release(self, row: int) -> None:
-        """Close the videos of a scene that has been read to its end."""
-        self._decoder.release(row)
+    def release(self, address: Address) -> None:
+        """Close the videos of a run that has been read to its end."""
+        self._decoder.release(address)
 
     def close(self) -> None:
         """Close the videos that are open in this process."""

@@ -22,7 +22,7 @@ keeps the same for ever.
 import heapq
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt64
@@ -250,7 +250,7 @@ class EpochOrder:
 
     @cached_property
     def _permuted(self) -> tuple[Numbers, Numbers]:
-        """The runs in the order of the epoch, and how many samples there are up to each one's end."""
+        """The runs in the order of the epoch, and how many samples they and those before have."""
         raw = self.raw(len(self.runs.pairs), part=0)
         runs: Numbers = np.argsort(raw, kind="stable")
         ends: Numbers = np.cumsum(self.runs.lengths[runs])
@@ -361,9 +361,12 @@ class _Group:
             self._chunks[number] = np.concatenate(samples)[merged], np.concatenate(ends)[merged]
         return self._chunks[number]
 
-    def _times(self, stream: int | slice, places: Int64[np.ndarray, "*n"]) -> Any:
+    def _times(
+        self, stream: int | slice, places: Int64[np.ndarray, "*n"]
+    ) -> Float64[np.ndarray, "*n"]:
         share = (places + self._offset[stream]) / self._lengths[stream]
-        return share + self._drift[stream] * share * (1 - share)
+        times: Float64[np.ndarray, "*n"] = share + self._drift[stream] * share * (1 - share)
+        return times
 
     def _samples_before(self) -> Int64[np.ndarray, "c1 s"]:
         """Return how many samples of each stream are due before each chunk, and in all."""
@@ -382,9 +385,7 @@ class _Group:
         none = np.zeros((1, len(self._lengths)), dtype=np.int64)
         return np.concatenate([none, before, self._lengths[None]])
 
-    def _samples_of(
-        self, stream: int, places: Numbers
-    ) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
+    def _samples_of(self, stream: int, places: Numbers) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
         """Return the samples at places of a stream, and which are the last of their piece."""
         pieces, ends = self._streams[stream], self._ends[stream]
         piece = np.searchsorted(ends, places, side="right")
@@ -399,7 +400,8 @@ class _Group:
         """
         first, pairs = self._runs.first_sample[run], self._runs.pairs[run]
         if (pairs == 1).all():
-            return first + place
+            plain: Numbers = first + place
+            return plain
         moments = (self._runs.first_sample[run + 1] - first) // pairs
         block, inside = np.divmod(place, pairs * self._rule.open_frames)
         opened = np.minimum(self._rule.open_frames, moments - block * self._rule.open_frames)
@@ -413,7 +415,8 @@ class _Group:
     def _started(self, stream: _Pieces, share: float) -> _Pieces:
         """Return a stream that starts inside its first piece and ends with what lies before."""
         run, begin, stop = int(stream.run[0]), int(stream.begin[0]), int(stream.stop[0])
-        block = int(self._runs.pairs[run]) * self._rule.open_frames
+        pairs = int(self._runs.pairs[run])
+        block = pairs * self._rule.open_frames if pairs > 1 else 1
         start = -(-int(begin + share * (stop - begin)) // block) * block
         if not begin < start < stop:
             return stream
