@@ -27,7 +27,7 @@ from benchmarks.workloads import RATES, WORKLOADS, Workload
 
 ROOT: Final = Path(__file__).parents[1]
 OTHERS: Final = ("accuracy", "profile", "start", "memory", "tried", "evaluation")
-"""What is measured beside the races; `--only` takes these names too."""
+"""Measurements beside the races; `--only` takes these names too."""
 
 QUICK: Final = ("first", "all-frames", "random", "accuracy", "profile")
 
@@ -37,19 +37,19 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     known = [workload.name for workload in WORKLOADS] + ["rates", *OTHERS]
     parser = argparse.ArgumentParser(prog="stereogenbench bench", description=__doc__)
     parser.add_argument(
-        "--only", action="append", choices=known, help="measure this; may be given again"
+        "--only", action="append", choices=known, help="measure only this; may be repeated"
     )
     parser.add_argument("--quick", action="store_true", help="one round of " + ", ".join(QUICK))
     parser.add_argument("--rounds", type=int, default=5, help="rounds of every race [5]")
     parser.add_argument("--workers", help="worker processes of every race, such as 2,0,1,4")
-    parser.add_argument("--whole", action="store_true", help="all frames, not a window of them")
+    parser.add_argument("--whole", action="store_true", help="race over all frames, not a window")
     parser.add_argument("--batches", type=int, default=2000, help="of the memory run [2000]")
-    parser.add_argument("--resume", action="store_true", help="keep the rounds that are there")
+    parser.add_argument("--resume", action="store_true", help="keep the rounds that exist")
     parser.add_argument("--draw", action="store_true", help="only draw and pack the data")
     parser.add_argument(
         "--check", action="store_true", help="only compare every contestant's samples with ours"
     )
-    parser.add_argument("--tables", action="store_true", help="only tables and plots, anew")
+    parser.add_argument("--tables", action="store_true", help="only write tables and plots again")
     parser.add_argument("--data", type=Path, default=ROOT / "build" / "bench")
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "performance")
     parser.add_argument("--size", type=int, default=1280, help=argparse.SUPPRESS)
@@ -59,7 +59,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def chosen(options: argparse.Namespace) -> tuple[list[Workload], list[str]]:
-    """Return the workloads to race over, and the names of what else is to be measured."""
+    """Return the workloads of the races, and the names of the other measurements."""
     names = options.only or (QUICK if options.quick else [w.name for w in WORKLOADS] + [*OTHERS])
     if "rates" in names:
         names = [*names, *(workload.name for workload in RATES)]
@@ -74,15 +74,15 @@ def chosen(options: argparse.Namespace) -> tuple[list[Workload], list[str]]:
     return workloads, [name for name in OTHERS if name in names]
 
 
-def measure(options: argparse.Namespace, *, say: Callable[[str], None]) -> list[str]:
-    """Measure what is asked for, and write results, tables and plots; return what failed."""
+def measure(options: argparse.Namespace, *, report: Callable[[str], None]) -> list[str]:
+    """Measure, and write results, tables and plots; return the failures."""
     material = Material(
         options.data, size_px=options.size, frames=options.frames, scale=options.scale
     )
     results = Results(options.out / "results.json")
     failed: list[str] = []
     if not options.tables:
-        prepared(material, say=say)
+        prepared(material, report=report)
         if options.draw:
             return failed
         if options.check:
@@ -93,29 +93,30 @@ def measure(options: argparse.Namespace, *, say: Callable[[str], None]) -> list[
         rounds = 1 if options.quick else options.rounds
         workloads, others = chosen(options)
         plan = Plan(rounds=rounds, resume=options.resume)
-        failed += run_races(workloads, material, results, plan=plan, say=say)
-        failed += _measure_others(others, material, results, options=options, say=say)
+        failed += run_races(workloads, material, results, plan=plan, report=report)
+        failed += measure_others(others, material, results, options=options, report=report)
     write_pages(results, options.out)
-    say(f"results are in {options.out}")
+    report(f"results are in {options.out}")
     return failed
 
 
-def _measure_others(
+def measure_others(
     names: list[str],
     material: Material,
     results: Results,
     *,
     options: argparse.Namespace,
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> list[str]:
+    """Run the measurements beside the races; return a message for each failure."""
     rounds = 1 if options.quick else options.rounds
     work = {
-        "accuracy": lambda: measure_accuracy(material, rounds=rounds, cases=CASES, say=say),
-        "profile": lambda: measure_profile(material, rounds=min(rounds, 3), say=say),
-        "start": lambda: measure_start(material, rounds=rounds, say=say),
-        "memory": lambda: measure_memory(material, batches=options.batches, say=say),
-        "tried": lambda: measure_tried(material, rounds=min(rounds, 3), say=say),
-        "evaluation": lambda: measure_evaluation(rounds=min(rounds, 3), say=say),
+        "accuracy": lambda: measure_accuracy(material, rounds=rounds, cases=CASES, report=report),
+        "profile": lambda: measure_profile(material, rounds=min(rounds, 3), report=report),
+        "start": lambda: measure_start(material, rounds=rounds, report=report),
+        "memory": lambda: measure_memory(material, batches=options.batches, report=report),
+        "tried": lambda: measure_tried(material, rounds=min(rounds, 3), report=report),
+        "evaluation": lambda: measure_evaluation(rounds=min(rounds, 3), report=report),
     }
     failed = []
     for name in names:
@@ -126,19 +127,19 @@ def _measure_others(
             results.put(name, in_a_fork(work[name]))
         except MeasurementError as error:
             failed.append(f"{name}: {error}")
-            say(f"{name} failed: {error}")
-        say(f"{name} took {time.perf_counter() - began:.0f} s")
+            report(f"{name} failed: {error}")
+        report(f"{name} took {time.perf_counter() - began:.0f} s")
     return failed
 
 
 def write_pages(results: Results, out: Path) -> None:
-    """Write tables and plots of the results at hand."""
+    """Write tables and plots of the results."""
     (out / "tables.md").write_text(tables(results.sections))
     plot_all(results.sections, out)
 
 
 def require_libraries(data: Path) -> None:
-    """Start this process anew if torchcodec's FFmpeg, or one thread a process, is not yet set."""
+    """Restart this process unless the path of torchcodec's FFmpeg and one thread are set."""
     links = link_libraries((data / "ffmpeg").resolve())
     paths = os.environ.get("LD_LIBRARY_PATH", "")
     if links is None or str(links) in paths.split(":"):
@@ -153,9 +154,9 @@ def main() -> None:
     options = parse(sys.argv[1:])
     require_libraries(options.data)
     try:
-        failed = measure(options, say=lambda text: print(text, file=sys.stderr, flush=True))  # noqa: T201
+        failed = measure(options, report=lambda text: print(text, file=sys.stderr, flush=True))  # noqa: T201
     except KeyboardInterrupt:
-        print("stopped; run the same command with --resume to go on", file=sys.stderr)  # noqa: T201
+        print("stopped; run the same command with --resume to continue", file=sys.stderr)  # noqa: T201
         sys.exit(130)
     sys.exit(1 if failed else 0)
 

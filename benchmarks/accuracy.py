@@ -1,8 +1,8 @@
-"""Speed against error: nanoseconds a pixel of every way, and how far it is from the truth.
+"""Speed against error: nanoseconds a pixel of every way, and its error.
 
-The disparity and visibility kernels also run beside a plain conversion of the map to float32. What
-the conversion costs depends on the memory that it writes into more than on anything else, so there
-are three readings, in each of which kernel and conversion write into memory of the same kind.
+The disparity and visibility kernels also run beside a plain conversion of the map to float32. The
+cost of the conversion depends mostly on the memory that it writes into. So there are three
+readings; in each, kernel and conversion write into memory of the same kind.
 """
 
 import math
@@ -19,7 +19,7 @@ import av
 import numpy as np
 
 from benchmarks.material import Material
-from benchmarks.results import Say, spread_of
+from benchmarks.results import Report, spread_of
 from benchmarks.ways import (
     WAYS,
     Pair,
@@ -40,13 +40,13 @@ SCREEN_PX: Final = 1280.0
 CONVERSION: Final = "uint16 to float32"
 
 INVENTED_PX: Final = 1.0
-"""A disparity so far from every surface at its pixel is of no surface: it was averaged."""
+"""A disparity that is farther from every surface at its pixel belongs to none: it was averaged."""
 
 SHORTEST_S: Final = 0.02
-"""A call is repeated until this much processor time has gone."""
+"""A call is repeated until it has used this much processor time."""
 
 KEPT: Final = 4
-"""Maps that the decoding loop holds, as those of a batch."""
+"""Maps that the decoding loop holds, like those of a batch."""
 FRAMES: Final = 16
 
 _TIGHT: Final[dict[str, Literal["the same", "fresh"]]] = {
@@ -60,13 +60,13 @@ Depths = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """What writes a map.
+    """A function that writes a map.
 
     Attributes:
-        dtype: Of the map that it writes.
-        inputs: What is made of a pair and its stored depths before the clock starts.
-        write: What is timed: writes a map of the inputs.
-        most: How many conversions it may take, if there is a mark.
+        dtype: The dtype of the map.
+        inputs: Makes the inputs from a pair and its stored depths, before the clock starts.
+        write: Writes a map from the inputs; this is timed.
+        most: The target: at most as many times the time of a conversion.
     """
 
     dtype: type
@@ -90,7 +90,7 @@ KERNELS: Final = {
 
 
 def hard_pairs(count: int = CASES) -> Iterator[tuple[Pair, np.ndarray]]:
-    """Yield pairs and maps of stored depth: the cases that the geometry tests call hard.
+    """Yield pairs and maps of stored depth: the hard cases of the geometry tests.
 
     Baselines of 1 cm to 7.5 m either way, depth of 0.1 to 6,553 m, 1e6 cm from the world's origin,
     looking straight up and down, focal lengths of the release and units of 0.1 mm to 0.1 m.
@@ -119,9 +119,11 @@ def hard_pairs(count: int = CASES) -> Iterator[tuple[Pair, np.ndarray]]:
         yield pair, units
 
 
-def measure_accuracy(material: Material, *, rounds: int, cases: int, say: Say) -> dict[str, Any]:
-    """Return the section of the results: every way's error and speed."""
-    say("speed against error")
+def measure_accuracy(
+    material: Material, *, rounds: int, cases: int, report: Report
+) -> dict[str, Any]:
+    """Return the section of the results: error and speed of every way."""
+    report("speed against error")
     pair, paths = rendered_pair(material)
     left, right = next(decoded(paths))
     ways = [
@@ -152,7 +154,7 @@ def measure_accuracy(material: Material, *, rounds: int, cases: int, say: Say) -
 
 
 def _errors(run: Callable[[np.ndarray, Pair], np.ndarray], cases: int) -> dict[str, Any]:
-    """Return how far a way is from the truth, over the hard cases."""
+    """Return the error of a way over the hard cases."""
     all_px, screen_px, ulps, of_bound, lost = [], [], 0.0, 0.0, 0
     for pair, units in hard_pairs(cases):
         true_px = pair.true_px(units)
@@ -208,7 +210,7 @@ def rendered_pair(material: Material) -> tuple[Pair, list[Path]]:
 def two_planes(
     u_px: np.ndarray, v_px: np.ndarray, *, size: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the disparity of a slanted disc before a slanted wall: seen, of the disc, of the wall.
+    """Return the disparity of a slanted disc before a slanted wall: visible, disc, wall.
 
     The disparity of a plane is linear in the pixel, so the truth at any point is known.
     """
@@ -219,7 +221,7 @@ def two_planes(
 
 
 def _resized(size: int) -> tuple[list[dict[str, Any]], dict[str, Callable[[], Any]]]:
-    """Return every resizing policy's error on two planes, at the paper's 832x480, and its call."""
+    """Return the error of every resizing policy on two planes at 832x480, and its call."""
     centres = np.arange(size) + 0.5
     here_px, _, _ = two_planes(centres[None, :], centres[:, None], size=size)
     height, width = max(2, size * 480 // 1280), max(2, size * 832 // 1280)
@@ -267,7 +269,7 @@ def _resized(size: int) -> tuple[list[dict[str, Any]], dict[str, Callable[[], An
 def _visibility(
     pair: Pair, left: np.ndarray, right: np.ndarray
 ) -> tuple[list[dict[str, Any]], dict[str, Callable[[], Any]]]:
-    """Return how often each way decides otherwise than float64 by both depths, and its call."""
+    """Return how often each way differs from float64 by both depths, and its call."""
     single, double = (
         sight_of(pair, left, right, dtype=dtype) for dtype in (np.float32, np.float64)
     )
@@ -297,7 +299,7 @@ def time_calls(
 ) -> dict[str, list[float]]:
     """Return nanoseconds a pixel of each call in every round, after one round that warms up.
 
-    Calls alternate, and their order turns about from round to round.
+    Calls alternate; their order reverses from round to round.
     """
     times: dict[str, list[float]] = {name: [] for name in calls}
     for number in range(rounds + 1):
@@ -312,7 +314,7 @@ def time_calls(
 
 
 def beside(times: Mapping[str, list[float]], *, base: str) -> dict[str, dict[str, float]]:
-    """Return the spread of every call's times, and of their ratio to one call's of the same round.
+    """Return the spread of the times of every call, and of their ratio to the base in each round.
 
     The base is a conversion of the map, so ratios are called conversions.
     """
@@ -327,7 +329,7 @@ def beside(times: Mapping[str, list[float]], *, base: str) -> dict[str, dict[str
 
 
 def _kernels(pair: Pair, paths: list[Path], *, rounds: int) -> list[dict[str, Any]]:
-    """Return the spreads of every kernel in every reading, with what it may take."""
+    """Return the spreads of every kernel in every reading, with its target."""
     depths = next(decoded(paths))
     readings = {
         memory: time_calls(
@@ -372,20 +374,20 @@ def _call(
     inputs, shape = kernel.inputs(pair, depths), depths[0].shape
     if where == "fresh":
         return lambda: kernel.write(inputs, pair, _fresh(shape, kernel.dtype))
-    room = np.empty(shape, kernel.dtype)
-    return lambda: kernel.write(inputs, pair, room)
+    out = np.empty(shape, kernel.dtype)
+    return lambda: kernel.write(inputs, pair, out)
 
 
 def _fresh(shape: tuple[int, ...], dtype: type) -> np.ndarray:
-    """Return an array whose memory the system has yet to give, as that of a worker's batch."""
+    """Return an array in memory that the system has not allocated yet, like that of a new batch."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     return np.frombuffer(mmap.mmap(-1, size), dtype).reshape(shape)
 
 
 def _after_decoding(pair: Pair, paths: list[Path], *, rounds: int) -> dict[str, list[float]]:
-    """Return nanoseconds a pixel where every map is written into what the allocator gives.
+    """Return nanoseconds a pixel if every map is written into newly allocated memory.
 
-    Each kernel has a loop of its own; of its frames the median counts.
+    Each kernel has its own loop; the median over its frames counts.
     """
     times: dict[str, list[float]] = {name: [] for name in KERNELS}
     for _ in range(rounds):

@@ -1,9 +1,9 @@
-"""How a contestant is timed: in a process of its own, from workers at the ready to the last batch.
+"""Timing of a contestant in its own process, from the start of its workers to the last batch.
 
-Each measurement forks from this process, which has imported everything and opened nothing, so that
-none inherits another's memory, files or threads. Time runs from the moment at which worker
-processes have started (their mean, where there are several) until the last batch has arrived; so
-opening files, filling queues and the unevenness of the end all count.
+Each measurement forks from this process, which has imported everything and opened nothing. So none
+inherits memory, files or threads of another. Time runs from the moment at which worker processes
+have started (the mean over several) until the last batch has arrived. So opening files, filling
+queues and the uneven end all count.
 """
 
 import multiprocessing
@@ -22,7 +22,7 @@ from benchmarks.field import CONTESTANTS, LIMIT, NO_DEPTH
 from benchmarks.workloads import Job, Wanted
 
 LONGEST_S: Final = 300.0
-"""After this long a contestant is taken to hang."""
+"""A contestant that takes longer counts as hanging."""
 
 Scenes = list[tuple[str, list[Wanted]]]
 
@@ -31,7 +31,7 @@ _FORK = multiprocessing.get_context("fork")
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """What came out: samples, seconds of wall time, and seconds of processor time in all."""
+    """A measurement: samples, wall time, and processor time of all processes, in seconds."""
 
     samples: int
     seconds: float
@@ -43,10 +43,10 @@ class MeasurementError(Exception):
 
 
 def measured(name: str, job: Job, *, workers: int) -> Measured:
-    """Return how fast a contestant loads a job's slice with so many worker processes.
+    """Return the time that a contestant needs to load the slice of a job.
 
     Raises:
-        MeasurementError: If it fails, saying why.
+        MeasurementError: If it fails; the message gives the reason.
     """
     return in_a_fork(lambda: _run(name, job, workers=workers), longest_s=LONGEST_S)
 
@@ -55,7 +55,7 @@ def in_a_fork(work: Callable[[], Any], *, longest_s: float | None = None) -> Any
     """Return what a function returns in a process forked from this one.
 
     Raises:
-        MeasurementError: If it raises, the process dies, or it takes longer than it may.
+        MeasurementError: If it raises, its process dies, or it takes longer than ``longest_s``.
     """
     here, there = _FORK.Pipe(duplex=False)
     process = _FORK.Process(target=_report, args=(work, there))
@@ -84,7 +84,7 @@ def _report(work: Callable[[], Any], to: Connection) -> None:
 
 def _run(name: str, job: Job, *, workers: int) -> Measured:
     torch.set_num_threads(1)
-    list(job.of_scene)  # worked out before the clock starts
+    list(job.of_scene)  # Computed before the clock starts.
     before = _cpu_s()
     if name in (LIMIT, NO_DEPTH):
         depth: limit.Depth = "given" if name == NO_DEPTH else "decoded"
@@ -117,7 +117,7 @@ def _batched(name: str, job: Job, *, workers: int) -> tuple[int, float]:
 
 
 def _bare(job: Job, *, processes: int, depth: limit.Depth) -> tuple[int, float]:
-    """Run the limit: N loops over scenes of their own, whose rates are added up."""
+    """Run the limit: N loops over different scenes; their rates are added up."""
     scenes = list(job.of_scene.items())
     if processes == 1:
         return _timed_loop(job, scenes, depth=depth)
@@ -133,7 +133,7 @@ def _bare(job: Job, *, processes: int, depth: limit.Depth) -> tuple[int, float]:
     ]
     for process in running:
         process.start()
-    there.close()  # so that waiting ends where they died
+    there.close()  # Waiting ends if all of them die.
     found = [here.recv() for _ in running]
     for process in running:
         process.join()

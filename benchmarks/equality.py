@@ -1,4 +1,4 @@
-"""Whether the contestants load the same samples: each one's arrays against ours."""
+"""Whether the contestants load the same samples: compares the arrays of each with ours."""
 
 from collections.abc import Collection
 from typing import Any
@@ -20,12 +20,12 @@ Difference = dict[str, float]
 
 
 def differences(material: Material, *, only: Collection[str] = ()) -> dict[str, dict[str, Any]]:
-    """Return, by workload and contestant, how far its samples are from ours.
+    """Return, by workload and contestant, the difference of its samples from ours.
 
-    A few samples of each workload (of those named, if any are) are compared: ``samples`` says how
-    many, ``grey`` by how many grey levels pictures differ on average, ``worst_grey`` at most, and
-    ``ulps`` by how many ulps of float32 disparities differ at most (from the limit, where depth
-    was measured). ``error`` says what failed.
+    It compares a few samples of each workload (or of the named ones). ``samples`` is their number,
+    ``grey`` the mean difference of pictures in grey levels, ``worst_grey`` the largest, and
+    ``ulps`` the largest difference of disparities in ulps of float32 (from the limit, where depth
+    was measured). ``error`` is the message of a failure.
     """
     found: dict[str, dict[str, Any]] = {}
     with serving(material.root, home=material.root / "server") as server:
@@ -46,7 +46,7 @@ def differences(material: Material, *, only: Collection[str] = ()) -> dict[str, 
 
 
 def difference(name: str, job: Job) -> Difference:
-    """Return how far a contestant's samples are from ours."""
+    """Return the difference of a contestant's samples from ours."""
     torch.set_num_threads(1)
     pairs = StereoPairs(job.tree, **job.selection)
     ours = {_key(sample): sample for sample in (pairs[number] for number in job.numbers)}

@@ -1,9 +1,9 @@
-"""How long scoring one scene takes, against decoding and resizing alone plus the matchers' time.
+"""The time to score one scene, beside decoding and resizing alone plus the time of the matchers.
 
-Part of the benchmark, and by itself: ``python -m benchmarks.evaluation [--frames 81] [--size 1280]
-[--out FILE]``. It draws one scene, writes its right views as PNG predictions, scores them by the
-offline metrics at 832x480 in one process, and prints JSON. Times are of the processor, so other
-work on the machine hardly shows.
+It is part of the benchmark, and runs alone as ``python -m benchmarks.evaluation [--frames 81]
+[--size 1280] [--out FILE]``. It draws one scene, writes its right views as PNG predictions, scores
+them by the offline metrics at 832x480 in one process, and prints JSON. It measures processor time,
+which other work on the machine hardly changes.
 """
 
 import argparse
@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.results import Say, spread_of
+from benchmarks.results import Report, spread_of
+from stereogenbench_data.evaluation.evaluate import Workload, select_workload
+from stereogenbench_data.evaluation.frame_metrics import MetricModels
 from stereogenbench_data.evaluation.predictions import PredictionFolder, frame_name, item_name
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, MetricModels
-from stereogenbench_data.evaluation.running import Workload, select_workload
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.evaluation.scene_scores import SceneWork, one_thread, score_scene
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.records import DepthEncoding
@@ -39,11 +40,11 @@ LIMIT = 3.0
 
 
 FRAMES = 12
-"""Frames of the scene, where nobody asks for more: all that is measured is in proportion."""
+"""Frames of the scene by default; all times are in proportion to them."""
 
 
 class Stopwatch:
-    """Adds up the processor's time that calls take."""
+    """Adds up the processor time of calls."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -72,20 +73,20 @@ class TimedMatcher:
         self._call = watch.timed(matcher) if callable(matcher) else None
 
     def __call__(self, *views: Any) -> Any:
-        """Return what the stereo matcher answers."""
+        """Return the result of the stereo matcher."""
         return self._call(*views) if self._call else None
 
 
-def measure_evaluation(*, rounds: int, say: Say) -> dict[str, Any]:
+def measure_evaluation(*, rounds: int, report: Report) -> dict[str, Any]:
     """Return the section of the results on scoring."""
-    say(f"evaluation: drawing and scoring {FRAMES} frames")
+    report(f"evaluation: drawing and scoring {FRAMES} frames")
     return measure(frames=FRAMES, size_px=1280, rounds=rounds)
 
 
 def measure(
     *, frames: int, size_px: int, rounds: int = 1, workers: int | None = None
 ) -> dict[str, Any]:
-    """Return the times of one scene in seconds of the processor, and their ratio."""
+    """Return the times of one scene in seconds of processor time, and their ratio."""
     with tempfile.TemporaryDirectory(prefix="stereogenbench-bench-") as temporary:
         root, predictions = Path(temporary) / "scenes", Path(temporary) / "predictions"
         request = SynthRequest(
@@ -148,7 +149,7 @@ def _streams(workload: Workload) -> Streams:
 
 
 def _decode(workload: Workload, predictions: Path) -> None:
-    """Decode and resize all that scoring reads, and nothing else."""
+    """Decode and resize all that scoring reads; do nothing else."""
     ((wanted,),) = workload.pairs
     scene = workload.index.scene(workload.rows[0])
     encoding = DepthEncoding(unit_m=scene.depth_unit_m[0])
@@ -166,7 +167,7 @@ def _decode(workload: Workload, predictions: Path) -> None:
 def _score(
     workload: Workload, predictions: Path, protocol: EvaluationProtocol
 ) -> tuple[float, float]:
-    """Return how long scoring took, and its matchers."""
+    """Return the times of scoring and of its matchers."""
     watch = Stopwatch()
     models = MetricModels(protocol)
     models.keypoint_matcher = TimedMatcher(models.keypoint_matcher, watch)
@@ -182,7 +183,7 @@ def _score(
 
 
 def main() -> None:
-    """Measure, print and, where asked to, write JSON."""
+    """Measure, print JSON, and write it if ``--out`` is given."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--size", type=int, default=1280)

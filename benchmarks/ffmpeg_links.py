@@ -1,7 +1,7 @@
 """FFmpeg for torchcodec: PyAV's own libraries, under the names by which torchcodec looks for them.
 
-torchcodec brings no FFmpeg. PyAV's wheel does, under names of its own; a folder of links on
-``LD_LIBRARY_PATH`` lets both decode with the very same build.
+torchcodec comes without FFmpeg. PyAV's wheel has it under other names. A folder of links on
+``LD_LIBRARY_PATH`` lets both decode with the same build.
 """
 
 import re
@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 def link_libraries(folder: Path) -> Path | None:
-    """Make the folder of links; return it, or None where PyAV's wheel holds no libraries."""
+    """Make the folder of links; return it, or None if PyAV's wheel has no libraries."""
     try:
         site = Path(str(distribution("av").locate_file("")))
     except PackageNotFoundError:

@@ -1,4 +1,4 @@
-"""Who races: by name, what makes the batches, and which slice of a workload it loads."""
+"""The contestants by name: the function that makes their batches, and the slice that they load."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ class Contestant:
 
     Attributes:
         name: Its name in results.
-        title: What tables call it.
-        reading: Which slice it loads.
-        batches: Returns the `DataLoader` for a job, with the options given to it.
-        module: What must be importable, if anything beside the package is.
+        title: Its name in tables.
+        reading: The slice that it loads.
+        batches: Returns the `DataLoader` for a job, with the given options.
+        module: A module that it needs beside the package, if any.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Contestant:
 
 
 def _anywhere(dataset: Callable[[Job], Any]) -> Callable[..., DataLoader[Any]]:
-    """Return what loads single samples: each is independent of the others."""
+    """Return a `DataLoader` of single samples, independent of each other."""
     return lambda job, **options: DataLoader(dataset(job), batch_size=1, **options)
 
 
@@ -119,7 +119,7 @@ CONTESTANTS: Final = {contestant.name: contestant for contestant in _CONTESTANTS
 
 
 def title(name: str) -> str:
-    """Return what tables call a contestant."""
+    """Return the name of a contestant in tables."""
     return _TITLES[name]
 
 
@@ -138,9 +138,9 @@ def why_not(name: str) -> str | None:
 
 
 def entrants(workload: Workload) -> list[tuple[str, int]]:
-    """Return who races over a workload: names, each with a number of worker processes.
+    """Return the entrants of a workload: names, each with a number of worker processes.
 
-    The first number of workers is the headline: everybody races under it. Under the others the
+    All contestants race with the first number of workers, the headline. With the others only the
     limit and ours race.
     """
     names = workload.field or (

@@ -1,10 +1,10 @@
-"""The data that is measured on: drawn once into a folder, kept, and used again if whole.
+"""The data of the benchmarks: drawn once into a folder, and reused if complete.
 
 Four scenes of two families are drawn. The trees `many` and `eight` hold hard links to their files
 under other keys: as many scenes open at a time as in a real epoch, without drawing for hours.
 
-Four of them are encoded again at lower bit rates, their depth linked: what a faster depth codec
-gives depends on what decoding the pictures costs, and that on their rate.
+Four of them are encoded again at lower bit rates, with links to their depth: the gain of a faster
+depth codec depends on the cost of decoding the pictures, and that on their bit rate.
 """
 
 import json
@@ -18,7 +18,7 @@ from typing import Any, Final
 
 import av
 
-from benchmarks.results import Say
+from benchmarks.results import Report
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Member, Scene, SceneId
@@ -55,10 +55,10 @@ _RELEASED: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """Where the data lie; `prepared` makes them.
+    """The folders of the data; `prepared` makes them.
 
     Attributes:
-        root: The folder of all of them.
+        root: The folder of all data.
         size_px: Width and height of the pictures.
         frames: Frames of a scene.
         scale: Share of the many scenes, and of the full index's; below 1 for tests.
@@ -112,73 +112,73 @@ def can_pack_blosc2() -> bool:
 def prepared(
     material: Material,
     *,
-    say: Say,
+    report: Report,
     workers: int | None = None,
     crfs: tuple[int, ...] = OTHER_CRFS,
 ) -> Material:
-    """Draw, link, index and pack what is not there yet.
+    """Draw, link, index and pack what does not exist yet.
 
     Args:
-        material: What is wanted, and where.
-        say: Is told what is being done.
+        material: The data to make.
+        report: Called with a line about each step.
         workers: Processes that draw; None is one a core.
-        crfs: Constant rate factors at which the pictures are wanted too.
+        crfs: Further constant rate factors of the pictures.
 
     Raises:
         RuntimeError: If the folder holds data of another size.
     """
     wanted = {"size_px": material.size_px, "frames": material.frames, "families": FAMILIES}
-    note, text = material.root / "material.json", json.dumps(wanted)
-    if note.exists() and note.read_text() != text:
+    record, text = material.root / "material.json", json.dumps(wanted)
+    if record.exists() and record.read_text() != text:
         raise RuntimeError(
-            f"{material.root}: holds other data ({note.read_text()}) than asked for ({text}): "
+            f"{material.root}: holds other data ({record.read_text()}) than requested ({text}): "
             "remove it, or choose another folder with --data."
         )
     workers = workers or os.cpu_count() or 1
-    _draw(material, say=say, workers=workers)
+    _draw(material, report=report, workers=workers)
     _link(material.release, material.many, scenes=max(EIGHT, round(MANY * material.scale)))
-    _index(material.many, say=say)
+    _index(material.many, report=report)
     _link(material.release, material.eight, scenes=EIGHT)
-    _index_and_pack(material, say=say, workers=workers)
+    _index_and_pack(material, report=report, workers=workers)
     for crf in crfs:
         other = material.at_rate(crf)
-        _reencode_tree(material.release, other.release, crf=crf, workers=workers, say=say)
+        _reencode_tree(material.release, other.release, crf=crf, workers=workers, report=report)
         _link(other.release, other.eight, scenes=FOUR)
-        _index_and_pack(other, say=say, workers=workers)
+        _index_and_pack(other, report=report, workers=workers)
     if not material.full_index.exists():
-        say("writing an index of as many scenes as the release has")
+        report("writing an index of as many scenes as the release has")
         _write_full_index(material)
-    note.write_text(text)
+    record.write_text(text)
     return material
 
 
-def _draw(material: Material, *, say: Say, workers: int) -> None:
+def _draw(material: Material, *, report: Report, workers: int) -> None:
     for family, seed in FAMILIES:
         request = SynthRequest(
             family=family, scenes=2, size_px=material.size_px, frames=material.frames, seed=seed
         )
-        told = -1
+        shown = -1
 
         def progress(done: int, total: int, family: str = family) -> None:
-            nonlocal told
-            if done * 20 // total > told:
-                told = done * 20 // total
-                say(f"drawing {family}: {done} of {total} frames")
+            nonlocal shown
+            if done * 20 // total > shown:
+                shown = done * 20 // total
+                report(f"drawing {family}: {done} of {total} frames")
 
         synthesise(material.release, request, workers=workers, progress=progress)
 
 
-def _reencode_tree(release: Path, tree: Path, *, crf: int, workers: int, say: Say) -> None:
+def _reencode_tree(release: Path, tree: Path, *, crf: int, workers: int, report: Report) -> None:
     """Make a tree like another, with the pictures at another constant rate factor.
 
-    All other files are hard links. What is there already is kept.
+    All other files are hard links. Existing files are kept.
 
     Args:
         release: The tree to encode again, in the released layout.
-        tree: Where the new one goes.
-        crf: The constant rate factor; all else is x264's default, as where pictures are drawn.
+        tree: The new tree.
+        crf: The constant rate factor; all other settings are x264's defaults, as in the drawn tree.
         workers: Processes that encode, one thread each.
-        say: Is told what is being done.
+        report: Called with a line about each step.
     """
     todo = []
     for file in sorted(path for path in release.rglob("scene_*/*") if path.is_file()):
@@ -192,7 +192,7 @@ def _reencode_tree(release: Path, tree: Path, *, crf: int, workers: int, say: Sa
             os.link(file, made)
     if not todo:
         return
-    say(f"encoding {len(todo)} videos at rate factor {crf}")
+    report(f"encoding {len(todo)} videos at rate factor {crf}")
     with ProcessPoolExecutor(workers) as pool:
         running = [pool.submit(_reencode, file, made, crf=crf) for file, made in todo]
         for encoded in running:
@@ -200,7 +200,7 @@ def _reencode_tree(release: Path, tree: Path, *, crf: int, workers: int, say: Sa
 
 
 def _reencode(file: Path, made: Path, *, crf: int) -> None:
-    """Encode an H.264 video again at another constant rate factor, whole or not at all."""
+    """Encode an H.264 video again at another constant rate factor; leave no partial file."""
     part = made.with_name(f"{made.name}.part")
     options = {"crf": str(crf), "x264-params": "cpu-independent=1"}
     with (
@@ -208,10 +208,10 @@ def _reencode(file: Path, made: Path, *, crf: int) -> None:
         av.open(part, "w", format="mp4", container_options={"fflags": "+bitexact"}) as target,
     ):
         stream = target.add_stream("libx264", rate=int(FRAME_RATE_HZ), options=options)
-        told = source.streams.video[0]
-        stream.width, stream.height, stream.pix_fmt = told.width, told.height, "yuv420p"
+        video = source.streams.video[0]
+        stream.width, stream.height, stream.pix_fmt = video.width, video.height, "yuv420p"
         stream.codec_context.thread_count = 1
-        for number, decoded in enumerate(source.decode(told)):
+        for number, decoded in enumerate(source.decode(video)):
             frame = decoded.reformat(format="yuv420p")
             frame.pts, frame.time_base = number, Fraction(1, int(FRAME_RATE_HZ))
             frame.pict_type = av.video.frame.PictureType.NONE  # the encoder's own choice
@@ -232,26 +232,26 @@ def _link(release: Path, tree: Path, *, scenes: int) -> None:
                 os.link(file, linked / file.name)
 
 
-def _index(tree: Path, *, say: Say) -> None:
+def _index(tree: Path, *, report: Report) -> None:
     if not (tree / INDEX_NAME).exists():
-        say(f"indexing {tree}")
+        report(f"indexing {tree}")
         SceneIndex.open(tree).write(tree / INDEX_NAME)
 
 
-def _index_and_pack(material: Material, *, say: Say, workers: int) -> None:
-    _index(material.eight, say=say)
-    _pack(material.eight, material.shards, say=say, workers=workers)
+def _index_and_pack(material: Material, *, report: Report, workers: int) -> None:
+    _index(material.eight, report=report)
+    _pack(material.eight, material.shards, report=report, workers=workers)
     if can_pack_blosc2():
-        _pack(material.eight, material.blosc2, say=say, workers=workers, depth_codec="blosc2")
+        _pack(material.eight, material.blosc2, report=report, workers=workers, depth_codec="blosc2")
 
 
 def _pack(
-    tree: Path, out: Path, *, say: Say, workers: int, depth_codec: DepthCodec = "released"
+    tree: Path, out: Path, *, report: Report, workers: int, depth_codec: DepthCodec = "released"
 ) -> None:
     """Pack a tree, one scene a shard."""
     if (out / INDEX_NAME).exists():
         return
-    say(f"packing {out}")
+    report(f"packing {out}")
     sizes = [
         sum(file.stat().st_size for file in scene.parent.iterdir())
         for scene in tree.rglob("baseline.json")
@@ -277,7 +277,7 @@ def _write_full_index(material: Material) -> None:
 
 
 def _moved(scene: Scene, name: SceneId, *, number: int) -> Scene:
-    """Return a scene under another key, every number slightly its own."""
+    """Return a scene under another key, with slightly different numbers."""
     members = {
         file: Member(f"{name.key}/{file}", 0, member.size + number)
         for file, member in scene.members.items()
@@ -292,7 +292,7 @@ def _moved(scene: Scene, name: SceneId, *, number: int) -> Scene:
 
 
 def facts(material: Material) -> dict[str, Any]:
-    """Return what the results say of the data: sizes and bit rates, and those of other rates."""
+    """Return the sizes and bit rates of the data, for the results."""
     sizes = {"size_px": material.size_px, "frames": material.frames, "scenes": 2 * len(FAMILIES)}
     others = {
         str(crf): _rates(material.at_rate(crf), scenes=FOUR)

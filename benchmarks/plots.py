@@ -1,4 +1,4 @@
-"""The pictures of the results, from the JSON file."""
+"""Plots of the results, from the JSON file."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -19,7 +19,7 @@ _TARGET: Final = "#c0392b"
 
 
 def plot_all(sections: dict[str, Any], folder: Path) -> list[Path]:
-    """Write a picture of every section at hand; return their paths.
+    """Write a plot of every section of the results; return their paths.
 
     Raises:
         ImportError: If matplotlib is not installed.
@@ -148,7 +148,7 @@ def _to_limit(race: dict[str, Any], name: str) -> Spread | None:
 
 
 def _by_rate(sections: dict[str, Any]) -> Any:
-    """Draw what depth's codec gives against the pictures' rate, and what it could give."""
+    """Draw the gain of the depth codec against the bit rate of the pictures, and its bound."""
     import matplotlib.pyplot as plt
 
     lines = (

@@ -1,8 +1,8 @@
 """Where an epoch's time goes: spans around the package's own functions, timed in one worker.
 
-The package is not touched: its functions are replaced, in the process that measures, by ones that
-note when they begin and end. A span's time is without that of the spans inside it. What a worker
-does beside making batches (handing them over, waiting for room) is "queueing".
+The package is not changed: in the measuring process, timed functions replace its own. The time of a
+span excludes that of the spans inside it. What a worker does beside making batches (handing them
+over, waiting for a free buffer) is "queueing".
 """
 
 import functools
@@ -18,7 +18,7 @@ import torch
 from benchmarks.clock import in_a_fork
 from benchmarks.contestants import ours
 from benchmarks.material import Material
-from benchmarks.results import Say
+from benchmarks.results import Report
 from benchmarks.workloads import WORKLOADS, Job
 
 Label = Callable[..., str]
@@ -59,12 +59,12 @@ class Spans:
     """Time by label, in memory that a worker process shares."""
 
     def __init__(self) -> None:
-        """Start at nothing."""
+        """Start at zero."""
         self.totals_s = torch.zeros(len(LABELS), dtype=torch.float64).share_memory_()
         self._inside: list[float] = []
 
     def around(self, work: Callable[..., Any], label: str | Label) -> Callable[..., Any]:
-        """Return a function that does the same and notes its time."""
+        """Return a function that does the same and records its time."""
 
         @functools.wraps(work, updated=())
         def timed(*values: Any, **named: Any) -> Any:
@@ -82,7 +82,7 @@ class Spans:
         return timed
 
     def install(self) -> list[str]:
-        """Replace the functions; return the names of those that are not there."""
+        """Replace the functions; return the names of those that do not exist."""
         missing = []
         for module, path, label in _SPANS:
             owner: Any = import_module(module)
@@ -96,7 +96,7 @@ class Spans:
         return missing
 
 
-def measure_profile(material: Material, *, rounds: int, say: Say) -> dict[str, Any]:
+def measure_profile(material: Material, *, rounds: int, report: Report) -> dict[str, Any]:
     """Return the section of the results: milliseconds a sample by label, for some workloads."""
     found = {}
     for workload in WORKLOADS:
@@ -108,8 +108,8 @@ def measure_profile(material: Material, *, rounds: int, say: Say) -> dict[str, A
             for source, data in sources.items():
                 if not data.exists():
                     continue
-                say(f"profile: {workload.name} from {source}")
-                runs = [in_a_fork(functools.partial(_profiled, job, data)) for _ in range(rounds)]
+                report(f"profile: {workload.name} from {source}")
+                runs = [in_a_fork(functools.partial(profiled, job, data)) for _ in range(rounds)]
                 found[f"{workload.name} from {source}"] = {
                     "title": workload.title,
                     "missing": runs[0]["missing"],
@@ -121,7 +121,8 @@ def measure_profile(material: Material, *, rounds: int, say: Say) -> dict[str, A
     return found
 
 
-def _profiled(job: Job, data: Path) -> dict[str, Any]:
+def profiled(job: Job, data: Path) -> dict[str, Any]:
+    """Return milliseconds a sample by label for a workload in one worker, and missing functions."""
     torch.set_num_threads(1)
     spans = Spans()
     missing = spans.install()

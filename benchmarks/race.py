@@ -8,18 +8,18 @@ from typing import Any
 from benchmarks.clock import MeasurementError, measured
 from benchmarks.field import CONTESTANTS, entrants, why_not
 from benchmarks.material import Material
-from benchmarks.results import Results, Say, entry
+from benchmarks.results import Report, Results, entry
 from benchmarks.server import WebServer, serving
 from benchmarks.workloads import Job, Workload
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """How a race is run.
+    """The settings of a race.
 
     Attributes:
-        rounds: How many rounds.
-        resume: Whether rounds that the results hold already, of the same settings, count.
+        rounds: The number of rounds.
+        resume: Whether rounds of the same settings in the results count.
     """
 
     rounds: int = 5
@@ -27,10 +27,10 @@ class Plan:
 
 
 class TimeLeft:
-    """An estimate of the time left, from what each measurement took before."""
+    """An estimate of the time left, from the durations of earlier measurements."""
 
     def __init__(self, results: Results, workloads: list[Workload], *, rounds: int) -> None:
-        """Take the durations that the results remember."""
+        """Take the durations in the results."""
         self._took: dict[str, float] = dict(results.sections.get("took_s", {}))
         self._results = results
         self._left = {
@@ -40,29 +40,29 @@ class TimeLeft:
         }
 
     def spent(self, what: str, seconds: float) -> None:
-        """Note what one measurement took."""
+        """Record the duration of a measurement."""
         self._took[what] = seconds
         self._results.sections["took_s"] = {k: round(v, 2) for k, v in self._took.items()}
         self.skip(what)
 
     def skip(self, what: str) -> None:
-        """Note that one measurement is not to come."""
+        """Record that a measurement will not take place."""
         self._left[what] = max(0, self._left.get(what, 0) - 1)
 
     def text(self) -> str:
-        """Return the time left as m:ss, about."""
+        """Return the approximate time left as m:ss."""
         mean = sum(self._took.values()) / len(self._took) if self._took else 5.0
         seconds = sum(count * self._took.get(what, mean) for what, count in self._left.items())
         return f"{int(seconds // 60)}:{int(seconds % 60):02d}"
 
 
 def run_races(
-    workloads: list[Workload], material: Material, results: Results, *, plan: Plan, say: Say
+    workloads: list[Workload], material: Material, results: Results, *, plan: Plan, report: Report
 ) -> list[str]:
     """Run the races of some workloads; results are written after every round.
 
     Returns:
-        What failed in them.
+        A message for each failure.
     """
     left = TimeLeft(results, workloads, rounds=plan.rounds)
     with ExitStack() as stack:
@@ -72,7 +72,7 @@ def run_races(
             server = stack.enter_context(serving(material.root, home=home))
         for workload in workloads:
             serves = server if workload.source == "web" else None
-            _race(workload, material, results, plan=plan, say=say, left=left, server=serves)
+            _race(workload, material, results, plan=plan, report=report, left=left, server=serves)
     return [
         f"{workload.name}: {name}: {why}"
         for workload in workloads
@@ -87,7 +87,7 @@ def _race(  # noqa: PLR0913 - one race's surroundings
     results: Results,
     *,
     plan: Plan,
-    say: Say,
+    report: Report,
     left: TimeLeft,
     server: WebServer | None,
 ) -> None:
@@ -111,7 +111,7 @@ def _race(  # noqa: PLR0913 - one race's surroundings
             for entrant in field:
                 left.skip(f"{workload.name} {entry(*entrant)}")
             continue
-        say(f"{workload.name}: round {number + 1} of {plan.rounds}, about {left.text()} left")
+        report(f"{workload.name}: round {number + 1} of {plan.rounds}, about {left.text()} left")
         turn = number % max(1, len(field))
         in_turn = field[turn:] + field[:turn]
         found = {}
@@ -121,7 +121,7 @@ def _race(  # noqa: PLR0913 - one race's surroundings
                 found[entry(name, workers)] = _measured(name, job, workers=workers, server=server)
             except MeasurementError as error:
                 section["failed"][entry(name, workers)] = str(error)[-500:]
-                say(f"{workload.name}: {name} failed: {str(error)[-300:]}")
+                report(f"{workload.name}: {name} failed: {str(error)[-300:]}")
             finally:
                 left.spent(f"{workload.name} {entry(name, workers)}", time.perf_counter() - began)
         section["rounds"].append(found)
@@ -129,7 +129,7 @@ def _race(  # noqa: PLR0913 - one race's surroundings
 
 
 def _measured(name: str, job: Job, *, workers: int, server: WebServer | None) -> dict[str, float]:
-    """Return what is noted of one contestant's turn.
+    """Return the record of one contestant's turn.
 
     Raises:
         MeasurementError: If it failed.
@@ -148,7 +148,7 @@ def _measured(name: str, job: Job, *, workers: int, server: WebServer | None) ->
 
 
 def addressed(job: Job, name: str) -> Job:
-    """Return the job with the address under which this contestant finds its shards."""
+    """Return the job with the URL of this contestant's shards."""
     if name.startswith("ours"):
         return job
     return replace(job, url=f"{job.url}/shards" if name.endswith("-web") else None)

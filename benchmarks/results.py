@@ -1,4 +1,4 @@
-"""The results file: written whole after every round, with the machine that it was measured on."""
+"""The results file: rewritten after every round, with a description of the machine."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from typing import Any, Final
 import av
 import numpy as np
 
-Say = Callable[[str], None]
+Report = Callable[[str], None]
 """What reports progress."""
 
 FORMAT: Final = 2
@@ -43,10 +43,10 @@ class Spread:
 
 
 class Results:
-    """The results file: a section for each thing that is measured."""
+    """The results file: one section per measurement."""
 
     def __init__(self, path: Path) -> None:
-        """Read what is there already; nothing is, of another format."""
+        """Read an existing file, unless its format is another."""
         self.path = path
         self.sections: dict[str, Any] = {"format": FORMAT}
         if path.exists():
@@ -55,30 +55,30 @@ class Results:
                 self.sections = found
 
     def put(self, name: str, section: Any) -> None:
-        """Put a section in place of what was there, and write the file."""
+        """Replace a section, and write the file."""
         self.sections[name] = section
         self.write()
 
     def write(self) -> None:
-        """Write the file, whole or not at all."""
+        """Write the file atomically."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         part = self.path.with_suffix(".part")
         part.write_text(json.dumps(self.sections, indent=1) + "\n")
         part.replace(self.path)
 
     def race(self, workload: str) -> dict[str, Any]:
-        """Return a workload's section, an empty one if there is none."""
+        """Return the section of a workload, empty if there is none."""
         found: dict[str, Any] = self.sections.get("races", {}).get(workload, {})
         return found or {"settings": {}, "rounds": [], "failed": {}}
 
     def put_race(self, workload: str, section: dict[str, Any]) -> None:
-        """Put a workload's section, and write the file."""
+        """Replace the section of a workload, and write the file."""
         self.sections.setdefault("races", {})[workload] = section
         self.write()
 
 
 def entry(name: str, workers: int) -> str:
-    """Return how an entrant is called in a round."""
+    """Return the name of an entrant in a round."""
     return f"{name}/{workers}"
 
 
@@ -92,7 +92,7 @@ def rates(rounds: list[Round], entrant: str) -> Spread | None:
 
 
 def ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
-    """Return how many times as fast an entrant is as another: one ratio a round."""
+    """Return the ratio of the speeds of two entrants, one per round."""
     return Spread.of(
         found[entrant]["samples"] / found[entrant]["seconds"]
         / (found[to]["samples"] / found[to]["seconds"])
@@ -102,7 +102,7 @@ def ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
 
 
 def shares(rounds: list[Round], entrant: str, *, without: str) -> Spread | None:
-    """Return the share of an entrant's time that another saves, which leaves out a part of it."""
+    """Return the share of an entrant's time that another one, which leaves out a part, saves."""
     return Spread.of(
         1 - (found[entrant]["samples"] / found[entrant]["seconds"])
         / (found[without]["samples"] / found[without]["seconds"])
@@ -112,7 +112,7 @@ def shares(rounds: list[Round], entrant: str, *, without: str) -> Spread | None:
 
 
 def cpu_ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
-    """Return the same by processor time a sample, which other processes disturb less."""
+    """Return the ratio of processor times per sample, which other processes disturb less."""
     return Spread.of(
         (found[to]["cpu_s"] / found[to]["samples"])
         / (found[entrant]["cpu_s"] / found[entrant]["samples"])
@@ -122,7 +122,7 @@ def cpu_ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
 
 
 def sent_mb(rounds: list[Round], entrant: str) -> Spread | None:
-    """Return the megabytes that an entrant fetched a sample, None where none were counted."""
+    """Return the megabytes that an entrant fetched per sample, None if they were not counted."""
     return Spread.of(
         found[entrant]["bytes"] / found[entrant]["samples"] / 1e6
         for found in rounds
@@ -145,7 +145,7 @@ _PACKAGES: Final = (
 
 
 def machine() -> dict[str, Any]:
-    """Return what results depend on beside the code."""
+    """Return the versions and the machine that results depend on."""
     model = re.search(r"model name\s*: (.*)", _read("/proc/cpuinfo"))
     memory = re.search(r"MemTotal:\s*(\d+)", _read("/proc/meminfo"))
     return {

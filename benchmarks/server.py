@@ -1,6 +1,6 @@
 """A web server on this machine that answers ranges and counts the bytes it sends.
 
-nginx where it is installed; else a small server in a process of its own.
+It is nginx if that is installed, else a small server in its own process.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ class WebServer:
     """A running server.
 
     Attributes:
-        url: Where its folder is.
+        url: The URL of its folder.
         kind: "nginx" or "python".
         log: A file with one line of bytes sent for every answer.
     """
@@ -52,7 +52,7 @@ class WebServer:
     log: Path
 
     def sent_bytes(self) -> int:
-        """Return how many bytes of bodies were sent so far."""
+        """Return the number of bytes of bodies sent so far."""
         time.sleep(0.1)
         return sum(int(line) for line in self.log.read_text().split()) if self.log.exists() else 0
 
@@ -125,7 +125,7 @@ class _Ranges(SimpleHTTPRequestHandler):
         self.log_file.flush()
 
     def log_message(self, format: str, *values: object) -> None:
-        """Say nothing."""
+        """Report nothing."""
 
 
 def _serve(folder: str, port: str, log: str) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.clock import in_a_fork
 from benchmarks.contestants import limit
 from benchmarks.material import Material
-from benchmarks.results import Say, spread_of
+from benchmarks.results import Report, spread_of
 from benchmarks.workloads import WORKLOADS, Job, Wanted
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.table import SceneIndex
@@ -51,9 +51,9 @@ _CHOOSE: Final = {
 }
 
 
-def measure_start(material: Material, *, rounds: int, say: Say) -> dict[str, Any]:
+def measure_start(material: Material, *, rounds: int, report: Report) -> dict[str, Any]:
     """Return the section of the results on starting."""
-    say("start: imports and commands")
+    report("start: imports and commands")
     imports = {name: _python("-c", code, rounds=rounds) for name, code in IMPORTS.items()}
     helps = {
         " ".join(["stereogenbench", *words]): _python(
@@ -65,11 +65,11 @@ def measure_start(material: Material, *, rounds: int, say: Say) -> dict[str, Any
         [sys.executable, "-c", "import sys, stereogenbench_data; sys.exit('torch' in sys.modules)"],
         check=False,
     )
-    say("start: index of 8,493 scenes")
-    index = [in_a_fork(lambda: _open_and_select(material)) for _ in range(rounds)]
-    say("start: first batch, cold")
+    report("start: index of 8,493 scenes")
+    index = [in_a_fork(lambda: open_and_select(material)) for _ in range(rounds)]
+    report("start: first batch, cold")
     first = _first_batches(material, rounds=rounds)
-    say("start: resuming at half an epoch")
+    report("start: resuming at half an epoch")
     resumed = [in_a_fork(lambda: _resume(material)) for _ in range(rounds)]
     return {
         "imports_s": imports,
@@ -94,7 +94,7 @@ def measure_start(material: Material, *, rounds: int, say: Say) -> dict[str, Any
 
 
 def _python(*words: str, rounds: int) -> dict[str, float]:
-    """Return how long a fresh interpreter takes, in seconds of wall time."""
+    """Return the wall time of a fresh interpreter, in seconds."""
     times = []
     for _ in range(rounds):
         began = time.perf_counter()
@@ -103,7 +103,8 @@ def _python(*words: str, rounds: int) -> dict[str, float]:
     return spread_of(times)
 
 
-def _open_and_select(material: Material) -> dict[str, float]:
+def open_and_select(material: Material) -> dict[str, float]:
+    """Return the seconds to open the full index and to select from it."""
     began = time.perf_counter()
     index = SceneIndex.open(material.full_index)
     opened = time.perf_counter()
@@ -118,8 +119,8 @@ def _open_and_select(material: Material) -> dict[str, float]:
 def _first_batches(material: Material, *, rounds: int) -> dict[str, list[float]]:
     """Return seconds from a fresh interpreter to its first batch, no file in the page cache.
 
-    Ours opens its index; the naive loader is given its list of scenes, and is charged for
-    importing torch and its own modules, not for making the list.
+    Ours opens its index. The naive loader gets its list of scenes; its time includes importing
+    torch and its own modules, and not making the list.
     """
     torch_s = min(
         float(
@@ -157,10 +158,10 @@ def forget_files(folder: Path) -> None:
 def _resume(material: Material) -> dict[str, float]:
     """Return seconds to a first batch, at the start and resumed at half an epoch.
 
-    Of an epoch of eight scenes' primary pairs. ``seek_s`` is what loading the state took by itself.
-    ``rest_from_start_s`` and ``rest_from_half_s`` are the time that a batch takes on average over
-    17 batches from there on. ``bare_start_s`` and ``bare_resume_s`` are what a bare loop takes that
-    opens the same videos and decodes once to the frames of the same first batch.
+    The epoch has the primary pairs of eight scenes. ``seek_s`` is the time to load the state.
+    ``rest_from_start_s`` and ``rest_from_half_s`` are the mean times of a batch over 17 batches
+    from there on. ``bare_start_s`` and ``bare_resume_s`` are the times of a bare loop that opens
+    the same videos and decodes once to the frames of the same first batch.
     """
     workload = next(workload for workload in WORKLOADS if workload.name == "all-frames")
     job = Job(workload, material)
@@ -199,7 +200,7 @@ def _resume(material: Material) -> dict[str, float]:
 
 
 def _samples(batch: dict[str, Any]) -> list[Wanted]:
-    """Return what was loaded in a batch."""
+    """Return the samples of a batch."""
     return [
         Wanted(scene, int(left), int(right), (int(frame),))
         for scene, (left, right), frame in zip(
@@ -209,7 +210,7 @@ def _samples(batch: dict[str, Any]) -> list[Wanted]:
 
 
 def _bare_s(job: Job, wanted: list[Wanted]) -> float:
-    """Return how long a bare loop takes that decodes each stream once, as far as is wanted."""
+    """Return the time of a bare loop that decodes each stream once, as far as needed."""
     scenes: dict[str, list[Wanted]] = {}
     for sample in sorted(wanted, key=lambda sample: sample.frames):
         scenes.setdefault(sample.scene, []).append(sample)
@@ -219,13 +220,14 @@ def _bare_s(job: Job, wanted: list[Wanted]) -> float:
     return time.perf_counter() - began
 
 
-def measure_memory(material: Material, *, batches: int, say: Say) -> dict[str, Any]:
+def measure_memory(material: Material, *, batches: int, report: Report) -> dict[str, Any]:
     """Return the section of the results on a worker's memory: all pairs, default settings."""
-    say(f"memory: {batches} batches")
-    return in_a_fork(lambda: _watch(material, batches=batches, say=say))
+    report(f"memory: {batches} batches")
+    return in_a_fork(lambda: watch_memory(material, batches=batches, report=report))
 
 
-def _watch(material: Material, *, batches: int, say: Say) -> dict[str, Any]:
+def watch_memory(material: Material, *, batches: int, report: Report) -> dict[str, Any]:
+    """Return the memory of workers in this process's loader, in megabytes after every batch."""
     workers, size = 2, 4
     pairs = StereoPairs(material.many, pairs="all", frames="all")
     loader = pairs.loader(size, num_workers=workers, seed=0)
@@ -239,7 +241,7 @@ def _watch(material: Material, *, batches: int, say: Say) -> dict[str, Any]:
         private.append(max(own for _, own in found))
         if number % 100 == 99:
             seconds = (time.perf_counter() - began) / (number + 1) * (batches - number - 1)
-            say(f"memory: batch {number + 1}, {megabytes[-1]:.0f} MB, {seconds:.0f} s left")
+            report(f"memory: batch {number + 1}, {megabytes[-1]:.0f} MB, {seconds:.0f} s left")
     quarter = max(1, len(megabytes) // 4)
     third, last = megabytes[-2 * quarter : -quarter] or megabytes, megabytes[-quarter:]
     growth_mb = float(np.mean(last) - np.mean(third)) / quarter * 1000
@@ -256,7 +258,7 @@ def _watch(material: Material, *, batches: int, say: Say) -> dict[str, Any]:
 
 
 def _resident(pid: int) -> tuple[float, float]:
-    """Return megabytes of a process: all that is resident, and without what is shared memory."""
+    """Return megabytes of a process: resident memory, and the same without shared memory."""
     found = {}
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         name, _, value = line.partition(":")

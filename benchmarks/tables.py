@@ -1,4 +1,4 @@
-"""The Markdown of the results: everything in it is worked out from the JSON file."""
+"""The Markdown tables of the results, computed from the JSON file."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
@@ -12,7 +12,7 @@ from stereogenbench_data.schema.text import counted
 
 
 def tables(sections: dict[str, Any]) -> str:
-    """Return all tables of the results at hand."""
+    """Return all tables of the results."""
     parts = ["# Measured\n", _how(sections)]
     races = sections.get("races", {})
     if races:
@@ -84,7 +84,7 @@ def _start(start: dict[str, Any]) -> str:
 
 
 def _resuming(start: dict[str, Any]) -> str:
-    """Return the table of starting and resuming beside what a bare loop has to decode anyway."""
+    """Return the table of starting and resuming, beside a bare loop over the same frames."""
     titles = {
         "start_s": "first batch at the start of an epoch",
         "resume_s": "first batch, resumed at half an epoch",
@@ -253,7 +253,7 @@ def _profile(profile: dict[str, Any]) -> str:
 
 
 def headlines(races: dict[str, Any]) -> str:
-    """Return the table of our ratios beside those that are to be reached."""
+    """Return the table of our ratios beside their targets."""
     rows = []
     for workload in WORKLOADS:
         if workload.name not in races or workload.target is None:
@@ -279,7 +279,7 @@ def headlines(races: dict[str, Any]) -> str:
 
 
 def by_rate(sections: dict[str, Any]) -> str:
-    """Return the table of what blosc2 depth gives by the bit rate of the pictures."""
+    """Return the table of the gain of blosc2 depth by the bit rate of the pictures."""
     rows = []
     for name in RATED:
         for crf in (DRAWN_CRF, *OTHER_CRFS):
@@ -387,12 +387,12 @@ def rate_text(spread: Spread | None) -> str:
 
 
 def at_least(spread: Spread | None, wanted: float | None) -> str:
-    """Return the ratio wanted, and whether the median reaches it."""
+    """Return the target ratio, and whether the median reaches it."""
     if spread is None or wanted is None:
         return ""
     return f"{wanted:g} {'reached' if spread.median >= wanted else '**missed**'}"
 
 
 def at_most(value: float, wanted: float, form: str = "g", *, scale: float = 1) -> str:
-    """Return what a value may be, times a scale, and whether it is no more."""
+    """Return the largest allowed value, times a scale, and whether the value is within it."""
     return f"{wanted * scale:{form}} {'reached' if value <= wanted else '**missed**'}"

@@ -1,7 +1,8 @@
-"""What was tried to decode and convert faster: each way beside the package's own.
+"""Attempts to decode and convert faster, each beside the package's own way.
 
-One process, files in the page cache; the ways of a group take turns. Processor time is compared, as
-a loader keeps every core busy anyway: what only spreads work over cores gives it nothing.
+They run in one process, with files in the page cache; the ways of a group take turns. They are
+compared by processor time: a loader keeps every core busy anyway, so spreading work over cores
+gains nothing.
 """
 
 import statistics
@@ -18,11 +19,11 @@ from av.video.frame import VideoFrame
 from av.video.reformatter import Interpolation, VideoReformatter
 
 from benchmarks.material import Material
-from benchmarks.results import Say, spread_of
+from benchmarks.results import Report, spread_of
 from stereogenbench_data.media.video import VideoReader, read_rgb
 
 PLACES: Final = (10, 30, 50, 70)
-"""The pictures that are asked for at random, as shares of 81."""
+"""The pictures to decode at random, as shares of 81."""
 
 PICTURES: Final = 24
 """How many pictures are decoded one after another."""
@@ -38,9 +39,9 @@ class Way:
     """One way of doing something.
 
     Attributes:
-        name: What tables call it.
-        run: Does it for ``pictures`` pictures.
-        pictures: How many these are.
+        name: Its name in tables.
+        run: Processes ``pictures`` pictures.
+        pictures: Their number.
         result: Returns pictures to compare with those of the group's first way, if it may differ.
     """
 
@@ -50,12 +51,12 @@ class Way:
     result: Callable[[], np.ndarray] | None = None
 
 
-def measure_tried(material: Material, *, rounds: int, say: Say) -> dict[str, Any]:
+def measure_tried(material: Material, *, rounds: int, report: Report) -> dict[str, Any]:
     """Return the section of the results: for each group its ways, the package's own first."""
     folder = sorted(path.parent for path in material.release.rglob("baseline.json"))[0]
     found = {}
     for group, ways in _groups(folder, material).items():
-        say(f"tried: {group}")
+        report(f"tried: {group}")
         times: dict[str, list[tuple[float, float]]] = {way.name: [] for way in ways}
         for number in range(rounds + 1):
             for way in ways if number % 2 else ways[::-1]:
@@ -64,12 +65,12 @@ def measure_tried(material: Material, *, rounds: int, say: Say) -> dict[str, Any
                 spent = time.process_time() - cpu_s, time.perf_counter() - wall_s
                 if number > 0:  # the first round warms up
                     times[way.name].append(spent)
-        found[group] = [_noted(way, ways[0], times) for way in ways]
+        found[group] = [_record_of(way, ways[0], times) for way in ways]
     return {"rounds": rounds, "groups": found}
 
 
-def _noted(way: Way, own: Way, times: dict[str, list[tuple[float, float]]]) -> dict[str, Any]:
-    """Return what is noted of a way: milliseconds a picture, and how many times its own way's."""
+def _record_of(way: Way, own: Way, times: dict[str, list[tuple[float, float]]]) -> dict[str, Any]:
+    """Return the record of a way: milliseconds a picture, and the ratio to our own way."""
     ratio = spread_of(
         (theirs / way.pictures) / (ours / own.pictures)
         for (theirs, _), (ours, _) in zip(times[way.name], times[own.name], strict=True)
@@ -158,7 +159,7 @@ def _at_random(path: Path, *, frames: int) -> list[Way]:
 
 
 def _conversions(path: Path, size: tuple[int, int] | None) -> list[Way]:
-    """Return ways from a decoded picture to red, green and blue planes in the batch's place."""
+    """Return ways from a decoded picture to red, green and blue planes in the batch."""
     frames = _decoded(path, 8)
     height, width = size or (frames[0].height, frames[0].width)
     out = np.empty((len(frames), 3, height, width), np.uint8)

@@ -29,7 +29,7 @@ class Pair:
         baseline_m: Signed baseline.
         unit_m: Metres in a stored unit.
         rotator_deg: Pitch, yaw and roll of both cameras, as Unreal records them.
-        offset_cm: Where the left camera stands.
+        offset_cm: Position of the left camera.
     """
 
     focal_px: float
@@ -40,7 +40,7 @@ class Pair:
 
     @cached_property
     def poses(self) -> CameraPoses:
-        """Both cameras' poses, as cameras 0 and 1 of a rig."""
+        """The poses of both cameras, as cameras 0 and 1 of a rig."""
         from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 
         rotation = rotation_from_rotator_deg(np.array(self.rotator_deg))
@@ -78,7 +78,7 @@ def float64_reference(units: np.ndarray, pair: Pair) -> np.ndarray:
 
 
 def in_blocks(units: np.ndarray, pair: Pair, out: np.ndarray | None = None) -> np.ndarray:
-    """What samples are made with: the closed form, a few rows at a time, into its place."""
+    """The package's way for samples: the closed form, a few rows at a time."""
     out = np.empty(units.shape, dtype=np.float32) if out is None else out
     shift_units = pair.focal_px * pair.baseline_m / pair.unit_m
     write_disparity(out, units, measured=_all_measured(units.shape), shift_units=shift_units)
@@ -126,7 +126,7 @@ def half_depth(units: np.ndarray, pair: Pair) -> np.ndarray:
 
 
 def table_look_up(units: np.ndarray, pair: Pair) -> np.ndarray:
-    """The disparity of all 65,536 stored numbers worked out in float64, then looked up."""
+    """The disparity of all 65,536 stored numbers, computed in float64, then looked up."""
     numbers = np.arange(65536, dtype=np.float64)
     numbers[0] = np.inf
     table = (pair.focal_px * pair.baseline_m / pair.unit_m / numbers).astype(np.float32)
@@ -139,7 +139,7 @@ def poses_float64(units: np.ndarray, pair: Pair) -> np.ndarray:
 
 
 def poses_float32_maps(units: np.ndarray, pair: Pair) -> np.ndarray:
-    """The package's way where a rig is not rectified, with float32 maps in and out."""
+    """The package's way for a rig that is not rectified, with float32 maps in and out."""
     return _through_poses((units * np.float64(pair.unit_m)).astype(np.float32), pair)
 
 
@@ -155,7 +155,7 @@ def _through_poses(depth_m: np.ndarray, pair: Pair) -> np.ndarray:
 
 
 def poses_textbook_float32(units: np.ndarray, pair: Pair) -> np.ndarray:
-    """What textbooks do, all in float32: to the world's coordinates and back."""
+    """The textbook chain, all in float32: to world coordinates and back."""
     height, width = units.shape
     camera = pair.intrinsics(units).matrix().astype(np.float32)
     left, right = (pair.poses.world_from_cam(0, cam).astype(np.float32) for cam in (0, 1))
@@ -176,8 +176,8 @@ class Way:
 
     Attributes:
         name: What tables call it.
-        run: What does it.
-        offered: Whether it is what the package does in some case, or a way it does not take.
+        run: The function.
+        offered: Whether the package uses it.
     """
 
     name: str
@@ -213,7 +213,7 @@ def interpolated(values: np.ndarray, *, size: tuple[int, int], mode: str) -> np.
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What visibility is decided from: depth in metres of both views, and where it was measured."""
+    """The input of visibility: depth in metres of both views, and where it was measured."""
 
     left_m: np.ndarray
     right_m: np.ndarray
@@ -224,7 +224,7 @@ class Sight:
 
 
 def sight_of(pair: Pair, left: np.ndarray, right: np.ndarray, *, dtype: Any) -> Sight:
-    """Return what visibility is decided from, made of the stored depth of both views."""
+    """Return the input of visibility from the stored depth of both views."""
     measured = [(units != 0) & (units != 65535) for units in (left, right)]
     left_m, right_m = (
         np.multiply(units, pair.unit_m, dtype=np.float64).astype(dtype) * there
@@ -241,7 +241,7 @@ def sight_of(pair: Pair, left: np.ndarray, right: np.ndarray, *, dtype: Any) -> 
 
 
 def visible_by_both(sight: Sight) -> Any:
-    """Return what the right camera sees, by its own depth."""
+    """Return the pixels that the right camera sees, by its own depth."""
     return visible_in_target(
         project_rectified(sight.left_m, sight.disparity_px),
         measured=sight.left_measured,
@@ -252,7 +252,7 @@ def visible_by_both(sight: Sight) -> Any:
 
 
 def visible_by_left(sight: Sight) -> Any:
-    """Return the same as far as the left depth tells."""
+    """Return the pixels that the right camera sees, by the left depth alone."""
     return visible_from_source(
         project_rectified(sight.left_m, sight.disparity_px),
         measured=sight.left_measured,

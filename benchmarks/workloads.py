@@ -1,9 +1,9 @@
-"""What is raced over: which samples a workload has, and how large a slice each contestant loads.
+"""The workloads of the races: their samples, and the slice that each contestant loads.
 
-Whoever reads videos forwards (ours, the limit, scene-wise decoders) costs the same for every
-frame, so a slice is the first ``window`` frames of each scene. Whoever starts anew for every sample
-costs more the later a frame comes, so a slice is chosen from *all* samples of the workload, spread
-evenly over the places in a video. Both are samples of the same workload.
+For contestants that read videos forwards (ours, the limit, scene-wise decoders) every frame costs
+the same, so their slice is the first ``window`` frames of each scene. For those that start again at
+every sample, later frames cost more, so their slice is drawn from *all* samples of the workload,
+spread evenly over the video. Both are samples of the same workload.
 """
 
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What the ratios to the limit and to the naive loader are to reach."""
+    """The targets of the ratios to the limit and to the naive loader."""
 
     limit: float
     naive: float
@@ -46,20 +46,20 @@ class Workload:
 
     Attributes:
         name: Its short name, for ``--only``.
-        title: What tables call it.
-        scenes: How many scenes are open to it.
+        title: Its name in tables.
+        scenes: The number of scenes.
         frames: `StereoPairs`'s ``frames``, for all of the workload.
-        window: The same for the slice of those that read forwards.
+        window: The same for the slice of contestants that read forwards.
         pairs: "primary" or "all".
         size: (height, width) that pictures are scaled to; None for the stored size.
-        both_ways: Whether the right view's disparity is wanted too.
+        both_ways: Whether samples have the disparity of the right view too.
         batch: Samples in a batch.
-        few: Samples in the slice of those that start anew for every sample.
+        few: Samples in the slice of contestants that start again at every sample.
         workers: Worker processes, the first being the headline.
-        target: The ratios to reach, if any are stated.
-        blosc2: The ratio to reach from blosc2 shards, if one is stated.
-        more: Contestants that race over this workload beside the usual ones.
-        field: Contestants that race over it instead of the usual ones.
+        target: The target ratios, if any.
+        blosc2: The target ratio with blosc2 shards, if any.
+        more: Further contestants in this workload.
+        field: Contestants in this workload instead of the usual ones.
         source: "local" files, or shards through the "web".
         crf: The constant rate factor of the pictures.
     """
@@ -89,7 +89,7 @@ class Workload:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The fields of a sample, in every contestant's."""
+        """The fields of a sample of every contestant."""
         maps = ("disparity", "disparity_right") if self.both_ways else ("disparity",)
         return ("left", "right", *maps, "baseline_m", "frame_index", "pair", "scene")
 
@@ -181,13 +181,13 @@ def tiny(workload: Workload) -> Workload:
 
 @dataclass(frozen=True)
 class Job:
-    """A workload on the data at hand: what a contestant is given.
+    """A workload on its data, as a contestant gets it.
 
     Attributes:
-        workload: What is raced over.
-        material: Where the data lie.
+        workload: The workload.
+        material: The data.
         reading: Whether the slice is that of forward readers, or a random choice of all samples.
-        url: The shards' address, where they are to be read through the web.
+        url: The URL of the shards, if they are read by HTTP.
     """
 
     workload: Workload
@@ -197,7 +197,7 @@ class Job:
 
     @property
     def data(self) -> Material:
-        """Where the data lie at the workload's bit rate."""
+        """The data at the bit rate of the workload."""
         return self.material.at_rate(self.workload.crf)
 
     @cached_property
@@ -207,7 +207,7 @@ class Job:
 
     @cached_property
     def keys(self) -> list[str]:
-        """The keys of the workload's scenes, both families alike."""
+        """The keys of the scenes, equally many of both families."""
         keys = SceneIndex.open(self.tree).column("key").tolist()
         half = len(keys) // 2
         mixed = [key for both in zip(keys[:half], keys[half:], strict=True) for key in both]
@@ -215,7 +215,7 @@ class Job:
 
     @property
     def selection(self) -> dict[str, Any]:
-        """What `StereoPairs` is asked for."""
+        """The selection, as options of `StereoPairs`."""
         workload = self.workload
         frames = workload.window if self.reading == "forwards" else workload.frames
         return {
@@ -232,8 +232,8 @@ class Job:
         """The numbers of the slice's samples: in order for forward readers, else from all.
 
         The latter are one of each of ``few`` equal shares of the samples by their last frame, so
-        that their mean place in a video is that of all. Early and late ones alternate in such an
-        order that two workers, who take turns, get as much to do.
+        their mean position in a video is that of all samples. Early and late ones alternate, so two
+        workers that take turns have equal work.
         """
         pairs = self._pairs
         count = len(pairs)

@@ -1,9 +1,9 @@
 """Batch work on one interface with two engines: processes of this machine, or a Ray cluster.
 
-`Engine.map` works on items in parallel and yields each result as it comes. A task is a function
-of a module that takes an item and a function to call now and then with how much of the item is
-done; there the task is interrupted when the work is stopped. Results depend neither on the engine
-nor on the number of workers.
+`Engine.map` works on items in parallel and yields each result as it comes. A task is a function of
+a module. It takes an item, and a function that it calls now and then with how much it has done
+since the last call; that call raises an exception when the work is stopped. Results depend neither
+on the engine nor on the number of workers.
 """
 
 import importlib
@@ -21,10 +21,9 @@ from multiprocessing.process import BaseProcess
 from multiprocessing.sharedctypes import Synchronized
 from multiprocessing.synchronize import Event
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Protocol, TypeVar, runtime_checkable
+from typing import Any, Final, NoReturn, Protocol, TypeVar, runtime_checkable
 
-from stereogenbench_data.errors import ExtraError, StorageError
+from stereogenbench_data.errors import ExtraError, StorageError, explain_os_errors
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -39,11 +38,11 @@ _SHOWN: Final = 3
 
 
 def no_advance(count: int) -> None:
-    """Take no note of what is done."""
+    """Ignore what is done."""
 
 
 def advance_of(progress: Progress | None, *, done: int = 0, total: int) -> Advance:
-    """Return an `Advance` that adds up what is done, and reports it along with the total."""
+    """Return an `Advance` that adds up what is done, and reports the sum and the total."""
 
     def advance(count: int) -> None:
         nonlocal done
@@ -67,19 +66,20 @@ class Engine(Protocol):
         workers: int | None = None,
         advance: Advance = no_advance,
     ) -> Generator[Result, None, None]:
-        """Do a task for each item, in any order, and yield the results; close it to stop the rest.
+        """Do a task for each item and yield the results in any order; closing stops the rest.
+
+        The error of a task is raised as it is, with a note that names the item, once the other
+        tasks are stopped.
 
         Args:
             task: A function of a module, which other processes can import.
-            items: What it is called with, one at a time; each can be pickled.
+            items: The arguments of its calls; each can be pickled.
             name: Returns what messages call an item.
-            workers: How many items are worked on at the same time; None for one a core.
+            workers: How many items are worked on at the same time; None for one per core.
             advance: Called now and then in this process with how much was done since.
 
         Raises:
             StorageError: If ``workers`` is below 1, or a worker died; the message names its item.
-                The error of a task is raised as it is, with a note that names the item, once the
-                other tasks are stopped.
         """
 
 
@@ -88,8 +88,8 @@ def engine_of(text: str, *, device: str = "cpu") -> Engine:
 
     Args:
         text: "local"; "ray" for the cluster that Ray finds by itself (``RAY_ADDRESS``, or one on
-            this machine); "ray://HOST:PORT" or "HOST:PORT" for the one at an address.
-        device: Where tasks compute; on Ray each has a GPU of its own unless it is "cpu".
+            this machine); "ray://HOST:PORT" or "HOST:PORT" for the cluster at an address.
+        device: Where tasks compute. On Ray each task has its own GPU, unless this is "cpu".
 
     Raises:
         StorageError: If it is none of these.
@@ -100,43 +100,44 @@ def engine_of(text: str, *, device: str = "cpu") -> Engine:
         text = "auto"
     elif not (text.startswith("ray://") or text.rpartition(":")[2].isdecimal()):
         raise StorageError(
-            f"engine {text!r}: there is none of that name. Choose local, ray, ray://HOST:PORT or "
+            f"engine {text!r}: there is no such engine. Choose local, ray, ray://HOST:PORT or "
             f"HOST:PORT."
         )
     return RayCluster(text, gpus=int(device != "cpu"))
 
 
-def _require_workers(workers: int | None) -> None:
+def require_workers(workers: int | None) -> None:
+    """Refuse a number of workers below 1.
+
+    Raises:
+        StorageError: If it is one.
+    """
     if workers is not None and workers < 1:
         raise StorageError(f"workers must be at least 1, got {workers}.")
 
 
-class _Naming:
-    """A context that adds a note to whatever error a task raises: the name of its item."""
-
-    def __init__(self, name: Callable[[Item], str], item: Item) -> None:
-        self._name: Callable[[], str] = lambda: name(item)
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(
-        self, kind: object, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if error is not None and not isinstance(error, BrokenProcessPool):
-            error.add_note(f"This happened while {self._name()} was worked on.")
+@contextmanager
+def _noting(name: Callable[[Item], str], item: Item) -> Iterator[None]:
+    """Add the name of an item to whatever error its task raises."""
+    try:
+        yield
+    except BrokenProcessPool:
+        raise
+    except BaseException as error:
+        error.add_note(f"This happened while {name(item)} was worked on.")
+        raise
 
 
 # Processes of this machine.
 
 
 class _Stopped(Exception):
-    """The work was called off."""
+    """The work was stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Shared:
-    """What processes tell each other: units done, whether to stop, who works on which item."""
+    """State shared by the processes: how much is done, whether to stop, who works on which item."""
 
     done: "Synchronized[int]"
     stop: Event
@@ -145,12 +146,12 @@ class _Shared:
 
 
 _shared: list[_Shared] = []
-"""What a worker process was given when it started; empty elsewhere."""
+"""In a worker process the state that it shares; empty elsewhere."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessPool:
-    """The engine of this machine: processes, or this one alone for one worker or one item."""
+    """Processes of this machine; for one worker or one item, this process alone."""
 
     def map(
         self,
@@ -161,12 +162,12 @@ class ProcessPool:
         workers: int | None = None,
         advance: Advance = no_advance,
     ) -> Generator[Result, None, None]:
-        """Work as `Engine.map` says; items of a dead worker are not tried again."""
-        _require_workers(workers)
+        """See `Engine.map`; the items of a dead worker are not tried again."""
+        require_workers(workers)
         needed = min(workers or os.cpu_count() or 1, len(items))
         if needed <= 1:
             for item in items:
-                with _Naming(name, item):
+                with _noting(name, item):
                     result = task(item, advance)
                 yield result
             return
@@ -217,13 +218,13 @@ def _results(
         advance(done - reported)
         reported = done
         for future in finished:
-            with _Naming(name, futures[future]):
+            with _noting(name, futures[future]):
                 result = future.result()
             yield result
 
 
 def _items_of_dead(workers: set[BaseProcess], shared: _Shared) -> list[int]:
-    """Return the numbers of the items whose workers died, not those that the pool then ended."""
+    """Return the numbers of the items whose workers died, without those the pool then ended."""
     ended = {each.pid for each in workers if each.exitcode in (0, -signal.SIGTERM)}
     return [
         number for number, pid in enumerate(shared.worked_on_by) if pid != 0 and pid not in ended
@@ -232,7 +233,7 @@ def _items_of_dead(workers: set[BaseProcess], shared: _Shared) -> list[int]:
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Start processes so that Ctrl-C never reaches them; here it counts as soon as they started."""
+    """Block Ctrl-C in processes that the block starts; here it takes effect after the block."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -244,17 +245,17 @@ def _interrupts_held() -> Iterator[None]:
 
 
 def _start_worker(shared: _Shared) -> None:
-    """Prepare a worker: Ctrl-C is left to the main process, and there is no life without it."""
+    """Prepare a worker: the main process handles Ctrl-C, and the worker ends when that ends."""
+
+    def die_with_parent() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_die_with_parent, daemon=True).start()
+    threading.Thread(target=die_with_parent, daemon=True).start()
     _shared.append(shared)
-
-
-def _die_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 def _run_in_process(task: Callable[[Item, Advance], Result], item: Item, number: int) -> Result:
@@ -277,26 +278,26 @@ def _run_in_process(task: Callable[[Item, Advance], Result], item: Item, number:
 # A Ray cluster.
 
 _TRIES: Final = 3
-"""How often an item is begun whose workers die."""
+"""How often an item is tried whose workers die."""
 _CANCEL_S: Final = 30.0
-"""How long to wait for tasks that are called off to remove what they began."""
+"""How long cancelled tasks have to remove their unfinished files."""
 _RAY_POLL_S: Final = 1.0
-_AHEAD: Final = 2
-"""How many items are handed to Ray for each core of the cluster, one of them waiting."""
+_PER_CORE: Final = 2
+"""How many items are submitted to Ray for each core of the cluster, one of them waiting."""
 
 
 @dataclass(frozen=True, slots=True)
 class RayCluster:
-    """A Ray cluster that runs already, one task an item; none is started. Needs the extra ``ray``.
+    """A running Ray cluster, with one task per item; none is started. Needs the extra ``ray``.
 
-    This package must be installed on all nodes. Files must be at the same paths on all of them, and
-    so must the working folder, which relative paths begin at. An item whose worker or node dies
-    is begun again, twice at most. What is done is reported when an item is finished.
+    All nodes need this package, the same files at the same paths, and the working folder that
+    relative paths start from. An item whose worker or node dies is tried again, twice at most.
+    Progress is reported when an item is finished.
 
     Attributes:
-        address: Where it is: "ray://HOST:PORT" (needs ``ray[client]``) or "HOST:PORT"; "auto" for
-            the one of ``RAY_ADDRESS`` or of this machine. A connection that this process has
-            already is used instead, and stays.
+        address: "ray://HOST:PORT" (needs ``ray[client]``) or "HOST:PORT"; "auto" for the cluster
+            of ``RAY_ADDRESS`` or of this machine. If this process is connected to Ray already,
+            that connection is used instead, and stays.
         gpus: How many GPUs each task has to itself.
     """
 
@@ -312,17 +313,23 @@ class RayCluster:
         workers: int | None = None,
         advance: Advance = no_advance,
     ) -> Generator[Result, None, None]:
-        """Work as `Engine.map` says.
+        """See `Engine.map`.
 
         Raises:
             ExtraError: If Ray is not installed.
             StorageError: If no cluster is there, it has too few GPUs, or workers died of one item
                 again and again.
         """
-        _require_workers(workers)
+        require_workers(workers)
         if not items:
             return
-        ray = _ray()
+        try:
+            ray = importlib.import_module("ray")
+        except ImportError as error:
+            raise ExtraError(
+                f"Ray cannot be imported ({error}): install `stereogenbench-data[ray]`, or choose "
+                f"the engine `local`."
+            ) from error
         with _connected(ray, self.address):
             remote = ray.remote(max_retries=0, num_cpus=1, num_gpus=self.gpus)(_run_on_ray)
             there = ray.cluster_resources()
@@ -331,100 +338,90 @@ class RayCluster:
                     f"{self.address}: this Ray cluster has {there.get('GPU', 0):g} GPUs, and each "
                     f"task needs {self.gpus}. Compute on the device cpu, or add a node with GPUs."
                 )
-            limit = workers or _AHEAD * max(1, int(there.get("CPU", 1)))
-            work = _RayWork(ray, lambda item: remote.remote(task, item, str(Path.cwd())), name)
-            with closing(work.results(list(items), limit=limit, advance=advance)) as results:
+            limit = workers or _PER_CORE * max(1, int(there.get("CPU", 1)))
+            folder = str(Path.cwd())
+            results = _ray_results(
+                ray,
+                lambda item: remote.remote(task, item, folder),
+                items,
+                name=name,
+                limit=limit,
+                advance=advance,
+            )
+            with closing(results):
                 yield from results
 
 
-@dataclass(frozen=True, slots=True)
-class _RayWork:
-    """Items that are handed to Ray, a bounded number at a time."""
+def _ray_results(
+    ray: Any,
+    submit: Callable[[Any], Any],
+    items: Sequence[Any],
+    *,
+    name: Callable[[Any], str],
+    limit: int,
+    advance: Advance,
+) -> Generator[Any, None, None]:
+    """Yield the result of each item, with at most ``limit`` items submitted at a time."""
+    waiting = [(item, 1) for item in reversed(items)]
+    running: dict[Any, tuple[Any, int]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < limit:
+                item, attempt = waiting.pop()
+                running[submit(item)] = (item, attempt)
+            finished, _ = ray.wait(list(running), num_returns=1, timeout=_RAY_POLL_S)
+            advance(0)
+            for reference in finished:
+                item, attempt = running.pop(reference)
+                try:
+                    result, done = ray.get(reference)
+                except ray.exceptions.RayTaskError as error:
+                    _raise_cause(error, name, item)
+                except ray.exceptions.RayError as error:
+                    if attempt == _TRIES:
+                        raise StorageError(
+                            f"{name(item)}: Ray did not finish it in {_TRIES} tries "
+                            f"({_first_line(error)}). Check whether its worker was killed for lack "
+                            f"of memory, and run it again with fewer workers; what is finished is "
+                            f"kept."
+                        ) from error
+                    waiting.append((item, attempt + 1))
+                    continue
+                advance(done)
+                yield result
+    finally:
+        for reference in running:
+            ray.cancel(reference)
+        if running:
+            ray.wait(list(running), num_returns=len(running), timeout=_CANCEL_S)
 
-    ray: Any
-    submit: Callable[[Any], Any]
-    name: Callable[[Any], str]
 
-    def results(
-        self, items: list[Any], *, limit: int, advance: Advance
-    ) -> Generator[Any, None, None]:
-        """Yield the result of each item."""
-        waiting = [(item, 1) for item in reversed(items)]
-        running: dict[Any, tuple[Any, int]] = {}
-        try:
-            while waiting or running:
-                while waiting and len(running) < limit:
-                    item, attempt = waiting.pop()
-                    running[self.submit(item)] = (item, attempt)
-                finished, _ = self.ray.wait(list(running), num_returns=1, timeout=_RAY_POLL_S)
-                advance(0)
-                for reference in finished:
-                    item, attempt = running.pop(reference)
-                    try:
-                        result, done = self.ray.get(reference)
-                    except self.ray.exceptions.RayTaskError as error:
-                        self._raise(item, error)
-                    except self.ray.exceptions.RayError as error:
-                        self._require_another_try(item, attempt, error)
-                        waiting.append((item, attempt + 1))
-                        continue
-                    advance(done)
-                    yield result
-        finally:
-            for reference in running:
-                self.ray.cancel(reference)
-            if running:
-                self.ray.wait(list(running), num_returns=len(running), timeout=_CANCEL_S)
-
-    def _raise(self, item: Any, error: Any) -> None:
-        """Raise what a task raised, without Ray's wrapping."""
-        cause = error.cause
-        if isinstance(cause, RuntimeError) and "failed to import" in _first_line(cause):
-            raise StorageError(
-                f"{self.name(item)}: a node of the Ray cluster cannot import this package, or has "
-                f"another version of it. Install the same stereogenbench-data on all nodes."
-            ) from error
-        with _Naming(self.name, item):
-            raise cause if isinstance(cause, Exception) else error
-
-    def _require_another_try(self, item: Any, attempt: int, error: Any) -> None:
-        if attempt == _TRIES:
-            raise StorageError(
-                f"{self.name(item)}: Ray did not finish it in {_TRIES} tries "
-                f"({_first_line(error)}). Look whether its worker was killed for want of memory, "
-                f"and run it again, with fewer workers; what is finished is kept."
-            ) from error
+def _raise_cause(error: Any, name: Callable[[Any], str], item: Any) -> NoReturn:
+    """Raise what a task raised, without Ray's wrapper."""
+    cause = error.cause
+    if isinstance(cause, RuntimeError) and "failed to import" in _first_line(cause):
+        raise StorageError(
+            f"{name(item)}: a node of the Ray cluster cannot import this package, or has another "
+            f"version of it. Install the same stereogenbench-data on all nodes."
+        ) from error
+    with _noting(name, item):
+        raise cause if isinstance(cause, Exception) else error
 
 
 def _run_on_ray(
     task: Callable[[Item, Advance], Result], item: Item, working_folder: str
 ) -> tuple[Result, int]:
     """Return the result of a task, and how much it reported as done; a worker of Ray calls this."""
-    try:
+    where = f"{working_folder}: the working folder cannot be entered on the node {platform.node()}"
+    with explain_os_errors(where, "Start the command in a folder that all nodes have."):
         os.chdir(working_folder)
-    except OSError as error:
-        raise StorageError(
-            f"{working_folder}: the working folder cannot be entered on the node {platform.node()} "
-            f"({error.strerror}). Start the command in a folder that all nodes have."
-        ) from error
     done = 0
 
     def advance(count: int) -> None:
         nonlocal done
         done += count
 
-    result = task(item, advance)
-    return result, done
-
-
-def _ray() -> Any:
-    try:
-        return importlib.import_module("ray")
-    except ImportError as error:
-        raise ExtraError(
-            f"Ray cannot be imported ({error}): install `stereogenbench-data[ray]`, or choose the "
-            f"engine `local`."
-        ) from error
+    return task(item, advance), done
 
 
 @contextmanager
@@ -444,7 +441,7 @@ def _connected(ray: Any, address: str) -> Iterator[None]:
         ) from error
     try:
         if in_main_thread and on_end is not None:
-            signal.signal(signal.SIGTERM, on_end)  # Ray put its own in place.
+            signal.signal(signal.SIGTERM, on_end)  # Ray has replaced it.
         yield
     finally:
         ray.shutdown()

@@ -16,19 +16,21 @@ StereoGenBenchError
 ├── EvaluationError (ValueError)  predictions, metrics or a protocol that cannot be scored
 └── ExtraError     (ImportError)  an optional dependency or its weights are not installed
 
-Each takes one message: so a DataLoader worker's error is rebuilt as itself in the main process.
-A message shows URLs without logins and queries, whatever it was made of.
+Each takes one message, so the error of a DataLoader worker is raised again as the same class in the
+main process. Messages show URLs without logins and queries.
 
-What to do about an error of the operating system follows from its number, wherever it occurs:
-`cure_of` holds the one table, and `describe_os_error` makes the message.
+An `OSError` has one cure, wherever it occurs: `cure_of` looks it up by its number,
+`describe_os_error` makes the message, and `explain_os_errors` raises ours instead.
 """
 
 import errno
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final
 
 _CHAIN: Final = re.compile(r"::(?=(?:[\w+.-]+::)*[A-Za-z][\w+.-]*://|/|data:|[\w+.-]*$)", re.ASCII)
-"""Where a chain of file systems goes on; the colons of an IPv6 address or a password are none."""
+"""Where a chain of file systems continues; colons of IPv6 addresses and passwords do not match."""
 _IN_TEXT: Final = re.compile(r"[A-Za-z][\w+.-]*(?:::[\w+.-]+)*://[^\s'\"<>]+", re.ASCII)
 _AS_PATH: Final = re.compile(
     r"\b(https?|s3a?|hf|ftps?|sftp|ssh|smb|gs|gcs|az|abfss?|webhdfs):/(?!/)([^\s'\"]+)"
@@ -40,24 +42,12 @@ _PORT: Final = re.compile(r"[^:]*(?::[0-9]*)?|\[.*", re.ASCII)
 
 
 def url_without_secrets(url: str) -> str:
-    """Return a URL, or a chain of them, without logins, queries and fragments.
-
-    It never fails, also where the URL is none.
+    """Return a URL, or a chain of them, without logins, queries and fragments; it never fails.
 
     >>> url_without_secrets("zip://a::https://me:word@host/all.zip?token=1")
     'zip://a::https://host/all.zip'
     """
     return "::".join(map(_link_without_secrets, _CHAIN.split(url)))
-
-
-def text_without_secrets(text: str) -> str:
-    """Return a text in which each URL is without login, query and fragment."""
-    whole = _IN_TEXT.sub(lambda found: url_without_secrets(found[0]), text)
-    return _AS_PATH.sub(_path_without_secrets, whole)
-
-
-def _path_without_secrets(found: re.Match[str]) -> str:
-    return url_without_secrets(f"{found[1]}://{found[2]}").replace("://", ":/", 1)
 
 
 def _link_without_secrets(link: str) -> str:
@@ -66,16 +56,23 @@ def _link_without_secrets(link: str) -> str:
         return link if len(link) < 64 or not link.startswith("data:") else "data:..."
     if scheme.lower() == "file":
         return link
-    end = _AUTHORITY_END.search(rest)
-    authority = rest[: end.start()] if end else rest
+    authority = _AUTHORITY_END.split(rest, maxsplit=1)[0]
     login, _, host = authority.rpartition("@")
     if not login and "@" in rest and not _PORT.fullmatch(authority):
         # The password holds a slash, a question mark or a hash.
         return _link_without_secrets(f"{scheme}://{rest.rpartition('@')[2]}")
     if scheme.lower() == "hf" and ":" not in login:
-        host = authority  # of the Hub, what follows the @ is a revision
+        host = authority  # On the Hub, a revision follows the @.
     path = re.split(r"[?#]", rest[len(authority) :], maxsplit=1)[0]
     return f"{scheme}://{host}{_LOGIN_IN_PATH.sub('', path)}"
+
+
+def text_without_secrets(text: str) -> str:
+    """Return a text in which each URL is without login, query and fragment."""
+    whole = _IN_TEXT.sub(lambda found: url_without_secrets(found[0]), text)
+    return _AS_PATH.sub(
+        lambda found: url_without_secrets(f"{found[1]}://{found[2]}").replace("://", ":/", 1), whole
+    )
 
 
 _CURES: Final = {
@@ -94,16 +91,15 @@ _CURES: Final = {
     errno.ELOOP: "Links lead in a circle: remove them.",
 }
 
-
 DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Numbers of errors that mean a full disk or quota."""
 
 NOT_WRITABLE: Final = frozenset({errno.EROFS, errno.EACCES, errno.EPERM})
-"""Numbers of errors that mean a place that may only be read."""
+"""Numbers of errors that mean a read-only place."""
 
 
 def describe_os_error(what: str, error: OSError, otherwise: str = "") -> str:
-    """Return what failed, the system's reason and the cure of `cure_of`, as one message.
+    """Return one message: what failed, the system's reason, and the cure as `cure_of` gives it.
 
     >>> full = OSError(errno.ENOSPC, "No space left on device")
     >>> describe_os_error("a.tar: cannot be written", full, "Choose another folder.")
@@ -115,8 +111,8 @@ def describe_os_error(what: str, error: OSError, otherwise: str = "") -> str:
 def cure_of(error: OSError, otherwise: str = "") -> str:
     """Return what to do about an error of the operating system.
 
-    Where its number tells the cause (a full disk, too many open files, no permission), the cure
-    belongs to that; for any other number it is what the caller says.
+    Its number decides where it tells the cause (a full disk, too many open files, no permission);
+    else the caller does.
 
     >>> cure_of(OSError(errno.ENOENT, "No such file or directory"), "Fetch it again.")
     'Fetch it again.'
@@ -128,7 +124,7 @@ class StereoGenBenchError(Exception):
     """The base of every error that this package raises on purpose."""
 
     def __init__(self, message: str = "") -> None:
-        """Say what is wrong, without what is secret in the URLs that are named."""
+        """Take a message; secrets are removed from the URLs in it."""
         super().__init__(text_without_secrets(str(message)))
 
 
@@ -186,3 +182,16 @@ class EvaluationError(StereoGenBenchError, ValueError):
 
 class ExtraError(StereoGenBenchError, ImportError):
     """A feature's optional dependency, or the weights it needs, are not installed."""
+
+
+@contextmanager
+def explain_os_errors(
+    what: str, otherwise: str = "", *, kind: type[StereoGenBenchError] = StorageError
+) -> Iterator[None]:
+    """Raise an `OSError` of the block as ours, in the words of `describe_os_error`."""
+    try:
+        yield
+    except StereoGenBenchError:
+        raise
+    except OSError as error:
+        raise kind(describe_os_error(what, error, otherwise)) from error

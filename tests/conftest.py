@@ -1,7 +1,7 @@
-"""What all tests share: the material that stands beside the project, and signals as they are usual.
+"""Fixtures of all tests: drawn scenes, the shared material beside the project, and usual signals.
 
-Where the material is missing, pytest's first and last lines say so, and under CI its tests fail
-unless SHARED_MATERIAL=none says that it is not to be had.
+If the material is missing, pytest's first and last lines say so. In CI its tests then fail, unless
+SHARED_MATERIAL=none says that it is not available.
 """
 
 import os
@@ -20,7 +20,7 @@ SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
 MATERIAL = ("scenes", "ground_truth")
-_CURE = f"put it at {SHARED}: without it nothing is compared with data that others made"
+_CURE = f"put it at {SHARED}: without it no test compares with data from elsewhere"
 
 
 def _missing_material() -> list[str]:
@@ -32,7 +32,7 @@ def _is_ci() -> bool:
 
 
 def pytest_report_header() -> str:
-    """Say at the start whether the shared material is at hand."""
+    """Print at the start whether the shared material exists."""
     missing = _missing_material()
     if not missing:
         return f"shared material: {SHARED}"
@@ -40,7 +40,7 @@ def pytest_report_header() -> str:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say at the end, too, what could not be tested for want of it."""
+    """Print at the end which tests did not run without it."""
     missing = _missing_material()
     if missing:
         terminalreporter.write_sep("!", "shared material is missing", red=True, bold=True)
@@ -52,7 +52,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 def _shared_folder(name: str) -> Path:
     folder = SHARED / name
     if not folder.is_dir():
-        reason = f"needs {name}, which stands beside the project and is not here: {_CURE}"
+        reason = f"needs {name} beside the project: {_CURE}"
         is_needed = _is_ci() and os.environ.get("SHARED_MATERIAL") != "none"
         pytest.fail(reason) if is_needed else pytest.skip(reason)
     return folder
@@ -60,9 +60,9 @@ def _shared_folder(name: str) -> Path:
 
 @pytest.fixture
 def usual_signals() -> Iterator[None]:
-    """Commands that a test starts get Ctrl-C and SIGTERM as from a terminal.
+    """Let commands that a test starts handle Ctrl-C and SIGTERM as in a terminal.
 
-    A script's background jobs ignore Ctrl-C, and what they start inherits that.
+    Background jobs of a script ignore Ctrl-C, and their children inherit that.
     """
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.getsignal(number) for number in numbers]
@@ -75,7 +75,7 @@ def usual_signals() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def shared_scenes() -> Path:
-    """The root of a released-layout tree with one scene that was rendered elsewhere."""
+    """The root of a tree in the released layout with one scene that was rendered elsewhere."""
     return _shared_folder("scenes")
 
 
@@ -87,7 +87,7 @@ def ground_truth() -> Path:
 
 @pytest.fixture(scope="session")
 def small_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A released-layout tree of small scenes: two families in train, both eval subsets."""
+    """A tree of small scenes in the released layout: two families in train, one in eval."""
     root = tmp_path_factory.mktemp("release")
     for request in (
         SynthRequest(family="IPD_Gaussian", scenes=1, size_px=64, frames=7, seed=1),

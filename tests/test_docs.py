@@ -1,4 +1,4 @@
-"""The documentation is built as a site: no page, link or docstring gives a warning."""
+"""The documentation builds as a site; no page, link or docstring gives a warning."""
 
 import os
 import re
@@ -17,7 +17,7 @@ HOME = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """What the build said, and where the site is."""
+    """The ended process of the build, and the folder of the site."""
     for module in ("mkdocs", "material", "mkdocstrings"):
         require_module(module)
     site = tmp_path_factory.mktemp("site")
@@ -36,8 +36,8 @@ def text_of(site, page):
 def test_the_strict_build_has_no_warning(built):
     done, _ = built
 
-    said = [line for line in done.stderr.splitlines() if line.startswith(("WARNING", "ERROR"))]
-    assert said == []
+    lines = [line for line in done.stderr.splitlines() if line.startswith(("WARNING", "ERROR"))]
+    assert lines == []
     assert done.returncode == 0, done.stderr[-3000:]
 
 
@@ -68,9 +68,9 @@ def test_tables_of_fields_and_pictures_stand_in_the_pages(built):
     assert (site / "pictures" / "sheet.png").stat().st_size < 400_000
 
 
-def test_the_reference_tells_what_a_class_takes_and_of_whom_a_default_is_zero(built):
+def test_the_reference_shows_signatures_and_defaults_of_zero(built):
     reference, commands = text_of(built[1], "api"), text_of(built[1], "commands")
 
     assert "StereoPairs(data, *," in " ".join(reference.split())
     assert "_MappedScenes" not in reference
-    assert re.search(r"--seed\s+What chance decides follows from it\.\s+0\s", commands)
+    assert re.search(r"--seed\s+Seed of all that is random\.\s+0\s", commands)

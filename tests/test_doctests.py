@@ -1,4 +1,4 @@
-"""The examples in docstrings run and print what they say."""
+"""The examples in docstrings run and print the output that they show."""
 
 import doctest
 from importlib import import_module
@@ -17,7 +17,7 @@ MODULES = [
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_the_examples_of_a_module_are_so(request, name):
+def test_the_examples_of_a_module_run(request, name):
     fixtures = {"getfixture": request.getfixturevalue}
 
     found = doctest.testmod(import_module(name), extraglobs=fixtures)

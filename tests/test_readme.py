@@ -1,4 +1,4 @@
-"""What README and documentation say is so: their Python runs, the table of fields is the code's."""
+"""README and documentation: their Python runs, their table of fields is the code's."""
 
 import gc
 import re
@@ -24,7 +24,7 @@ DOCUMENTED = [(path, block) for path in PAGES for block in blocks_of(path)]
 
 @pytest.fixture(scope="module")
 def folder_with_scenes(tmp_path_factory):
-    """A folder that holds ``scenes/``, as the README has its reader make."""
+    """A folder with ``scenes/``, as a reader of the README makes it."""
     folder = tmp_path_factory.mktemp("readme")
     (folder / "shards").symlink_to(README.parent / "shards")
     synthesise(
@@ -64,9 +64,9 @@ def test_there_are_blocks_to_run():
 
 def test_the_table_of_fields_is_the_codes():
     table = README.read_text().split("<!-- fields -->")[1].split("<!-- /fields -->")[0]
-    told = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|$", table, flags=re.MULTILINE)
+    rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|$", table, flags=re.MULTILINE)
 
-    assert told == [
+    assert rows == [
         (name, f"{field.dtype} {field.shape}".strip() if field.dtype != "str" else "str",
          field.meaning)
         for name, field in PAIR_FIELDS.items()

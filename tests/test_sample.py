@@ -1,4 +1,4 @@
-"""The sample in the repository: whole, small, made as its README says, the same if packed again."""
+"""The sample in the repository: complete, small, made by its README's commands, reproducible."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""What is told to whoever works on the package: versions that are tested, paths that exist."""
+"""Facts for developers: the tested versions, and the paths that pages name."""
 
 import re
 import tomllib
@@ -13,11 +13,11 @@ HOME = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((HOME / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 TOOLS = {"bench", "dev", "docs"}
-"""Extras of who works on the package: what they need is tested in its newest release alone."""
+"""Extras for developers: only the newest releases of their packages are tested."""
 
 
 def lower_bounds():
-    """Return the lowest version that is stated of each package that users install."""
+    """Return the stated lowest version of each package that users install."""
     lines = PROJECT["dependencies"] + [
         line for extra, lines in EXTRAS.items() if extra not in TOOLS for line in lines
     ]
@@ -37,7 +37,7 @@ def test_the_lowest_versions_that_are_tested_are_those_that_are_stated():
     tested = {pin.name: str(pin.specifier).removeprefix("==") for pin in pins("lowest")}
 
     for name, lowest in lower_bounds().items():
-        # Where no release has the very number, the first one after it is pinned.
+        # If no release has this number, the next one is pinned.
         assert Version(tested[name]) in SpecifierSet(f">={lowest},=={lowest}.*"), name
 
 

@@ -1,1 +1,1 @@
-"""Those who race: one module each, written as a careful user of that library would write it."""
+"""The contestants, one module each, written as a careful user of that library would write it."""

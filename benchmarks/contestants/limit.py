@@ -1,11 +1,10 @@
 """The limit: each needed stream decoded once by a bare PyAV loop, every array written once.
 
-Nothing else is done: no checks, no masks, no batches, no queues. Arrays are written into buffers
-that are used again and again, so that not even memory is asked for. With N processes, N of these
-loops run over scenes of their own.
+It does nothing else: no checks, no masks, no batches, no queues. It reuses its buffers, so it does
+not even allocate memory. With N processes, N of these loops run over different scenes.
 
-With depth for nothing, no depth file is opened and every map is of the same numbers: how much
-faster the loop then is bounds what any other codec for depth can give.
+With depth for nothing, no depth file is opened and every map has the same numbers. The speed of
+this loop bounds the gain of any other codec for depth.
 """
 
 import json
@@ -27,10 +26,10 @@ Depth = Literal["decoded", "given"]
 
 
 class Stream:
-    """The frames of one video, forwards; what the last one was converted to is kept."""
+    """The frames of one video, forwards; keeps the last converted frame."""
 
     def __init__(self, path: Path, size: tuple[int, int]) -> None:
-        """Open a video whose pictures are wanted at (height, width); one thread decodes."""
+        """Open a video, to be scaled to (height, width); one thread decodes."""
         self.container = av.open(str(path))
         video = self.container.streams.video[0]
         video.codec_context.thread_count = 1
@@ -55,7 +54,7 @@ class Stream:
         return self._kept
 
     def _scaled(self, frame: Any) -> Any:
-        """Return a frame at the size wanted, with colour where brightness is."""
+        """Return a frame at the target size, with chroma where luma is."""
         if self._graph is None:
             self._graph = av.filter.Graph()
             self._graph.threads = 1
@@ -88,7 +87,7 @@ class Stream:
 
     def _frame(self, index: int) -> Any:
         if index < self._at:
-            raise ValueError(f"frame {index} is asked for after frame {self._at}")
+            raise ValueError(f"frame {index} is requested after frame {self._at}")
         for _ in range(self._at, index):
             frame = next(self._decoded)
         self._at = index
@@ -99,7 +98,7 @@ class GivenDepth:
     """Depth that costs nothing to decode: the same stored numbers for every frame."""
 
     def __init__(self, stored: np.ndarray, size: tuple[int, int]) -> None:
-        """Take numbers as stored, wanted at (height, width)."""
+        """Take stored numbers, to be scaled to (height, width)."""
         self._stored = stored
         self._size = size
         self._at = -1

@@ -1,4 +1,4 @@
-"""The naive loader: what the paper's snippet leads to.
+"""The naive loader, written after the paper's snippet.
 
 Every sample parses the scene's JSONs, opens its files, decodes up to its frames, converts with
 ``to_ndarray`` and divides; torch's own `DataLoader` shuffles and batches.
@@ -48,7 +48,7 @@ class NaivePairs(Dataset[dict[str, Any]]):
     """Samples by number."""
 
     def __init__(self, job: Job) -> None:
-        """Take which samples there are."""
+        """Take the samples to load."""
         self._job = job
 
     def __len__(self) -> int:

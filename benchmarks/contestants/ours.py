@@ -10,7 +10,7 @@ from stereogenbench_data import StereoPairs, StereoPairStream
 
 
 def mapped(job: Job, data: str | Path, **options: Any) -> DataLoader[Any]:
-    """Return the loader of `StereoPairs`, its options the defaults."""
+    """Return the loader of `StereoPairs` with default options."""
     pairs = StereoPairs(data, **job.selection)
     return pairs.loader(job.workload.batch, tail="uneven", seed=SEED, **options)
 

@@ -1,7 +1,7 @@
 """torchcodec and decord for the pictures, PyAV for depth: decoders kept open, frames by number.
 
-Neither gives 16-bit depth whole, so depth goes through PyAV, which seeks to the key frame before
-the frame wanted. A careful user's loader: as many videos are kept open as pays.
+Neither returns all 16 bits of depth, so PyAV decodes depth and seeks to the key frame before the
+frame. As a careful user would, the loader keeps as many videos open as pays off.
 """
 
 import json
@@ -95,7 +95,7 @@ class KeptOpenPairs(Dataset[dict[str, Any]]):
     """Samples by number."""
 
     def __init__(self, job: Job, video: type[TorchcodecVideo] | type[DecordVideo]) -> None:
-        """Take which samples there are, and what reads pictures."""
+        """Take the samples to load, and the class that reads pictures."""
         self._job = job
         self._video = video
         self._open: OrderedDict[Path, Any] = OrderedDict()

@@ -1,4 +1,4 @@
-"""What a careful user of any library needs beside its decoder: a pair's numbers, and disparity."""
+"""What a careful user of any library adds to its decoder: the numbers of a pair, and disparity."""
 
 import re
 from collections.abc import Iterable
@@ -16,7 +16,7 @@ NO_DEPTH: Final = (0, 65535)
 
 @dataclass(frozen=True, slots=True)
 class PairNumbers:
-    """What turns stored depth into disparity: focal length and baseline of a pair."""
+    """Focal length and baseline of a pair, which turn stored depth into disparity."""
 
     fx_px: float
     baseline_m: float
@@ -33,7 +33,7 @@ def camera_number(name: str | int) -> int:
 
 
 def pair_numbers(document: dict[str, Any], *, left: int, right: int, width_px: int) -> PairNumbers:
-    """Return a pair's numbers out of ``baseline.json``, for pictures of this width."""
+    """Return the numbers of a pair from ``baseline.json``, for pictures of this width."""
     intrinsics = document["camera_intrinsics"]
     fx_px = intrinsics["focal_length_mm"] / intrinsics["sensor_width_mm"] * width_px
     for entry in document["pairwise_pairs"]:
@@ -43,7 +43,7 @@ def pair_numbers(document: dict[str, Any], *, left: int, right: int, width_px: i
 
 
 def unit_m_of(container: Any) -> float:
-    """Return the metres in a stored unit, as a depth video's tags tell."""
+    """Return the metres in a stored unit from the tags of a depth video."""
     tags = container.metadata | container.streams.video[0].metadata
     return float(next((tags[key] for key in tags if "scale" in key.lower()), 0.1))
 

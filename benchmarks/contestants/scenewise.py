@@ -1,8 +1,8 @@
 """Plain webdataset and Hugging Face datasets: whole scenes from shards, with a decode step.
 
-A scene is one sample of a shard. The decode step decodes each needed video of it once, from
-memory, and gives the scene's pairs one after another. So frames of one scene follow each other:
-shuffling them over scenes would take a buffer of many scenes' samples.
+A scene is one sample of a shard. The decode step decodes each needed video of the scene once, from
+memory, and yields the scene's pairs one after another. So frames of one scene follow each other;
+shuffling them over scenes would need a buffer of many scenes' samples.
 """
 
 import io
@@ -26,7 +26,7 @@ from stereogenbench_data.index.table import SceneIndex
 
 
 def urls(job: Job) -> list[str]:
-    """Return where the shards of the workload's scenes are, as far as they are packed.
+    """Return the paths or URLs of the shards of the workload's scenes, as far as they are packed.
 
     A workload of more scenes than are packed is read in part: each scene costs the same here.
     """
@@ -72,7 +72,7 @@ def decoded(job: Job, key: str, files: dict[str, bytes]) -> Iterator[dict[str, A
 
 
 def _arrays(frames: dict[str, Any], size: tuple[int, int] | None) -> dict[str, np.ndarray]:
-    """Return pictures (3, h, w) and stored depth (h, w) of one moment."""
+    """Return pictures (3, h, w) and stored depth (h, w) of one frame."""
     scaled = {} if size is None else {"height": size[0], "width": size[1], "interpolation": "AREA"}
     return {
         name: frame.to_ndarray()
@@ -111,7 +111,7 @@ class DecodedScenes(IterableDataset[dict[str, Any]]):
     """A stream of scenes' files, decoded."""
 
     def __init__(self, job: Job, scenes: Callable[[], Any]) -> None:
-        """Take what makes an iterable of scenes; torch's workers share its shards out."""
+        """Take a function that makes an iterable of scenes; torch's workers share its shards."""
         self._job = job
         self._scenes = scenes()
 

@@ -1,32 +1,32 @@
 """Whether a scene's pictures, depth, poses and focal length fit together to a part of a pixel.
 
-Points of a smooth surface are taken from one camera to another, or from one moment to another, by
-their depth and the recorded poses. On a plane 1 / depth is linear in the pixel, so the inverse
-depth that the target stores there, interpolated, equals the expected one but for rounding. What is
-left over is explained by one parameter at a time (least squares, Tukey's weights): depth of one
-camera shifted, scaled or along the ray; a focal length off, which shifts the depth of every camera
-by its disparity. In the same way the difference of two
-pictures is explained by one of them being shifted (Lucas and Kanade, 1981), or by every disparity
-being off by a factor. The parameter that explains most is kept, its camera is left out, and the
-rest is fitted again.
+Points on smooth surfaces are taken from one camera to another, or from one moment to another, by
+their depth and the recorded poses. On a plane 1 / depth is linear in the pixel, so the target's
+inverse depth, interpolated at that place, equals the expected one but for rounding. The residual
+is fitted by one parameter at a time (least squares, Tukey's weights): depth of one camera that is
+shifted, scaled or along the ray; a wrong focal length, which shifts the depth of every camera by
+its disparity. In the same way the difference of two pictures is fitted by a shift of one of them
+(Lucas and Kanade, 1981), or by a factor of every disparity. The parameter that explains most is
+kept, its camera is left out, and the rest is fitted again.
 
-What lies behind what is expected is seen through a surface. An occluder hides what is behind it
-and so never causes that, whatever else the target sees: with right data the share is 0 to 0.1 %
-between cameras of one moment. Things that move cause it between two moments.
+A point is seen through if the target sees something behind it. An occluder never causes that: it
+hides what is behind it. In correct data the share of such points is 0 to 0.1 % between cameras at
+one moment; moving objects cause it between two moments.
 
-Errors are those of sums over 16 parts of the picture in each of at most 5 moments, which differ
-in content (sandwich estimate). What would not be seen if it were there, because its error is as
-large as what is looked for, is not testable.
+Standard errors come from sums over 16 parts of the picture in each of at most 5 moments, which
+differ in content (sandwich estimate). A quantity is not testable if its error is as large as the
+effect in question.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float, Float64
 
 from stereogenbench_data.audit.audit_records import Alignment, Estimate, PairFit
+from stereogenbench_data.audit.picture_check import luma_of
 from stereogenbench_data.audit.reprojection import MeasuredDepth
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
@@ -38,43 +38,43 @@ ALIGNED_PAIRS: Final = tuple(
     for b in range(CAMERA_COUNT)
     if abs(a - b) in (1, 2, CAMERA_COUNT - 1)
 )
-"""Directed pairs that are compared: neighbours, those one further on, and the outermost."""
+"""Directed pairs that are compared: neighbours, next but one, and the outermost."""
 
 _POINTS: Final = 1600
 _FEW_FRAMES: Final = 4
-"""Fewer frames than that are compared both ways; of more, each takes half of the directions."""
+"""Fewer frames are compared in both directions; of more, each takes half of the directions."""
 _FEWEST_POINTS: Final = 100
 _CELLS: Final = 4
 _MOMENTS: Final = 5
-"""Into so many moments a scene's frames are put: those of one show the same things, and so err
-alike."""
+"""Number of groups of a scene's frames: frames of one group show the same content and share their
+errors."""
 _TOLERANCE: Final = 0.005
-"""Share of the depth, beside two stored steps, beyond which a point counts as seen through; a
-surface that passes as smooth bends by less between pixels."""
+"""Share of the depth, plus two stored steps, beyond which a point counts as seen through. A smooth
+surface bends by less between pixels."""
 _VISIBLE: Final = 0.02
 _BEND: Final = 0.004
-"""Largest second difference of 1 / depth in a smooth patch, as a share, beside four steps."""
+"""Largest second difference of 1 / depth in a smooth patch, as a share, plus four steps."""
 _COARSE: Final = 0.05
-"""Depth stored in steps larger than this share of itself is too coarse to compare."""
+"""Depth whose stored steps are a larger share of it is too coarse to compare."""
 _WINDOW: Final = {"depth": 0.05, "motion": 0.1}
-"""Relative differences of depth from which on a point has no weight."""
+"""Relative differences of depth beyond which a point has no weight."""
 CERTAIN: Final = 6.0
-"""Standard errors that an estimate must be away from 0; 4 or 5 occur by chance among the 30
-parameters of each of 8,000 scenes, and parts of a picture are not quite independent."""
-_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+"""How many standard errors an estimate must be away from 0. Among the 30 parameters of each of
+8,000 scenes, 4 or 5 occur by chance, and parts of a picture are not quite independent."""
+
 LEAST_CONTRAST: Final = 2.0
-"""Standard deviation in grey levels of the band-passed points of a picture with texture."""
+"""Least standard deviation, in grey levels, of a band-passed picture with texture."""
 _NOTED: Final = {
     "shift": 0.05, "scale": 0.001, "ray": 0.02, "focal": 0.002,
 }  # fmt: skip
-"""What is worth an estimate of its own, well below every limit."""
+"""Estimates below these are ignored; they are well below every limit."""
 
 Points = Float64[np.ndarray, " n"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Landed:
-    """Points of one view that land in another, with derivatives of where and how deep.
+    """Points of one view that land in another, with derivatives of their place and depth there.
 
     ``by_*`` are (d column, d row, d log inverse depth) for a relative change of the point's
     inverse depth or of a focal length.
@@ -85,7 +85,6 @@ class _Landed:
     u_px: Points
     v_px: Points
     cell: np.ndarray
-    inverse: Points
     off: Points
     steps: Points
     smooth: np.ndarray
@@ -95,7 +94,7 @@ class _Landed:
     slope: tuple[tuple[Points, Points], tuple[Points, Points]]
 
     def depth_columns(self) -> dict[str, tuple[Points, Points]]:
-        """Return d(off) of each parameter, of the source's depth and of the target's."""
+        """Return d(off) for each parameter: of the source's depth, and of the target's."""
         by_depth = self._seen(self.by_depth)
         (source_x, source_y), (target_x, target_y) = self.slope
         return {
@@ -106,7 +105,7 @@ class _Landed:
         }
 
     def focal_columns(self) -> tuple[Points, Points]:
-        """Return d(off) of the horizontal and of the vertical focal length."""
+        """Return d(off) for the horizontal and for the vertical focal length."""
         return self._seen(self.by_focal[0]), self._seen(self.by_focal[1])
 
     def _seen(self, moved: tuple[Points, Points, Points]) -> Points:
@@ -116,7 +115,7 @@ class _Landed:
 
 
 def _patch(depth: MeasuredDepth, rows: Any, columns: Any, *, side: int) -> Any:
-    """Return 1 / depth of side x side pixels from (rows, columns) on, nan where not measured."""
+    """Return 1 / depth of side x side pixels from (rows, columns), nan where not measured."""
     steps = np.arange(side)
     places = (rows + steps[:, None, None], columns + steps[:, None])
     known = depth.measured[places]
@@ -143,7 +142,7 @@ def _landed(
     intrinsics: Intrinsics,
     motion: Float64[np.ndarray, "4 4"],
 ) -> _Landed | None:
-    """Take evenly spread points to a target; those that land in it on measured depth."""
+    """Take evenly spread points to a target; return those that land in it, None if too few do."""
     height, width = source.depth_m.shape
     every = max(1, int((height * width / _POINTS) ** 0.5))
     rows, columns = (
@@ -194,7 +193,6 @@ def _landed(
         u_px=u_px,
         v_px=v_px,
         cell=rows * _CELLS // height * _CELLS + columns * _CELLS // width,
-        inverse=inverse,
         off=found / expected - 1,
         steps=steps,
         smooth=smooth & np.isfinite(found) & (steps <= _COARSE),
@@ -223,7 +221,7 @@ def _relative_step(depth: MeasuredDepth, depth_m: Points) -> Points:
 
 @dataclass(slots=True)
 class _Sums:
-    """What one directed pair adds to a fit, of every frame, before any parameter is chosen."""
+    """The residuals and derivatives of one directed pair, over all frames."""
 
     differences: list[Points] = field(default_factory=list)
     weights: list[Points] = field(default_factory=list)
@@ -233,7 +231,7 @@ class _Sums:
     through: int = 0
 
     def add(self, off: Points, weight: Points, cell: np.ndarray, columns: dict[str, Any]) -> None:
-        """Take points into account; single precision is enough and half the memory."""
+        """Add points; single precision is enough and takes half the memory."""
         self.differences.append(off.astype(np.float32))
         self.weights.append(weight.astype(np.float32))
         self.cells.append(cell)
@@ -251,8 +249,8 @@ _OF_ALL: Final = -1
 class _Fit:
     """One-parameter fits over directed pairs.
 
-    ``window`` is the difference from which on a point has no weight; infinite where the weights
-    that points come with are kept.
+    ``window`` is the residual beyond which a point has no weight; infinite to keep the points' own
+    weights.
     """
 
     def __init__(self, sums: Mapping[tuple[int, int], _Sums], *, window: float) -> None:
@@ -280,7 +278,7 @@ class _Fit:
     def estimates(
         self, check: str, *, of_cameras: Iterable[str], of_all: Iterable[str]
     ) -> Iterator[Estimate]:
-        """Yield an estimate of each parameter of each camera, and of those that all share."""
+        """Yield an estimate of each parameter of each camera, and of each that all share."""
         if self.is_empty:
             return
         for name in of_cameras:
@@ -323,10 +321,10 @@ class _Fit:
 
 
 class AlignmentCheck:
-    """Takes a scene's frames one after another; `result` is what they say together."""
+    """Takes a scene's frames one after another; `result` returns what all frames show."""
 
     def __init__(self, intrinsics: Intrinsics, *, frames: int) -> None:
-        """Prepare for so many frames of one rig."""
+        """Prepare for a number of frames of one rig."""
         self.intrinsics = intrinsics
         self._is_both_ways = frames < _FEW_FRAMES
         self._frames_a_moment = -(-frames // _MOMENTS)
@@ -349,13 +347,13 @@ class AlignmentCheck:
         bands: Mapping[tuple[int, int], Float[np.ndarray, "h w"]],
         poses: CameraPoses,
     ) -> None:
-        """Take one frame into account.
+        """Add one frame.
 
         Args:
             frame: Its number.
             depths: Each camera's depth.
-            bands: By camera and frame, `band` of pictures of this frame and those beside it.
-            poses: Of all frames.
+            bands: By (camera, frame), the `band` of pictures of this frame and its neighbours.
+            poses: Poses of all frames.
         """
         for source, target in ALIGNED_PAIRS:
             is_turn = self._is_both_ways or (source < target) == (self._frames % 2 == 0)
@@ -407,17 +405,17 @@ class AlignmentCheck:
         none = np.zeros_like(across)
         columns["focal"] = (across + down, none)
         if check == "motion":
-            columns = {
-                "scale": columns["scale"],
-                "ray": columns["ray"],
-                "focal": columns["focal"],
-                "focal_x": (across, none),
-                "focal_y": (down, none),
-            }
-        cells = landed.cell[keep] + _CELLS**2 * (self._frames // self._frames_a_moment)
+            columns |= {"focal_x": (across, none), "focal_y": (down, none)}
+            del columns["shift_x"], columns["shift_y"]
         # Coarse steps make a point count less; rounding moves it by 0.3 of one.
         weight = 1 / (1 + (landed.steps[keep] / _TOLERANCE) ** 2)
-        sums.add(landed.off[keep], weight, cells, columns)
+        sums.add(landed.off[keep], weight, self._cells(landed, keep), columns)
+
+    def _cells(self, landed: _Landed, keep: np.ndarray) -> np.ndarray:
+        """Return the part of the picture and the moment of each point."""
+        moment = self._frames // self._frames_a_moment
+        cells: np.ndarray = landed.cell[keep] + _CELLS**2 * moment
+        return cells
 
     def _add_pictures(
         self,
@@ -460,7 +458,7 @@ class AlignmentCheck:
         gain = float((first * second).sum() / max(float((first * first).sum()), 1e-9))
         off = second - np.clip(gain, 0.5, 2.0) * first
         spread = 1.4826 * float(np.median(np.abs(off)))
-        # A picture that is aside by a pixel differs by its slope: that counts in full.
+        # A picture that is off by a pixel differs by its slope: that counts in full.
         cut = max(6 * spread, 3 * float(np.sqrt((slope_x**2 + slope_y**2).mean())))
         weight = np.clip(1 - (off / cut) ** 2, 0, None) ** 2 / max(spread, 1.0) ** 2
         by_depth_x, by_depth_y = landed.by_depth[0][seen], landed.by_depth[1][seen]
@@ -470,15 +468,10 @@ class AlignmentCheck:
             "shift_y": (slope_y, -slope_y),
             "scale": (-by_scale, np.zeros_like(by_scale)),
         }
-        self._pictures[pair].add(
-            off,
-            weight,
-            landed.cell[seen] + _CELLS**2 * (self._frames // self._frames_a_moment),
-            columns,
-        )
+        self._pictures[pair].add(off, weight, self._cells(landed, seen), columns)
 
     def result(self) -> Alignment:
-        """Return what all frames say together."""
+        """Return what all frames show."""
         pairs = tuple(
             PairFit(
                 left=left,
@@ -505,10 +498,6 @@ class AlignmentCheck:
         pictures = _explained(
             clean, "pictures", of_cameras=("shift_x", "shift_y"), of_all=("scale",)
         )
-        smooth, through = (
-            sum(getattr(each, name) for each in self._motion.values())
-            for name in ("smooth", "through")
-        )
         return Alignment(
             pairs=pairs,
             estimates=(*depth, *motion, *pictures),
@@ -516,8 +505,8 @@ class AlignmentCheck:
                 (camera, lag, float(np.mean(gained)))
                 for (camera, lag), gained in sorted(self._lags.items())
             ),
-            moved_smooth=smooth,
-            moved_through=through,
+            moved_smooth=sum(each.smooth for each in self._motion.values()),
+            moved_through=sum(each.through for each in self._motion.values()),
             picture_px=self._factor,
             width_px=self.intrinsics.width_px / self._factor,
             moved_px=_mean([self._moved_px]),
@@ -532,9 +521,9 @@ def _explained(
     of_cameras: tuple[str, ...] = (),
     of_all: tuple[str, ...] = (),
 ) -> list[Estimate]:
-    """Return all estimates; those that explain what others do not are first ones.
+    """Return all estimates, those that explained most in a round first and marked.
 
-    A first one is the best of a round; its camera is left out of the next.
+    The camera of a round's best estimate is left out of the next round.
     """
     left, first = dict(sums), []
     estimates: list[Estimate] = []
@@ -551,7 +540,7 @@ def _explained(
         if not certain:
             break
         best = max(certain, key=lambda each: each.explained)
-        first.append(best.as_first())
+        first.append(replace(best, is_first=True))
         if best.camera == _OF_ALL:
             break
         left = {pair: each for pair, each in left.items() if best.camera not in pair}
@@ -560,10 +549,10 @@ def _explained(
 
 
 def band(picture: Any) -> Float[np.ndarray, "h w"]:
-    """Return grey levels of a (3, h, w) picture, blurred a little, less their mean over 13 px."""
-    blurred = mean = np.tensordot(_LUMA, picture.astype(np.float32), axes=1)
+    """Return grey levels of a (3, h, w) picture, slightly blurred, less their mean over 13 px."""
+    blurred = mean = luma_of(picture)
     for _ in range(2):
-        # Each turn works down the columns, and puts rows in their place.
+        # Each turn filters down the columns, and transposes.
         size = len(blurred)
         padded = np.pad(blurred, ((2, 2), (0, 0)), mode="edge")
         near, far = padded[1:-3] + padded[3:-1], padded[:-4] + padded[4:]
@@ -596,8 +585,9 @@ def _value(picture: Any, u_px: Points, v_px: Points) -> Points:
     height, width = picture.shape
     x, y = np.clip(u_px - 0.5, 0, width - 1.001), np.clip(v_px - 0.5, 0, height - 1.001)
     left, top = x.astype(np.intp), y.astype(np.intp)
-    inner = [[picture[top + down, left + across] for across in (0, 1)] for down in (0, 1)]
-    value: Points = _between(np.array(inner), x - left, y - top)
+    steps = np.arange(2)
+    inner = picture[top + steps[:, None, None], left + steps[:, None]]
+    value: Points = _between(inner, x - left, y - top)
     return value
 
 

@@ -1,61 +1,58 @@
-"""What an audit finds out: plain numbers for each scene and camera, made of JSON's own types.
+"""The records of an audit: figures of each scene and camera, in types that JSON has.
 
-Numbers are nan where they could not be measured; `plain` turns them into JSON's null.
+A figure is nan where it could not be measured; `plain` turns nan into JSON's null.
 """
 
 import math
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Final
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from typing import Any, Final, get_args, get_origin, get_type_hints
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 QUANTILES: Final = tuple(step / 40 for step in range(41))
-"""Where each scene's errors are kept, from the least to the largest: 0, 2.5 %, 5 % ... 100 %."""
-MEDIAN, P95 = QUANTILES.index(0.5), QUANTILES.index(0.95)
+"""The quantiles of each scene's errors that are kept: 0, 2.5 %, 5 % ... 100 %."""
 
 
 @dataclass(frozen=True, slots=True)
 class AuditLimits:
-    """Beyond which figures a scene is listed as a finding.
+    """The limits beyond which a figure of a scene is a finding.
 
     Attributes:
         intrinsics_px: Largest deviation of recorded intrinsics.
         baseline_cm: Largest difference between recorded and pose-derived baselines.
         rectified_px: Largest displacement by unequal rotations, or by cameras off the line.
         reprojection_px: Largest median error of the primary pair, at the widest tolerance.
-        agreement: Least share of unhidden pixels whose depths agree, of the primary pair and of
-            any adjacent one.
-        agreement_long: The same of cameras 0 and 5; in pictures narrower than 128 px the share
-            that may disagree grows as they shrink, as more pixels lie at edges.
+        agreement: Least share of unhidden pixels whose depths agree, in the primary pair and in
+            any adjacent pair.
+        agreement_long: The same for cameras 0 and 5. In pictures narrower than 128 px, where more
+            pixels lie at edges, the share that may disagree grows.
         frames: Frames that every video must have; 0 for as many as the scene has poses.
         valid_depth: Least share of measured pixels in any depth picture.
         depth_levels: Least number of different depths in a camera's pictures.
-        depth_step: Largest step of stored numbers, in units: more says that depth was rounded
-            or stretched before it was stored.
+        depth_step: Largest step of stored numbers, in units: a larger one means that depth was
+            rounded or stretched before it was stored.
         brightness: Least 95th percentile of luma (0 to 255) in any picture.
         contrast: Least distance between the 5th and 95th percentile of luma.
-        change: Least mean change of luma from one audited frame to the next, where the camera
-            moves.
+        change: Least mean change of luma to the next audited frame while the camera moves.
         occluder: Largest share of a picture hidden from its border.
-        see_through: Largest share of points of smooth surfaces of one camera that another sees
-            through, of any compared pair.
-        moved_through: The same from one audited frame to the next; things that move cause it.
-        depth_shift_px: Largest shift of one camera's depth against that of the others.
+        see_through: Largest share of one camera's points on smooth surfaces that another camera
+            sees through, in any compared pair.
+        moved_through: The same from one audited frame to the next; moving objects cause it too.
+        depth_shift_px: Largest shift of one camera's depth against the other cameras.
         depth_scale: Largest factor, less 1, by which one camera's depth differs.
-        depth_ray: How far depth may be from depth along the axis towards depth along the ray,
-            from 0 to 1.
-        focal: Largest factor, less 1, by which a focal length, or the unit of depth, differs from
-            what depth says while the cameras move.
+        depth_ray: Largest deviation from depth along the axis (0) towards depth along the ray (1).
+        focal: Largest factor, less 1, by which a focal length or the unit of depth differs from
+            what depth shows while the cameras move.
         picture_shift_px: Largest shift of one camera's pictures against the others, in pixels of
-            the picture that is looked at, which is at most 320 a side. Along the rows, where
-            disparity is, more is allowed of pictures narrower than 256 px: 0.3 px at 128.
+            a picture reduced to at most 320 a side. Along the rows the limit grows for pictures
+            narrower than 256 px: 0.3 px at 128.
         picture_scale: Largest factor, less 1, between disparity in the pictures and by depth.
         picture_fit: Least correlation of a camera's pictures with those of the camera that they
-            fit best, taken there by depth.
-        picture_odd: By how much that of each of a camera's pairs may be less than that of the
-            other cameras' pairs of as much disparity.
-        picture_lag: By how much that may grow if another frame's pictures are taken.
+            fit best, after a warp by depth.
+        picture_odd: Largest difference of that correlation between all of a camera's pairs and
+            pairs of other cameras with as much disparity.
+        picture_lag: Largest gain of that correlation by pictures of another frame.
     """
 
     intrinsics_px: float = 1e-3
@@ -86,10 +83,10 @@ class AuditLimits:
 
     @classmethod
     def parse(cls, settings: list[str]) -> "AuditLimits":
-        """Return the limits with some set by texts such as ``baseline_cm=0.01``.
+        """Return the limits, some of them set by texts such as ``baseline_cm=0.01``.
 
         Raises:
-            SelectionError: If a text names no limit or no number.
+            SelectionError: If a text does not name a limit and a number.
         """
         names = [each.name for each in fields(cls)]
         given: dict[str, float] = {}
@@ -109,7 +106,7 @@ class AuditLimits:
 
 @dataclass(frozen=True, slots=True)
 class At:
-    """A figure and the frame in which it was found; frame -1 where there is none."""
+    """A figure and the frame where it was found; the frame is -1 if there is no figure."""
 
     value: float = math.nan
     frame: int = -1
@@ -117,25 +114,24 @@ class At:
 
 @dataclass(frozen=True, slots=True)
 class CameraAudit:
-    """What was found of one camera.
+    """The audit of one camera.
 
     Attributes:
-        rgb_frames: Frames that the colour video has; -1 where it cannot be opened.
-        depth_frames: The same of the depth video.
-        depth_unit_m: Metres in a stored unit, as the contract says.
-        depth_step_units: The step in which stored numbers are spaced; nan if fewer than two.
-        depth_levels: How many different numbers were met.
-        valid_depth: Share of measured pixels, mean of all audited pictures.
-        least_valid_depth: The least of any picture.
+        rgb_frames: Number of frames of the colour video; -1 if it cannot be opened.
+        depth_frames: The same for the depth video.
+        depth_unit_m: Metres in a stored unit, by the contract.
+        depth_step_units: The step between stored numbers; nan for fewer than two numbers.
+        depth_levels: How many different numbers were found.
+        valid_depth: Mean share of measured pixels over all audited pictures.
+        least_valid_depth: The least share of any picture.
         brightness: The least 95th percentile of luma.
-        contrast: The least distance between 5th and 95th percentile of luma.
-        change: The least mean change of luma to the next audited frame, among those between
-            which the camera moved.
-        still_depth: Frame from which on to the next depth stays the same bit for bit although the
-            camera moves, -1 where there is none.
+        contrast: The least distance between the 5th and 95th percentile of luma.
+        change: The least mean change of luma to the next audited frame while the camera moves.
+        still_depth: The frame whose depth equals that of the next audited frame bit for bit
+            although the camera moves; -1 for none.
         occluder: The largest share of a picture that something near hides from its border.
-        occluder_side: "left", "right", "top" or "all"; empty where nothing does.
-        twin: Another camera with the same pictures bit for bit, -1 where there is none.
+        occluder_side: "left", "right", "top" or "all"; empty for none.
+        twin: Another camera with the same pictures bit for bit; -1 for none.
     """
 
     rgb_frames: int = -1
@@ -153,14 +149,6 @@ class CameraAudit:
     occluder_side: str = ""
     twin: int = -1
 
-    @classmethod
-    def revived(cls, plain: dict[str, Any]) -> "CameraAudit":
-        """Return the record that `plain` turned into JSON."""
-        values = _numbers(plain)
-        for name in ("least_valid_depth", "brightness", "contrast", "change", "occluder"):
-            values[name] = At(**_numbers(plain[name]))
-        return cls(**values)
-
 
 @dataclass(frozen=True, slots=True)
 class ToleranceAudit:
@@ -172,22 +160,17 @@ class ToleranceAudit:
 
     @property
     def median_px(self) -> float:
-        """The median error, nan where no pixel was kept."""
-        return self.errors_px[MEDIAN] if self.errors_px else math.nan
-
-    @property
-    def p95_px(self) -> float:
-        """The 95th percentile, nan where no pixel was kept."""
-        return self.errors_px[P95] if self.errors_px else math.nan
+        """The median error, nan if no pixel was kept."""
+        return self.errors_px[QUANTILES.index(0.5)] if self.errors_px else math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class PairAudit:
     """Reprojection of one pair over the audited frames; counts are of pixels.
 
-    ``comparable`` land inside the right picture where depth was measured; ``unhidden`` are those
-    of them that nothing in the left view hides, ``agreeing`` those whose depths agree. Errors
-    are kept of the primary and the long pair.
+    ``comparable`` pixels land inside the right picture where depth was measured. Of these, nothing
+    in the left view hides the ``unhidden`` ones; of these, the two depths agree at the ``agreeing``
+    ones. Errors are kept for the primary and the long pair.
     """
 
     left: int
@@ -201,36 +184,27 @@ class PairAudit:
 
     @property
     def agreement(self) -> float:
-        """Share of the unhidden pixels whose depths agree, nan where there is none."""
+        """Share of the unhidden pixels whose depths agree, nan if there are no such pixels."""
         return self.agreeing / self.unhidden if self.unhidden else math.nan
-
-    @classmethod
-    def revived(cls, plain: dict[str, Any]) -> "PairAudit":
-        """Return the record that `plain` turned into JSON."""
-        tolerances = tuple(
-            ToleranceAudit(each["tolerance"], each["kept"], tuple(each["errors_px"]))
-            for each in plain["tolerances"]
-        )
-        return cls(**{**plain, "tolerances": tolerances})
 
 
 @dataclass(frozen=True, slots=True)
 class RigAudit:
-    """What was found of a scene's cameras by its metadata alone.
+    """The audit of a scene's cameras by its metadata alone.
 
     Attributes:
-        fx_px: Focal length that the paper's equation gives.
+        fx_px: Focal length by the paper's equation.
         fy_px: The same, vertically.
-        intrinsics_px: Largest deviation of any intrinsics recorded in pixels, of any camera and
-            frame, and of those that samples come with, from that.
+        intrinsics_px: Largest deviation from the paper's equation, of the intrinsics recorded in
+            pixels for any camera and frame, and of those in samples.
         intrinsics_recorded: How many numbers were recorded in pixels.
         adjacent_mean_cm: Mean difference of recorded and pose-derived adjacent baselines.
-        adjacent_max_cm: The largest one.
-        pairs_mean_cm: Mean over all 15 pairs.
-        pairs_max_cm: The largest one.
-        rotation_deg: Largest angle between camera 0 and another in the same frame.
-        rotation_px: How far that moves a point of the picture at most.
-        lateral_px: How far cameras off the line of the rig move one at most.
+        adjacent_max_cm: Largest such difference.
+        pairs_mean_cm: Mean difference over all 15 pairs.
+        pairs_max_cm: Largest difference over all 15 pairs.
+        rotation_deg: Largest angle between camera 0 and another camera in the same frame.
+        rotation_px: Largest displacement of a picture's point by these angles.
+        lateral_px: Largest displacement by cameras off the line of the rig.
     """
 
     fx_px: float = math.nan
@@ -248,17 +222,17 @@ class RigAudit:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """One parameter that explains what is left between cameras, frames or pictures.
+    """The estimate of one parameter that explains residuals between cameras, frames or pictures.
 
     Attributes:
-        check: "depth" (cameras of one moment), "motion" (one camera over time) or "pictures".
+        check: "depth" (cameras at one moment), "motion" (one camera over time) or "pictures".
         what: "scale", "ray", "shift_x", "shift_y", "focal", "focal_x" or "focal_y"; factors are
             less 1, shifts in pixels to the right or down of what was compared.
-        camera: Of which camera; -1 for all.
-        value: The estimate, nan where nothing tells.
+        camera: The camera; -1 for all.
+        value: The estimate, nan if it cannot be estimated.
         error: Its standard error.
-        explained: How much of what is left it explains, the more the better.
-        is_first: Whether it explains more than any other, once the first ones before are left out.
+        explained: The weighted sum of squares that it explains.
+        is_first: Whether it explained most in its round of `alignment`.
     """
 
     check: str
@@ -269,23 +243,19 @@ class Estimate:
     explained: float = math.nan
     is_first: bool = False
 
-    def as_first(self) -> "Estimate":
-        """Return it as one that explains more than any other."""
-        return replace(self, is_first=True)
-
 
 @dataclass(frozen=True, slots=True)
 class PairFit:
-    """How well two cameras fit, points taken both ways.
+    """How well two cameras fit, by points taken in both directions.
 
     Attributes:
         left: One camera.
-        right: The other.
-        smooth: Points of smooth surfaces that land on smooth surfaces.
-        through: Those of them that lie before what the other camera sees there.
-        contrast: Standard deviation of compared pictures, grey levels; nan where none was.
-        correlation: Of the pictures at the same points; nan where they have no texture.
-        disparity_px: Mean disparity of those points, in pixels of the pictures compared.
+        right: The other camera.
+        smooth: Number of points on smooth surfaces that land on smooth surfaces.
+        through: How many of them lie in front of what the other camera sees there.
+        contrast: Standard deviation of the compared pictures in grey levels; nan for none.
+        correlation: Correlation of the pictures at the same points; nan without texture.
+        disparity_px: Mean disparity of these points, in pixels of the compared pictures.
     """
 
     left: int
@@ -298,25 +268,25 @@ class PairFit:
 
     @property
     def see_through(self) -> float:
-        """The share that is seen through, nan where fewer than 100 points tell."""
+        """The share of points that is seen through, nan for fewer than 100 points."""
         return self.through / self.smooth if self.smooth >= 100 else math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Whether pictures, depth, poses and focal length fit together, see `alignment`.
+    """How well pictures, depth, poses and focal length fit together, see `alignment`.
 
     Attributes:
         pairs: The cameras that were compared.
         estimates: What may be off, and by how much.
-        lags: (camera, lag, gain): by how much the correlation of pictures grows if a camera's
-            (-1: all cameras') pictures of frame t + lag are taken.
-        moved_smooth: Points of smooth surfaces taken from one audited frame to the next.
-        moved_through: Those of them that are seen through there.
-        moved_px: How far those points move, the mean of the frames' medians.
-        picture_px: Pixels of the scene's pictures to one of those compared.
-        width_px: Width of the pictures compared; nan where none was.
-        disparity_px: Mean disparity of compared points, in pixels of the pictures compared.
+        lags: (camera, lag, gain): the gain in correlation if a camera's (-1: all cameras')
+            pictures of frame t + lag replace those of frame t.
+        moved_smooth: Number of points on smooth surfaces taken from one audited frame to the next.
+        moved_through: How many of them are seen through there.
+        moved_px: How far these points move, the mean of the frames' medians.
+        picture_px: Pixels of the scene's pictures in one pixel of the compared pictures.
+        width_px: Width of the compared pictures; nan for none.
+        disparity_px: Mean disparity of compared points, in pixels of the compared pictures.
     """
 
     pairs: tuple[PairFit, ...] = ()
@@ -329,33 +299,21 @@ class Alignment:
     width_px: float = math.nan
     disparity_px: float = math.nan
 
-    @classmethod
-    def revived(cls, plain: dict[str, Any]) -> "Alignment":
-        """Return the record that `plain` turned into JSON."""
-        return cls(
-            **{
-                **_numbers(plain),
-                "pairs": tuple(PairFit(**_numbers(each)) for each in plain["pairs"]),
-                "estimates": tuple(Estimate(**_numbers(each)) for each in plain["estimates"]),
-                "lags": tuple((camera, lag, gain) for camera, lag, gain in plain["lags"]),
-            }
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class SceneAudit:
-    """What was found of one scene.
+    """The audit of one scene.
 
     Attributes:
         key: The scene's key.
-        frames: Frames that the index gives it.
-        audited_frames: Which frames were decoded.
-        rig: The metadata's figures.
-        cameras: Those of each camera.
-        pairs: Reprojection of the primary pair, of cameras 0 and 5, and, of fewer pixels, of the
-            other adjacent pairs.
-        problems: File (or empty) and what could not be read of it.
-        alignment: Whether pictures, depth, poses and focal length fit together.
+        frames: Number of frames by the index.
+        audited_frames: The frames that were decoded.
+        rig: Figures of the metadata.
+        cameras: Figures of each camera.
+        pairs: Reprojection of the primary pair, of cameras 0 and 5, and, with fewer pixels, of
+            the other adjacent pairs.
+        problems: (file, reason) of files that could not be read.
+        alignment: How well pictures, depth, poses and focal length fit together.
     """
 
     key: str
@@ -367,31 +325,15 @@ class SceneAudit:
     problems: tuple[tuple[str, str], ...]
     alignment: Alignment = field(default_factory=Alignment)
 
-    @classmethod
-    def revived(cls, plain: dict[str, Any]) -> "SceneAudit":
-        """Return the record that `plain` turned into JSON.
-
-        Raises:
-            ValueError: If it is not such a record; or another error of Python's, the same way.
-        """
-        cameras = tuple(CameraAudit.revived(each) for each in plain["cameras"])
-        if len(cameras) != CAMERA_COUNT:
-            raise ValueError(f"{len(cameras)} cameras")
-        return cls(
-            key=plain["key"],
-            frames=plain["frames"],
-            audited_frames=tuple(plain["audited_frames"]),
-            rig=RigAudit(**_numbers(plain["rig"])),
-            cameras=cameras,
-            pairs=tuple(PairAudit.revived(each) for each in plain["pairs"]),
-            problems=tuple((name, text) for name, text in plain["problems"]),
-            alignment=Alignment.revived(plain["alignment"]),
-        )
+    def __post_init__(self) -> None:
+        """Refuse a record of another number of cameras."""
+        if len(self.cameras) != CAMERA_COUNT:
+            raise ValueError(f"{self.key}: {len(self.cameras)} cameras, not {CAMERA_COUNT}")
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something beyond a limit, or that could not be read: where, which check, what was found."""
+    """A figure beyond its limit, or a file that cannot be read."""
 
     scene: str
     member: str
@@ -410,19 +352,19 @@ QUANTITIES: Final = {
     "shift_y": "a shift up or down", "focal": "a factor of the focal length",
     "focal_x": "the sensor's width", "focal_y": "the sensor's height",
 }  # fmt: skip
-"""What an `Estimate` is of, in words."""
+"""What an `Estimate` estimates, in words."""
 
 
 @dataclass(frozen=True, slots=True)
 class Untested:
-    """A check that the content of a scene did not allow.
+    """A check that the content of a scene does not allow.
 
     Attributes:
         scene: The scene's key.
         check: The check.
-        quantity: Which of `QUANTITIES` could not be told; empty for the whole check.
-        of: Of which cameras; empty for all.
-        why: Why, or from which size on it is seen.
+        quantity: Which of `QUANTITIES` cannot be estimated; empty for the whole check.
+        of: The cameras concerned; empty for all.
+        why: The reason, or the smallest value that would be seen.
     """
 
     scene: str
@@ -433,7 +375,7 @@ class Untested:
 
     @property
     def what(self) -> str:
-        """What was not tested, of which cameras."""
+        """The quantity and the cameras that were not tested."""
         return " of ".join(part for part in (self.quantity, self.of) if part) or "all cameras"
 
     def __str__(self) -> str:
@@ -443,7 +385,7 @@ class Untested:
 
 @dataclass(frozen=True, slots=True)
 class AuditRow:
-    """A line of the audit's table: texts, in the paper's words where it has the line."""
+    """A row of the audit's table."""
 
     check: str
     quantity: str
@@ -454,19 +396,19 @@ class AuditRow:
 
 @dataclass(frozen=True, slots=True)
 class AuditReport:
-    """What an audit of some data found.
+    """The audit of a data set.
 
     Attributes:
         root: Where the data are.
-        scenes_there: Scenes of the index.
+        scenes_there: Number of scenes of the index.
         scenes_audited: How many of them were audited.
-        frames: Frames audited of each scene; 0 for all.
-        seed: What the sample of scenes was drawn with.
-        limits: Beyond which figures a scene is a finding.
+        frames: Number of frames audited of each scene; 0 for all.
+        seed: Seed of the random choice of scenes.
+        limits: The limits beyond which a figure is a finding.
         rows: The table.
-        findings: What is beyond a limit, in the order of scenes.
-        untested: Checks that the content of a scene did not allow.
-        notes: What is no finding and should be known.
+        findings: The findings, in the order of scenes.
+        untested: Checks that the content of a scene does not allow.
+        notes: Remarks that are not findings.
         scenes: Each scene's figures.
     """
 
@@ -483,13 +425,13 @@ class AuditReport:
     scenes: tuple[SceneAudit, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """Return the report as values that `json.dumps` takes, nan as null."""
+        """Return the report as values for `json.dumps`, with None for nan."""
         document: dict[str, Any] = plain(asdict(self))
         return document
 
 
 def plain(value: Any) -> Any:
-    """Return a value with every nan and infinity in it as None."""
+    """Return a value with None in place of every nan and infinity in it."""
     if isinstance(value, dict):
         return {key: plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -497,5 +439,25 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _numbers(values: dict[str, Any]) -> dict[str, Any]:
-    return {name: math.nan if value is None else value for name, value in values.items()}
+def revived(kind: Any, value: Any) -> Any:
+    """Return the record, or the part of one, that `plain` made ``value`` of.
+
+    Raises:
+        TypeError: If ``value`` is not such a record, or of other types.
+        ValueError: If it has other fields or another length, or is not a whole record.
+    """
+    found: Any = value
+    if isinstance(kind, type) and is_dataclass(kind):
+        hints = get_type_hints(kind)
+        if value.keys() != hints.keys():
+            raise ValueError(f"{kind.__name__} has fields {', '.join(hints)}; got {list(value)}")
+        found = kind(**{name: revived(hints[name], each) for name, each in value.items()})
+    elif get_origin(kind) is tuple:
+        kinds = get_args(kind)
+        kinds = kinds[:1] * len(value) if kinds[-1] is Ellipsis else kinds
+        found = tuple(revived(*pair) for pair in zip(kinds, value, strict=True))
+    elif kind is float:
+        found = math.nan if value is None else float(value)
+    elif type(value) is not kind:
+        raise TypeError(f"a value of {kind.__name__} is stored as {value!r}")
+    return found

@@ -1,7 +1,7 @@
-"""The audit's table and its Markdown: our figures, the paper's beside them, and the limits."""
+"""The audit's table, and the report as Markdown: our figures, the paper's, and the limits."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
 from typing import Final
 
@@ -76,22 +76,15 @@ def _rig_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[Aud
             paper,
             f"{limits.baseline_cm:g} cm",
         )
-    turned_deg = _largest(rig.rotation_deg for rig in rigs)
-    turned_px = _largest(rig.rotation_px for rig in rigs)
-    yield AuditRow(
-        "rig rotation",
-        "largest turn of a camera against camera 0, and what it moves",
-        f"{_number(turned_deg)} deg / {_number(turned_px)} px",
-        "",
-        f"{limits.rectified_px:g} px",
-    )
-    yield AuditRow(
-        "lateral residual",
-        "largest shift by cameras off the rig's line",
-        f"{_number(_largest(rig.lateral_px for rig in rigs))} px",
-        "",
-        f"{limits.rectified_px:g} px",
-    )
+    turned_deg = _number(_largest(rig.rotation_deg for rig in rigs))
+    turned_px = _number(_largest(rig.rotation_px for rig in rigs))
+    lateral_px = _number(_largest(rig.lateral_px for rig in rigs))
+    for check, quantity, ours in (
+        ("rig rotation", "largest turn of a camera against camera 0, and what it moves",
+         f"{turned_deg} deg / {turned_px} px"),
+        ("lateral residual", "largest shift by cameras off the rig's line", f"{lateral_px} px"),
+    ):  # fmt: skip
+        yield AuditRow(check, quantity, ours, "", f"{limits.rectified_px:g} px")
 
 
 def _depth_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
@@ -215,16 +208,18 @@ def _alignment_rows(
 
 
 def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
+    expected = [int(limits.frames) or scene.frames for scene in scenes for _ in scene.cameras]
     for name, count_of in (
         ("RGB", attrgetter("rgb_frames")),
         ("depth", attrgetter("depth_frames")),
     ):
-        counts = [count for scene in scenes for camera in scene.cameras
-                  if (count := count_of(camera)) >= 0]  # fmt: skip
-        expected = [int(limits.frames) or scene.frames for scene in scenes for _ in scene.cameras]
-        found = [max(0, count_of(camera)) for scene in scenes for camera in scene.cameras]
-        missing = sum(max(0, most - got) for most, got in zip(expected, found, strict=True))
-        span = _span(counts)
+        found = [count_of(camera) for scene in scenes for camera in scene.cameras]
+        counts = [count for count in found if count >= 0]
+        missing = sum(max(0, most - max(0, got)) for most, got in zip(expected, found, strict=True))
+        span = "-"
+        if counts:
+            low, high = min(counts), max(counts)
+            span = f"{low}" if low == high else f"{low} to {high}"
         yield AuditRow(
             "frames",
             f"{name} frames in all (of a video), missing",
@@ -236,35 +231,18 @@ def _frame_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[A
 
 def _picture_rows(scenes: Sequence[SceneAudit], limits: AuditLimits) -> Iterator[AuditRow]:
     cameras = [camera for scene in scenes for camera in scene.cameras]
-    for check, quantity, value, limit in (
-        (
-            "too dark",
-            "least 95th percentile of luma",
-            _least(camera.brightness.value for camera in cameras),
-            f"{limits.brightness:g}",
-        ),
-        (
-            "flat",
-            "least span of luma (5th to 95th percentile)",
-            _least(camera.contrast.value for camera in cameras),
-            f"{limits.contrast:g}",
-        ),
-        (
-            "frozen",
-            "least mean change of luma while the camera moves",
-            _least(camera.change.value for camera in cameras),
-            f"{limits.change:g}",
-        ),
+    for check, what, figure, limit in (
+        ("too dark", "least 95th percentile of luma", "brightness", limits.brightness),
+        ("flat", "least span of luma (5th to 95th percentile)", "contrast", limits.contrast),
+        ("frozen", "least mean change of luma while the camera moves", "change", limits.change),
     ):
-        yield AuditRow("pictures", f"{check}: {quantity}", f"{_number(value)} of 255", "", limit)
-    hidden = _largest(camera.occluder.value for camera in cameras)
+        value = _number(_least(getattr(camera, figure).value for camera in cameras))
+        yield AuditRow("pictures", f"{check}: {what}", f"{value} of 255", "", f"{limit:g}")
     yield AuditRow(
-        "pictures",
-        "occluder: largest share of a picture hidden from its border",
-        _percent(hidden),
-        "",
+        "pictures", "occluder: largest share of a picture hidden from its border",
+        _percent(_largest(camera.occluder.value for camera in cameras)), "",
         _percent(limits.occluder),
-    )
+    )  # fmt: skip
 
 
 def _finding_rows(findings: Sequence[Finding]) -> Iterator[AuditRow]:
@@ -278,9 +256,9 @@ def _finding_rows(findings: Sequence[Finding]) -> Iterator[AuditRow]:
 
 
 def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:
-    """Return a quantile of the errors of several scenes together, nan where there is none.
+    """Return a quantile of the errors of several scenes together, nan for no errors.
 
-    It is that of the mixture of the scenes' own quantile functions, each by its number of pixels.
+    The scenes' own quantile functions are mixed, weighted by their numbers of pixels.
     """
     kept = [each for each in audits if each.kept]
     if not kept:
@@ -297,7 +275,7 @@ def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:
 
 
 def audit_markdown(report: AuditReport) -> str:
-    """Return a report as Markdown: the table, the definitions that it needs, and the findings."""
+    """Return a report as Markdown: the table, its definitions, and the findings."""
     frames = "all frames" if report.frames == 0 else f"up to {counted(report.frames, 'frame')}"
     lines = [
         f"# Audit of {markdown_text(str(report.root))}",
@@ -308,15 +286,14 @@ def audit_markdown(report: AuditReport) -> str:
         "| check | quantity | here | paper | limit |",
         "|---|---|---|---|---|",
         *(
-            "| "
-            + " | ".join([row.check, row.quantity, row.ours, row.paper or "-", row.limit or "-"])
-            + " |"
+            f"| {row.check} | {row.quantity} | {row.ours} | {row.paper or '-'} "
+            f"| {row.limit or '-'} |"
             for row in report.rows
         ),
         "",
         "Reprojection: left depth to the right camera, and back by the right depth; pixels whose "
         "two depths differ by more than the tolerance (share of depth + steps of stored depth) "
-        "count as occluded. The paper does not tell its tolerance.",
+        "count as occluded. The paper does not state its tolerance.",
     ]
     lines += _listed("Findings", [str(finding) for finding in report.findings])
     lines += _listed("Not testable", [str(each) for each in report.untested])
@@ -332,35 +309,27 @@ def _listed(title: str, texts: list[str]) -> list[str]:
         "",
         f"## {title} ({len(texts)})",
         "",
-        *(f"- {_inert(each)}" for each in texts[:_LISTED]),
+        # Commands in our own messages stay quoted.
+        *(f"- {markdown_text(each)}".replace(r"\`", "`") for each in texts[:_LISTED]),
         *more,
     ]
-
-
-def _inert(text: str) -> str:
-    """Return a sentence that holds names of the data, with our own quotation of commands."""
-    return markdown_text(text).replace(r"\`", "`")
 
 
 def _finite(values: Iterable[float]) -> list[float]:
     return [value for value in values if not math.isnan(value)]
 
 
-def _reduced(values: Iterable[float], reduce: Callable[[list[float]], float]) -> float:
-    finite = _finite(values)
-    return float(reduce(finite)) if finite else math.nan
-
-
 def _largest(values: Iterable[float]) -> float:
-    return _reduced(values, max)
+    return max(_finite(values), default=math.nan)
 
 
 def _least(values: Iterable[float]) -> float:
-    return _reduced(values, min)
+    return min(_finite(values), default=math.nan)
 
 
 def _mean(values: Iterable[float]) -> float:
-    return _reduced(values, lambda finite: float(np.mean(finite)))
+    finite = _finite(values)
+    return float(np.mean(finite)) if finite else math.nan
 
 
 def _ratio(part: int, whole: int) -> float:
@@ -368,7 +337,7 @@ def _ratio(part: int, whole: int) -> float:
 
 
 def _number(value: float) -> str:
-    """Return three significant digits; a dash where there is no number."""
+    """Return three significant digits; a dash for nan."""
     return "-" if math.isnan(value) else f"{value:.3g}"
 
 
@@ -376,15 +345,8 @@ def _percent(value: float) -> str:
     return "-" if math.isnan(value) else f"{value * 100:.4g} %"
 
 
-def _span(counts: Sequence[int]) -> str:
-    if not counts:
-        return "-"
-    low, high = min(counts), max(counts)
-    return f"{low}" if low == high else f"{low} to {high}"
-
-
 def _distinct(values: Iterable[float]) -> str:
-    """Return lengths in m, each once; their range where there are many."""
+    """Return lengths in m, each once; their range if they are many."""
     found = sorted({float(f"{value:.6g}") for value in _finite(values)})
     if not found:
         return "-"

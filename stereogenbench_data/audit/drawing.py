@@ -1,4 +1,4 @@
-"""What pictures of a scene are drawn with: colour scales with ticks, and pages with captions."""
+"""Drawing tools: colour scales with ticks, pages with captions, and matplotlib's figures."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -10,18 +10,34 @@ import numpy as np
 from jaxtyping import Bool, Float
 from PIL import Image, ImageDraw, ImageFont
 
+from stereogenbench_data.errors import ExtraError
 from stereogenbench_data.samples.picture import NOT_MEASURED, Picture, coloured
+
+
+def figure_class() -> Any:
+    """Return matplotlib's `Figure`, which draws without a display.
+
+    Raises:
+        ExtraError: If matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ExtraError(
+            "plots need matplotlib: pip install 'stereogenbench-data[plots]'."
+        ) from error
+    return Figure
 
 
 @dataclass(frozen=True, slots=True)
 class ColourScale:
-    """A range of sizes (of -3 px the size is 3), and what its ends look like.
+    """The range of absolute values that a map's colours cover.
 
     Attributes:
-        low: The smallest value that has a colour of its own, above 0 for "log".
-        high: The largest.
-        kind: "linear", from blue to red; or "log", from red to blue: what is near is red, in maps
-            of disparity as of depth.
+        low: The smallest value with a colour of its own, above 0 for "log".
+        high: The largest such value.
+        kind: "linear", from blue to red, for disparity; or "log", from red to blue, for depth: red
+            is near in both.
     """
 
     low: float
@@ -38,13 +54,13 @@ class ColourScale:
         return coloured(places, measured=measured, largest=1.0)
 
     def place(self, value: Any) -> Any:
-        """Return where a value, or each of an array, lies: 0 at the low end, 1 at the high one."""
+        """Return the position of values (a number or an array): 0 at the low end, 1 at the high."""
         if self.kind == "log":
             return np.log(value / self.low) / max(math.log(self.high / self.low), 1e-12)
         return (value - self.low) / max(self.high - self.low, 1e-12)
 
     def ticks(self, most: int) -> list[float]:
-        """Return at most so many round numbers within the range, ascending.
+        """Return at most ``most`` round numbers within the range, ascending.
 
         >>> ColourScale(0.0, 87.0).ticks(5)
         [0.0, 20.0, 40.0, 60.0, 80.0]
@@ -77,7 +93,7 @@ def scale_of(
     measured: Bool[np.ndarray, "..."],
     kind: Literal["linear", "log"] = "linear",
 ) -> ColourScale:
-    """Return a scale for the middle 96 % of measured values; a linear one begins at 0 if it can."""
+    """Return a scale for the middle 96 % of measured values; a linear one starts at 0 if it can."""
     found = np.abs(values[measured])
     if found.size == 0:
         return ColourScale(1.0 if kind == "log" else 0.0, 2.0, kind)
@@ -96,15 +112,15 @@ FRAME: Final[Colour] = (205, 207, 212)
 GREY: Final[Colour] = NOT_MEASURED
 
 Label = tuple[float, str]
-"""Where along a bar (0 to 1), and what is written there."""
+"""A position along a bar, from 0 to 1, and the text there."""
 
 
 class Page:
     """A picture under construction.
 
     Attributes:
-        font_px: The size of captions, in pixels; all distances follow it.
-        line_px: The height of a line of captions.
+        font_px: The size of captions in pixels, to which all distances are relative.
+        line_px: The height of a line of captions in pixels.
     """
 
     def __init__(self, width_px: int, height_px: int, *, font_px: int) -> None:
@@ -123,7 +139,7 @@ class Page:
         colour: Colour = INK,
         scale: float = 1.0,
     ) -> None:
-        """Write one line from its top left corner, shortened to a width."""
+        """Write one line from its top left corner, shortened to the width."""
         font = _font(round(self.font_px * scale))
         self._draw.text(place, fitted(text, font=font, width_px=width_px), fill=colour, font=font)
 
@@ -142,7 +158,7 @@ class Page:
         self, place: tuple[int, int], scale: ColourScale, rows: Sequence[Sequence[Label]], *,
         width_px: int,
     ) -> None:  # fmt: skip
-        """Draw a colour bar with rows of labels below it; a label that has no room is left out."""
+        """Draw a colour bar with rows of labels below it; labels without room are left out."""
         left, top = place
         height = max(6, round(self.font_px * 0.7))
         spread = np.geomspace if scale.kind == "log" else np.linspace
@@ -164,7 +180,7 @@ class Page:
     def swatches(
         self, place: tuple[int, int], entries: Sequence[tuple[Colour, str]], *, width_px: int
     ) -> None:
-        """Write one line for each colour and what it means."""
+        """Write one line for each colour and its meaning."""
         left, top = place
         side = round(self.font_px * 0.8)
         for number, (colour, text) in enumerate(entries):
@@ -182,12 +198,12 @@ class Page:
 
 
 def line_height(font_px: int) -> int:
-    """Return how far the lines of a font of some size are apart, in pixels."""
+    """Return the distance between lines of a font size, in pixels."""
     return round(font_px * 1.4)
 
 
 def fitted(text: str, *, font: Any, width_px: int) -> str:
-    """Return a text that is no wider than so many pixels, cut with three dots if need be."""
+    """Return a text no wider than ``width_px``, cut and ended with three dots if need be."""
     if font.getlength(text) <= width_px:
         return text
     while text and font.getlength(f"{text.rstrip()}...") > width_px:
@@ -198,10 +214,10 @@ def fitted(text: str, *, font: Any, width_px: int) -> str:
 def resized(
     picture: Picture, *, width_px: int, shrink: Literal["average", "nearest"] = "average"
 ) -> Picture:
-    """Return a picture at another width; what grows has its pixels repeated.
+    """Return a picture at another width, its aspect kept; enlarging repeats pixels.
 
     Args:
-        picture: To be resized, its shape kept.
+        picture: The picture.
         width_px: The new width.
         shrink: "average" for photographs; "nearest" for maps, whose colours have a meaning.
     """
@@ -218,10 +234,10 @@ def scale_rows(scale: ColourScale) -> list[list[Label]]:
 
 
 def disparity_rows(scale: ColourScale, *, shift_px_m: float) -> list[list[Label]]:
-    """Return the labels of a bar of disparity: in pixels, and below them depth in metres.
+    """Return the labels of a bar of disparity: in pixels, and below that depth in metres.
 
     Args:
-        scale: Of the disparities, in pixels.
+        scale: The scale of disparities in pixels.
         shift_px_m: Focal length in pixels times baseline in metres: disparity times depth.
     """
     metres = [

@@ -1,4 +1,4 @@
-"""From a scene's figures to what is beyond the limits."""
+"""A scene's findings: which of its figures are beyond the limits."""
 
 import math
 from collections.abc import Iterator
@@ -8,12 +8,10 @@ from typing import Final
 from stereogenbench_data.audit.alignment import CERTAIN
 from stereogenbench_data.audit.audit_records import (
     QUANTITIES,
-    At,
     AuditLimits,
     CameraAudit,
     Estimate,
     Finding,
-    PairAudit,
     PairFit,
     SceneAudit,
     Untested,
@@ -23,29 +21,25 @@ from stereogenbench_data.schema.release import ADJACENT_PAIRS, CAMERA_COUNT, dep
 
 
 def findings_of(scene: SceneAudit, limits: AuditLimits) -> list[Finding]:
-    """Return what is wrong with a scene, or beyond a limit; each thing once."""
-    found = [
-        Finding(scene.key, name, "unreadable", _without_place(text, name))
-        for name, text in scene.problems
-    ]
+    """Return the files of a scene that cannot be read, and its figures beyond a limit."""
+    found = []
+    for name, text in scene.problems:
+        # The file's path stands in front of some messages.
+        place, colon, rest = text.partition(f"{name}: ")
+        text = rest if colon and " " not in place else text
+        found.append(Finding(scene.key, name, "unreadable", text))
     unreadable = {name for name, _ in scene.problems}
     found += _rig_findings(scene, limits)
     found += _alignment_findings(scene, limits)
-    for number in range(CAMERA_COUNT):
-        for name, of_camera in (
-            (rgb_name(number), _rgb_findings),
-            (depth_name(number), _depth_findings),
+    for number, camera in enumerate(scene.cameras):
+        frames = int(limits.frames) or scene.frames
+        for name, of_file in (
+            (rgb_name(number), _rgb_findings(camera, frames, limits)),
+            (depth_name(number), _depth_findings(camera, frames, limits)),
         ):
             if name not in unreadable:
-                of_file = of_camera(scene, number, limits)
                 found += [Finding(scene.key, name, check, text) for check, text in of_file]
     return found
-
-
-def _without_place(text: str, name: str) -> str:
-    """Return a message without the path of the file, which stands before it."""
-    place, colon, rest = text.partition(f"{name}: ")
-    return rest if colon and " " not in place else text
 
 
 def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
@@ -56,9 +50,9 @@ def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
         ("pose/baseline", rig.pairs_max_cm, limits.baseline_cm, "cm",
          "pose-derived and recorded baselines differ by"),
         ("rig rotation", rig.rotation_px, limits.rectified_px, "px",
-         f"cameras are turned against camera 0 by {rig.rotation_deg:.3g} deg, which is"),
+         f"cameras are turned against camera 0 by {rig.rotation_deg:.3g} deg: points move by"),
         ("lateral residual", rig.lateral_px, limits.rectified_px, "px",
-         "cameras stand off the rig's line, which is"),
+         "cameras stand off the rig's line: points move by"),
         ("reprojection", primary.tolerances[-1].median_px, limits.reprojection_px, "px",
          f"median error of pair {primary.left}-{primary.right} is"),
     ):  # fmt: skip
@@ -66,49 +60,44 @@ def _rig_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
             text = f"{what} {value:.3g} {unit} (limit {limit:g})"
             yield Finding(scene.key, "", check, text)
     for pair in scene.pairs:
-        limit = _least_agreement(scene, pair, limits)
+        limit = limits.agreement
+        if pair is not primary and (pair.left, pair.right) not in ADJACENT_PAIRS:
+            narrow = max(1.0, _NARROW_PX / scene.alignment.width_px)
+            limit = 1 - (1 - limits.agreement_long) * narrow
         if pair.agreement < limit:
             text = (
-                f"of the pixels of camera {pair.left} that nothing hides from camera "
-                f"{pair.right}, the two depths agree at {pair.agreement:.1%} "
-                f"(limit {limit:.0%})"
+                f"the two depths agree at {pair.agreement:.1%} of the pixels of camera {pair.left} "
+                f"that nothing hides from camera {pair.right} (limit {limit:.0%})"
             )
             yield Finding(scene.key, "", "agreement", text)
 
 
-def _least_agreement(scene: SceneAudit, pair: PairAudit, limits: AuditLimits) -> float:
-    if pair is scene.pairs[0] or (pair.left, pair.right) in ADJACENT_PAIRS:
-        return limits.agreement
-    narrow = max(1.0, _NARROW_PX / scene.alignment.width_px)
-    return 1 - (1 - limits.agreement_long) * narrow
-
-
 _NARROW_PX: Final = 128
-"""Narrower pictures have more of their pixels at edges."""
+"""In narrower pictures a larger share of the pixels lies at edges."""
 _SHARP_PX: Final = 256
-"""In narrower pictures, what is sampled between pixels is aside by more of them."""
+"""In narrower pictures, sampling between pixels is less accurate."""
 _OWN_MOTION_PX: Final = 0.03
 _SHIFTS: Final = {"shift_x": "to the right", "shift_y": "down"}
 
 
 def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
-    """Yield what does not fit between cameras, frames and pictures."""
+    """Yield the misfits between cameras, frames and pictures."""
     found = scene.alignment
     through = [pair for pair in found.pairs if pair.see_through > limits.see_through]
     if through:
         worst = max(through, key=lambda pair: pair.see_through)
         pairs = ", ".join(f"{pair.left}-{pair.right}" for pair in through)
         text = (
-            f"depth of cameras {pairs} contradicts: of pair {worst.left}-{worst.right}, "
-            f"{worst.see_through:.1%} of the points of smooth surfaces lie before what the other "
-            f"camera sees there (limit {limits.see_through:.0%})"
+            f"the depths of cameras {pairs} contradict each other: in pair "
+            f"{worst.left}-{worst.right}, {worst.see_through:.1%} of the points on smooth surfaces "
+            f"lie in front of what the other camera sees there (limit {limits.see_through:.0%})"
         )
         yield Finding(scene.key, "", "depth consistency", text)
     moved = found.moved_through / found.moved_smooth if found.moved_smooth >= 1000 else 0.0
     if moved > limits.moved_through:
         text = (
-            f"depth of one frame contradicts that of the next audited one by the recorded poses at "
-            f"{moved:.0%} of its points (limit {limits.moved_through:.0%})"
+            f"by the recorded poses, depth of one frame contradicts that of the next audited one "
+            f"at {moved:.0%} of its points (limit {limits.moved_through:.0%})"
         )
         yield Finding(scene.key, "", "motion", text)
     has_wrong_depth = bool(through) or any(
@@ -122,8 +111,8 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
         if gained > limits.picture_lag:
             of = "all cameras" if camera < 0 else f"camera {camera}"
             text = (
-                f"pictures of {of} fit better, by {gained:.3f} of correlation, if those of the "
-                f"frame {'before' if lag < 0 else 'after'} are taken "
+                f"pictures of {of} fit better if those of the frame "
+                f"{'before' if lag < 0 else 'after'} are taken: correlation grows by {gained:.3f} "
                 f"(limit {limits.picture_lag:g})"
             )
             name = "" if camera < 0 else rgb_name(camera)
@@ -132,31 +121,32 @@ def _alignment_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Find
 
 
 def _content_findings(scene: SceneAudit, limits: AuditLimits) -> Iterator[Finding]:
-    """Yield the cameras whose pictures show something else than those of the others."""
+    """Yield the cameras whose pictures show something else than the others do."""
     found = scene.alignment
     for camera in range(CAMERA_COUNT):
         fits = [pair.correlation for pair in found.pairs if camera in (pair.left, pair.right)
                 and not math.isnan(pair.correlation)]  # fmt: skip
         if fits and max(fits) < limits.picture_fit:
             text = (
-                f"pictures of camera {camera}, taken to any other camera by depth, correlate with "
-                f"its pictures at {max(fits):.2f} or less (limit {limits.picture_fit:g})"
+                f"pictures of camera {camera}, warped by depth to any other camera, have a "
+                f"correlation of {max(fits):.2f} or less with its pictures "
+                f"(limit {limits.picture_fit:g})"
             )
             yield Finding(scene.key, rgb_name(camera), "picture content", text)
         elif (less := _correlated_less(scene, camera)) > limits.picture_odd:
             text = (
-                f"pictures of camera {camera}, taken to the others by depth, correlate with theirs "
-                f"by {less:.2f} less than the others with each other, or more "
-                f"(limit {limits.picture_odd:g})"
+                f"pictures of camera {camera}, warped by depth to the others, have a correlation "
+                f"with theirs that is at least {less:.2f} less than that of the others with each "
+                f"other (limit {limits.picture_odd:g})"
             )
             yield Finding(scene.key, rgb_name(camera), "picture content", text)
 
 
 def _correlated_less(scene: SceneAudit, camera: int) -> float:
-    """Return by how much each of a camera's pairs correlates less than other pairs, at least.
+    """Return the least by which a camera's pairs correlate less than other pairs.
 
-    Only pairs of as much disparity are compared, since pictures differ the more, the wider a pair;
-    0 where fewer than two of the camera's pairs can be.
+    Each is compared with pairs of at least its disparity, because wider pairs differ more. 0 if
+    fewer than two of the camera's pairs can be compared.
     """
     pairs = [pair for pair in scene.alignment.pairs if not math.isnan(pair.correlation)]
     less = []
@@ -171,7 +161,7 @@ def _correlated_less(scene: SceneAudit, camera: int) -> float:
 
 
 def limit_of(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> float:
-    """Return beyond which size an estimate is a finding."""
+    """Return the size beyond which an estimate is a finding."""
     if each.check == "depth":
         by_name = {
             "scale": limits.depth_scale, "ray": limits.depth_ray, "focal": limits.focal,
@@ -180,12 +170,12 @@ def limit_of(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> float:
     if each.check == "motion":
         if each.what == "ray":
             return limits.depth_ray
-        # Things that move by themselves are mistaken for more, the less the camera moves.
+        # The less the camera moves, the more do moving objects disturb the estimate.
         return max(limits.focal, _OWN_MOTION_PX / max(scene.alignment.moved_px, 1e-6))
     if each.what == "shift_y":
         return limits.picture_shift_px
     shift_px = limits.picture_shift_px * max(1.0, _SHARP_PX / scene.alignment.width_px)
-    # A factor is known no better than the shift that it causes.
+    # A factor cannot be known better than the shift that it causes.
     least = shift_px / max(scene.alignment.disparity_px, 1e-6)
     return shift_px if each.what == "shift_x" else max(limits.picture_scale, least)
 
@@ -195,7 +185,7 @@ _ENOUGH: Final = 1000
 
 
 def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Untested]:
-    """Return the checks of `alignment` that the content of a scene did not allow."""
+    """Return the checks of `alignment` that the content of a scene does not allow."""
     found = scene.alignment
     untested: list[tuple[str, str, str, str]] = []
     blind = _cameras_without(found.pairs, "see_through")
@@ -217,14 +207,14 @@ def untested_of(scene: SceneAudit, limits: AuditLimits) -> list[Untested]:
         > -limits.picture_lag
     ]  # fmt: skip
     if late:
-        why = "pictures of the frames beside fit as well, or there are none"
+        why = "pictures of the neighbouring frames fit as well, or there are none"
         untested.append(("picture time", "", _cameras(late), why))
     untested += _untested_fits(scene, limits)
     return [Untested(scene.key, *each) for each in untested]
 
 
 def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str, str, str, str]]:
-    """Yield the quantities whose limit is smaller than what could be seen in this scene."""
+    """Yield the quantities whose limit is below what can be seen in this scene."""
     for check, whats in (
         ("depth", ("scale", "ray", "shift_x", "shift_y")),
         ("motion", ("scale", "focal", "focal_x", "focal_y")),
@@ -245,7 +235,7 @@ def _untested_fits(scene: SceneAudit, limits: AuditLimits) -> Iterator[tuple[str
             blind = sorted(camera for camera in wanted if not seen.get(camera, math.inf) <= limit)
             if blind:
                 from_on = max(seen.get(camera, math.inf) for camera in blind)
-                why = "nothing tells" if math.isinf(from_on) else f"seen from {from_on:.2g} on"
+                why = "no estimate" if math.isinf(from_on) else f"seen from {from_on:.2g} on"
                 of = _cameras([camera for camera in blind if camera >= 0])
                 yield f"{check} fit", QUANTITIES[what], of, f"{why} (limit {limit:.2g})"
 
@@ -259,17 +249,16 @@ def _cameras_without(pairs: tuple[PairFit, ...], figure: str) -> list[int]:
 
 
 def _cameras(numbers: list[int]) -> str:
-    if len(numbers) == CAMERA_COUNT:
-        return ""
-    return f"camera {', '.join(map(str, numbers))}" if numbers else ""
+    some = 0 < len(numbers) < CAMERA_COUNT
+    return f"camera {', '.join(map(str, numbers))}" if some else ""
 
 
 def _estimate_findings(scene: SceneAudit, each: Estimate, limits: AuditLimits) -> Iterator[Finding]:
-    of = "all cameras" if each.camera < 0 else f"camera {each.camera}"
-    size = abs(each.value)
-    limit = limit_of(scene, each, limits)
+    of, name = "all cameras", ""
+    if each.camera >= 0:
+        of = f"camera {each.camera}"
+        name = depth_name(each.camera) if each.check == "depth" else rgb_name(each.camera)
     if each.check == "depth":
-        name = "" if each.camera < 0 else depth_name(each.camera)
         what = {
             "scale": f"differs from that of the others by {each.value:+.2%}",
             "ray": f"is {each.value:.0%} of the way from the axis to along the ray",
@@ -284,7 +273,6 @@ def _estimate_findings(scene: SceneAudit, each: Estimate, limits: AuditLimits) -
                 f"{-each.value:+.2%}"
             )
     elif each.check == "motion":
-        name = ""
         what = {
             "scale": "the unit of depth or of poses",
             "ray": "depth along the ray, by",
@@ -294,66 +282,50 @@ def _estimate_findings(scene: SceneAudit, each: Estimate, limits: AuditLimits) -
         }[each.what]
         text = f"from frame to frame, depth and poses fit if {what} is corrected {-each.value:+.2%}"
     else:
-        name = "" if each.camera < 0 else rgb_name(each.camera)
         text = (
             f"pictures of {of} are {each.value * scene.alignment.picture_px:+.2f} px "
             f"{_SHIFTS[each.what]} of where depth and the others put them"
             if each.what in _SHIFTS
             else f"disparity of the pictures differs from that of depth by {each.value:+.2%}"
         )
-    if size > limit and size > CERTAIN * each.error:
+    limit = limit_of(scene, each, limits)
+    if abs(each.value) > limit and abs(each.value) > CERTAIN * each.error:
         yield Finding(scene.key, name, f"{each.check} fit", f"{text} (limit {limit:.3g})")
 
 
-def _expected_frames(scene: SceneAudit, limits: AuditLimits) -> int:
-    return int(limits.frames) or scene.frames
-
-
-def _rgb_findings(scene: SceneAudit, number: int, limits: AuditLimits) -> Iterator[tuple[str, str]]:
-    camera = scene.cameras[number]
-    expected = _expected_frames(scene, limits)
+def _rgb_findings(
+    camera: CameraAudit, expected: int, limits: AuditLimits
+) -> Iterator[tuple[str, str]]:
+    is_flat = camera.contrast.value < limits.contrast
     if camera.rgb_frames != expected:
         yield "missing frames", f"has {camera.rgb_frames} frames of {expected}"
     if camera.brightness.value < limits.brightness:
-        what = "95 % of the picture are darker than"
-        yield "too dark", _dark_or_flat(camera.brightness, limits.brightness, what)
-    elif camera.contrast.value < limits.contrast:
-        what = "the picture's grey levels span"
-        yield "flat", _dark_or_flat(camera.contrast, limits.contrast, what)
-    if camera.change.value < limits.change and not camera.contrast.value < limits.contrast:
+        yield (
+            "too dark",
+            f"frame {camera.brightness.frame}: 95 % of the picture are darker than "
+            f"{camera.brightness.value:.0f} of 255 (limit {limits.brightness:g})",
+        )
+    elif is_flat:
+        yield (
+            "flat",
+            f"frame {camera.contrast.frame}: the picture's grey levels span "
+            f"{camera.contrast.value:.0f} of 255 (limit {limits.contrast:g})",
+        )
+    if camera.change.value < limits.change and not is_flat:
         yield (
             "frozen",
             f"from frame {camera.change.frame} to the next audited one the camera moves and the "
             f"picture changes by {camera.change.value:.2g} grey levels (limit {limits.change:g})",
         )
-    if camera.twin >= 0 and not camera.contrast.value < limits.contrast:
+    if camera.twin >= 0 and not is_flat:
         yield "copied view", f"shows the same pictures as {rgb_name(camera.twin)}, bit for bit"
 
 
 def _depth_findings(
-    scene: SceneAudit, number: int, limits: AuditLimits
+    camera: CameraAudit, expected: int, limits: AuditLimits
 ) -> Iterator[tuple[str, str]]:
-    camera = scene.cameras[number]
-    expected = _expected_frames(scene, limits)
     if camera.depth_frames != expected:
         yield "missing frames", f"has {camera.depth_frames} frames of {expected}"
-    yield from _payload_findings(camera, limits)
-    if camera.still_depth >= 0:
-        yield (
-            "frozen",
-            f"from frame {camera.still_depth} to the next audited one the camera moves and depth "
-            f"stays the same",
-        )
-    if camera.occluder.value > limits.occluder:
-        side = "everywhere" if camera.occluder_side == "all" else f"from the {camera.occluder_side}"
-        yield (
-            "occluder",
-            f"in frame {camera.occluder.frame} something near hides {camera.occluder.value:.0%} of "
-            f"the picture, {side} (limit {limits.occluder:.0%})",
-        )
-
-
-def _payload_findings(camera: CameraAudit, limits: AuditLimits) -> Iterator[tuple[str, str]]:
     least = camera.least_valid_depth
     if least.value < limits.valid_depth:
         yield (
@@ -373,19 +345,27 @@ def _payload_findings(camera: CameraAudit, limits: AuditLimits) -> Iterator[tupl
             f"its numbers are {camera.depth_step_units:g} units apart, so that depth was rounded "
             f"to {step_m:g} m before it was stored (limit {limits.depth_step:g} units)",
         )
-
-
-def _dark_or_flat(least: At, limit: float, what: str) -> str:
-    return f"frame {least.frame}: {what} {least.value:.0f} of 255 (limit {limit:g})"
+    if camera.still_depth >= 0:
+        yield (
+            "frozen",
+            f"from frame {camera.still_depth} to the next audited one the camera moves and depth "
+            f"stays the same",
+        )
+    if camera.occluder.value > limits.occluder:
+        side = "everywhere" if camera.occluder_side == "all" else f"from the {camera.occluder_side}"
+        yield (
+            "occluder",
+            f"in frame {camera.occluder.frame} something near hides {camera.occluder.value:.0%} of "
+            f"the picture, {side} (limit {limits.occluder:.0%})",
+        )
 
 
 def broken_finding(key: str, text: str) -> Finding:
-    """Return the finding that a scene which could not be indexed is.
+    """Return the finding for a scene that could not be indexed.
 
     Args:
         key: The scene's key.
-        text: What is wrong with it; the place that it may begin with, a scene's or a file's, is
-            left out.
+        text: What is wrong with it; a path at its beginning becomes the finding's place.
     """
     before, found, rest = text.partition(key)
     if not found or " " in before:

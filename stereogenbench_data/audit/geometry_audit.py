@@ -1,9 +1,9 @@
-"""The audit of any data: the paper's geometry table and quality checks, measured scene by scene."""
+"""The audit of a data set: the paper's geometry table and quality checks, scene by scene."""
 
 import hashlib
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, Unpack
@@ -16,17 +16,19 @@ from stereogenbench_data.audit.audit_records import (
     AuditReport,
     SceneAudit,
     plain,
+    revived,
 )
 from stereogenbench_data.audit.audit_table import table_rows
 from stereogenbench_data.audit.findings import broken_finding, findings_of, untested_of
+from stereogenbench_data.audit.scene_access import SceneAccess
 from stereogenbench_data.audit.scene_audit import AuditTask, audit_scene, spread_frames
-from stereogenbench_data.engine import LOCAL, Engine
+from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
 from stereogenbench_data.index.build import Journal, walk
 from stereogenbench_data.index.open import IncompleteSceneWarning
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.rows import row_of
-from stereogenbench_data.index.scene_folder import open_scene_folder
+from stereogenbench_data.index.scene_folder import SceneFolder
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
@@ -34,8 +36,6 @@ from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.sources.filesystems import MissingObject
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.remote import RemoteObject
-
-Progress = Callable[[int, int], None]
 
 DEFAULT_FRAMES: Final = 5
 _FORMAT: Final = 3
@@ -45,18 +45,17 @@ _KEY_FILTERS: Final = {"split": "split", "subset": "subset", "family": "family",
 
 @dataclass(frozen=True, slots=True)
 class AuditRequest:
-    """How much is audited, and against what.
+    """What to audit, and against which limits.
 
     Attributes:
-        sample: How many scenes, drawn at random by ``seed``; None for all.
-        frames: How many frames of each, evenly spread from the first to the last; 0 for all, as
-            the paper did.
-        seed: What the sample is drawn with.
-        depth: A depth contract that overrides what the files say, or None.
-        limits: Beyond which figures a scene is a finding.
+        sample: How many scenes to draw at random; None for all.
+        frames: How many frames of each scene, evenly spread; 0 for all, as in the paper.
+        seed: Seed of the random draw.
+        depth: A depth contract that overrides what the files state, or None.
+        limits: Values beyond which a scene is a finding.
 
     Raises:
-        SelectionError: If a number is below its least.
+        SelectionError: If a number is too small.
     """
 
     sample: int | None = None
@@ -66,7 +65,7 @@ class AuditRequest:
     limits: AuditLimits = field(default_factory=AuditLimits)
 
     def __post_init__(self) -> None:
-        """Refuse what no audit can do."""
+        """Refuse numbers that are too small."""
         for name, value, least in (
             ("sample", self.sample, 1), ("frames", self.frames, 0), ("seed", self.seed, 0),
         ):  # fmt: skip
@@ -83,27 +82,27 @@ def open_for_audit(
     progress: Progress | None = None,
     **filters: Unpack[SceneFilters],
 ) -> SceneIndex:
-    """Return the index of some data some of whose scenes may be broken; the index lists those.
+    """Return the index of data in which scenes may be broken; the index lists those scenes.
 
     Args:
         data: Whatever `SceneIndex.open` opens.
-        root: Where the data of an index file are, by the user's word.
-        workers: Processes that walk a tree that has no index.
-        engine: Where they are.
-        progress: Called with the scenes walked, and all there are.
-        **filters: Scenes of a tree whose paths do not match are not described.
+        root: Where the data of an index file are, if the user says so.
+        workers: Number of processes that read a tree without an index.
+        engine: Where these processes run.
+        progress: Called with the number of scenes read and of all scenes.
+        **filters: Scenes of a tree whose paths do not match are not read.
 
     Raises:
-        StorageError: If there is no such data, or no such scene in it, whole or not.
+        StorageError: If there is no such data, or it has no such scene.
     """
     if root is None and _is_plain_tree(data):
-        is_concerned = _Concerned(filters)
+        key_filter = _KeyFilter(filters)
         report = walk(
             data if is_remote(data) else local_path(data),
             workers=workers,
             engine=engine,
             progress=progress,
-            wanted=is_concerned.matches if is_concerned.wanted else None,
+            wanted=key_filter.matches if key_filter.wanted else None,
         )
         return SceneIndex.from_report(report)
     with warnings.catch_warnings():
@@ -135,19 +134,19 @@ def audit(
     journal: Journal | None = None,
     **filters: Unpack[SceneFilters],
 ) -> AuditReport:
-    """Measure whether data are right: the paper's geometry audit, and its quality checks.
+    """Measure whether data are right: the paper's geometry audit and its quality checks.
 
-    The reprojection error is defined in `reprojection`. Broken scenes do not stop the audit: they
-    are findings.
+    `reprojection` defines the reprojection error. A broken scene does not stop the audit; it is
+    a finding.
 
     Args:
         data: A released tree, shards, an index file, the URL of either, or an index.
-        request: How much is audited, and against what limits.
-        workers: Processes that work at the same time; None is one a core.
-        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
-        progress: Called now and then with the frames audited, and all there are.
-        journal: Where what was found of each scene is kept, so that an audit that was killed
-            goes on, see `audit_journal`; None keeps nothing.
+        request: What to audit, and against which limits.
+        workers: Number of worker processes; None is one a core.
+        engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster`.
+        progress: Called with the number of frames audited and of all frames.
+        journal: Keeps the result of each scene, so that a stopped audit can go on, see
+            `audit_journal`; None keeps nothing.
         **filters: Which scenes, see `SceneFilters`.
 
     Raises:
@@ -162,20 +161,32 @@ def audit(
         index = data
     else:
         index = open_for_audit(data, workers=workers, engine=engine, **filters)
-    is_concerned = _Concerned(filters)
-    broken = {key: text for key, text in index.broken.items() if is_concerned(key)}
-    incomplete = {key: text for key, text in index.incomplete.items() if is_concerned(key)}
+    is_wanted = _KeyFilter(filters)
+    broken = {key: text for key, text in index.broken.items() if is_wanted(key)}
+    incomplete = {key: text for key, text in index.incomplete.items() if is_wanted(key)}
     rows = _chosen(index, request, filters, left_out=broken | incomplete)
     scenes = [index.scene(int(row)) for row in rows]
-    audited = _audited(
-        index,
-        scenes,
-        request,
-        workers=workers,
-        engine=engine,
-        progress=progress,
-        journal=journal,
+    stamps: dict[str, str] = {}
+    found: dict[str, SceneAudit] = {}
+    if journal is not None:
+        stamps = {scene.id.key: _stamp(index, scene) for scene in scenes}
+        found = _known(journal, stamps)
+    tasks = [
+        AuditTask(SceneAccess.of(index, scene), request.frames, request.depth)
+        for scene in scenes
+        if scene.id.key not in found
+    ]
+    advance = advance_of(
+        progress, total=sum(len(spread_frames(scene.frames, request.frames)) for scene in scenes)
     )
+    advance(sum(len(known.audited_frames) for known in found.values()))
+    for each in engine.map(
+        audit_scene, tasks, name=lambda task: task.access.key, workers=workers, advance=advance
+    ):
+        found[each.key] = each
+        if journal is not None:
+            journal.note(each.key, plain(asdict(each)), stamp=stamps[each.key])
+    audited = [found[scene.id.key] for scene in scenes]
     findings = [broken_finding(key, text) for key, text in sorted(broken.items())]
     for scene in audited:
         findings += findings_of(scene, request.limits)
@@ -195,8 +206,8 @@ def audit(
     )
 
 
-class _Concerned:
-    """Whether a scene that could not be indexed is one that the filters ask for, by its key."""
+class _KeyFilter:
+    """Tells by its key whether the filters ask for a scene that could not be indexed."""
 
     def __init__(self, filters: Mapping[str, Any]) -> None:
         self.wanted = {
@@ -212,14 +223,14 @@ class _Concerned:
             return not self.wanted
 
     def matches(self, scene: SceneId) -> bool:
-        """Return whether the path of a scene is in line with the filters."""
+        """Tell whether a scene's path passes the filters."""
         return all(getattr(scene, name) in (*values, None) for name, values in self.wanted.items())
 
 
 def _chosen(
     index: SceneIndex, request: AuditRequest, filters: SceneFilters, *, left_out: Mapping[str, str]
 ) -> Int64[np.ndarray, " n"]:
-    """Return the rows to audit, ascending; none only where what was left out is all there is."""
+    """Return the rows to audit, ascending; none if every wanted scene was left out."""
     wanted = filters.get("scenes")
     if wanted is not None:
         keys = [wanted] if isinstance(wanted, str) else list(wanted)
@@ -237,97 +248,38 @@ def _chosen(
     return np.sort(drawn)
 
 
-def _audited(  # noqa: PLR0913 - options of `audit`
-    index: SceneIndex,
-    scenes: list[Scene],
-    request: AuditRequest,
-    *,
-    workers: int | None,
-    engine: Engine,
-    progress: Progress | None,
-    journal: Journal | None,
-) -> list[SceneAudit]:
-    """Return what was found of each scene, in their order."""
-    total = sum(len(spread_frames(scene.frames, request.frames)) for scene in scenes)
-    stamps: dict[str, str] = {}
-    found: dict[str, SceneAudit] = {}
-    done = 0
-
-    def after_frames(count: int) -> None:
-        nonlocal done
-        done += count
-        if progress is not None:
-            progress(min(done, total), total)
-
-    if journal is not None:
-        stamps = {scene.id.key: _stamp(index, scene) for scene in scenes}
-        found = _known(journal, stamps)
-    after_frames(sum(len(known.audited_frames) for known in found.values()))
-    tasks = [_task(index, scene, request) for scene in scenes if scene.id.key not in found]
-    results = engine.map(
-        audit_scene,
-        tasks,
-        name=lambda task: task.scene.id.key,
-        workers=workers,
-        advance=after_frames,
-    )
-    for audited in results:
-        found[audited.key] = audited
-        if journal is not None:
-            journal.note(audited.key, plain(asdict(audited)), stamp=stamps[audited.key])
-    return [found[scene.id.key] for scene in scenes]
-
-
-def _task(index: SceneIndex, scene: Scene, request: AuditRequest) -> AuditTask:
-    places = {member.path for member in scene.members.values()}
-    return AuditTask(
-        root=index.root,
-        retry=index.retry,
-        shards={path: index.shards[path] for path in places if path in index.shards},
-        revision=index.digest,
-        scene=scene,
-        frames=request.frames,
-        depth=request.depth,
-    )
-
-
 def audit_journal(path: Path, index: SceneIndex, request: AuditRequest) -> Journal:
     """Return the journal of an audit.
 
-    That of another root, depth contract or choice of frames is begun anew; limits, filters and
-    the number of scenes may differ.
+    The journal starts anew for another root, depth contract or number of frames. Limits, filters
+    and the number of scenes may differ.
 
     Raises:
-        StorageError: If the file is there and cannot be read.
+        StorageError: If the file exists and cannot be read.
     """
-    work = {
-        "audit": _FORMAT,
-        "root": index.where,
-        "frames": request.frames,
-        "depth": repr(request.depth),
-    }
-    return Journal(path, work=work)
+    work = {"audit": _FORMAT, "root": index.where, "frames": request.frames}
+    return Journal(path, work={**work, "depth": repr(request.depth)})
 
 
 def _known(journal: Journal, stamps: Mapping[str, str]) -> dict[str, SceneAudit]:
-    """Return what earlier runs found of scenes that have not changed since."""
+    """Return the results of earlier runs for scenes that have not changed since."""
     known: dict[str, SceneAudit] = {}
     for key, stamp in stamps.items():
         value = journal.value(key, stamp=stamp)
         try:
             if value is not None:
-                known[key] = SceneAudit.revived(value)
+                known[key] = revived(SceneAudit, value)
         except (KeyError, TypeError, ValueError, IndexError, AttributeError):
             continue
     return known
 
 
 def _stamp(index: SceneIndex, scene: Scene) -> str:
-    """Return a short text that changes when a scene's row or one of its local files does."""
+    """Return a hash that changes when a scene's row or one of its local files does."""
     parts: list[Any] = [row_of(scene)]
     if not index.shards and not is_remote(index.root):
         try:
-            parts.append(open_scene_folder(index.root, scene.id.key).stamps())
+            parts.append(SceneFolder(index.root, scene.id.key).stamps())
         except StorageError as error:
             parts.append(str(error))
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]

@@ -1,64 +1,71 @@
-"""The paper's post-render checks: payloads, light, motion, and what hides a picture's border."""
+"""The paper's checks of rendered pictures: stored depth, light, motion and border occluders."""
 
 import math
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8, UInt16
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 
 from stereogenbench_data.audit.audit_records import At
 
 NEAR_SHARE: Final = 0.3
-"""An occluder is nearer than this share of how far away the subject is, see `subject_m`."""
+"""An occluder is nearer than this share of the distance of the subject, see `subject_m`."""
 _SUBJECT_PERCENT: Final = 20
 MOVED_SHARE: Final = 0.01
-"""Motion of a picture's middle, as a share of its width, from which on pictures must change."""
+"""Motion of a picture's middle, as a share of its width, beyond which pictures must change."""
 _COVERED: Final = 0.8
 _LOOKED_AT_PX: Final = 320
 _STORED_NUMBERS: Final = 1 << 16
 ENOUGH_LEVELS: Final = 64
-"""Different numbers from which on their spacing says how they were rounded."""
+"""Least count of different numbers whose spacing shows how they were rounded."""
 _LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
 
+Luma = Float32[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 Map = Float64[np.ndarray, "h w"]
 
 
+def luma_of(picture: UInt8[np.ndarray, "3 h w"]) -> Luma:
+    """Return the luma of a picture, from 0 to 255."""
+    luma: Luma = np.tensordot(_LUMA, picture.astype(np.float32), axes=1)
+    return luma
+
+
 @dataclass(slots=True)
 class Least:
-    """The least of some figures, and where it was."""
+    """The least of some figures, and its frame."""
 
     at: At = field(default_factory=At)
 
     def take(self, value: float, frame: int) -> None:
-        """Take a figure into account."""
+        """Add a figure."""
         if not self.at.value <= value:
             self.at = At(float(value), frame)
 
 
 def reduced_size(height_px: int, width_px: int) -> tuple[int, int]:
-    """Return (height, width) at which light and motion are judged."""
+    """Return the (height, width) at which light and motion are judged."""
     factor = max(1, math.ceil(max(height_px, width_px) / _LOOKED_AT_PX))
     return max(1, height_px // factor), max(1, width_px // factor)
 
 
 class LightCheck:
-    """How bright, how rich in contrast and how changing one camera's pictures are."""
+    """Brightness, contrast and change of one camera's pictures."""
 
     def __init__(self) -> None:
         self.brightness, self.contrast, self.change = Least(), Least(), Least()
         self._last: tuple[int, np.ndarray] | None = None
 
     def take(self, picture: UInt8[np.ndarray, "3 h w"], frame: int, *, moved: bool) -> None:
-        """Take the next picture into account.
+        """Add the next picture.
 
         Args:
             picture: The picture.
             frame: Its number.
             moved: Whether the camera has moved since the last one, so that it must differ.
         """
-        luma = np.tensordot(_LUMA, picture.astype(np.float32), axes=1)
+        luma = luma_of(picture)
         dark, bright = np.percentile(luma, (5, 95))
         self.brightness.take(bright, frame)
         self.contrast.take(bright - dark, frame)
@@ -68,7 +75,7 @@ class LightCheck:
 
 
 class PayloadCheck:
-    """What numbers one camera's depth stores, and whether they change."""
+    """The numbers that one camera's depth stores, and whether they change."""
 
     def __init__(self) -> None:
         self.least_valid = Least()
@@ -80,7 +87,7 @@ class PayloadCheck:
     def take(
         self, units: UInt16[np.ndarray, "h w"], measured: Mask, frame: int, *, moved: bool
     ) -> None:
-        """Take the next depth picture into account: stored numbers, and where they are depths."""
+        """Add the next depth picture: stored numbers, and where they are measured."""
         share = float(measured.mean())
         self._shares.append(share)
         self.least_valid.take(share, frame)
@@ -97,21 +104,20 @@ class PayloadCheck:
 
     @property
     def levels(self) -> int:
-        """How many different numbers were met."""
+        """How many different numbers were found."""
         return int(self._seen.sum())
 
     @property
     def step_units(self) -> float:
-        """The step in which stored numbers are spaced, see `stored_step`."""
+        """The step between stored numbers, see `stored_step`."""
         return stored_step(np.flatnonzero(self._seen))
 
 
 def stored_step(numbers: np.ndarray) -> float:
-    """Return the step in which ascending stored numbers are spaced, nan for fewer than two.
+    """Return the step between ascending stored numbers, nan for fewer than two.
 
-    That is the greatest common divisor of their distances; or, where that is 1 and there are
-    enough of them, the least distance: numbers of 10 or 12 bits that were stretched to 16 are not
-    spaced evenly.
+    It is the greatest common divisor of their distances. If that is 1 and the numbers are many, it
+    is the least distance: numbers of 10 or 12 bits that were stretched to 16 are not evenly spaced.
 
     >>> stored_step(np.array([100, 300, 400])), stored_step(np.array([7, 8, 20]))
     (100.0, 1.0)
@@ -125,10 +131,10 @@ def stored_step(numbers: np.ndarray) -> float:
 
 
 def subject_m(depths: list[tuple[Map, Mask]]) -> float:
-    """Return about how far away what some cameras look at is, nan where nothing was measured.
+    """Return the approximate distance of what the cameras look at, nan if nothing was measured.
 
     It is the median over cameras of the 20th percentile of depth in the middle half of the
-    picture: nearer than most of the background, and not moved by what covers a camera or two.
+    picture: nearer than most of the background, and unaffected by what covers a camera or two.
     """
     nearest = []
     for depth_m, measured in depths:
@@ -141,19 +147,19 @@ def subject_m(depths: list[tuple[Map, Mask]]) -> float:
 
 
 def border_occluder(depth_m: Map, measured: Mask, *, far_m: float) -> tuple[float, str]:
-    """Return which share of a picture something near hides from a border, and from which.
+    """Return the share of a picture that something near hides from a border, and which border.
 
-    Near is what is closer than `NEAR_SHARE` of ``far_m``. Counted are unbroken runs of near pixels
-    that begin at the left, right or top border; a row that is near from end to end is the ground
-    unless nearly the whole picture is near.
+    Near is closer than `NEAR_SHARE` of ``far_m``. Unbroken runs of near pixels from the left,
+    right or top border count. A row that is near from end to end is the ground unless nearly the
+    whole picture is near.
 
     Args:
         depth_m: Depth in metres.
         measured: Where it was measured.
-        far_m: How far away the subject is, see `subject_m`.
+        far_m: The distance of the subject, see `subject_m`.
 
     Returns:
-        The share, and "left", "right", "top", "all", or "" where it is 0.
+        The share, and "left", "right", "top", "all", or "" if it is 0.
     """
     if math.isnan(far_m):
         return 0.0, ""
@@ -162,16 +168,11 @@ def border_occluder(depth_m: Map, measured: Mask, *, far_m: float) -> tuple[floa
     if near.mean() > _COVERED:
         return float(near.mean()), "all"
     beside = near & ~near.all(axis=1, keepdims=True)
-    shares = {
-        "left": _runs(beside),
-        "right": _runs(beside[:, ::-1]),
-        "top": _runs(near.T),
-    }
-    side = max(shares, key=lambda each: shares[each])
-    return (shares[side], side) if shares[side] else (0.0, "")
-
-
-def _runs(near: Mask) -> float:
-    """Return the share of a picture in runs of True that begin at its first column."""
-    lengths = np.where(near.all(axis=1), near.shape[1], near.argmin(axis=1))
-    return float(lengths.sum() / near.size)
+    share, side = 0.0, ""
+    for name, turned in (("left", beside), ("right", beside[:, ::-1]), ("top", near.T)):
+        # The lengths of runs of near pixels from the first column.
+        lengths = np.where(turned.all(axis=1), turned.shape[1], turned.argmin(axis=1))
+        found = float(lengths.sum() / turned.size)
+        if found > share:
+            share, side = found, name
+    return share, side

@@ -2,21 +2,20 @@
 
 A left pixel's centre u with depth z is the point X = z K^-1 u; the recorded poses take it to the
 right camera, X' = R X + t, where it lands at u' with depth z'. The right camera's own depth z" is
-that of the pixel in which u' falls. Where z" is measured and differs from z' by no more than a
-tolerance the pixel counts as not occluded, and there the point at u' with depth z" is taken back
-to the left camera: the distance in pixels between where it lands and u is the error. It is 0 where
-both cameras saw the same point, and B fx |1/z' - 1/z"| for a rectified pair.
+that of the pixel at u'. If z" is measured and differs from z' by no more than a tolerance, the
+pixel counts as not occluded. Then the point at u' with depth z" is taken back to the left camera;
+its distance from u in pixels is the error. It is 0 if both cameras see the same point, and
+B fx |1/z' - 1/z"| for a rectified pair.
 
-A tolerance bounds the error that it lets through, so the median alone proves little: it goes with
-the share of pixels that were kept. ``agreement`` is stricter: of the pixels that nothing in the
-left view hides from the right camera, the share of which the right depth agrees.
+A tolerance bounds the error that it keeps, so the median is reported with the share of pixels that
+were kept. ``agreement`` is stricter: the share of pixels for which the right depth agrees, of those
+that nothing in the left view hides from the right camera.
 
 Source: the StereoGenBench paper, table of the geometry consistency audit and appendix on geometry
-derivation. The paper does not tell its tolerance; ours are `TOLERANCES`.
+derivation. The paper does not state its tolerance; ours are `TOLERANCES`.
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -34,10 +33,10 @@ Map = Float64[np.ndarray, "h w"]
 Mask = Bool[np.ndarray, "h w"]
 
 MOST_PIXELS: Final = 250_000
-"""Pixels of a picture that are projected: of a larger one every k-th row is taken."""
+"""How many pixels of a picture are projected: every k-th row of a larger one."""
 
 FEWER_PIXELS: Final = 32_000
-"""The same where only the agreement of depths is wanted."""
+"""The same if only the agreement of depths is wanted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +66,8 @@ class MeasuredDepth:
     Attributes:
         depth_m: (h, w) float64 along the optical axis, 0 where not measured.
         measured: (h, w) bool.
-        step_m: The step in which depth is stored: a number, or with inverse depth the number by
-            which depth squared is divided.
+        step_m: The step of stored depth in metres; for inverse depth, the divisor of depth
+            squared that gives the step.
         form: "depth" or "inverse".
     """
 
@@ -84,11 +83,11 @@ class MeasuredDepth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairErrors:
-    """What came of one pair in one frame.
+    """The reprojection of one pair in one frame.
 
     Attributes:
-        measured: Left pixels with depth.
-        comparable: Those that land inside the right picture where depth was measured.
+        measured: Number of left pixels with depth.
+        comparable: How many land inside the right picture where depth was measured.
         errors_px: For each of `TOLERANCES`, (n,) float64 errors of the pixels kept.
         unhidden: Comparable pixels that nothing in the left view hides.
         agreeing: Those of them kept at the last tolerance.
@@ -102,7 +101,7 @@ class PairErrors:
 
 
 def row_step(height_px: int, width_px: int, *, most_pixels: int) -> int:
-    """Return k so that every k-th row of a picture makes at most about so many pixels."""
+    """Return k so that every k-th row of a picture has about ``most_pixels`` at most."""
     return max(1, math.ceil(height_px * width_px / most_pixels))
 
 
@@ -117,9 +116,9 @@ def reproject(
     """Return the reprojection errors of a left camera's pixels, all in float64.
 
     Args:
-        left: The camera whose pixels are taken.
-        right: The camera to which they go and from which they come back.
-        intrinsics: Of both pictures.
+        left: Depth of the camera whose pixels are taken.
+        right: Depth of the camera to which they go and from which they come back.
+        intrinsics: The intrinsics of both pictures.
         right_from_left: The motion between the cameras' axes, in metres.
         most_pixels: How many pixels to take, whole rows evenly spread.
     """
@@ -168,7 +167,7 @@ def _moved(
     intrinsics: Intrinsics,
     target_from_source: Float64[np.ndarray, "4 4"],
 ) -> tuple[Map, Map, Map]:
-    """Return where points of one camera land in the other, and how deep; nan behind its plane."""
+    """Return where points of one camera land in the other, and their depth; nan if behind it."""
     x_m = (u_px - intrinsics.cx_px) / intrinsics.fx_px * depth_m
     y_m = (v_px - intrinsics.cy_px) / intrinsics.fy_px * depth_m
     moved = [
@@ -186,6 +185,12 @@ def pair_audit(
     pair: tuple[int, int], found: list[PairErrors], *, keep: Literal["errors", "agreement"]
 ) -> PairAudit:
     """Return the figures of a pair over all audited frames, with or without its errors."""
+    tolerances = []
+    for place, tolerance in enumerate(TOLERANCES if keep == "errors" else ()):
+        errors_px = np.concatenate([np.empty(0), *(each.errors_px[place] for each in found)])
+        quantiles = np.quantile(errors_px, QUANTILES).tolist() if len(errors_px) else []
+        rounded = tuple(float(f"{each:.{_SIGNIFICANT}g}") for each in quantiles)
+        tolerances.append(ToleranceAudit(tolerance.name, len(errors_px), rounded))
     return PairAudit(
         left=pair[0],
         right=pair[1],
@@ -194,14 +199,5 @@ def pair_audit(
         comparable=sum(each.comparable for each in found),
         unhidden=sum(each.unhidden for each in found),
         agreeing=sum(each.agreeing for each in found),
-        tolerances=() if keep == "agreement" else tuple(_tolerance_audits(found)),
+        tolerances=tuple(tolerances),
     )
-
-
-def _tolerance_audits(found: list[PairErrors]) -> Iterator[ToleranceAudit]:
-    for place, tolerance in enumerate(TOLERANCES):
-        errors = [each.errors_px[place] for each in found]
-        errors_px = np.concatenate(errors) if errors else np.empty(0)
-        quantiles = np.quantile(errors_px, QUANTILES).tolist() if len(errors_px) else []
-        rounded = tuple(float(f"{each:.{_SIGNIFICANT}g}") for each in quantiles)
-        yield ToleranceAudit(tolerance.name, len(errors_px), rounded)

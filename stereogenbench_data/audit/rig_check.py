@@ -1,9 +1,8 @@
-"""What a scene's metadata say of its cameras, held against each other; no picture is needed.
+"""Consistency of what a scene's metadata records of its cameras; no picture is needed.
 
-Intrinsics are compared with the paper's equation wherever metadata record them in pixels. The
-release's files are known to record millimetres; should any record pixels too, of the rig, a camera
-or a frame, they are found by name at any depth: ``fx``, ``fy``, ``cx``, ``cy`` and their longer
-spellings, and 3x3 camera matrices.
+Intrinsics recorded in pixels are compared with the paper's equation. The release's files record
+millimetres. Pixels, of the rig, a camera or a frame, are found by name at any depth of the
+document: ``fx``, ``fy``, ``cx``, ``cy`` and their longer spellings, and 3x3 camera matrices.
 """
 
 import math
@@ -32,7 +31,7 @@ _PLACES: Final = {"fx_px": (0, 0), "fy_px": (1, 1), "cx_px": (0, 2), "cy_px": (1
 
 
 def recorded_px(node: Any) -> Iterator[tuple[str, float]]:
-    """Yield the name (of `Intrinsics`) and the value of each number of pixels, at any depth."""
+    """Yield the name (of `Intrinsics`) and value of each number in pixels, at any depth."""
     if isinstance(node, list):
         for each in node:
             if isinstance(each, dict | list):
@@ -54,7 +53,7 @@ def recorded_px(node: Any) -> Iterator[tuple[str, float]]:
 
 
 def _matrix(value: Any) -> Any:
-    """Return a 3x3 array of numbers, None where the value is none."""
+    """Return a value as a 3x3 array of numbers, None if it is not one."""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -68,7 +67,7 @@ def rig_audit(rig: Rig, poses: CameraPoses, documents: list[dict[str, Any]]) -> 
     Args:
         rig: What ``baseline.json`` records.
         poses: What ``trajectory.json`` records, over all frames.
-        documents: Both files as parsed from JSON, to be searched for intrinsics in pixels.
+        documents: Both files as parsed JSON, to search for intrinsics in pixels.
 
     Source: the StereoGenBench paper, fx = f_mm / sensor_width_mm * width_px, and its table of the
     geometry consistency audit.
@@ -118,14 +117,14 @@ def motion_px(
 ) -> float:
     """Return about how far a camera's motion between frames moves the middle of its picture.
 
-    Its turn and its way are each taken whole, as if they were across the line of sight.
+    Rotation and translation count in full, as if both were across the line of sight.
 
     Args:
         poses: All cameras' poses.
-        camera: Which camera.
+        camera: The camera.
         frames: Two frames.
-        intrinsics: Of the picture.
-        far_m: How far away its subject is; nan for a motion that only turns.
+        intrinsics: The picture's intrinsics.
+        far_m: The distance of its subject; nan to leave out the translation.
     """
     first, second = frames
     turned_rad = rotation_angle_rad(

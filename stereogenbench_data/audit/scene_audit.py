@@ -1,13 +1,13 @@
 """The audit of one scene: each video is decoded once, forwards, and only at the audited frames.
 
-Nothing that a scene's files hold stops the audit: what cannot be read is noted, and the rest is
-measured.
+A file that cannot be read does not stop the audit: it is noted, and the rest is measured.
 """
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Final, Literal, ParamSpec, TypeVar
+from itertools import combinations
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from stereogenbench_data.audit.reprojection import (
     reproject,
 )
 from stereogenbench_data.audit.rig_check import motion_px, rig_audit
+from stereogenbench_data.audit.scene_access import SceneAccess
 from stereogenbench_data.engine import Advance
 from stereogenbench_data.errors import MediaError, StereoGenBenchError, StorageError
 from stereogenbench_data.geometry.camera import rig_intrinsics
@@ -38,7 +39,7 @@ from stereogenbench_data.media.depth import depth_frame_index, depth_m_from_unit
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.samples.streams import Streams
 from stereogenbench_data.schema.document import parse_object
-from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
+from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     BASELINE_JSON,
@@ -48,48 +49,34 @@ from stereogenbench_data.schema.release import (
     rgb_name,
 )
 from stereogenbench_data.schema.trajectory import parse_trajectory
-from stereogenbench_data.sources.members import MemberSource
-from stereogenbench_data.sources.retry import RetryPolicy
 
 LONG_PAIR: Final = (0, CAMERA_COUNT - 1)
 """The non-adjacent pair that the paper audits beside the primary one."""
 
-_METADATA: Final = (BASELINE_JSON, TRAJECTORY_JSON)
 
 Result = TypeVar("Result")
-Arguments = ParamSpec("Arguments")
 
 
 class AuditedFiles:
     """A scene's metadata, frame counts and decoded frames.
 
-    A file that cannot be read is noted once in ``problems``, and not tried again.
-
     Attributes:
-        problems: File name to what was wrong with it.
+        problems: Maps the name of a file that cannot be read to the reason; it is not tried again.
     """
 
-    def __init__(self, source: MemberSource, scene: Scene, *, contract: DepthEncoding) -> None:
+    def __init__(self, access: SceneAccess, *, contract: DepthEncoding) -> None:
         """Prepare to read; nothing is opened yet."""
         self.problems: dict[str, str] = {}
-        self.scene = scene
-        self.source = source
+        self.scene = access.scene
+        self.source = access.source()
         self.contract = contract
-        self.streams = Streams(source)
-        self.intrinsics = rig_intrinsics(scene.rig)
-
-    def close(self) -> None:
-        """Close the open videos."""
-        self.streams.close()
+        self.streams = Streams(self.source)
+        self.intrinsics = rig_intrinsics(self.scene.rig)
 
     def attempt(
-        self,
-        name: str,
-        read: Callable[Arguments, Result],
-        *args: Arguments.args,
-        **kwargs: Arguments.kwargs,
+        self, name: str, read: Callable[..., Result], *args: Any, **kwargs: Any
     ) -> Result | None:
-        """Return what is read of a file, None once anything about it was wrong."""
+        """Return what ``read`` returns for a file, None if it or an earlier attempt failed."""
         if name in self.problems:
             return None
         try:
@@ -105,10 +92,10 @@ class AuditedFiles:
 
     def _require_member(self, name: str) -> None:
         if self.scene.held_name(name) not in self.scene.members:
-            raise StorageError("is missing: the index knows no such file of this scene")
+            raise StorageError("is missing: the index has no such file of this scene")
 
     def counted(self, camera: int) -> tuple[int, int]:
-        """Return how many frames a camera's two videos have, -1 where they cannot be opened."""
+        """Return the number of frames of a camera's two videos, -1 for one that does not open."""
         rgb, depth = rgb_name(camera), depth_name(camera)
         found = (
             self.attempt(rgb, self._probed, rgb, "later"),
@@ -129,13 +116,13 @@ class AuditedFiles:
                 close()
 
     def picture(self, camera: int, frame: int) -> Any:
-        """Return a frame as (3, h, w) uint8, at the size at which light and motion are judged."""
+        """Return a frame as (3, h, w) uint8, at the reduced size that the checks use."""
         rig = self.scene.rig
         size = reduced_size(rig.image_height_px, rig.image_width_px)
         return self.streams.rgb(self.scene, rgb_name(camera), frame, size=size)
 
     def depth(self, camera: int, frame: int) -> tuple[Any, MeasuredDepth] | None:
-        """Return stored numbers and depth, None where the contract has no picture for a frame."""
+        """Return stored numbers and depth, None if the frame lag leaves the frame without depth."""
         encoding = self._encoding(camera)
         index = depth_frame_index(frame, encoding=encoding, frames=self.scene.frames)
         if index is None:
@@ -162,43 +149,36 @@ class AuditedFiles:
         if source == "unreadable":
             if self.contract.unit_m is None:
                 raise MediaError(
-                    "its tags do not tell one positive number of metres in a stored unit of depth"
+                    "its tags do not state one positive number of metres in a stored unit of depth"
                 )
             return self.contract
         return self.contract.with_file_unit(self.scene.depth_unit_m[camera], source=source)
 
     def unit_m(self, camera: int) -> float:
-        """Return metres in a stored unit of a camera's depth, nan where its tags contradict."""
-        if self.scene.depth_unit_source[camera] == "unreadable" and self.contract.unit_m is None:
+        """Return the metres in a stored unit of a camera's depth, nan if its tags contradict."""
+        try:
+            return self._encoding(camera).known_unit_m
+        except MediaError:
             return math.nan
-        return self._encoding(camera).known_unit_m
 
 
 @dataclass(frozen=True, slots=True)
 class AuditTask:
-    """What is to be audited; travels to worker processes.
+    """One scene to audit; can be sent to worker processes.
 
     Attributes:
-        root: The folder or URL that members' paths are relative to.
-        shards: What the index knows of the shards that hold the scene.
-        revision: The index's digest.
-        scene: The scene.
+        access: The scene and where its files are.
         frames: How many frames to audit, evenly spread; 0 for all.
-        depth: The depth contract, None for what the files say.
-        retry: How reading deals with a slow server, None for the defaults.
+        depth: The depth contract, None for what the files state.
     """
 
-    root: str
-    shards: dict[str, ShardFacts]
-    revision: str
-    scene: Scene
+    access: SceneAccess
     frames: int
     depth: DepthEncoding | None = None
-    retry: RetryPolicy | None = None
 
 
 def spread_frames(frames: int, wanted: int) -> tuple[int, ...]:
-    """Return the numbers of ``wanted`` frames, evenly spread from the first to the last; 0 is all.
+    """Return the numbers of ``wanted`` frames, evenly spread from first to last; 0 means all.
 
     >>> spread_frames(81, 5), spread_frames(2, 5)
     ((0, 20, 40, 60, 80), (0, 1))
@@ -211,31 +191,28 @@ def spread_frames(frames: int, wanted: int) -> tuple[int, ...]:
 
 
 def audit_scene(task: AuditTask, after_bytes: Advance) -> SceneAudit:
-    """Return what is found of a scene; nothing that is wrong with it is raised.
+    """Return the audit of a scene; errors in its files become findings and are not raised.
 
     Args:
-        task: The scene, and how it is audited.
-        after_bytes: Called with 1 after each frame, where the work may be interrupted.
+        task: The scene, and how to audit it.
+        after_bytes: Called with 1 after each frame; the work may be interrupted there.
     """
     return _SceneCheck(task).run(after_bytes)
 
 
 class _SceneCheck:
-    """The state of one scene's audit: open videos, and what was found so far."""
+    """The state of one scene's audit: open videos, and the results so far."""
 
     def __init__(self, task: AuditTask) -> None:
-        self.scene = task.scene
-        self.frames = spread_frames(task.scene.frames, task.frames)
-        self.intrinsics = rig_intrinsics(task.scene.rig)
-        source = MemberSource(
-            task.root, shards=task.shards, revision=task.revision, retry=task.retry
-        )
-        self.files = AuditedFiles(source, task.scene, contract=task.depth or DepthEncoding())
+        self.scene = task.access.scene
+        self.frames = spread_frames(self.scene.frames, task.frames)
+        self.files = AuditedFiles(task.access, contract=task.depth or DepthEncoding())
+        self.intrinsics = self.files.intrinsics
         self.light = [LightCheck() for _ in range(CAMERA_COUNT)]
         self.payload = [PayloadCheck() for _ in range(CAMERA_COUNT)]
         self.occluders = [(At(0.0), "")] * CAMERA_COUNT
         self.same: dict[tuple[int, int], bool] = {}
-        self.measured_pairs = (task.scene.rig.primary_pair, LONG_PAIR)
+        self.measured_pairs = (self.scene.rig.primary_pair, LONG_PAIR)
         pairs = dict.fromkeys([*self.measured_pairs, *ADJACENT_PAIRS])
         self.errors: dict[tuple[int, int], list[PairErrors]] = {pair: [] for pair in pairs}
         self.alignment = AlignmentCheck(self.intrinsics, frames=len(self.frames))
@@ -252,7 +229,7 @@ class _SceneCheck:
                 before = frame
                 after_bytes(1)
         finally:
-            self.files.close()
+            self.files.streams.close()
         return SceneAudit(
             key=self.scene.id.key,
             frames=self.scene.frames,
@@ -270,24 +247,21 @@ class _SceneCheck:
         )
 
     def _metadata(self) -> tuple[RigAudit, CameraPoses | None]:
-        texts = {name: self.files.attempt(name, self.files.text, name) for name in _METADATA}
-        documents = [
-            self.files.attempt(name, parse_object, text, where=name)
-            for name, text in texts.items()
-            if text is not None
-        ]
-        text = texts[TRAJECTORY_JSON]
-        poses = (
-            None
-            if text is None
-            else self.files.attempt(
-                TRAJECTORY_JSON,
-                lambda: CameraPoses.from_trajectory(parse_trajectory(text, where=TRAJECTORY_JSON)),
-            )
-        )
+        documents = []
+        poses: CameraPoses | None = None
+        for name in (BASELINE_JSON, TRAJECTORY_JSON):
+            text = self.files.attempt(name, self.files.text, name)
+            if text is None:
+                continue
+            document = self.files.attempt(name, parse_object, text, where=name)
+            documents += [] if document is None else [document]
+            if name == TRAJECTORY_JSON:
+                trajectory = self.files.attempt(name, parse_trajectory, text, where=name)
+                if trajectory is not None:
+                    poses = self.files.attempt(name, CameraPoses.from_trajectory, trajectory)
         if poses is None:
             return RigAudit(fx_px=self.intrinsics.fx_px, fy_px=self.intrinsics.fy_px), None
-        rig = rig_audit(self.scene.rig, poses, [each for each in documents if each is not None])
+        rig = rig_audit(self.scene.rig, poses, documents)
         if poses.frame_count >= self.scene.frames:
             return rig, poses
         self.files.problems[TRAJECTORY_JSON] = (
@@ -296,7 +270,7 @@ class _SceneCheck:
         return rig, None
 
     def _frame(self, frame: int, before: int | None, poses: CameraPoses | None) -> None:
-        """Decode one frame of all cameras, and take it into account."""
+        """Decode one frame of all cameras, and add it to the checks."""
         depths: dict[int, MeasuredDepth] = {}
         stored: dict[int, Any] = {}
         for camera in range(CAMERA_COUNT):
@@ -307,24 +281,35 @@ class _SceneCheck:
         far_m = subject_m([(each.depth_m, each.measured) for each in depths.values()])
         pictures: dict[int, np.ndarray] = {}
         for camera in range(CAMERA_COUNT):
-            moved = self._has_moved(camera, frame, before, poses=poses, far_m=far_m)
-            if camera in depths:
-                self._hide(camera, frame, depths[camera], far_m=far_m)
-                self.payload[camera].take(
-                    stored[camera], depths[camera].measured, frame, moved=moved
+            # A camera that moved this far must show another picture.
+            moved = (
+                before is not None
+                and poses is not None
+                and motion_px(
+                    poses, camera, (before, frame), intrinsics=self.intrinsics, far_m=far_m
                 )
+                >= MOVED_SHARE * self.intrinsics.width_px
+            )
+            depth = depths.get(camera)
+            if depth is not None:
+                share, side = border_occluder(depth.depth_m, depth.measured, far_m=far_m)
+                if share > self.occluders[camera][0].value:
+                    self.occluders[camera] = (At(share, frame), side)
+                self.payload[camera].take(stored[camera], depth.measured, frame, moved=moved)
             picture = self._seen(camera, frame)
             if picture is not None:
                 pictures[camera] = picture
                 self.light[camera].take(picture, frame, moved=moved)
-        self._compare(pictures)
+        for pair in combinations(pictures, 2):
+            if self.same.get(pair, True):
+                self.same[pair] = np.array_equal(pictures[pair[0]], pictures[pair[1]])
         if poses is not None:
             self._reproject(frame, depths, poses)
             bands = {place: found[1] for place, found in self.seen.items()}
             self.alignment.take(frame, depths, bands, poses)
 
     def _seen(self, camera: int, frame: int) -> Any:
-        """Return a picture, None where it cannot be read; those beside it are kept with it."""
+        """Return a picture, None if it cannot be read; its neighbours in time are kept with it."""
         near = [
             at for at in range(max(0, frame - 1), min(frame + 2, self.scene.frames))
             if at in self.frames or frame in self.frames[1::max(2, len(self.frames) - 3)]
@@ -355,35 +340,6 @@ class _SceneCheck:
                         most_pixels=MOST_PIXELS if is_measured else FEWER_PIXELS,
                     )
                 )
-
-    def _hide(self, camera: int, frame: int, depth: MeasuredDepth, *, far_m: float) -> None:
-        share, side = border_occluder(depth.depth_m, depth.measured, far_m=far_m)
-        if share > self.occluders[camera][0].value:
-            self.occluders[camera] = (At(share, frame), side)
-
-    def _has_moved(
-        self,
-        camera: int,
-        frame: int,
-        before: int | None,
-        *,
-        poses: CameraPoses | None,
-        far_m: float,
-    ) -> bool:
-        """Return whether a camera moved so far since a frame that its picture must differ."""
-        if before is None or poses is None:
-            return False
-        moved_px = motion_px(
-            poses, camera, (before, frame), intrinsics=self.intrinsics, far_m=far_m
-        )
-        return moved_px >= MOVED_SHARE * self.intrinsics.width_px
-
-    def _compare(self, pictures: dict[int, np.ndarray]) -> None:
-        for first in pictures:
-            for second in pictures:
-                if first < second and self.same.get((first, second), True):
-                    alike = np.array_equal(pictures[first], pictures[second])
-                    self.same[first, second] = alike
 
     def _camera(self, camera: int, counts: tuple[int, int]) -> CameraAudit:
         light, payload = self.light[camera], self.payload[camera]

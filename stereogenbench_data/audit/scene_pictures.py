@@ -1,4 +1,4 @@
-"""A scene in pictures: all its views and maps on one page, or one pair over time as a clip."""
+"""Pictures of a scene: all views and maps on one page, or a clip of one pair over time."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -25,6 +25,7 @@ from stereogenbench_data.audit.drawing import (
     scale_rows,
 )
 from stereogenbench_data.audit.scene_reader import SceneReader
+from stereogenbench_data.engine import Progress, advance_of
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.samples.fields import Sample
@@ -40,7 +41,7 @@ LEFT: Final[Colour] = (0, 104, 178)
 RIGHT: Final[Colour] = (196, 52, 32)
 HIDDEN: Final[Colour] = (204, 0, 150)
 MOST_DIFFERENT: Final = 64
-"""The difference of two pictures, of 255, that is drawn white."""
+"""The difference of two pictures, of 255 levels, that is drawn white."""
 
 _NARROWEST_PX: Final = 200
 _USUAL_PX: Final = 320
@@ -58,9 +59,9 @@ class _Tile:
 
 
 def tile_width(scene: Scene, wanted_px: int | None) -> int:
-    """Return how wide a tile is drawn: as asked, or a whole multiple of a small picture.
+    """Return a tile's width in pixels: as asked, or a whole multiple of a small picture.
 
-    A tile is never too narrow for its caption: 200 pixels at least.
+    A tile has at least 200 pixels, enough for its caption.
     """
     width = scene.rig.image_width_px
     if wanted_px is None:
@@ -83,8 +84,8 @@ def scene_sheet(
         row: The scene's row in the index.
         pair: The cameras (left, right), None for the pair that the scene records.
         frame: The frame's number.
-        tile_px: How wide one picture is drawn, None for what suits it. Numbers on the sheet are
-            of the stored pictures, whatever that is.
+        tile_px: The width of one picture on the sheet, None for a suitable one. Numbers on the
+            sheet always refer to the stored pictures.
 
     Raises:
         SelectionError: If there is no such pair or frame.
@@ -100,18 +101,21 @@ def scene_sheet(
     return _laid_out(_title(scene, sample, pair=pair, frame=frame), rows, width_px=width)
 
 
-def _laid_out(title: list[str], rows: list[list[_Tile]], *, width_px: int) -> Picture:
+def _text_sizes(width_px: int) -> tuple[int, int]:
+    """Return the font size, which is also the gap between tiles, and the height of a line."""
     font_px = min(max(round(width_px / 21), 13), 30)
-    gap, line = font_px, line_height(font_px)
+    return font_px, line_height(font_px)
+
+
+def _laid_out(title: list[str], rows: list[list[_Tile]], *, width_px: int) -> Picture:
+    gap, line = _text_sizes(width_px)
     shape = rows[0][0].picture.shape
     height_px = max(1, round(shape[0] * width_px / shape[1]))
     legends = [0, _LEGEND_LINES * line + gap // 2]
     head = round(line * 1.6) + line * (len(title) - 1) + gap
     total = 2 * gap + head + sum(line + 4 + height_px + gap + legend for legend in legends)
-    page = Page(
-        len(rows[0]) * (width_px + gap) + gap, total - gap // 2, font_px=font_px
-    )  # the last legend needs no gap below
     inner = len(rows[0]) * (width_px + gap) - gap
+    page = Page(inner + 2 * gap, total - gap // 2, font_px=gap)  # no gap below the last legend
     page.text((gap, gap), title[0], width_px=inner, scale=1.3)
     for number, text in enumerate(title[1:]):
         place = (gap, gap + round(line * 1.6) + number * line)
@@ -146,14 +150,16 @@ def _title(scene: Scene, sample: Sample, *, pair: tuple[int, int], frame: int) -
 def _view_tiles(scene: Scene, views: Any, pair: tuple[int, int]) -> list[_Tile]:
     tiles = []
     for camera in range(CAMERA_COUNT):
-        caption, frame = f"camera {camera}, at {scene.lateral_m[camera] * 100:.1f} cm", FRAME
-        if camera in pair:
-            side = "left" if camera == pair[0] else "right"
-            caption += f": {side}"
-            frame = LEFT if side == "left" else RIGHT
-        picture = np.ascontiguousarray(views[camera].transpose(1, 2, 0))
-        tiles.append(_Tile(caption, picture, _no_legend, frame))
+        side, frame = {pair[1]: (": right", RIGHT), pair[0]: (": left", LEFT)}.get(
+            camera, ("", FRAME)
+        )
+        caption = f"camera {camera}, at {scene.lateral_m[camera] * 100:.1f} cm{side}"
+        tiles.append(_Tile(caption, _channels_last(views[camera]), _key([]), frame))
     return tiles
+
+
+def _channels_last(picture: Any) -> Picture:
+    return np.ascontiguousarray(picture.transpose(1, 2, 0))
 
 
 def _pair_tiles(scene: Scene, sample: Sample) -> list[_Tile]:
@@ -161,7 +167,13 @@ def _pair_tiles(scene: Scene, sample: Sample) -> list[_Tile]:
     valid = sample["valid"][0]
     disparity = scale_of(sample["disparity"][0], measured=valid)
     depth = scale_of(sample["depth"][0], measured=valid, kind="log")
-    hidden, holes = _tinted_hidden(sample), _tinted_holes(sample)
+    # The left view, faint, with what the right one does not see in one colour.
+    grey_levels = sample["left"].astype(np.float32).mean(axis=0) * 0.6 + 90
+    hidden = np.repeat(np.minimum(grey_levels, 255).astype(np.uint8)[..., None], 3, axis=-1)
+    hidden[~sample["visible"][0]] = HIDDEN
+    hidden[~valid] = GREY
+    holes = _channels_last(sample["warped_right"])
+    holes[sample["hole"][0]] = HIDDEN
     seen = float(sample["visible"].mean())
     empty = float(sample["hole"].mean())
     difference, median = _difference(sample)
@@ -184,38 +196,14 @@ def _pair_tiles(scene: Scene, sample: Sample) -> list[_Tile]:
     ]  # fmt: skip
 
 
-def _tinted_hidden(sample: Sample) -> Picture:
-    """Return the left view, faint, with what the right one does not see in one colour."""
-    picture = _faint(sample["left"])
-    picture[~sample["visible"][0]] = HIDDEN
-    picture[~sample["valid"][0]] = GREY
-    return picture
-
-
-def _tinted_holes(sample: Sample) -> Picture:
-    picture = np.ascontiguousarray(sample["warped_right"].transpose(1, 2, 0))
-    picture[sample["hole"][0]] = HIDDEN
-    return picture
-
-
-def _faint(picture: Any) -> Picture:
-    grey = picture.astype(np.float32).mean(axis=0) * 0.6 + 90
-    faint: Picture = np.repeat(np.minimum(grey, 255).astype(np.uint8)[..., None], 3, axis=-1)
-    return faint
-
-
 def _difference(sample: Sample) -> tuple[Picture, float]:
-    """Return how far the warped view is from the right one, black where equal; and the median."""
+    """Return the difference of the warped and the right view, black where equal; and its median."""
     landed = ~sample["hole"][0]
     apart = np.abs(sample["warped_right"].astype(np.int16) - sample["right"]).mean(axis=0)
     median = float(np.median(apart[landed])) if landed.any() else 0.0
     level = np.minimum(apart * (255 / MOST_DIFFERENT), 255).astype(np.uint8)
     level[~landed] = 0
     return np.repeat(level[..., None], 3, axis=-1), median
-
-
-def _no_legend(page: Page, place: tuple[int, int], width_px: int) -> None:
-    """Draw nothing below a tile."""
 
 
 def _key(entries: list[tuple[Colour, str]]) -> Callable[[Page, tuple[int, int], int], None]:
@@ -232,9 +220,7 @@ CLIP_FIELDS: Final = ("left", "right", "disparity", "valid", "baseline_m")
 CLIP_SUFFIXES: Final = (".mp4", ".gif")
 
 _SCALED_ON: Final = 5
-"""From how many frames the range of colours is taken, which is the same throughout."""
-
-Progress = Callable[[int, int], None]
+"""How many frames determine the range of colours, which is the same throughout."""
 
 
 def clip_pages(
@@ -246,7 +232,7 @@ def clip_pages(
         reader: Reads the data.
         row: The scene's row in the index.
         pair: The cameras (left, right), None for the pair that the scene records.
-        tile_px: How wide one picture is drawn, None for what suits it.
+        tile_px: The width of one picture on the page, None for a suitable one.
 
     Raises:
         SelectionError: If there is no such pair.
@@ -273,11 +259,8 @@ def clip_pages(
 def _page(
     scene: Scene, sample: Sample, scale: ColourScale, *, heading: str, width_px: int
 ) -> Picture:
-    font_px = min(max(round(width_px / 21), 13), 30)
-    gap, line = font_px, line_height(font_px)
-    left, right = (
-        np.ascontiguousarray(sample[name].transpose(1, 2, 0)) for name in ("left", "right")
-    )
+    gap, line = _text_sizes(width_px)
+    left, right = (_channels_last(sample[name]) for name in ("left", "right"))
     baseline_m = float(sample["baseline_m"])
     disparity = scale.paint(sample["disparity"][0], measured=sample["valid"][0])
     tiles = [
@@ -289,7 +272,7 @@ def _page(
     height_px = tiles[0][1].shape[0]
     top = gap + 2 * line
     size = (len(tiles) * (width_px + gap) + gap, top + height_px + gap + 3 * line)
-    page = Page(size[0] + size[0] % 2, size[1] + size[1] % 2, font_px=font_px)
+    page = Page(size[0] + size[0] % 2, size[1] + size[1] % 2, font_px=gap)
     page.text((gap, gap // 2), heading, width_px=size[0] - 2 * gap, colour=FAINT)
     for column, (caption, tile) in enumerate(tiles):
         at = gap + column * (width_px + gap)
@@ -312,11 +295,11 @@ def write_clip(
     """Write pages as an H.264 video or as an animated GIF, by the path's ending.
 
     Args:
-        path: Ends in .mp4 or .gif; a file that is there is replaced.
+        path: Ends in .mp4 or .gif; an existing file is replaced.
         pages: (h, w, 3) uint8, with even sides.
-        frames: How many pages there are, for the progress.
+        frames: Number of pages, for the progress.
         rate_hz: Pages a second.
-        progress: Called with (pages written, all) after each.
+        progress: Called with (pages written, all) after each page.
 
     Raises:
         SelectionError: If the path ends in neither.
@@ -326,23 +309,21 @@ def write_clip(
     write = writers.get(path.suffix.lower())
     if write is None:
         raise SelectionError(f"{path}: a clip is {' or '.join(CLIP_SUFFIXES)}, by its ending.")
+    advance = advance_of(progress, total=frames)
+
+    def reported() -> Iterator[Picture]:
+        for page in pages:
+            yield page
+            advance(1)
+
     try:
         with open_output(path) as file:
-            write(file, _counted(pages, frames=frames, progress=progress), rate_hz)
+            write(file, reported(), rate_hz)
     except av.FFmpegError as error:
-        # PyAV says only that writing to the file object failed; why is what it came upon.
+        # PyAV only says that writing to the file object failed; the reason is the error's context.
         if isinstance(error.__context__, OSError):
             raise error.__context__ from None
         raise
-
-
-def _counted(
-    pages: Iterator[Picture], *, frames: int, progress: Progress | None
-) -> Iterator[Picture]:
-    for number, page in enumerate(pages, start=1):
-        yield page
-        if progress is not None:
-            progress(number, frames)
 
 
 def _write_mp4(file: Any, pages: Iterator[Picture], rate_hz: float) -> None:
@@ -360,7 +341,7 @@ def _write_mp4(file: Any, pages: Iterator[Picture], rate_hz: float) -> None:
 
 
 def _write_gif(file: Any, pages: Iterator[Picture], rate_hz: float) -> None:
-    """Write a GIF with the colours of its first page; its clock ticks hundredths of a second."""
+    """Write a GIF with the colours of its first page, timed in hundredths of a second."""
     first = Image.fromarray(next(pages)).quantize(256, dither=Image.Dither.NONE)
     others = (
         Image.fromarray(page).quantize(palette=first, dither=Image.Dither.NONE) for page in pages

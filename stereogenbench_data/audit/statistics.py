@@ -1,4 +1,4 @@
-"""The paper's statistics of any data, from their index alone: counts, baselines, focal lengths."""
+"""The paper's statistics, from an index alone: counts, baselines and focal lengths."""
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -15,14 +15,13 @@ from stereogenbench_data.schema.release import (
     BASELINE_BINS,
     CAMERA_PAIRS,
     FAMILIES,
-    baseline_bin,
 )
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
-from stereogenbench_data.selection.pairs import PAIR_NUMBER
+from stereogenbench_data.selection.pairs import PAIR_NUMBER, in_bin
 
 ADJACENT_COLUMNS: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
 FOCAL_EDGES_MM: Final = np.arange(15.0, 86.0, 5.0)
-"""Edges of the focal histogram, around the paper's 18 to 85 mm; two more bins are beyond them."""
+"""Edges of the focal histogram, around the paper's 18 to 85 mm; two more bins lie outside."""
 
 _SPLITS: Final = ("train", "eval")
 _SUBSETS: Final = ("", "seen_map", "unseen_map")
@@ -30,7 +29,7 @@ _SUBSETS: Final = ("", "seen_map", "unseen_map")
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
-    """How some numbers are spread; the standard deviation divides by their count."""
+    """The distribution of some numbers; the standard deviation divides by their count."""
 
     count: int
     min: float
@@ -41,7 +40,7 @@ class Distribution:
 
     @classmethod
     def of(cls, values: Float64[np.ndarray, "*any"]) -> "Distribution":
-        """Return the spread of one or more numbers."""
+        """Return the distribution of one or more numbers."""
         return cls(
             count=int(values.size),
             min=float(values.min()),
@@ -54,20 +53,20 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True)
 class FamilyStatistics:
-    """Figures of one family of a split (and subset, empty where both are taken together).
+    """Figures of one family of a split, and of a subset.
 
     Attributes:
         split: "train" or "eval".
-        subset: "seen_map", "unseen_map" or empty.
+        subset: "seen_map" or "unseen_map"; empty for both together and for train.
         family: Such as "Uniform".
-        scenes: How many scenes.
-        maps: Map to its number of scenes.
+        scenes: Number of scenes.
+        maps: Maps each map to its number of scenes.
         adjacent_cm: Baselines of the five adjacent pairs of each scene.
-        all_pairs_cm: Those of all 15.
-        bins: Name of a baseline bin to how many primary, adjacent and all pairs lie in it.
+        all_pairs_cm: Baselines of all 15 pairs of each scene.
+        bins: Maps each baseline bin to its number of primary, adjacent and all pairs.
         focal_mm: Focal lengths.
-        focal_counts: Scenes in each bin of the focal histogram: below 15 mm, 14 of 5 mm, above
-            85 mm.
+        focal_counts: Scenes in each bin of the focal histogram: below 15 mm, 14 bins of 5 mm,
+            above 85 mm.
     """
 
     split: str
@@ -93,14 +92,14 @@ class ShortPairs:
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """The statistics of some data.
+    """The statistics of a data set.
 
     Attributes:
         root: Where the data are.
-        scenes: How many scenes were counted.
-        families: Each (split, subset, family) that there is.
-        branches: Each (split, family), the subsets of eval together.
-        short_pairs: The tail of Pairwise_Uniform.
+        scenes: Number of scenes.
+        families: Figures of each (split, subset, family) of the data.
+        branches: Figures of each (split, family), the subsets of eval together.
+        short_pairs: The short baselines of Pairwise_Uniform.
     """
 
     root: str
@@ -110,14 +109,14 @@ class Statistics:
     short_pairs: ShortPairs
 
     def to_json(self) -> dict[str, Any]:
-        """Return the statistics as values that `json.dumps` takes."""
+        """Return the statistics as values for `json.dumps`."""
         document: dict[str, Any] = plain(asdict(self))
         document["focal_edges_mm"] = [float(edge) for edge in FOCAL_EDGES_MM]
         return document
 
 
 def statistics(index: SceneIndex, **filters: Unpack[SceneFilters]) -> Statistics:
-    """Return the statistics of an index, or of the scenes of it that pass filters.
+    """Return the statistics of an index, or of its scenes that pass filters.
 
     Args:
         index: The index; nothing else is read.
@@ -138,19 +137,24 @@ def statistics(index: SceneIndex, **filters: Unpack[SceneFilters]) -> Statistics
         for subset in _in_order(subsets, _SUBSETS):
             chosen = of_branch[subsets == subset]
             families.append(_family(index, chosen, split=split, subset=subset, family=family))
+    train = _texts(index, "split", rows) == "train"
+    pairwise = rows[train & (_texts(index, "family", rows) == "Pairwise_Uniform")]
+    short = index.column("baselines_cm")[pairwise] < SHORT_PAIRS["below_cm"]
+    concerned = pairwise[short.any(axis=1)]
+    maps = np.unique(_texts(index, "map_name", concerned)).tolist()
     return Statistics(
         root=index.where,
         scenes=len(rows),
         families=tuple(families),
         branches=tuple(branches),
-        short_pairs=_short_pairs(index, rows),
+        short_pairs=ShortPairs(int(short.sum()), len(concerned), tuple(maps)),
     )
 
 
 def branch_rows(
     index: SceneIndex, rows: Int64[np.ndarray, " n"]
 ) -> Iterator[tuple[str, str, Int64[np.ndarray, " m"]]]:
-    """Yield each split and family that there is, the paper's first, with its rows."""
+    """Yield each split and family of the data with its rows, the paper's first."""
     splits, families = _texts(index, "split", rows), _texts(index, "family", rows)
     for split in _in_order(splits, _SPLITS):
         for family in _in_order(families[splits == split], FAMILIES):
@@ -161,6 +165,7 @@ def _family(
     index: SceneIndex, rows: Int64[np.ndarray, " n"], *, split: str, subset: str, family: str
 ) -> FamilyStatistics:
     baselines_cm = index.column("baselines_cm")[rows]
+    adjacent_cm = baselines_cm[:, ADJACENT_COLUMNS]
     left, right = index.column("primary_left")[rows], index.column("primary_right")[rows]
     primary_cm = baselines_cm[np.arange(len(rows)), PAIR_NUMBER[left, right]]
     focal_mm = index.column("focal_mm")[rows]
@@ -172,44 +177,28 @@ def _family(
         family=family,
         scenes=len(rows),
         maps=dict(zip(names.tolist(), counts.tolist(), strict=True)),
-        adjacent_cm=Distribution.of(baselines_cm[:, ADJACENT_COLUMNS]),
+        adjacent_cm=Distribution.of(adjacent_cm),
         all_pairs_cm=Distribution.of(baselines_cm),
-        bins=_bins(primary_cm, baselines_cm[:, ADJACENT_COLUMNS], baselines_cm),
+        bins={
+            name: (
+                int(in_bin(primary_cm, name).sum()),
+                int(in_bin(adjacent_cm, name).sum()),
+                int(in_bin(baselines_cm, name).sum()),
+            )
+            for name in BASELINE_BINS
+            if in_bin(baselines_cm, name).any()
+        },
         focal_mm=Distribution.of(focal_mm),
         focal_counts=tuple(np.histogram(focal_mm, edges)[0].tolist()),
     )
 
 
-def _bins(*kinds_cm: Float64[np.ndarray, "*any"]) -> dict[str, tuple[int, int, int]]:
-    """Return how many baselines of each kind lie in each bin that holds any."""
-    counted = []
-    for kind_cm in kinds_cm:
-        values, counts = np.unique(kind_cm, return_counts=True)
-        in_bins = dict.fromkeys(BASELINE_BINS, 0)
-        for value, count in zip(values.tolist(), counts.tolist(), strict=True):
-            in_bins[baseline_bin(value)] += count
-        counted.append(in_bins)
-    primary, adjacent, every = counted
-    return {
-        name: (primary[name], adjacent[name], every[name]) for name in BASELINE_BINS if every[name]
-    }
-
-
-def _short_pairs(index: SceneIndex, rows: Int64[np.ndarray, " n"]) -> ShortPairs:
-    train = _texts(index, "split", rows) == "train"
-    chosen = rows[train & (_texts(index, "family", rows) == "Pairwise_Uniform")]
-    short = index.column("baselines_cm")[chosen] < SHORT_PAIRS["below_cm"]
-    concerned = chosen[short.any(axis=1)]
-    maps = np.unique(_texts(index, "map_name", concerned)).tolist()
-    return ShortPairs(baselines=int(short.sum()), scenes=len(concerned), maps=tuple(maps))
-
-
 def _texts(index: SceneIndex, column: str, rows: Int64[np.ndarray, " n"]) -> np.ndarray:
-    """Return a column's texts, empty where there is none."""
+    """Return a column's texts, empty for missing ones."""
     return np.array([text or "" for text in index.column(column)[rows]], dtype=str)
 
 
 def _in_order(values: np.ndarray, known: tuple[str, ...]) -> list[str]:
-    """Return the different texts, the known ones first and in their order."""
+    """Return the distinct texts, the known ones first and in their order."""
     there = set(values.tolist())
     return [*(each for each in known if each in there), *sorted(there - set(known))]

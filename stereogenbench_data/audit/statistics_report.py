@@ -1,4 +1,4 @@
-"""Statistics as a report: against the paper's figures, as Markdown, and as histograms."""
+"""Statistics compared with the paper's figures, as Markdown, and as histograms."""
 
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
@@ -9,6 +9,7 @@ from typing import Any, Final, Unpack
 import numpy as np
 from jaxtyping import Float64
 
+from stereogenbench_data.audit.drawing import figure_class
 from stereogenbench_data.audit.paper_figures import (
     ADJACENT,
     ADJACENT_TABLE,
@@ -34,19 +35,18 @@ from stereogenbench_data.audit.statistics import (
     Statistics,
     branch_rows,
 )
-from stereogenbench_data.errors import ExtraError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import markdown_text
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.sources.files import open_atomic
 
 _RELEASE_SIZED: Final = 0.1
-"""By which share a split's number of scenes may differ from the paper's to be compared with it."""
+"""Largest relative difference between a split's number of scenes and the paper's."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One figure of the paper beside ours, both as texts with as many digits as the paper has."""
+    """One figure of the paper and ours, both as texts with the paper's number of digits."""
 
     table: str
     item: str
@@ -55,24 +55,25 @@ class Line:
 
     @property
     def agrees(self) -> bool:
-        """Whether the two are the same."""
+        """Whether the two are equal."""
         return self.paper == self.ours
 
 
 def release_sized_splits(found: Statistics) -> tuple[str, ...]:
-    """Return the splits that have about as many scenes as the paper's, within a tenth."""
-    scenes = dict.fromkeys(SPLITS, 0)
-    for branch in found.branches:
-        scenes[branch.split] = scenes.get(branch.split, 0) + branch.scenes
+    """Return the splits whose number of scenes is within a tenth of the paper's."""
     return tuple(
         split
         for split, count in SPLITS.items()
-        if abs(scenes[split] - count) <= _RELEASE_SIZED * count
+        if abs(_scenes_of(found, split) - count) <= _RELEASE_SIZED * count
     )
 
 
+def _scenes_of(found: Statistics, split: str) -> int:
+    return sum(each.scenes for each in found.branches if each.split == split)
+
+
 def compared(found: Statistics, *, splits: tuple[str, ...] = tuple(SPLITS)) -> tuple[Line, ...]:
-    """Return every figure of the paper's tables on some splits beside that of the statistics."""
+    """Return every figure of the paper's tables for some splits, and that of the statistics."""
     lines = [
         *_count_lines(found),
         *_baseline_lines(found),
@@ -90,7 +91,7 @@ def _count_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
         item = "scenes, " + " ".join(part for part in place if part)
         yield place[0], Line(COUNTS_TABLE, item, str(COUNTS.get(place, 0)), str(ours.get(place, 0)))
     for split, count in SPLITS.items():
-        total = sum(each.scenes for each in found.branches if each.split == split)
+        total = _scenes_of(found, split)
         yield split, Line(COUNTS_TABLE, f"scenes, {split} total", str(count), str(total))
 
 
@@ -170,7 +171,7 @@ _BAR: Final = 40
 
 
 def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
-    """Return statistics as Markdown, with the paper's figures beside, where given."""
+    """Return statistics as Markdown, with the comparison with the paper if given."""
     text = [
         f"# Statistics of {markdown_text(str(found.root))}",
         *_section("Scenes", _count_rows(found)),
@@ -183,27 +184,19 @@ def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
     if lines:
         agreeing = sum(line.agrees for line in lines)
         title = f"Against the paper: {agreeing} of {len(lines)} figures agree"
-        text += _section(title, _paper_rows(lines))
+        rows = [
+            ("same" if line.agrees else "**differs**", line.item, line.paper, line.ours, line.table)
+            for line in sorted(lines, key=lambda each: each.agrees)
+        ]
+        text += _section(title, [("", "figure", "paper", "here", "source"), *rows])
     return "\n".join(text) + "\n"
 
 
-def _paper_rows(lines: Sequence[Line]) -> Iterator[Sequence[str]]:
-    """Yield the compared figures, those that differ first."""
-    yield ("", "figure", "paper", "here", "source")
-    for line in sorted(lines, key=lambda each: each.agrees):
-        mark = "same" if line.agrees else "**differs**"
-        yield (mark, line.item, line.paper, line.ours, line.table)
-
-
 def _section(title: str, rows: Iterable[Sequence[str]]) -> list[str]:
-    return ["", f"## {title}", "", *_table(rows)]
-
-
-def _table(rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    for place, row in enumerate(rows):
-        yield f"| {' | '.join(map(markdown_text, row))} |"
-        if place == 0:
-            yield "|" + "---|" * len(row)
+    """Return a title and a table, whose first row is its head."""
+    head, *body = rows
+    lines = [f"| {' | '.join(map(markdown_text, row))} |" for row in (head, *body)]
+    return ["", f"## {title}", "", lines[0], "|" + "---|" * len(head), *lines[1:]]
 
 
 def _count_rows(found: Statistics) -> Iterator[Sequence[str]]:
@@ -211,8 +204,7 @@ def _count_rows(found: Statistics) -> Iterator[Sequence[str]]:
     for each in found.families:
         yield (each.split, each.subset or "-", each.family, f"{each.scenes:,}")
     for split in dict.fromkeys(each.split for each in found.branches):
-        total = sum(each.scenes for each in found.branches if each.split == split)
-        yield (split, "", "total", f"{total:,}")
+        yield (split, "", "total", f"{_scenes_of(found, split):,}")
     yield ("all", "", "total", f"{found.scenes:,}")
 
 
@@ -259,17 +251,17 @@ _HISTOGRAM_BINS: Final = 40
 _COLOURS: Final = {"IPD_Gaussian": "#4477aa", "Uniform": "#ee6677", "Pairwise_Uniform": "#228833"}
 _COLUMNS: Final = 3
 _HEADROOM: Final = 1.3
-"""Room above the bars for the legend."""
+"""Room for the legend above the bars."""
 _INCHES: Final = (4.2, 3.2)
 
 
 def write_plots(
     index: SceneIndex, folder: Path, **filters: Unpack[SceneFilters]
 ) -> tuple[Path, Path]:
-    """Write ``baselines.png`` and ``focal_lengths.png`` into a folder, which is made if need be.
+    """Write ``baselines.png`` and ``focal_lengths.png`` into a folder, made if need be.
 
-    A panel shows the adjacent baselines of a split's family, of Pairwise_Uniform those of all 15
-    pairs, with the mean dashed and the median dotted.
+    A panel shows the adjacent baselines of a split's family (for Pairwise_Uniform those of all 15
+    pairs), with the mean dashed and the median dotted.
 
     Raises:
         ExtraError: If matplotlib is not installed.
@@ -313,26 +305,16 @@ def _histogram(axes: Any, values: Float64[np.ndarray, " n"], *, bins: Any, colou
     axes.axvline(median, color="black", linestyle=":", linewidth=1.4, label=f"median {median:.2f}")
     axes.set_ylim(top=axes.get_ylim()[1] * _HEADROOM)
     axes.legend(
-        title=f"n = {len(values):,}",
-        loc="upper right",
-        fontsize=8,
-        title_fontsize=8,
-        ncols=2,
+        title=f"n = {len(values):,}", loc="upper right", fontsize=8, title_fontsize=8, ncols=2,
         framealpha=1,
-    )
+    )  # fmt: skip
 
 
 def _figure(panels: int) -> Any:
-    """Return a figure with room for panels; the unused ones are blank."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ExtraError(
-            "plots need matplotlib: pip install 'stereogenbench-data[plots]'."
-        ) from error
+    """Return a figure with that many panels; the rest of its grid is blank."""
     columns = min(_COLUMNS, panels)
     rows = -(-panels // columns)
-    figure = Figure(figsize=(_INCHES[0] * columns, _INCHES[1] * rows), layout="constrained")
+    figure = figure_class()(figsize=(_INCHES[0] * columns, _INCHES[1] * rows), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat[panels:]:
         axes.set_axis_off()

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.bridges import about
-from stereogenbench_data.errors import DescriptorError, cure_of
+from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
@@ -28,6 +28,7 @@ from stereogenbench_data.sources.files import write_atomic
 CARD_NAME: Final = "README.md"
 MARK: Final = "<!-- made by stereogenbench card -->"
 """Marks a card that this package wrote. A README.md without it is never overwritten."""
+_Configs = dict[str, dict[str, list[str]]]
 _SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 _ADJACENT: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
 
@@ -44,7 +45,9 @@ def card(index: SceneIndex, *, repository: str) -> str:
     """
     if not index.shards:
         raise DescriptorError(f"{index.where}: not a folder of shards. Pack the data first.")
-    return "\n".join([_head(index), MARK, "", *_body(index, repository)]) + "\n"
+    configs = _configs(index)
+    lines = [*_head(index, configs), MARK, "", *_body(index, configs, repository)]
+    return "\n".join(lines) + "\n"
 
 
 def write_card(index: SceneIndex, folder: Path, *, repository: str) -> Path:
@@ -64,15 +67,15 @@ def write_card(index: SceneIndex, folder: Path, *, repository: str) -> Path:
         write_atomic(path, text.encode())
     except OSError as error:
         raise DescriptorError(
-            f"{path}: cannot be written ({error.strerror or error}). "
-            + cure_of(error, "Choose another place with --out.")
+            describe_os_error(
+                f"{path}: cannot be written", error, "Choose another place with --out."
+            )
         ) from error
     return path
 
 
-def _head(index: SceneIndex) -> str:
+def _head(index: SceneIndex, configs: _Configs) -> list[str]:
     """Return the YAML head; JSON texts are YAML too."""
-    names = _configs(index)
     lines = [
         "---",
         f"pretty_name: {about.TITLE}",
@@ -86,16 +89,16 @@ def _head(index: SceneIndex) -> str:
         f"- {next((name for most, name in _SIZES if len(index) < most), '100K<n<1M')}",
         "configs:",
     ]
-    for config, splits in names.items():
+    for config, splits in configs.items():
         lines += [f"- config_name: {config}", "  data_files:"]
         for split, paths in splits.items():
             lines += [f"  - split: {split}", f"    path: {json.dumps(paths)}"]
     lines.append("dataset_info:")
-    for config in names:
+    for config in configs:
         lines += [f"- config_name: {config}", "  features:"]
         for name, kind in _features(index).items():
             lines += [f"  - name: {name}", f"    dtype: {kind}"]
-    return "\n".join([*lines, "---"])
+    return [*lines, "---"]
 
 
 def _features(index: SceneIndex) -> dict[str, str]:
@@ -104,7 +107,7 @@ def _features(index: SceneIndex) -> dict[str, str]:
     return kinds | dict.fromkeys(videos, "binary") | {"__key__": "string", "__url__": "string"}
 
 
-def _configs(index: SceneIndex) -> dict[str, dict[str, list[str]]]:
+def _configs(index: SceneIndex) -> _Configs:
     """Return config to split to patterns of shards: a config per family, and one for all."""
     found: dict[str, dict[str, set[str]]] = {}
     for row in range(len(index)):
@@ -135,9 +138,11 @@ def _patterns(paths: set[str], index: SceneIndex) -> list[str]:
     return sorted(patterns)
 
 
-def _body(index: SceneIndex, repository: str) -> list[str]:
-    config = next(name for name in _configs(index) if name != "all")
-    split = next(iter(_configs(index)[config]))
+def _body(index: SceneIndex, configs: _Configs, repository: str) -> list[str]:
+    config = next(name for name in configs if name != "all")
+    split = next(iter(configs[config]))
+    rules: dict[str, Any] = about.RESPONSIBLE_USE
+    sections = ("dataUseCases", "dataLimitations", "dataBiases", "personalSensitiveInformation")
     return [
         f"# {about.TITLE}",
         "",
@@ -183,10 +188,7 @@ def _body(index: SceneIndex, repository: str) -> list[str]:
         "",
         "## Responsible use",
         "",
-        *(f"- {text}" for text in _texts("rai:dataUseCases")),
-        *(f"- {text}" for text in _texts("rai:dataLimitations")),
-        *(f"- {text}" for text in _texts("rai:dataBiases")),
-        *(f"- {text}" for text in _texts("rai:personalSensitiveInformation")),
+        *(f"- {text}" for section in sections for text in rules[f"rai:{section}"]),
         "",
         "## Citation",
         "",
@@ -196,31 +198,21 @@ def _body(index: SceneIndex, repository: str) -> list[str]:
     ]
 
 
-def _texts(name: str) -> list[str]:
-    texts: Any = about.RESPONSIBLE_USE[name]
-    return list(texts)
-
-
 def _counts(index: SceneIndex) -> list[str]:
-    kinds = list(
-        zip(
-            index.column("split"), index.column("subset"), index.column("family"), strict=True
-        )
-    )  # fmt: skip
-    scenes = Counter(kinds)
+    columns = (index.column(name) for name in ("split", "subset", "family"))
+    kinds = list(zip(*columns, strict=True))
     adjacent_cm = index.column("baselines_cm")[:, _ADJACENT]
     lines = [
         "| split | subset | family | scenes | pairs | adjacent baselines, cm |",
         "|---|---|---|---:|---:|---|",
     ]
-    for kind in sorted(scenes, key=lambda each: (each[0] != "train", str(each[1]), each[2])):
+    for kind in sorted(set(kinds), key=lambda each: (each[0] != "train", str(each[1]), each[2])):
         rows = [number for number, each in enumerate(kinds) if each == kind]
         low, high = adjacent_cm[rows].min(), adjacent_cm[rows].max()
         split, subset, family = kind
-        count = scenes[kind]
         lines.append(
-            f"| {split} | {subset or ''} | {markdown_text(family)} | {count} "
-            f"| {count * len(CAMERA_PAIRS)} | {low:.2f} to {high:.2f} |"
+            f"| {split} | {subset or ''} | {markdown_text(family)} | {len(rows)} "
+            f"| {len(rows) * len(CAMERA_PAIRS)} | {low:.2f} to {high:.2f} |"
         )
     return lines
 
@@ -246,11 +238,9 @@ def _depth(index: SceneIndex) -> list[str]:
     units = sorted(set(index.column("depth_unit_m").ravel().tolist()))
     codecs = sorted(set(index.column("depth_codec").ravel().tolist()))
     formats = sorted(set(index.column("depth_pixel_format").ravel().tolist()))
-    sources = set(np.asarray(index.column("depth_unit_source")).ravel().tolist())
+    sources = set(np.ravel(index.column("depth_unit_source")).tolist())
     scale = "each file's own tag" if sources == {"tag"} else "each file's tag, else 0.1 m"
-    advice = [
-        "Decode them in their own pixel format: a decoder that gives 8 bits destroys them.",
-    ]
+    advice = ["Decode them in their own pixel format: a decoder that gives 8 bits destroys them."]
     if "blosc2" in codecs:
         advice = [
             "They are blosc2 frames (`.b2frame`), which no decoder of videos reads: `StereoPairs`",

@@ -1,4 +1,4 @@
-"""``stereogenbench bench``: runs the benchmark of a checkout."""
+"""``stereogenbench bench``: run the benchmark of a checkout."""
 
 import subprocess
 import sys
@@ -15,26 +15,26 @@ def bench(  # noqa: PLR0913 - one parameter an option
     *,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="Measure this alone, such as all-frames or accuracy; may be repeated."),
+        typer.Option(help="Measure only this, such as all-frames or accuracy; may be repeated."),
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="One round of the main things.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="One round of the main races.")] = False,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of every race.")] = 5,
     workers: Annotated[
         str | None, typer.Option(help="Worker processes of every race, such as 2,0,1,4.")
     ] = None,
     whole: Annotated[
-        bool, typer.Option("--whole", help="Races over all frames, not a window of them.")
+        bool, typer.Option("--whole", help="Race over all frames instead of a window.")
     ] = False,
     batches: Annotated[int, typer.Option(min=2, help="Batches of the memory run.")] = 2000,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Keep rounds and sections that are there.")
+        bool, typer.Option("--resume", help="Keep rounds and sections that exist.")
     ] = False,
     draw: Annotated[bool, typer.Option("--draw", help="Only draw and pack the data.")] = False,
     check: Annotated[
         bool, typer.Option("--check", help="Only compare every contestant's samples with ours.")
     ] = False,
     tables: Annotated[
-        bool, typer.Option("--tables", help="Only write tables and plots anew.")
+        bool, typer.Option("--tables", help="Only write tables and plots again.")
     ] = False,
     data: Annotated[
         Path | None, typer.Option(help="Folder of the data [build/bench of the checkout].")
@@ -45,43 +45,32 @@ def bench(  # noqa: PLR0913 - one parameter an option
 ) -> None:
     """Race this package against a bare decoding loop and other loaders; needs a checkout.
 
-    The first run draws four scenes (20 minutes of processor time), and keeps them. Results are
+    The first run draws four scenes (20 minutes of processor time) and keeps them. Results are
     written after every round.
     """
-    checkout = _checkout()
+    beside = Path(__file__).resolve().parents[2]
+    places = [beside, Path.cwd()]
+    checkouts = [each for each in places if (each / "benchmarks" / "ffmpeg_links.py").is_file()]
+    if not checkouts:
+        raise StorageError(
+            f"benchmarks/: is neither in {beside} nor in {Path.cwd()}. An installed package comes "
+            f"without the benchmark: run the command in a checkout."
+        )
     flags = {
         "--quick": quick, "--whole": whole, "--resume": resume, "--draw": draw,
         "--check": check, "--tables": tables,
     }  # fmt: skip
     values = {
-        "--workers": workers,
-        "--data": None if data is None else data.resolve(),
-        "--out": None if out is None else out.resolve(),
-    }
-    command = [sys.executable, "-m", "benchmarks", "--rounds", str(rounds)]
-    command += ["--batches", str(batches)]
+        "--workers": workers, "--data": data and data.resolve(), "--out": out and out.resolve(),
+        "--rounds": rounds, "--batches": batches,
+    }  # fmt: skip
+    command = [sys.executable, "-m", "benchmarks"]
     command += [word for name in only or () for word in ("--only", name)]
     command += [flag for flag, given in flags.items() if given]
     for name, value in values.items():
         command += [] if value is None else [name, str(value)]
     try:
-        done = subprocess.run(command, cwd=checkout, check=False)
+        done = subprocess.run(command, cwd=checkouts[0], check=False)
     except KeyboardInterrupt:
         raise typer.Exit(STOPPED) from None
     raise typer.Exit(done.returncode)
-
-
-def _checkout() -> Path:
-    """Return the folder that holds this package's benchmark.
-
-    Raises:
-        StorageError: If there is none: an installed package comes without it.
-    """
-    beside = Path(__file__).resolve().parents[2]
-    for folder in (beside, Path.cwd()):
-        if (folder / "benchmarks" / "ffmpeg_links.py").is_file():
-            return folder
-    raise StorageError(
-        f"benchmarks/: is neither in {beside} nor in {Path.cwd()}: the benchmark is part of the "
-        "source, not of the installed package. Run the command in a checkout."
-    )

@@ -1,17 +1,12 @@
-"""``stereogenbench browse``: a local web page to look through scenes."""
+"""``stereogenbench browse``: look through scenes in a local web page."""
 
 import webbrowser
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from stereogenbench_data.cli.options import (
-    DataOptions,
-    DepthUnitOption,
-    depth_of,
-    grouped,
-)
+from stereogenbench_data.cli.opening import full_place
+from stereogenbench_data.cli.options import DataOptions, DepthUnitOption, depth_of, grouped
 from stereogenbench_data.schema.text import counted
 
 
@@ -19,9 +14,7 @@ from stereogenbench_data.schema.text import counted
 def browse(
     source: DataOptions,
     *,
-    port: Annotated[
-        int, typer.Option("--port", min=0, max=65535, help="Port [any that is free].")
-    ] = 0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port [any free one].")] = 0,
     open_page: Annotated[
         bool, typer.Option("--open/--no-open", help="Open the page in the web browser.")
     ] = True,
@@ -29,23 +22,16 @@ def browse(
 ) -> None:
     """Look through scenes, pairs and frames in a local web page.
 
-    It filters scenes, flips through pairs and frames, tells disparity in pixels and depth in metres
-    under the cursor, and gives the Python line of what is shown. Only this machine can reach it,
-    and nothing is written. Ctrl-C ends it.
+    The page filters scenes, flips through pairs and frames, shows disparity in pixels and depth in
+    metres under the cursor, and gives the Python line for what is shown. Only this machine can
+    reach it. Nothing is written. Ctrl-C ends it.
     """
     from stereogenbench_data.audit.browser.catalogue import Catalogue
     from stereogenbench_data.audit.browser.server import PageServer
     from stereogenbench_data.audit.browser.service import Service
     from stereogenbench_data.audit.scene_reader import SceneReader
-    from stereogenbench_data.sources.location import is_remote, shown
 
-    index = source.open()
-    shown_data = (
-        shown(source.data)
-        if is_remote(source.data)
-        else str(Path(source.data).expanduser().resolve())
-    )
-    depth = depth_of(depth_unit_m)
+    index, depth, shown_data = source.open(), depth_of(depth_unit_m), full_place(source.data)
     reader = SceneReader(index, depth=depth)
     service = Service(Catalogue(index, shown_data=shown_data, depth=depth), reader)
     with PageServer(service, port=port) as server:

@@ -1,6 +1,7 @@
-"""The commands of ``stereogenbench`` in the order of use; each imports what it needs late."""
+"""The commands of ``stereogenbench`` in the order of use; each imports late what it needs."""
 
 import sys
+from collections.abc import Callable
 from contextlib import nullcontext
 from importlib.metadata import version as package_version
 from io import TextIOWrapper
@@ -24,20 +25,47 @@ from stereogenbench_data.cli.stats import stats
 from stereogenbench_data.cli.stopping import stop_by_exception
 from stereogenbench_data.cli.synth import synth
 
-_START: Final = "Have scenes"
-_LOOK: Final = "Look at them"
-_CHECK: Final = "Check them"
-_PACK: Final = "Pack them"
-_SCORE: Final = "Score with them"
+_COMMANDS: Final[dict[str, dict[Callable[..., None], str]]] = {
+    "Have scenes": {
+        synth: "synth scenes/ --family Uniform --scenes 4 --size 256",
+        index: "index scenes/",
+        download: "download hf://datasets/ORG/NAME --split eval --cameras 0,1 --dest data/",
+    },
+    "Look at them": {
+        show: "show shards/ scene_000001 --pair 0-5 -o sheet.png",
+        browse: "browse shards/",
+    },
+    "Pack them": {
+        pack: "pack scenes/ shards/ --shard-size 2GB",
+        unpack: "unpack shards/ scenes/",
+        croissant: "croissant shards/ -o croissant/sample.json",
+        card: "card shards/ --repo ORG/NAME -o shards/",
+        upload: "upload shards/ ORG/NAME",
+    },
+    "Check them": {
+        stats: "stats shards/ --plots plots/",
+        doctor: "doctor scenes/ -o doctor.png",
+        audit: "audit shards/ --scenes 20 -o audit.md",
+        verify: "verify shards/ --deep",
+        bench: "bench --only all-frames",
+    },
+    "Score with them": {
+        export_inputs: "export-inputs shards/ inputs/ --tier G1 --split eval",
+        evaluate: "evaluate shards/ predictions/ --tier G1 --split eval",
+        controls: "controls shards/ --frames every:20",
+    },
+}
+"""Panel of the help to its commands, each with a call that works."""
 
 _DEBUG: Final = "--debug"
+_HELP_OPTIONS: Final = {"help_option_names": ["-h", "--help"]}
 
 
 class _Commands(TyperGroup):
-    """The group of commands: errors are reported in short, or whole with --debug."""
+    """The group of commands. Errors end it with a message, with --debug in a traceback."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run what was asked for."""
+        """Run the command of the context."""
         stop_by_exception()
         if ctx.params.get("debug"):
             return super().invoke(ctx)
@@ -51,7 +79,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings=_HELP_OPTIONS,
     help=(
         "Stereo pairs out of StereoGenBench scenes: 6 cameras, 15 pairs, exact disparity.\n\n"
         "New here? Draw two small scenes, look at one, browse them all:\n\n"
@@ -70,39 +98,13 @@ app = typer.Typer(
 )
 
 
-def _command(function: Any, *, panel: str, example: str) -> None:
-    """Register a command, in the panel of the help that it belongs to, with a call that works."""
-    app.command(
-        rich_help_panel=panel,
-        epilog=f"Example: `stereogenbench {example}`",
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )(function)
-
-
-_command(synth, panel=_START, example="synth scenes/ --family Uniform --scenes 4 --size 256")
-_command(index, panel=_START, example="index scenes/")
-_command(
-    download,
-    panel=_START,
-    example="download hf://datasets/ORG/NAME --split eval --cameras 0,1 --dest data/",
-)
-_command(show, panel=_LOOK, example="show shards/ scene_000001 --pair 0-5 -o sheet.png")
-_command(browse, panel=_LOOK, example="browse shards/")
-_command(pack, panel=_PACK, example="pack scenes/ shards/ --shard-size 2GB")
-_command(unpack, panel=_PACK, example="unpack shards/ scenes/")
-_command(croissant, panel=_PACK, example="croissant shards/ -o croissant/sample.json")
-_command(card, panel=_PACK, example="card shards/ --repo ORG/NAME -o shards/")
-_command(upload, panel=_PACK, example="upload shards/ ORG/NAME")
-_command(stats, panel=_CHECK, example="stats shards/ --plots plots/")
-_command(doctor, panel=_CHECK, example="doctor scenes/ -o doctor.png")
-_command(audit, panel=_CHECK, example="audit shards/ --scenes 20 -o audit.md")
-_command(verify, panel=_CHECK, example="verify shards/ --deep")
-_command(bench, panel=_CHECK, example="bench --only all-frames")
-_command(
-    export_inputs, panel=_SCORE, example="export-inputs shards/ inputs/ --tier G1 --split eval"
-)
-_command(evaluate, panel=_SCORE, example="evaluate shards/ predictions/ --tier G1 --split eval")
-_command(controls, panel=_SCORE, example="controls shards/ --frames every:20")
+for _panel, _examples in _COMMANDS.items():
+    for _function, _example in _examples.items():
+        app.command(
+            rich_help_panel=_panel,
+            epilog=f"Example: `stereogenbench {_example}`",
+            context_settings=_HELP_OPTIONS,
+        )(_function)
 
 
 def _print_version(value: bool) -> None:
@@ -124,14 +126,11 @@ def _common(
         ),
     ] = False,
 ) -> None:
-    """Take the options of all commands; the group itself acts on them."""
+    """Declare the options of all commands; `_Commands` acts on them."""
 
 
 def run() -> None:
-    """Run the command line; how it ends is in `outcome`.
-
-    What the terminal's encoding lacks is printed as question marks.
-    """
+    """Run the command line; print characters that the terminal's encoding lacks as ``?``."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")

@@ -1,4 +1,4 @@
-"""``stereogenbench doctor``: the depth contract, found from the pictures themselves."""
+"""``stereogenbench doctor``: find the depth contract from the pictures."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from stereogenbench_data.cli.options import (
     JsonOption,
     OutOption,
     SceneOptions,
-    WorkersOption,
+    WorkOptions,
     grouped,
 )
 from stereogenbench_data.cli.outcome import FINDINGS
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 
 
 QUOTIENT_MEANS = (
-    "Only unit / (focal length x baseline) is seen in disparity: which of the three is wrong where "
-    "the quotient is, or whether two of them make up for each other, no picture tells."
+    "Disparity shows only the quotient unit / (focal length x baseline). No picture tells which of "
+    "the three is wrong, or whether two of them cancel out."
 )
 NOT_ASKED = (
-    "Not asked here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
-    "beside the poses, colours, depth that lies a pixel aside or where there is no texture, "
-    "frames other than those looked at."
+    "Not tested here, see `stereogenbench audit`: the sensor's height, the baselines recorded "
+    "beside the poses, colours, depth that is off by a pixel or lies where there is no texture, "
+    "and all other frames."
 )
 _DB_NOTE = (
     "dB of the quotient, kind and offset count small differences under a tight cap: they "
@@ -46,32 +46,33 @@ _DB_NOTE = (
 def doctor(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     *,
-    scenes: Annotated[int, typer.Option("--scenes", min=1, help="Look at so many scenes.")] = 6,
+    scenes: Annotated[int, typer.Option(min=1, help="Scenes to look at.")] = 6,
     frames: Annotated[int, typer.Option(min=1, help="Frames of each scene.")] = 4,
     chosen: SceneOptions,
     unit_m: Annotated[
         float | None,
-        typer.Option(help="Ask about this many metres in a stored unit [as tagged, else 0.1]."),
+        typer.Option(help="Declare this many metres in a stored unit [as tagged, else 0.1]."),
     ] = None,
     kind: Annotated[
-        Literal["planar", "ray"], typer.Option(help="Ask about depth along the axis or the ray.")
+        Literal["planar", "ray"], typer.Option(help="Declare depth along the axis or the ray.")
     ] = "planar",
     form: Annotated[
-        Literal["depth", "inverse"], typer.Option(help="Ask about stored depth, or its inverse.")
+        Literal["depth", "inverse"], typer.Option(help="Declare stored depth or its inverse.")
     ] = "depth",
     frame_lag: Annotated[
-        int, typer.Option(help="Ask about depth frame t + LAG for RGB frame t.")
+        int, typer.Option(help="Declare that RGB frame t has depth frame t + LAG.")
     ] = 0,
     out: OutOption = None,
     as_json: JsonOption = False,
-    workers: WorkersOption = None,
+    work: WorkOptions,
 ) -> None:
-    """Find out from the pictures how stored depth becomes metres, and where it belongs.
+    """Find from the pictures how stored depth becomes metres, and which picture it belongs to.
 
-    Compares what a scene's cameras see with what depth predicts: planar or ray, inverse, frame lag,
-    camera order, flips, offset, unit / (focal length x baseline), and each camera beside the
-    others. -o writes a picture. The exit status is 0 if the declared contract fits or nothing can
-    be told, 1 if another one is clearly better or a camera does not fit, 2 if it could not be done.
+    The doctor compares what the cameras of a scene see with what depth predicts: planar or ray,
+    inverse, frame lag, camera order, flips, offset, unit / (focal length x baseline), and each
+    camera beside the others. -o writes a picture. The exit status is 0 if the declared contract
+    fits or the pictures cannot tell, 1 if another one is clearly better or a camera does not fit,
+    2 if the command failed.
     """
     from stereogenbench_data.audit.contract.doctor import diagnose
     from stereogenbench_data.audit.contract.picture import draw_report, require_picture_file
@@ -88,7 +89,7 @@ def doctor(  # noqa: PLR0913 - one parameter an option
             scenes=scenes,
             frames=frames,
             depth=depth,
-            workers=workers,
+            **work.options(),
             progress=progress,
             filters=filters,
         )
@@ -119,24 +120,17 @@ def _lines(report: "DoctorReport") -> list[str]:
     if silent and len(silent) < len(report.scenes):
         lines += [f"{scene.key}: cannot tell: {scene.problem}" for scene in silent]
     for verdict in report.verdicts:
-        lines += ["", *_verdict_lines(verdict, report)]
+        lines.append("")
+        if len(report.verdicts) > 1:
+            lines.append(f"{counted(len(verdict.scenes), 'scene')}: {', '.join(verdict.scenes)}")
+        rows = [("question", "declared", "pictures say", "", "next best")]
+        rows += [_row(answer) for answer in verdict.answers]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines += ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        lines += ["", *_conclusion(verdict, report), *_tested_lines(verdict), *verdict.beside]
     if any(math.isfinite(scene.gain.mean_db) for scene in report.scenes):
         lines += ["", QUOTIENT_MEANS, _DB_NOTE]
     return lines
-
-
-def _verdict_lines(verdict: "Verdict", report: "DoctorReport") -> list[str]:
-    lines = []
-    if len(report.verdicts) > 1:
-        lines.append(f"{counted(len(verdict.scenes), 'scene')}: {', '.join(verdict.scenes)}")
-    rows = [_row(answer) for answer in verdict.answers]
-    rows.insert(0, ("question", "declared", "pictures say", "", "next best"))
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    for row in rows:
-        cells = [text.ljust(width) for text, width in zip(row, widths, strict=False)]
-        lines.append("  ".join([*cells, row[4]]).rstrip())
-    lines += ["", *_conclusion(verdict, report), *_tested_lines(verdict)]
-    return [*lines, *verdict.beside]
 
 
 def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
@@ -148,25 +142,25 @@ def _conclusion(verdict: "Verdict", report: "DoctorReport") -> list[str]:
             f"Another contract is {_gain_words(verdict.gain)} better than the declared one."
         )
     if verdict.choices:
-        lines.append("One of these explains the quotient, and the pictures do not tell which:")
+        lines.append("One of these explains the quotient; the pictures cannot tell which:")
         lines += [f"  - {choice}" for choice in verdict.choices]
     if verdict.encoding is not None:
         lines.append(f"Paste: {encoding_line(verdict.encoding)}")
     elif verdict.is_wrong:
-        lines.append("Nothing to paste: no DepthEncoding is sure to put this right.")
+        lines.append("Nothing to paste: no DepthEncoding is certain to correct this.")
     elif verdict.fits:
         lines.append(f"The declared contract fits: {encoding_line(report.declared)}")
     elif math.isfinite(verdict.agreement) and not verdict.unexplained_cameras:
         open_topics = [a.topic for a in verdict.answers if a.status == "cannot tell"]
-        untold = f" Not told: {', '.join(open_topics)}." if open_topics else ""
-        lines.append(f"Cannot tell on the whole: nothing contradicts what is declared.{untold}")
+        undecided = f" Undecided: {', '.join(open_topics)}." if open_topics else ""
+        lines.append(f"Cannot tell: nothing contradicts the declared contract.{undecided}")
     else:
-        lines.append("Cannot tell: the pictures do not decide on the declared contract.")
+        lines.append("Cannot tell: the pictures do not decide about the declared contract.")
     return lines
 
 
 def _tested_lines(verdict: "Verdict") -> list[str]:
-    """Return which cameras were tested, how much is explained, and what is not asked here."""
+    """Return which cameras were tested, how much is explained, and what is not tested here."""
     lines = []
     if math.isfinite(verdict.agreement):
         lines.append(
@@ -182,7 +176,7 @@ def _tested_lines(verdict: "Verdict") -> list[str]:
         lines.append(f"Depth and pictures tested: {_cameras(verdict.tested_cameras)}.")
     if verdict.untested_cameras:
         lines.append(
-            f"NOT TESTED, for want of matches: {_cameras(verdict.untested_cameras)}. "
+            f"NOT TESTED, too few matches: {_cameras(verdict.untested_cameras)}. "
             "Run `stereogenbench audit`."
         )
     return [*lines, NOT_ASKED]
@@ -194,14 +188,12 @@ def _cameras(cameras: Sequence[int]) -> str:
 
 
 def _row(answer: "Answer") -> tuple[str, str, str, str, str]:
-    last = answer.note
+    notes = [answer.note] if answer.note else []
+    is_wrong = "wrong" in answer.status
     if answer.behind is not None and math.isfinite(answer.behind.mean_db):
-        gain = _gain_words(answer.behind)
-        said = f"declared is {gain} worse" if "wrong" in answer.status else f"{gain} worse"
-        last = f"{said}; {answer.note}" if answer.note else said
-    return answer.topic, answer.declared, answer.found or "?", answer.status.upper() if (
-        "wrong" in answer.status
-    ) else answer.status, last  # fmt: skip
+        notes.insert(0, f"{'declared is ' * is_wrong}{_gain_words(answer.behind)} worse")
+    status = answer.status.upper() if is_wrong else answer.status
+    return answer.topic, answer.declared, answer.found or "?", status, "; ".join(notes)
 
 
 def _gain_words(gain: "Gain") -> str:
@@ -211,32 +203,30 @@ def _gain_words(gain: "Gain") -> str:
 
 
 def _json(report: "DoctorReport") -> str:
+    from stereogenbench_data.audit.contract.verdict import encoding_line
+
+    verdicts = []
+    for verdict in report.verdicts:
+        paste = None if verdict.encoding is None else encoding_line(verdict.encoding)
+        verdicts.append(asdict(verdict) | {"paste": paste})
+    scenes = []
+    for scene in report.scenes:
+        offsets_px = [{"pair": pair, "px": px} for pair, px in scene.offsets_px.items()]
+        scenes.append(asdict(scene) | {"offsets_px": offsets_px})
     document = {
         "data": report.data,
         "is_wrong": report.is_wrong,
         "quotient_means": QUOTIENT_MEANS,
         "not_asked": NOT_ASKED,
-        "verdicts": [_plain(_verdict_document(verdict)) for verdict in report.verdicts],
-        "scenes": [_plain(_scene_document(asdict(scene))) for scene in report.scenes],
+        "verdicts": verdicts,
+        "scenes": scenes,
         "left_out": report.left_out,
     }
-    return json.dumps(document, indent=2)
-
-
-def _verdict_document(verdict: "Verdict") -> dict[str, Any]:
-    from stereogenbench_data.audit.contract.verdict import encoding_line
-
-    encoding = verdict.encoding
-    return asdict(verdict) | {"paste": None if encoding is None else encoding_line(encoding)}
-
-
-def _scene_document(scene: dict[str, Any]) -> dict[str, Any]:
-    offsets_px = [{"pair": pair, "px": px} for pair, px in scene["offsets_px"].items()]
-    return scene | {"offsets_px": offsets_px}
+    return json.dumps(_plain(document), indent=2)
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON has it: numbers that are none become null."""
+    """Return a value as JSON has it; numbers that are not finite become null."""
     if isinstance(value, dict):
         return {str(name): _plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple | set | frozenset):

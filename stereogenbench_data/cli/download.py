@@ -1,4 +1,4 @@
-"""``stereogenbench download``: the part of a release that a selection needs, onto this disk."""
+"""``stereogenbench download``: copy the part of a release that a selection needs to this disk."""
 
 import json
 from pathlib import Path
@@ -6,12 +6,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from stereogenbench_data.cli.options import (
-    DataOptions,
-    JsonOption,
-    SceneOptions,
-    grouped,
-)
+from stereogenbench_data.cli.options import DataOptions, JsonOption, SceneOptions, grouped
 from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
@@ -22,31 +17,36 @@ from stereogenbench_data.schema.text import counted
 def download(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     *,
-    dest: Annotated[Path, typer.Option("--dest", help="Folder to write into.")],
+    dest: Annotated[Path, typer.Option(help="Folder to write into.")],
     cameras: Annotated[
-        str, typer.Option(help="Numbers of the cameras wanted, such as 0,1.")
+        str, typer.Option(help="Numbers of the cameras, such as 0,1.")
     ] = "0,1,2,3,4,5",
     streams: Annotated[
         Literal["both", "rgb", "depth"], typer.Option(help="Which videos.")
     ] = "both",
     chosen: SceneOptions,
-    workers: Annotated[int, typer.Option(min=1, help="Files fetched at a time.")] = 8,
+    workers: Annotated[int, typer.Option(min=1, help="Files to fetch at a time.")] = 8,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say how much it would be, and fetch nothing.")
+        bool, typer.Option("--dry-run", help="Print the size and fetch nothing.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Fetch only what a selection needs, laid out as it was released.
+    """Fetch only what a selection needs, in the released layout.
 
-    Every file is checked as it comes; a run that was stopped goes on if it is run again. The folder
-    then opens with `StereoPairs(DEST)`, for the cameras that were fetched.
+    Every file is checked as it arrives. To continue a stopped run, run it again. The folder opens
+    with `StereoPairs(DEST)`, for the cameras that were fetched.
     """
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.selection.filters import filter_scenes
     from stereogenbench_data.shards.download import download as fetched
     from stereogenbench_data.shards.download import plan_download
 
-    numbers = _cameras(cameras)
+    parts = [part.strip() for part in cameras.split(",")]
+    if not all(part in set("012345") for part in parts):
+        raise typer.BadParameter(
+            f"{cameras!r}: write numbers from 0 to 5, such as 0,1", param_hint="--cameras"
+        )
+    numbers = sorted({int(part) for part in parts})
     filters: Any = chosen.filters()
     index = SceneIndex.open(source.data, root=source.data_root)
     rows = filter_scenes(index, filters)
@@ -58,17 +58,8 @@ def download(  # noqa: PLR0913 - one parameter an option
     if not dry_run:
         with progress_bar("downloading", unit="MB") as progress:
             fetched(index, wanted, dest, workers=workers, progress=progress)
-    summary = {"scenes": len(rows), "files": len(wanted.files), "bytes": wanted.size_bytes}
     if as_json:
+        summary = {"scenes": len(rows), "files": len(wanted.files), "bytes": wanted.size_bytes}
         typer.echo(json.dumps(summary | {"dest": None if dry_run else str(dest)}, indent=2))
     elif not dry_run:
         typer.echo(f"{dest}: {scenes}, {size:,.1f} MB")
-
-
-def _cameras(text: str) -> list[int]:
-    parts = [part.strip() for part in text.split(",")]
-    if not all(part in set("012345") for part in parts):
-        raise typer.BadParameter(
-            f"{text!r}: write numbers from 0 to 5, such as 0,1", param_hint="--cameras"
-        )
-    return sorted({int(part) for part in parts})

@@ -1,6 +1,6 @@
-"""``stereogenbench evaluate``, ``export-inputs``, ``controls``: scores as the paper has them.
+"""``stereogenbench evaluate``, ``export-inputs``, ``controls``: scores by the paper's protocol.
 
-Their options are the same: which scenes, pairs and frames, which metrics, with what.
+They share their options: scenes, pairs and frames, metrics and models, the report.
 """
 
 import json
@@ -14,11 +14,10 @@ import typer
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
-    EngineOption,
     JsonOption,
     SceneOptions,
     SplitOption,
-    WorkersOption,
+    WorkOptions,
     depth_of,
     grouped,
 )
@@ -34,11 +33,7 @@ if TYPE_CHECKING:
 
 
 def parse_pairs(text: str) -> Any:
-    """Return the pairs that an option names, as `StereoPairs` takes them.
-
-    Raises:
-        typer.BadParameter: If the text does not name any.
-    """
+    """Return the pairs of ``--pairs`` as `StereoPairs` takes them."""
     if text in ("primary", "adjacent", "all"):
         return text
     pairs = [each.split("-") for each in text.split(",")]
@@ -51,11 +46,7 @@ def parse_pairs(text: str) -> Any:
 
 
 def parse_frames(text: str) -> Any:
-    """Return the frames that an option names, as `StereoPairs` takes them.
-
-    Raises:
-        typer.BadParameter: If the text does not name any.
-    """
+    """Return the frames of ``--frames`` as `StereoPairs` takes them."""
     if text in ("all", "first"):
         return text
     every, _, step = text.partition(":")
@@ -69,11 +60,7 @@ def parse_frames(text: str) -> Any:
 
 
 def parse_picture_size(text: str) -> tuple[int, int]:
-    """Return (height, width) of an option that says WIDTHxHEIGHT.
-
-    Raises:
-        typer.BadParameter: If it does not.
-    """
+    """Return (height, width) of ``--size``, which is WIDTHxHEIGHT."""
     from stereogenbench_data.errors import FieldError
     from stereogenbench_data.samples.size import parse_size
 
@@ -84,11 +71,7 @@ def parse_picture_size(text: str) -> tuple[int, int]:
 
 
 def parse_strata(texts: list[str] | None) -> dict[str, tuple[float, ...]]:
-    """Return columns to stratify by, with their edges.
-
-    Raises:
-        typer.BadParameter: If an edge is not a number.
-    """
+    """Return the columns of ``--by``, each with its edges."""
     strata: dict[str, tuple[float, ...]] = {}
     for text in texts or []:
         column, _, edges = text.partition(":")
@@ -96,7 +79,7 @@ def parse_strata(texts: list[str] | None) -> dict[str, tuple[float, ...]]:
             strata[column] = tuple(float(edge) for edge in edges.split(",")) if edges else ()
         except ValueError:
             raise typer.BadParameter(
-                f"{text!r}: its edges {edges!r} are not numbers, such as 18,35.", param_hint="--by"
+                f"{text!r}: the edges {edges!r} are not numbers such as 18,35.", param_hint="--by"
             ) from None
     return strata
 
@@ -104,16 +87,11 @@ def parse_strata(texts: list[str] | None) -> dict[str, tuple[float, ...]]:
 TierOption = Annotated[
     str,
     typer.Option(
-        "--tier",
-        help="What the method was given: G0 target geometry, G1 camera, G2 the left view alone.",
+        help="Input of the method: G0 target geometry, G1 camera, G2 only the left view.",
     ),
 ]
 SizeOption = Annotated[
-    str,
-    typer.Option(
-        "--size",
-        help="WIDTHxHEIGHT at which everything is scored [the paper's].",
-    ),
+    str, typer.Option(help="WIDTHxHEIGHT at which everything is scored [the paper's].")
 ]
 PAPER_SIZE = "832x480"
 
@@ -123,20 +101,18 @@ class PairsOptions(SceneOptions):
     """Which pairs and frames of which scenes are scored."""
 
     pairs: Annotated[
-        str,
-        typer.Option("--pairs", help="primary, adjacent, all, or pairs such as 0-1,0-5."),
+        str, typer.Option(help="primary, adjacent, all, or pairs such as 0-1,0-5.")
     ] = "primary"
     frames: Annotated[
-        str,
-        typer.Option("--frames", help="all, first, every:K, or numbers such as 0,40,80."),
+        str, typer.Option(help="all, first, every:K, or numbers such as 0,40,80.")
     ] = "all"
     baseline_cm: Annotated[
         tuple[float, float] | None,
-        typer.Option("--baseline-cm", help="Shortest and longest baseline, in cm."),
+        typer.Option(help="Shortest and longest baseline, in cm."),
     ] = None
 
     def selection(self) -> dict[str, Any]:
-        """Return the options of `StereoPairs` that select.
+        """Return the options of `StereoPairs` that select samples.
 
         Raises:
             typer.BadParameter: If the text of the pairs or of the frames cannot be parsed.
@@ -148,36 +124,34 @@ class PairsOptions(SceneOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class EvalPairsOptions(PairsOptions):
-    """The same, of the split that is for evaluation."""
+    """The same, with the eval split as the default."""
 
     split: SplitOption = "eval"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ProtocolOptions:
-    """Which metrics are computed, and with what."""
+    """The metrics and the models that compute them."""
 
     size: SizeOption = PAPER_SIZE
     metrics: Annotated[
         str,
         typer.Option(
-            "--metrics",
             help="Of psnr, ssim, lpips, e_match, p_psnr, sd, fid, fvd, fd-colour, fd-motion.",
         ),
     ] = "psnr,ssim,e_match,p_psnr,sd"
     keypoint_matcher: Annotated[
-        str, typer.Option("--keypoint-matcher", help="For E_match: sift, or dedode (the paper's).")
+        str, typer.Option(help="For E_match: sift, or dedode (the paper's).")
     ] = "sift"
     stereo_matcher: Annotated[
         str,
-        typer.Option("--stereo-matcher", help="For SD: sgbm, or foundation-stereo (the paper's)."),
+        typer.Option(help="For SD: sgbm, or foundation-stereo (the paper's)."),
     ] = "sgbm"
     fit: Annotated[
         str,
         typer.Option(
-            "--fit",
-            help="The fit of SD that relations are judged by: filtered, least_squares or "
-            "theil_sen. Reports always show the first two.",
+            help="Fit of SD that decides relations: filtered, least_squares or theil_sen. "
+            "Reports always show the first two.",
         ),
     ] = "filtered"
     depth_unit_m: DepthUnitOption = None
@@ -188,16 +162,16 @@ class ProtocolOptions:
         ),
     ] = None
     checkout: Annotated[
-        Path | None, typer.Option("--checkout", help="Clone of FoundationStereo's repository.")
+        Path | None, typer.Option(help="Clone of FoundationStereo's repository.")
     ] = None
-    device: Annotated[str, typer.Option("--device", help="Where learned parts run.")] = "cpu"
+    device: Annotated[str, typer.Option(help="Device of learned models.")] = "cpu"
 
     def protocol(self) -> "EvaluationProtocol":
-        """Return the protocol that the options ask for.
+        """Return the protocol of the options.
 
         Raises:
             typer.BadParameter: If the size is not WIDTHxHEIGHT.
-            EvaluationError: If a metric, a matcher or a fit is not known.
+            EvaluationError: If a metric, a matcher or a fit is unknown.
         """
         from stereogenbench_data.evaluation.columns import require_metrics
         from stereogenbench_data.evaluation.models.registry import ModelOptions
@@ -217,11 +191,11 @@ class ProtocolOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions:
-    """Where scores are reported."""
+    """The report of scores."""
 
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder of the report, which keeps partial results too."),
+        typer.Option("--out", "-o", help="Folder of the report and of partial results."),
     ] = None
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw metric by baseline.")] = (
         True
@@ -236,7 +210,7 @@ class ReportOptions:
         *,
         found: "Sequence[Relation]" = (),
     ) -> None:
-        """Write the files of the report, and print its page, or as JSON what is in it."""
+        """Write the files of the report; print it as a page or as JSON."""
         from stereogenbench_data.evaluation.report import document, page, write_report
 
         files = write_report(
@@ -252,7 +226,7 @@ class ReportOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ControlsReportOptions(ReportOptions):
-    """The same, without plots unless they are asked for."""
+    """The same, without plots by default."""
 
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw metric by baseline.")] = (
         False
@@ -269,13 +243,13 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
     chosen: PairsOptions,
     size: SizeOption = PAPER_SIZE,
     depth_unit_m: DepthUnitOption = None,
-    workers: WorkersOption = None,
+    work: WorkOptions,
 ) -> None:
     """Write the inputs of a tier: left views as PNG; G0 adds geometry, G1 the camera.
 
-    One folder an item, a pair of a scene, with a name that tells neither. Write what the method
-    makes of it as PREDICTIONS/ITEM/000.png ... or PREDICTIONS/ITEM.mp4, then run `stereogenbench
-    evaluate` with the same selection. A stopped run goes on if it is run again.
+    An item is one pair of one scene; its folder's name reveals neither. Write the output of the
+    method as PREDICTIONS/ITEM/000.png ... or PREDICTIONS/ITEM.mp4, then run `stereogenbench
+    evaluate` with the same selection. To continue a stopped run, run it again.
     """
     from stereogenbench_data.evaluation.inputs import export_inputs as exported
 
@@ -288,7 +262,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
             tier=tier,
             size=size_px,
             depth=depth_of(depth_unit_m),
-            workers=workers,
+            **work.options(),
             progress=progress,
             **selection,
         )
@@ -305,34 +279,30 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     *,
     tier: TierOption,
     name: Annotated[
-        str | None, typer.Option("--name", help="What tables call the method [the folder's name].")
+        str | None, typer.Option(help="Name of the method [the folder's name].")
     ] = None,
     chosen: PairsOptions,
     scoring: ProtocolOptions,
     by: Annotated[
         list[str] | None,
         typer.Option(
-            "--by",
             help="Column of the index to stratify by, such as map_name, or focal_mm:18,35,85 with "
-            "edges; may be given again.",
+            "edges; may be repeated.",
         ),
     ] = None,
     allow_missing: Annotated[
         int,
-        typer.Option(min=0, help="Pairs whose right view may be missing or unusable; counted."),
+        typer.Option(min=0, help="Most pairs whose right view may be missing or unusable."),
     ] = 0,
     report: ReportOptions,
-    workers: WorkersOption = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
 ) -> None:
     """Score a method's right views by the paper's protocol, beside the paper's own rows.
 
-    Write the inputs of a tier with `stereogenbench export-inputs`; PREDICTIONS holds, for each
-    item, a folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON,
-    plots) goes to --out [evaluation/NAME-TIER], and so do partial results: a stopped run goes on
-    if it is run again.
+    `stereogenbench export-inputs` writes the inputs of a tier. PREDICTIONS holds, for each item, a
+    folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON, plots) and
+    partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it again.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.evaluation.evaluate import evaluate as evaluated
     from stereogenbench_data.evaluation.tables import tables_of
 
@@ -349,8 +319,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
             name=called,
             protocol=protocol,
             out=folder / "partial",
-            workers=workers,
-            engine=engine_of(engine, device=scoring.device),
+            **work.options(device=scoring.device),
             allow_missing=allow_missing,
             progress=progress,
             **selection,
@@ -360,26 +329,22 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
 
 @grouped
 @resumable()
-def controls(  # noqa: PLR0913 - one parameter an option
+def controls(
     source: DataOptions,
     *,
-    seed: Annotated[
-        int, typer.Option(min=0, help="Decides whose right view stands in for whose.")
-    ] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random right views.")] = 0,
     chosen: EvalPairsOptions,
     scoring: ProtocolOptions,
     report: ControlsReportOptions,
-    workers: WorkersOption = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
 ) -> None:
-    """Score the calibration controls: what a perfect, a copied, a wrong and a random view get.
+    """Score the calibration controls: a perfect, a copied, a wrong and a random right view.
 
-    The rendered target, the left view, the same scene from the next camera (02 for 01), and the
-    right view of another scene. Prints the paper's own controls beside them, and whether the
-    relations between them hold; the exit status is 1 if one does not. The report goes to --out
-    [evaluation/controls], and a stopped run goes on if it is run again.
+    They are the rendered target, the left view, the view of the next camera (02 for 01), and the
+    right view of another scene. The report shows the paper's own controls beside them, and
+    whether the relations between them hold; the exit status is 1 if one does not. It goes to --out
+    [evaluation/controls]. To continue a stopped run, run it again.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.evaluation.controls import relations, score_controls
     from stereogenbench_data.evaluation.tables import branch_table, control_table, explaining_table
 
@@ -392,8 +357,7 @@ def controls(  # noqa: PLR0913 - one parameter an option
             protocol=protocol,
             seed=seed,
             out=folder / "partial",
-            workers=workers,
-            engine=engine_of(engine, device=scoring.device),
+            **work.options(device=scoring.device),
             progress=progress,
             **selection,
         )

@@ -1,4 +1,4 @@
-"""``stereogenbench index``: walk a released tree once, and keep what training asks of it."""
+"""``stereogenbench index``: walk a released tree once, so that it opens at once afterwards."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.console import Console
 
+from stereogenbench_data.cli.opening import full_place
 from stereogenbench_data.cli.options import (
-    EngineOption,
     FamilyOption,
     JsonOption,
     MapOption,
     SplitOption,
-    workers_option,
+    WorkOptions,
+    grouped,
 )
 from stereogenbench_data.cli.outcome import FINDINGS, resumable
 from stereogenbench_data.cli.progress import progress_bar
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _INDEX_NAME = "index.parquet"
 
 
+@grouped
 @resumable()
 def index(  # noqa: PLR0913 - one parameter an option
     root: Annotated[
@@ -39,8 +41,7 @@ def index(  # noqa: PLR0913 - one parameter an option
             "--out", "-o", help=f"Index file to write [ROOT/{_INDEX_NAME}; for a URL here]."
         ),
     ] = None,
-    workers: Annotated[int | None, workers_option("Processes that read scenes")] = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
     valid_depth: Annotated[
         bool,
         typer.Option(
@@ -56,24 +57,22 @@ def index(  # noqa: PLR0913 - one parameter an option
 ) -> None:
     """Index a released tree, so that it opens at once.
 
-    The walk goes on where it stopped if it is run again after an interruption. Incomplete scenes
-    are listed and left out. Broken ones too, and then the exit status is 1. With --split,
-    --family or --map only such scenes are read.
+    After an interruption, run the same command again to continue. Incomplete and broken scenes are
+    listed and left out; the exit status is 1 if a scene is broken. --split, --family and --map
+    restrict which scenes are read.
     """
-    from stereogenbench_data.engine import engine_of
-    from stereogenbench_data.index.build import SceneJournal, walk
+    from stereogenbench_data.index.build import scene_journal, walk
     from stereogenbench_data.index.parquet import recorded_root
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.sources.location import is_remote, local_path, shown
 
     console = Console(stderr=True)
-    place = "." if is_remote(root) else root
-    target = Path(place, _INDEX_NAME) if out is None else out
+    target = out or Path("." if is_remote(root) else root, _INDEX_NAME)
     mode: Literal["skip", "sample"] = "sample" if valid_depth else "skip"
     wanted = _passing(split, family or [], map_name or [])
     if wanted is not None and out is None:
         raise typer.BadParameter(
-            "the index of a part needs a file of its own: name it with --out FILE.",
+            "the index of a part needs its own file: name it with --out FILE.",
             param_hint="--out",
         )
     if target.is_dir():
@@ -85,17 +84,16 @@ def index(  # noqa: PLR0913 - one parameter an option
         raise typer.BadParameter(
             f"{target} is not a regular file, and an index would replace it.", param_hint="--out"
         )
-    recorded_root(root, beside=target.parent)  # before hours of work, whether it may be written
+    recorded_root(root, beside=target.parent)  # Refuses a root before hours of work.
     done_before = target.with_name(f"{target.name}.journal")
     with (
         writing(done_before),
-        SceneJournal(done_before, walk=f"{_whole(root)} valid_depth={mode}") as journal,
+        scene_journal(done_before, walk=f"{full_place(root)} valid_depth={mode}") as journal,
         progress_bar("indexing", unit="scenes") as progress,
     ):
         report = walk(
             root,
-            workers=workers,
-            engine=engine_of(engine),
+            **work.options(),
             progress=progress,
             journal=journal,
             valid_depth=mode,
@@ -104,46 +102,44 @@ def index(  # noqa: PLR0913 - one parameter an option
         if report.scenes:
             SceneIndex.from_report(report).write(target)
             journal.delete()
+    status = FINDINGS if report.broken or not report.scenes else 0
     if as_json:
-        found = {"scenes": len(report.scenes), "incomplete": dict(report.incomplete)}
-        found |= {"broken": dict(report.broken), "notes": list(report.notes)}
-        written = {"index": str(target) if report.scenes else None}
-        typer.echo(json.dumps(written | found, indent=2))
-        raise typer.Exit(FINDINGS if report.broken or not report.scenes else 0)
-    _list(console, "incomplete, left out", report.incomplete)
-    _list(console, "broken, left out", report.broken)
-    _list(console, "to know", {note: note for note in report.notes})
+        document = {
+            "index": str(target) if report.scenes else None,
+            "scenes": len(report.scenes),
+            "incomplete": report.incomplete,
+            "broken": report.broken,
+            "notes": report.notes,
+        }
+        typer.echo(json.dumps(document, indent=2))
+        raise typer.Exit(status)
+    _list(console, f"{len(report.incomplete)} incomplete, left out", report.incomplete)
+    _list(console, f"{len(report.broken)} broken, left out", report.broken)
+    _list(console, counted(len(report.notes), "note"), {note: note for note in report.notes})
     if not report.scenes:
         console.print(
-            f"{plain_line(shown(root))}: no scene is whole, so there is nothing to index",
+            f"{plain_line(shown(root))}: no scene is complete, so there is nothing to index",
             markup=False,
         )
-        raise typer.Exit(FINDINGS)
+        raise typer.Exit(status)
     typer.echo(f"{target}: {counted(len(report.scenes), 'scene')}")
     if not is_remote(root) and target.parent.resolve() != local_path(root).resolve():
         console.print(
             f"its data are not beside it: open it as SceneIndex.open({str(target)!r}, "
-            f"root={_whole(root)!r}), or with --root {_whole(root)}",
+            f"root={full_place(root)!r}), or with --root {full_place(root)}",
             markup=False, highlight=False, soft_wrap=True,
         )  # fmt: skip
-    if report.broken:
-        raise typer.Exit(FINDINGS)
-
-
-def _whole(root: str) -> str:
-    from stereogenbench_data.sources.location import is_remote, local_path, shown
-
-    return shown(root) if is_remote(root) else str(local_path(root).resolve())
+    raise typer.Exit(status)
 
 
 def _passing(
     split: str | None, families: list[str], maps: list[str]
 ) -> "Callable[[SceneId], bool] | None":
-    """Return whether a scene is asked for, by what its path says."""
+    """Return a function that says whether the options select a scene; None if they select all."""
     if not (split or families or maps):
         return None
     return lambda scene: (
-        (not split or scene.split == split)
+        split in (None, "", scene.split)
         and (not families or scene.family in families)
         and (not maps or scene.map_name in maps)
     )
@@ -151,7 +147,7 @@ def _passing(
 
 def _list(console: Console, title: str, reasons: Mapping[str, str]) -> None:
     if reasons:
-        console.print(f"{len(reasons)} {title}:", style="bold", highlight=False)
+        console.print(f"{title}:", style="bold", highlight=False)
     for key, reason in reasons.items():
         text = reason if key in reason else f"{key}: {reason}"
         console.print(f"  {plain_line(text)}", markup=False, highlight=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Where the command ``stereogenbench`` starts: little is imported before Ctrl-C is quiet."""
+"""Entry point of the command ``stereogenbench``: sets up Ctrl-C before the long imports."""
 
 from stereogenbench_data.cli.stopping import stop_at_once
 

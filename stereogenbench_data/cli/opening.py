@@ -1,7 +1,6 @@
-"""How commands open DATA: with a progress bar, and with a report of the scenes left out."""
+"""Opening DATA: a progress bar while a tree is read, and a report of the scenes left out."""
 
 import warnings
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
@@ -10,7 +9,6 @@ from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted, plain_line
 
 if TYPE_CHECKING:
-    from stereogenbench_data.index.build import TreeReport
     from stereogenbench_data.index.table import SceneIndex
 
 
@@ -19,7 +17,7 @@ def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
 
     Args:
         data: What the command was given.
-        root: Where an index file's data are, by the user's word.
+        root: Where an index file's data are, if the user says so.
 
     Raises:
         StorageError: If the data do not exist, or hold no complete scene.
@@ -30,21 +28,26 @@ def open_data(data: str, *, root: str | None = None) -> "SceneIndex":
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.sources.location import is_remote, local_path
 
-    folder = None if is_remote(data) else local_path(data)
-    if folder is None or root is not None or not folder.is_dir():
-        return open_index(data, root=root)
-    if (folder / INDEX_NAME).is_file():
+    folder = local_path(data)
+    is_tree = not is_remote(data) and folder.is_dir() and not (folder / INDEX_NAME).is_file()
+    if root is not None or not is_tree:
         return open_index(data, root=root)
     with progress_bar("reading scenes", unit="scenes") as progress:
         report = walk(folder, progress=progress)
+    reasons = [*report.broken.values(), *report.incomplete.values()]
+    if not reasons:
+        return SceneIndex.from_report(report)
+    more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
     if not report.scenes:
-        reasons = [*report.broken.values(), *report.incomplete.values()]
-        more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
         raise StorageError(
             f"{folder}: has no complete scene: {reasons[0]}{more}. `stereogenbench index {folder}` "
             f"lists them all."
         )
-    _report_left_out(folder, report)
+    counts = {"broken": len(report.broken), "incomplete": len(report.incomplete)}
+    left_out = " and ".join(f"{count} {name}" for name, count in counts.items() if count)
+    found = counted(len(report.scenes) + len(reasons), "scene")
+    reason = plain_line(f"{folder}: {left_out} of {found} left out: {reasons[0]}")
+    typer.echo(f"{reason}{more} `stereogenbench index {folder}` lists them all.", err=True)
     return SceneIndex.from_report(report)
 
 
@@ -53,7 +56,7 @@ def open_index(data: str, *, root: str | None = None) -> "SceneIndex":
 
     Args:
         data: What the command was given.
-        root: Where an index file's data are, by the user's word.
+        root: Where an index file's data are, if the user says so.
 
     Raises:
         StorageError: If the data do not exist, or hold a broken scene.
@@ -71,16 +74,8 @@ def open_index(data: str, *, root: str | None = None) -> "SceneIndex":
     return index
 
 
-def _report_left_out(root: Path, report: "TreeReport") -> None:
-    reasons = [*report.broken.values(), *report.incomplete.values()]
-    if not reasons:
-        return
-    counts = {"broken": len(report.broken), "incomplete": len(report.incomplete)}
-    left_out = " and ".join(f"{count} {name}" for name, count in counts.items() if count)
-    found = len(report.scenes) + len(reasons)
-    typer.echo(
-        plain_line(f"{root}: {left_out} of {counted(found, 'scene')} left out: {reasons[0]}")
-        + (f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else "")
-        + f" `stereogenbench index {root}` lists them all.",
-        err=True,
-    )
+def full_place(data: str) -> str:
+    """Return the URL of some data without login and query, or their absolute path."""
+    from stereogenbench_data.sources.location import is_remote, local_path, shown
+
+    return shown(data) if is_remote(data) else str(local_path(data).resolve())

@@ -1,7 +1,7 @@
-"""Options that several commands share, and groups of them, each declared once.
+"""Options that several commands share, single and in groups, each declared once.
 
-A command takes a group as one parameter: a dataclass whose fields are options. `grouped` gives
-typer one option a field, in the parameter's place.
+A group is a dataclass whose fields are options. A command takes it as one parameter; `grouped`
+shows typer the fields in its place.
 """
 
 import inspect
@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterable
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
 from stereogenbench_data.cli.opening import open_data
-from stereogenbench_data.schema.release import FAMILIES, TRAIN_MAPS, UNSEEN_MAPS
+from stereogenbench_data.schema.release import FAMILIES, TRAIN_MAPS, UNSEEN_MAPS, Split, Subset
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """Return a command that typer sees with one option for each field of its groups.
+    """Return a command that has, for typer, one option for each field of its groups.
 
     Args:
         command: A function. Each parameter whose type is a dataclass is a group of options.
     """
-    parameters = inspect.signature(command).parameters.values()
+    parameters = inspect.signature(command).parameters
     groups: dict[str, Any] = {
-        each.name: each.annotation for each in parameters if is_dataclass(each.annotation)
+        name: each.annotation for name, each in parameters.items() if is_dataclass(each.annotation)
     }
 
     @wraps(command)
@@ -38,29 +38,24 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
             values[name] = group(**{field.name: values.pop(field.name) for field in fields(group)})
         command(**values)
 
-    options = []
-    for each in parameters:
-        options += _options_of(each.annotation) if each.name in groups else [each]
-    options = [option.replace(kind=inspect.Parameter.KEYWORD_ONLY) for option in options]
+    required, keyword_only = inspect.Parameter.empty, inspect.Parameter.KEYWORD_ONLY
+    options: list[inspect.Parameter] = []
+    for name, parameter in parameters.items():
+        if name not in groups:
+            options.append(parameter.replace(kind=keyword_only))
+            continue
+        for field in fields(groups[name]):
+            default = required if field.default is MISSING else field.default
+            options.append(
+                inspect.Parameter(field.name, keyword_only, default=default, annotation=field.type)
+            )
     called.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
     called.__annotations__ = {option.name: option.annotation for option in options}
     return called
 
 
-def _options_of(group: Any) -> list[inspect.Parameter]:
-    return [
-        inspect.Parameter(
-            field.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if field.default is MISSING else field.default,
-            annotation=field.type,
-        )
-        for field in fields(group)
-    ]
-
-
 def complete_from(values: Iterable[str]) -> Callable[[str], list[str]]:
-    """Return a function for shell completion: the values that begin with what was typed."""
+    """Return a function for shell completion that lists the values with the typed beginning."""
     known = sorted(values)
     return lambda incomplete: [
         value for value in known if value.lower().startswith(incomplete.lower())
@@ -68,12 +63,12 @@ def complete_from(values: Iterable[str]) -> Callable[[str], list[str]]:
 
 
 def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
-    """Return the keys of scenes that begin with what was typed, if DATA has an index."""
+    """Return the keys of scenes with the typed beginning, if DATA has an index."""
     from stereogenbench_data.errors import StereoGenBenchError
     from stereogenbench_data.index.parquet import INDEX_NAME
     from stereogenbench_data.index.table import SceneIndex
 
-    # Before an option without its value yet, the arguments are parsed but not assigned.
+    # While an option lacks its value, typer has parsed the arguments but not assigned them.
     data = Path(str(context.params.get("data") or next(iter(context.args), "")))
     if not (data.is_file() or (data / INDEX_NAME).is_file()):
         return []
@@ -85,33 +80,27 @@ def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def depth_of(unit_m: float | None) -> "DepthEncoding | None":
-    """Return the depth contract that ``--depth-unit-m`` asks for, None for that of the data."""
+    """Return the depth contract of ``--depth-unit-m``; None without it: files state their own."""
     from stereogenbench_data.schema.records import DepthEncoding
 
     return None if unit_m is None else DepthEncoding(unit_m=unit_m)
-
-
-def workers_option(processes: str = "Processes") -> Any:
-    """Return ``--workers`` with a help text that begins with what the processes do."""
-    return typer.Option("--workers", min=1, help=f"{processes} [one a core].")
 
 
 RootOption = Annotated[
     str | None,
     typer.Option(
         "--root",
-        help="Root of an index file's data, on your word, where they are not beside it and it "
-        "names no plain URL.",
+        help="Folder or URL of an index file's data, where they are not beside it and it names "
+        "no plain URL.",
     ),
 ]
 SplitOption = Annotated[
     str | None,
-    typer.Option("--split", help="train or eval.", autocompletion=complete_from(("train", "eval"))),
+    typer.Option(help="train or eval.", autocompletion=complete_from(get_args(Split))),
 ]
 FamilyOption = Annotated[
     list[str] | None,
     typer.Option(
-        "--family",
         help="Baseline family; may be given again.",
         autocompletion=complete_from(FAMILIES),
     ),
@@ -127,16 +116,14 @@ MapOption = Annotated[
 DepthUnitOption = Annotated[
     float | None,
     typer.Option(
-        "--depth-unit-m",
         help="Metres in a stored unit of depth, whatever the files state [their own tag].",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")]
-WorkersOption = Annotated[int | None, workers_option()]
+WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes [one a core].")]
 EngineOption = Annotated[
     str,
     typer.Option(
-        "--engine",
         help="local: processes here; ray: the Ray cluster of RAY_ADDRESS or of this machine "
         "(extra 'ray'); ray://HOST:PORT or HOST:PORT: the one there.",
         autocompletion=complete_from(("local", "ray")),
@@ -176,25 +163,22 @@ class SceneOptions:
     subset: Annotated[
         str | None,
         typer.Option(
-            "--subset",
             help="seen_map or unseen_map (of eval scenes).",
-            autocompletion=complete_from(("seen_map", "unseen_map")),
+            autocompletion=complete_from(get_args(Subset)),
         ),
     ] = None
     family: FamilyOption = None
     map_name: MapOption = None
     scene: Annotated[
         list[str] | None,
-        typer.Option(
-            "--scene", help="Key of a scene; may be given again.", autocompletion=complete_scene
-        ),
+        typer.Option(help="Key of a scene; may be given again.", autocompletion=complete_scene),
     ] = None
     focal_mm: Annotated[
         tuple[float, float] | None,
-        typer.Option("--focal-mm", help="Shortest and longest focal length, in mm."),
+        typer.Option(help="Shortest and longest focal length, in mm."),
     ] = None
     caption: Annotated[
-        str | None, typer.Option("--caption", help="Words that must all be in the description.")
+        str | None, typer.Option(help="Words that must all be in the description.")
     ] = None
 
     def filters(self) -> dict[str, Any]:
@@ -209,3 +193,24 @@ class SceneOptions:
             "caption": self.caption,
         }
         return {name: value for name, value in options.items() if value not in (None, [], ())}
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkOptions:
+    """How many processes do the work of a command, and where."""
+
+    workers: WorkersOption = None
+    engine: EngineOption = "local"
+
+    def options(self, *, device: str = "cpu") -> dict[str, Any]:
+        """Return ``workers`` and ``engine`` as the functions that do batch work take them.
+
+        Args:
+            device: Where tasks compute; on Ray each has its own GPU unless it is "cpu".
+
+        Raises:
+            StorageError: If there is no engine of that name.
+        """
+        from stereogenbench_data.engine import engine_of
+
+        return {"workers": self.workers, "engine": engine_of(self.engine, device=device)}

@@ -1,4 +1,4 @@
-"""How a command ends: an error is reported in one or two lines, with an exit status."""
+"""How a command ends: with an exit status, and one or two lines about an error."""
 
 import errno
 import os
@@ -12,7 +12,7 @@ from typing import Final, TextIO
 import typer
 
 from stereogenbench_data.cli.stopping import STOPPED
-from stereogenbench_data.errors import StereoGenBenchError, cure_of
+from stereogenbench_data.errors import StereoGenBenchError, describe_os_error
 from stereogenbench_data.schema.text import plain_line
 
 FINDINGS: Final = 1
@@ -28,11 +28,12 @@ _CURES: Final = {
     errno.EISDIR: "Name a file, not a folder.",
     errno.EADDRINUSE: "Choose another port.",
 }
+"""Cures of errors that are not in the table of `errors`, for a path or a port that was named."""
 
 
 @contextmanager
 def resumable() -> Iterator[None]:
-    """Report on Ctrl-C that the command resumes if it is run again. Decorates its function."""
+    """Say on Ctrl-C that the same command resumes the work. Decorates a command."""
     try:
         yield
     except KeyboardInterrupt:
@@ -43,14 +44,16 @@ def resumable() -> Iterator[None]:
 class ErrorsReported:
     """A context in which every error ends the command with a message instead of a traceback.
 
-    Exits and usage errors pass: the command line's framework reports them. The context flushes
-    stdout before it ends, so that it notices a closed pipe.
+    Exits and usage errors pass: typer reports them. The context flushes stdout before it ends, so
+    that it notices a closed pipe.
     """
 
     def __enter__(self) -> "ErrorsReported":
-        """Print warnings in one line, too."""
+        """Print each warning in one line."""
         self._formatwarning = warnings.formatwarning
-        warnings.formatwarning = _warning_line
+        warnings.formatwarning = lambda message, category, *_, **__: (
+            _plain_lines(f"{category.__name__}: {message}") + "\n"
+        )
         return self
 
     def __exit__(
@@ -77,7 +80,7 @@ class ErrorsReported:
 def _flush_error() -> OSError | None:
     """Flush stdout; return the error if that fails, else None."""
     try:
-        if sys.stdout is not None:  # as it is where the shell closed it
+        if sys.stdout is not None:  # It is None if the shell closed it.
             sys.stdout.flush()
     except OSError as error:
         _discard(sys.stdout)
@@ -88,45 +91,38 @@ def _flush_error() -> OSError | None:
 def _print_error(message: str) -> None:
     """Print a message on stderr; if that fails, only the exit status is left."""
     try:
-        typer.echo("\n".join(map(plain_line, message.split("\n"))), err=True)
+        typer.echo(_plain_lines(message), err=True)
     except OSError:
         _discard(sys.stderr)
 
 
+def _plain_lines(text: str) -> str:
+    return "\n".join(map(plain_line, text.split("\n")))
+
+
 def _message(error: BaseException) -> str:
-    """Return the message for an error; empty if the framework reports it."""
+    """Return the message for an error; empty if typer reports it."""
     if isinstance(error, StereoGenBenchError):
         return f"{type(error).__name__}: {error}"
     if isinstance(error, OSError) and error.errno is not None:
-        where = f"{error.filename}: " if error.filename else ""
-        cure = cure_of(error, _CURES.get(error.errno, ""))
-        return f"{type(error).__name__}: {where}{error.strerror}. {cure}".rstrip()
+        where = f": {error.filename}" if error.filename else ""
+        return describe_os_error(
+            f"{type(error).__name__}{where}", error, _CURES.get(error.errno, "")
+        )
     if isinstance(error, MemoryError):
         return "MemoryError: memory is short. Use fewer workers or smaller pictures."
-    if _is_reported_elsewhere(error):
+    by_typer = isinstance(error, typer.Exit | typer.Abort | EOFError)
+    by_typer |= type(error).__module__.startswith(("typer.", "click."))
+    if by_typer or not isinstance(error, Exception):
         return ""
     first_line = str(error).strip().partition("\n")[0]
     return (
         f"{type(error).__name__}: {first_line}\n"
-        "This was not foreseen: run it again as `stereogenbench --debug ...` to see where it arose."
+        "This error was not expected: run `stereogenbench --debug ...` to see where it arose."
     )
-
-
-def _is_reported_elsewhere(error: BaseException) -> bool:
-    """Return whether the framework reports an error: exits, usage errors."""
-    return not isinstance(error, Exception) or isinstance(
-        error, (typer.Exit, typer.Abort, EOFError)
-    ) or type(error).__module__.startswith(("typer.", "click."))  # fmt: skip
 
 
 def _discard(stream: TextIO) -> None:
     """Point a stream at the null device, so that Python does not flush it again when it ends."""
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def _warning_line(
-    message: Warning | str, category: type[Warning], *_place: object, **_line: object
-) -> str:
-    lines = f"{category.__name__}: {message}".split("\n")
-    return "\n".join(map(plain_line, lines)) + "\n"

@@ -1,4 +1,4 @@
-"""The progress bar of every long command: done, rate and time left, on stderr.
+"""The progress bar of long commands on stderr: count, rate and time left.
 
 If stderr is not a terminal, as in the log of a batch job, a line is printed every minute.
 """
@@ -22,54 +22,43 @@ from rich.text import Text
 Report = Callable[[int, int], None]
 
 _BYTES_IN: Final = {"MB": 1_000_000}
-"""Units whose progress is reported in bytes, and the bytes in each."""
-_ROOM_FOR_BAR: Final = 60
-_LOGGED_EVERY_S: Final = 60
+"""Units of progress that is reported in bytes, with the bytes in each."""
+_WIDTH_WITH_BAR: Final = 60
+"""Columns of the narrowest terminal in which a bar is shown."""
 
 
-class _DoneColumn(ProgressColumn):
-    """How much is done of how much, as far as it is known."""
-
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self._unit = unit
-
-    def render(self, task: Task) -> Text:
-        """Return 3/8 scenes, or nothing before the total is known."""
-        if task.total is None:
-            return Text("")
-        total = f"{task.total:,.0f}"
-        return Text(f"{task.completed:>{len(total)},.0f}/{total} {self._unit}", style="cyan")
-
-
-class _RateColumn(ProgressColumn):
-    """Units a second."""
+class _CountColumn(ProgressColumn):
+    """The count and the rate so far."""
 
     def __init__(self, unit: str) -> None:
         super().__init__()
         self._unit = unit
 
     def render(self, task: Task) -> Text:
-        """Return the rate since the start, or nothing before there is one."""
+        """Return ``3/8 scenes 1.5 scenes/s``, without what is not known yet."""
+        shown = Text()
+        if task.total is not None:
+            total = f"{task.total:,.0f}"
+            shown.append(f"{task.completed:>{len(total)},.0f}/{total} {self._unit} ", "cyan")
         rate = task.finished_speed or task.speed
-        return Text("" if rate is None else f"{rate:,.1f} {self._unit}/s")
+        return shown if rate is None else shown.append(f"{rate:,.1f} {self._unit}/s")
 
 
 @contextmanager
-def progress_bar(doing: str, *, unit: str) -> Iterator[Report]:
-    """Show a bar while the block runs; yield a function to call with (done, total).
+def progress_bar(doing: str, *, unit: str, log_every_s: float = 60) -> Iterator[Report]:
+    """Show a bar while the block runs; yield a function that takes (done, total).
 
     Args:
         doing: What the command does, such as "packing".
         unit: What is counted. For "MB", pass done and total in bytes.
+        log_every_s: Seconds between two lines where stderr is not a terminal.
     """
     divisor = _BYTES_IN.get(unit, 1)
     console = Console(stderr=True)
     columns = (
         TextColumn(doing),
-        *([BarColumn()] if console.width >= _ROOM_FOR_BAR else []),
-        _DoneColumn(unit),
-        _RateColumn(unit),
+        *([BarColumn()] if console.width >= _WIDTH_WITH_BAR else []),
+        _CountColumn(unit),
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
     )
     with Progress(*columns, console=console) as bar:
@@ -79,7 +68,7 @@ def progress_bar(doing: str, *, unit: str) -> Iterator[Report]:
         def report(done: int, total: int) -> None:
             nonlocal last_line_s
             bar.update(task, completed=-(-done // divisor), total=-(-total // divisor))
-            if not console.is_terminal and time.monotonic() - last_line_s >= _LOGGED_EVERY_S:
+            if not console.is_terminal and time.monotonic() - last_line_s >= log_every_s:
                 last_line_s = time.monotonic()
                 console.print(bar)
 

@@ -1,4 +1,4 @@
-"""``stereogenbench croissant``, ``card``, ``upload``: describe packed shards and publish them."""
+"""``stereogenbench croissant``, ``card``, ``upload``: describe and publish shards."""
 
 import json
 from dataclasses import asdict
@@ -18,7 +18,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         str | None,
         typer.Argument(
             help="Folder of shards, released tree, index file or URL; with --check, a descriptor. "
-            "Left out: the public release in folders, as it stands on the Hub."
+            "Without it, the public release in folders on the Hub."
         ),
     ] = None,
     *,
@@ -43,7 +43,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     ] = None,
     name: Annotated[str | None, typer.Option(help="The dataset's name [StereoGenBench].")] = None,
     release: Annotated[
-        str | None, typer.Option("--release", help="MAJOR.MINOR.PATCH of the data [1.0.0].")
+        str | None, typer.Option(help="MAJOR.MINOR.PATCH of the data [1.0.0].")
     ] = None,
     published: Annotated[
         datetime | None,
@@ -51,7 +51,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     ] = None,
     mapping: Annotated[
         list[str] | None,
-        typer.Option("--map-file", help="ID=PATH with --check: where a file named by URL lies."),
+        typer.Option("--map-file", help="ID=PATH with --check: local copy of a file behind a URL."),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Report as JSON; with --check the findings.")
@@ -59,7 +59,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
 ) -> None:
     """Write a Croissant 1.1 descriptor with responsible-AI fields, or check one.
 
-    The check reads what `mlcroissant validate` does not: files, checksums, columns, references,
+    The check covers what `mlcroissant validate` does not: files, checksums, columns, references,
     names and the context.
     """
     if check:
@@ -67,7 +67,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         return
     if out is None:
         raise typer.BadParameter(
-            "the descriptor needs a file: name it with -o FILE.", param_hint="--out"
+            "no file for the descriptor: name it with -o FILE.", param_hint="--out"
         )
     from stereogenbench_data.bridges import about
     from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
@@ -92,7 +92,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
 
 def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
     if data is None:
-        raise typer.BadParameter("--check needs a descriptor: name its file.", param_hint="DATA")
+        raise typer.BadParameter("no descriptor to check: name its file.", param_hint="DATA")
     from stereogenbench_data.bridges.croissant.check import check_descriptor
 
     places = {}
@@ -124,7 +124,7 @@ def card(
         Path | None, typer.Option("--out", "-o", help="Folder to write README.md into [stdout].")
     ] = None,
 ) -> None:
-    """Write the dataset card of shards: what the Hub shows, and how `datasets` finds the shards."""
+    """Write the dataset card of shards, which the Hub shows and `datasets` reads."""
     from stereogenbench_data.bridges.card import card as card_text
     from stereogenbench_data.bridges.card import write_card
     from stereogenbench_data.index.table import SceneIndex
@@ -133,11 +133,11 @@ def card(
     if out is None:
         typer.echo(card_text(index, repository=repository), nl=False)
         return
-    typer.echo(f"{write_card(index, out, repository=repository)}")
+    typer.echo(str(write_card(index, out, repository=repository)))
 
 
 def upload(
-    shards: Annotated[Path, typer.Argument(help="Folder of shards, as pack made it.")],
+    shards: Annotated[Path, typer.Argument(help="Folder of shards, as `pack` wrote it.")],
     repository: Annotated[str, typer.Argument(help="ORG/NAME of a dataset on the Hub.")],
     *,
     branch: Annotated[str, typer.Option(help="Branch to commit to.")] = "main",
@@ -145,8 +145,8 @@ def upload(
 ) -> None:
     """Upload shards with index, dataset card and Croissant descriptor (extra 'hub').
 
-    The card and the descriptor are written into the folder first. Log in with `hf auth login`.
-    A run that was stopped goes on if it is run again.
+    The card and the descriptor are written into the folder first. Log in with `hf auth login`. To
+    continue a stopped run, run it again.
     """
     from stereogenbench_data.bridges.upload import upload as uploaded
 

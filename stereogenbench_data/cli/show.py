@@ -1,7 +1,7 @@
 """``stereogenbench show``: one scene as a picture or a clip."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -15,9 +15,6 @@ from stereogenbench_data.cli.options import (
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
 
-if TYPE_CHECKING:
-    from stereogenbench_data.audit.scene_reader import SceneReader
-
 _CLIPS = (".mp4", ".gif")
 
 
@@ -27,7 +24,7 @@ def show(  # noqa: PLR0913 - one parameter an option
     scene: Annotated[
         str | None,
         typer.Argument(
-            help="Key of a scene, or a part of one that no other has [the first scene].",
+            help="Key of a scene, or a part that no other key has [the first scene].",
             autocompletion=complete_scene,
         ),
     ] = None,
@@ -39,12 +36,12 @@ def show(  # noqa: PLR0913 - one parameter an option
         ),
     ] = None,
     pair: Annotated[
-        str | None, typer.Option("--pair", help="Two cameras, such as 0-5 [the recorded pair].")
+        str | None, typer.Option(help="Two cameras, such as 0-5 [the recorded pair].")
     ] = None,
-    frame: Annotated[int, typer.Option("--frame", min=0, help="Number of the frame.")] = 0,
+    frame: Annotated[int, typer.Option(min=0, help="Number of the frame.")] = 0,
     size: Annotated[
         int | None,
-        typer.Option("--size", min=1, max=2048, help="How wide one picture is drawn, px [320]."),
+        typer.Option(min=1, max=2048, help="Width of each drawn picture, px [320]."),
     ] = None,
     clip: Annotated[
         bool, typer.Option("--clip", help="Write all frames as a clip, .mp4 or .gif [KEY.mp4].")
@@ -53,58 +50,43 @@ def show(  # noqa: PLR0913 - one parameter an option
 ) -> None:
     """Draw one scene: its six views, and a pair's disparity, depth, visibility and warp.
 
-    Disparity has a bar in pixels and in metres; numbers are of the stored pictures. With --clip:
-    left, right, disparity and anaglyph over time.
+    The bar of disparity shows pixels and metres, of the stored pictures. A clip shows left, right,
+    disparity and anaglyph over time.
     """
+    from stereogenbench_data.audit import scene_pictures
     from stereogenbench_data.audit.scene_reader import SceneReader
+    from stereogenbench_data.samples.picture import write_png
     from stereogenbench_data.selection.filters import find_scene
 
-    cameras = None if pair is None else _cameras(pair)
+    cameras = None
+    if pair is not None:
+        left, _, right = pair.replace(",", "-").partition("-")
+        if not (left.strip().isdecimal() and right.strip().isdecimal()):
+            raise typer.BadParameter(
+                f"{pair!r} is not a pair: write two cameras, such as 0-5.", param_hint="--pair"
+            )
+        cameras = int(left), int(right)
     clip = clip or (out is not None and out.suffix.lower() in _CLIPS)
     if out is not None and out.suffix.lower() not in (_CLIPS if clip else (".png",)):
         wanted = "a clip is .mp4 or .gif" if clip else "a sheet is .png"
         raise typer.BadParameter(f"{out}: {wanted}, by its ending.", param_hint="--out")
     index = source.open()
     row = 0 if scene is None else find_scene(index, scene)
-    key = index.scene(row).id.key
+    recorded = index.scene(row)
+    key = recorded.id.key
     target = out or Path(key.replace("/", "_") + (".mp4" if clip else ".png"))
     reader = SceneReader(index, depth=depth_of(depth_unit_m))
     with writing(target):
         if clip:
-            _write_clip(reader, row, target, pair=cameras, size=size)
+            with progress_bar("drawing", unit="frames") as progress:
+                scene_pictures.write_clip(
+                    target,
+                    scene_pictures.clip_pages(reader, row, pair=cameras, tile_px=size),
+                    frames=recorded.frames,
+                    rate_hz=recorded.frame_rate_hz,
+                    progress=progress,
+                )
         else:
-            from stereogenbench_data.audit.scene_pictures import scene_sheet
-            from stereogenbench_data.samples.picture import write_png
-
-            write_png(target, scene_sheet(reader, row, pair=cameras, frame=frame, tile_px=size))
+            sheet = scene_pictures.scene_sheet(reader, row, pair=cameras, frame=frame, tile_px=size)
+            write_png(target, sheet)
     typer.echo(f"{target}: {key}")
-
-
-def _write_clip(
-    reader: "SceneReader",
-    row: int,
-    target: Path,
-    *,
-    pair: tuple[int, int] | None,
-    size: int | None,
-) -> None:
-    from stereogenbench_data.audit.scene_pictures import clip_pages, write_clip
-
-    scene = reader.index.scene(row)
-    with progress_bar("drawing", unit="frames") as progress:
-        write_clip(
-            target,
-            clip_pages(reader, row, pair=pair, tile_px=size),
-            frames=scene.frames,
-            rate_hz=scene.frame_rate_hz,
-            progress=progress,
-        )
-
-
-def _cameras(text: str) -> tuple[int, int]:
-    left, _, right = text.replace(",", "-").partition("-")
-    if not (left.strip().isdecimal() and right.strip().isdecimal()):
-        raise typer.BadParameter(
-            f"{text!r} is not a pair: write two cameras, such as 0-5.", param_hint="--pair"
-        )
-    return int(left), int(right)

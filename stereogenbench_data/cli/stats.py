@@ -1,4 +1,4 @@
-"""``stereogenbench stats``: the paper's tables of any data, from their index alone."""
+"""``stereogenbench stats``: the paper's tables for any data, from their index alone."""
 
 import json
 from dataclasses import asdict
@@ -26,7 +26,7 @@ def stats(
     compare: Annotated[
         Literal["auto", "always", "never"],
         typer.Option(
-            help="The paper's figures beside: auto for splits of about the release's size."
+            help="Show the paper's figures beside; auto: for splits of about the release's size."
         ),
     ] = "auto",
     plots: Annotated[
@@ -37,7 +37,7 @@ def stats(
 ) -> None:
     """Count scenes, maps, baselines and focal lengths, as the paper's tables do.
 
-    Only the index is read. With --compare always the exit status is 1 if a figure differs from
+    It reads only the index. With --compare always, the exit status is 1 if a figure differs from
     the paper's.
     """
     from stereogenbench_data.audit.paper_figures import SPLITS
@@ -46,10 +46,10 @@ def stats(
         compared,
         release_sized_splits,
         statistics_markdown,
+        write_plots,
     )
 
-    index = source.open()
-    filters = chosen.filters()
+    index, filters = source.open(), chosen.filters()
     found = statistics(index, **filters)
     splits = {"always": tuple(SPLITS), "never": ()}.get(compare)
     lines = compared(found, splits=release_sized_splits(found) if splits is None else splits)
@@ -59,8 +59,6 @@ def stats(
     text = json.dumps(document, indent=1)
     markdown = statistics_markdown(found, lines)
     if plots is not None:
-        from stereogenbench_data.audit.statistics_report import write_plots
-
         with writing(plots):
             written = write_plots(index, plots, **filters)
         for path in written:

@@ -1,19 +1,19 @@
-"""Ctrl-C and SIGTERM: at once while the command is starting, by an exception once it works."""
+"""Ctrl-C and SIGTERM end a starting command at once, and raise an exception in a running one."""
 
 import os
 import signal
 from types import FrameType
 
 STOPPED = 130
-"""Exit status after Ctrl-C: 128 and the number of the signal."""
+"""Exit status after Ctrl-C: 128 plus the number of the signal."""
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def stop_at_once() -> None:
-    """Let a signal end this process without a traceback, as long as nothing needs tidying up.
+    """Let a signal end this process at once, without a traceback.
 
-    A signal that is ignored, as Ctrl-C is in the background of a shell script, stays ignored.
+    An ignored signal stays ignored, such as Ctrl-C in the background of a shell script.
     """
     for number in _SIGNALS:
         if signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL):
@@ -21,7 +21,7 @@ def stop_at_once() -> None:
 
 
 def stop_by_exception() -> None:
-    """Let a signal that `stop_at_once` took raise KeyboardInterrupt from here on."""
+    """Let a signal that `stop_at_once` handles raise KeyboardInterrupt from now on."""
     for number in _SIGNALS:
         if signal.getsignal(number) is _end:
             signal.signal(number, signal.default_int_handler)

@@ -1,4 +1,4 @@
-"""``stereogenbench synth``: scenes in the released layout, drawn without Unreal."""
+"""``stereogenbench synth``: draw scenes in the released layout, without Unreal."""
 
 import json
 from pathlib import Path
@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 import typer
 
 from stereogenbench_data.cli.options import (
-    EngineOption,
     JsonOption,
+    WorkOptions,
     complete_from,
-    workers_option,
+    grouped,
 )
 from stereogenbench_data.cli.outcome import resumable
 from stereogenbench_data.cli.progress import progress_bar
@@ -24,9 +24,10 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.schema.text import counted
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
-"""As in `synthesis.request`, which is imported when scenes are drawn, not for the help."""
+"""The same as in `synthesis.request`, which the help does not import."""
 
 
+@grouped
 @resumable()
 def synth(  # noqa: PLR0913 - one parameter an option
     out: Annotated[Path, typer.Argument(help="Folder to write train/ or eval/ into.")],
@@ -34,37 +35,35 @@ def synth(  # noqa: PLR0913 - one parameter an option
     family: Annotated[
         str,
         typer.Option(
-            help=f"How far the cameras stand apart: {', '.join(FAMILIES)}.",
+            help=f"Family of baselines: {', '.join(FAMILIES)}.",
             autocompletion=complete_from(FAMILIES),
         ),
     ] = FAMILIES[0],
-    scenes: Annotated[int, typer.Option(help="How many scenes, numbered from 0.")] = 1,
+    scenes: Annotated[int, typer.Option(help="Number of scenes; they are numbered from 0.")] = 1,
     size: Annotated[int, typer.Option(help="Width and height, even.")] = IMAGE_SIZE_PX,
     frames: Annotated[int, typer.Option(help="Frames, at 15 Hz.")] = FRAME_COUNT,
-    seed: Annotated[int, typer.Option(help="What chance decides follows from it.")] = 0,
-    split: Annotated[Split, typer.Option(help="Pairwise_Uniform is in train alone.")] = "train",
-    subset: Annotated[Subset, typer.Option(help="Of maps; counts in eval.")] = "seen_map",
+    seed: Annotated[int, typer.Option(help="Seed of all that is random.")] = 0,
+    split: Annotated[Split, typer.Option(help="Pairwise_Uniform is only in train.")] = "train",
+    subset: Annotated[Subset, typer.Option(help="Kind of maps; used in eval.")] = "seen_map",
     map_name: Annotated[str, typer.Option("--map", help="Folder of the scenes.")] = "SynthStage",
     focal_mm: Annotated[
-        float | None, typer.Option(help="Focal length (default: one of 18..85 for each scene).")
+        float | None, typer.Option(help="Focal length, mm [random, 18 to 85, for each scene].")
     ] = None,
     depth_unit_m: Annotated[float, typer.Option(help="Metres in a stored unit.")] = 0.001,
     depth_tag: Annotated[
-        str, typer.Option(help="Tag that tells the unit; '' writes none.")
+        str, typer.Option(help="Name of the tag that states the unit; '' writes none.")
     ] = "DEPTH_SCALE",
     rotation: Annotated[
         RotationForm, typer.Option(help="How trajectory.json records rotations.")
     ] = "rotator",
-    workers: Annotated[int | None, workers_option("Processes that draw")] = None,
-    engine: EngineOption = "local",
+    work: WorkOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Draw scenes with exact depth, poses and intrinsics, in the released layout.
 
-    Scenes that the same request wrote before are kept, so a run that was stopped goes on if it
-    is run again. Scene i is the same for any number of scenes and workers.
+    To continue a stopped run, run it again: it keeps the scenes that the same request wrote. Scene
+    i is the same for any number of scenes and workers.
     """
-    from stereogenbench_data.engine import engine_of
     from stereogenbench_data.synthesis.produce import synthesise
     from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
@@ -83,9 +82,7 @@ def synth(  # noqa: PLR0913 - one parameter an option
         ),
     )
     with progress_bar("drawing", unit="frames") as progress:
-        keys = synthesise(
-            out, request, workers=workers, engine=engine_of(engine), progress=progress
-        )
+        keys = synthesise(out, request, progress=progress, **work.options())
     if as_json:
         typer.echo(json.dumps({"root": str(out), "scenes": keys}, indent=2))
     else:

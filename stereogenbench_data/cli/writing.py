@@ -1,4 +1,4 @@
-"""How commands write: a report whole or not at all, and errors that name the file."""
+"""Writing reports: each whole or not at all; errors of the disk name the file."""
 
 import errno
 from collections.abc import Iterator
@@ -6,12 +6,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-_OF_WRITING: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+from stereogenbench_data.errors import DISK_FULL
+
+_OF_WRITING: Final = DISK_FULL | {errno.EFBIG, errno.EROFS}
 
 
 @contextmanager
 def writing(place: Path) -> Iterator[None]:
-    """Add the file's name to errors of the disk that lack one, such as a full disk."""
+    """Name the file in an error of writing that names none, such as that of a full disk."""
     try:
         yield
     except OSError as error:
@@ -21,9 +23,9 @@ def writing(place: Path) -> Iterator[None]:
 
 
 def write_report(path: Path, text: str) -> None:
-    """Write a report as UTF-8; make its folders, and replace a file of that name.
+    """Write a report as UTF-8 into a new file or over an existing one; create its folder.
 
-    Bytes of file names that are not UTF-8 become question marks.
+    What UTF-8 cannot encode, such as odd bytes of file names, becomes ``?``.
 
     Raises:
         OSError: If it cannot be written. An existing file keeps its content, unless it is a

@@ -85,14 +85,15 @@ class BatchArrays:
 
     def as_tensors(self, number: int, sample: Sample) -> Sample:
         """Return a sample with tensors for arrays, slices of the batch's where it was written."""
-        return {name: self._as_tensor(number, name, value) for name, value in sample.items()}
-
-    def _as_tensor(self, number: int, name: str, value: Any) -> Any:
-        if isinstance(value, str):
-            return value
-        whole = self.tensors[name]
-        same = tuple(whole.shape[1:]) == value.shape
-        return whole[number] if same else torch.from_numpy(value)
+        tensors: Sample = {}
+        for name, value in sample.items():
+            if isinstance(value, str):
+                tensors[name] = value
+            else:
+                whole = self.tensors[name]
+                same = tuple(whole.shape[1:]) == value.shape
+                tensors[name] = whole[number] if same else torch.from_numpy(value)
+        return tensors
 
     def _whole(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> torch.Tensor:
         if name not in self.tensors:
@@ -343,7 +344,8 @@ def _open_batch(
     """Return the batch of a handle; the slot is given back when none of its tensors is left."""
     if status is not None and memory is not None:
         if owner not in _opened:
-            _forget_ended()
+            running = {process.pid for process in multiprocessing.active_children()}
+            forget_slots({each.pid for each in _opened if each.pid not in running})
             _opened[owner] = _OpenedSlots(status, {})
         _opened[owner].memory[slot] = memory
     slots = _opened[owner]
@@ -395,8 +397,3 @@ def forget_slots(pids: set[int]) -> None:
     for owner in tuple(_opened):
         if owner.pid in pids:
             _opened.pop(owner, None)
-
-
-def _forget_ended() -> None:
-    running = {process.pid for process in multiprocessing.active_children()}
-    forget_slots({owner.pid for owner in _opened if owner.pid not in running})

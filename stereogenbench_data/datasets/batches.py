@@ -1,5 +1,6 @@
 """The batches of an epoch for one rank, and positions in them that can be saved."""
 
+import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
@@ -9,7 +10,6 @@ import numpy as np
 import torch.distributed
 from torch.utils.data import Sampler
 
-from stereogenbench_data.datasets.frameworks import require_shared_once
 from stereogenbench_data.datasets.open_videos import fitting_rule
 from stereogenbench_data.datasets.shared import SharedEpoch
 from stereogenbench_data.errors import SelectionError, StateError
@@ -45,7 +45,7 @@ class EpochOptions(TypedDict, total=False):
         drop_last: As in torch: True is ``tail="drop"``, the default; False is ``tail="uneven"``,
             and refused for several ranks, which must choose between "uneven" and "wrap".
         shuffle: As in torch: True is ``order="shuffled"``, the default; False is "sequential".
-        tail: What becomes of the epoch's last batches. "drop" (the default): each rank gets as
+        tail: What happens to the epoch's last batches. "drop" (the default): each rank gets as
             many batches, all of them full; what is left over is dropped (see
             `EpochBatches.left_out`). "wrap": each rank gets as many full batches and no sample is
             left out; samples from the epoch's start fill up, marked in the field ``is_padding``
@@ -129,11 +129,11 @@ class EpochBatches(Sampler[list[int]]):
     """A batch sampler: the samples of each batch of an epoch, for one rank.
 
     Its passes are of the same epoch until `set_epoch` is called, as with torch's samplers; a
-    ``loader(...)`` goes to the next epoch by itself. The order depends on the selection, the seed,
-    the epoch, the batch size, the shuffle groups and the open scenes, and on nothing else: global
-    batch n goes to rank n mod world_size, whoever asks. It offers its position as torchdata's
-    ``StatefulDataLoader`` asks for it; with torch's own `DataLoader`, which reads ahead, use the
-    dataset's ``loader(...)``, which counts what the training loop has taken.
+    ``loader(...)`` goes to the next epoch by itself. The order depends only on the selection, the
+    seed, the epoch, the batch size, the shuffle groups and the open scenes; rank r gets the global
+    batches n with n mod world_size = r. torchdata's ``StatefulDataLoader`` can save and load its
+    position. torch's own `DataLoader` reads ahead: use the dataset's ``loader(...)``, which counts
+    what the training loop has taken.
 
     >>> from stereogenbench_data import EpochBatches, StereoPairs
     >>> pairs = StereoPairs(getfixture("small_release"), frames="all")
@@ -224,7 +224,7 @@ class EpochBatches(Sampler[list[int]]):
         Raises:
             SelectionError: If Accelerate would share these batches among ranks a second time.
         """
-        require_shared_once(self, type(self).__name__, rank=self.rank, world_size=self.world_size)
+        self._require_shared_once(self)
         epoch, start = self._next_position()
         return BatchPass(self, epoch=epoch, start=start)
 
@@ -257,7 +257,7 @@ class EpochBatches(Sampler[list[int]]):
         return (epoch, start) if epoch == self._epoch.value else (self._epoch.value, 0)
 
     def _begin(self, latest: "BatchPass | None" = None) -> None:
-        """Record that a pass has begun: the next one starts its epoch from the beginning."""
+        """Record that a pass has begun: the next one begins its epoch at the first batch."""
         self._resumed = (0, 0)
         self._latest = latest
 
@@ -312,6 +312,36 @@ class EpochBatches(Sampler[list[int]]):
                 f"process is rank {rank} of {world_size} now. Make them after init_process_group "
                 "(Accelerate: after Accelerator(); Lightning: in train_dataloader() of a module or "
                 "data module), or give rank= and world_size=."
+            )
+
+    def _require_shared_once(self, data: object) -> None:
+        """Require that Accelerate does not divide these batches among processes a second time.
+
+        Args:
+            data: What it would divide: these batches, or a stream of their samples.
+
+        Raises:
+            SelectionError: If it does.
+        """
+        states = sys.modules.get("accelerate.state")
+        if self.world_size == 1 or states is None:
+            return
+        active = states.GradientState().active_dataloader
+        if active is None or isinstance(getattr(active, "batches", None), EpochBatches):
+            return
+        dataset = getattr(active, "dataset", None)
+        sampler = getattr(active, "batch_sampler", None)
+        wrapped = [getattr(dataset, "dataset", None), getattr(sampler, "batch_sampler", None)]
+        if hasattr(active, "slice_fn"):
+            # Process 0 alone reads for all.
+            wrapped += [dataset, sampler]
+        if any(each is data for each in wrapped):
+            raise SelectionError(
+                f"Accelerate shares these batches among {states.PartialState().num_processes} "
+                f"processes, and this {type(data).__name__} gives rank {self.rank} of "
+                f"{self.world_size} its share already: samples would be lost. Prepare "
+                "pairs.loader(...) instead, which shares once and keeps its position, or do not "
+                "prepare this loader."
             )
 
     def batch(self, number: int, *, epoch: int) -> EpochBatch:

@@ -3,63 +3,23 @@
 Accelerate and Lightning give each rank its share of a torch `DataLoader`. Our loaders have already
 done that; dividing them again would silently lose samples. Lightning leaves loaders alone whose
 sampler is torch's `DistributedSampler`, Accelerate those that say they are prepared. Batches and
-streams that are divided twice all the same are refused.
+streams that are divided twice all the same are refused (`EpochBatches`).
 """
 
 import sys
-from collections.abc import Iterable, Iterator, Sized
-from typing import Any, Final, Protocol
+from collections.abc import Iterator
+from typing import Any, Final
 
 import torch
 from torch.utils.data import DistributedSampler
 
-from stereogenbench_data.errors import SelectionError
-
-_SHARED_TWICE: Final = (
-    "Accelerate shares these batches among {processes} processes, and this {name} gives rank "
-    "{rank} of {world_size} its share already: samples would be lost. Prepare pairs.loader(...) "
-    "instead, which shares once and keeps its position, or do not prepare this loader."
-)
-
-
-class RankBatches(Protocol):
-    """The batches of one rank: what this module asks of `EpochBatches`."""
-
-    rank: int
-    world_size: int
-
-    @property
-    def tail(self) -> str:
-        """What becomes of the last batches."""
-        ...
-
-    @property
-    def samples_of_epoch(self) -> int:
-        """How many samples an epoch has, of all ranks."""
-        ...
-
-    @property
-    def batch_size(self) -> int:
-        """How many samples a batch of one rank has."""
-        ...
-
-    def __iter__(self) -> Iterator[Iterable[int]]: ...
-
-    def __len__(self) -> int: ...
-
-    def set_epoch(self, epoch: int) -> None:
-        """Go to another epoch."""
-        ...
-
-    def _require_group(self, rank: int, world_size: int) -> None:
-        """Require that these are the batches of a rank of so many."""
-        ...
+from stereogenbench_data.datasets.batches import EpochBatches
 
 
 class ShareSampler(DistributedSampler[Any]):
     """The samples of one rank, as a sampler that tells frameworks that they are divided already."""
 
-    def __init__(self, batches: RankBatches) -> None:
+    def __init__(self, batches: EpochBatches) -> None:
         """Stand for the samples of these batches."""
         # torch asks a sampler's dataset for its length alone.
         samples: Any = range(batches.samples_of_epoch)
@@ -90,7 +50,7 @@ class AcceleratedLoader:
             padding.
     """
 
-    batches: RankBatches
+    batches: EpochBatches
     use_stateful_dataloader: Final = True
     end_of_dataloader = False
     remainder = 0
@@ -163,34 +123,3 @@ def accelerates_epoch(dataset: object) -> int | None:
         return None
     iteration = getattr(active, "iteration", None)
     return iteration if isinstance(iteration, int) else None
-
-
-def require_shared_once(data: Sized | object, name: str, *, rank: int, world_size: int) -> None:
-    """Refuse data that Accelerate is about to divide among processes a second time.
-
-    Args:
-        data: A batch sampler or an iterable dataset.
-        name: What to call it.
-        rank: Whose share it is.
-        world_size: Of how many.
-
-    Raises:
-        SelectionError: If it would be shared twice.
-    """
-    states = sys.modules.get("accelerate.state")
-    if world_size == 1 or states is None:
-        return
-    active = states.GradientState().active_dataloader
-    if active is None or isinstance(active, AcceleratedLoader):
-        return
-    dataset = getattr(active, "dataset", None)
-    sampler = getattr(active, "batch_sampler", None)
-    wrapped = [getattr(dataset, "dataset", None), getattr(sampler, "batch_sampler", None)]
-    if hasattr(active, "slice_fn"):
-        # Process 0 alone reads for all.
-        wrapped += [dataset, sampler]
-    if any(each is data for each in wrapped):
-        processes = states.PartialState().num_processes
-        raise SelectionError(
-            _SHARED_TWICE.format(processes=processes, name=name, rank=rank, world_size=world_size)
-        )

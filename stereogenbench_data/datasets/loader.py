@@ -32,7 +32,7 @@ from stereogenbench_data.samples.streams import StreamStats
 _ORDERED: Final = "or torch's own DataLoader over the dataset"
 _INSTEAD: Final = {
     "sampler": f"use seed= and order=, {_ORDERED}",
-    "lanes": "it is called shuffle_groups",
+    "lanes": "use shuffle_groups",
     "batch_sampler": f"use seed= and order=, {_ORDERED} with EpochBatches",
 }
 """Options that a loader does not take, and what to use instead."""
@@ -58,15 +58,12 @@ class Loadable(Numbered, Protocol):
 
     def _keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Keep videos open for the scenes that one of so many processes reads at a time."""
-        ...
 
     def stats(self) -> StreamStats:
         """Return how many videos this process has open."""
-        ...
 
     def close(self) -> None:
         """Close the videos that are open in this process."""
-        ...
 
 
 class LoaderStats(NamedTuple):
@@ -95,19 +92,18 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     It is a torch `DataLoader`. `state_dict` counts the batches that the loop has taken, not those
     that workers have read ahead, so that it can be saved after any batch and loaded under other
-    numbers of ranks and workers. A pass that gave its last batch is followed by one of the next
-    epoch, unless an epoch was set since: training loops need not call `set_epoch`, and a pass to
-    be repeated, as for validation on random frames, is asked for by ``set_epoch(0)`` before it.
+    numbers of ranks and workers. After a whole pass the next pass is of the next epoch, unless an
+    epoch was set since. So training loops need not call `set_epoch`. To repeat a pass, as for
+    validation on random frames, call ``set_epoch(0)`` before it.
 
-    A pass owns its workers and their memory: the loader can be iterated while another iteration of
-    it goes on. Workers that persist serve one pass at a time: a new one ends the one before, which
-    then raises `PassError`. Where a worker dies, the loop ends with `WorkerError`, or with torch's
-    own `RuntimeError` if it dies while the body of the loop runs: catch `RuntimeError`, of which
-    `WorkerError` is one. Threads that share a pass take turns.
+    A pass owns its workers and their memory, so several passes over one loader can run at a time.
+    Workers that persist serve one pass at a time: a new pass ends the previous one, which then
+    raises `PassError`. If a worker dies, the loop ends with `WorkerError`, or with torch's own
+    `RuntimeError` if it dies while the body of the loop runs: catch `RuntimeError`, the base of
+    `WorkerError`. Threads that share a pass take turns.
 
-    Its epoch is its own from the first `set_epoch` or `load_state_dict` on, and until then goes
-    with the dataset that it was made from; its open videos are its own. So loaders of one dataset,
-    one to train and one to validate, leave each other alone.
+    Its epoch follows that of its dataset until the first `set_epoch` or `load_state_dict`. Its open
+    videos are its own. So a loader to train and a loader to validate may share a dataset.
 
     ``accelerator.prepare(loader)`` of Accelerate returns the loader itself, as it shares batches
     among ranks already; from then on batches come on the accelerator's device, and
@@ -284,7 +280,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             self._unfinished.discard(by)
 
     def _ended(self, ended: "LoaderPass") -> None:
-        """Record that a pass is over. If it ran within another pass, the position is that one's."""
+        """Record that a pass is over; the position becomes that of a pass that it ran within."""
         self._running -= 1
         if self._running == 0:
             self._leave_loop()
@@ -371,7 +367,12 @@ class LoaderPass(Iterator[Any]):
                 an error ended it.
             WorkerError: If a worker process died.
         """
-        self._require_own_process()
+        if os.getpid() != self._pid:
+            raise PassError(
+                f"process {self._pid} began this pass, and its fork {os.getpid()} uses it: both "
+                "would take batches from the same workers. Call iter(loader) in the process that "
+                "uses it."
+            )
         with self._lock:
             return self._next()
 
@@ -383,7 +384,12 @@ class LoaderPass(Iterator[Any]):
         workers = self._workers
         if workers is None:
             raise StopIteration
-        self._require_current(workers)
+        if workers.passes != self._number:
+            raise PassError(
+                f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
+                "batches, as another one was begun: workers that persist serve one pass at a time. "
+                "Use a loader for each, or persistent_workers=False."
+            )
         self._over = (
             f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} batches "
             "with an error: begin another one, or load a state."
@@ -424,22 +430,6 @@ class LoaderPass(Iterator[Any]):
     def __del__(self) -> None:
         """End the pass when nobody refers to it."""
         self.close()
-
-    def _require_own_process(self) -> None:
-        if os.getpid() != self._pid:
-            raise PassError(
-                f"process {self._pid} began this pass, and its fork {os.getpid()} uses it: both "
-                "would take batches from the same workers. Call iter(loader) in the process that "
-                "uses it."
-            )
-
-    def _require_current(self, workers: "_Workers") -> None:
-        if workers.passes != self._number:
-            raise PassError(
-                f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
-                "batches, as another one was begun: workers that persist serve one pass at a time. "
-                "Use a loader for each, or persistent_workers=False."
-            )
 
 
 class _Workers:
@@ -510,12 +500,10 @@ class _Workers:
         self._context.stop()
         # Now, and not when the last traceback is gone that knows the iterator. Lightning ends
         # workers in this way, too; where none could be started there is nothing to end.
-        getattr(batches, "_shutdown_workers", _pass)()
+        shutdown = getattr(batches, "_shutdown_workers", None)
+        if shutdown is not None:
+            shutdown()
         forget_slots(self._context.pids)
-
-
-def _pass() -> None:
-    """Do nothing."""
 
 
 class _Numbers(Sampler[list[int]]):

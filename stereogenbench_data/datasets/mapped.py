@@ -83,7 +83,7 @@ class _MappedScenes(Dataset[Sample]):
     def set_epoch(self, epoch: int) -> None:
         """Draw random frames and transforms anew, in this process and in running workers.
 
-        Loaders that were made before, and were not told an epoch themselves, go with it.
+        Loaders that were made before follow, unless an epoch of their own was set.
 
         Args:
             epoch: Number of the epoch, from 0.
@@ -213,14 +213,14 @@ class _MappedScenes(Dataset[Sample]):
     def stats(self) -> StreamStats:
         """Return how many videos this process has open for this dataset, and may have.
 
-        A loader has its own, which its ``stats()`` tells.
+        A loader has its own videos: see its ``stats()``.
         """
         return self._loader.stats
 
     def close(self) -> None:
         """Close the videos that this process holds open; the dataset can be used again.
 
-        A loader has its own, which its ``close()`` closes.
+        A loader has its own videos, which its ``close()`` closes.
         """
         self._loader.close()
 
@@ -291,7 +291,7 @@ class StereoPairs(_MappedScenes):
             MediaError: If depth that a field needs cannot have been stored whole (8 bits, a lossy
                 codec, chroma) and the depth contract does not accept it.
         """
-        index = open_index(data)
+        index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
         plan = plan_pairs(index, seed=seed, **selection)
         request = parse_request(
             "pairs",
@@ -359,14 +359,8 @@ class SceneViews(_MappedScenes):
             depth=depth,
             transform=transform,
         )
-        index = open_index(data)
-        plan = plan_views(
-            index,
-            cameras=cameras,
-            frames=frames,
-            seed=seed,
-            filters=filters,
-        )
+        index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
+        plan = plan_views(index, cameras=cameras, frames=frames, seed=seed, filters=filters)
         super().__init__(index, plan, request, cache=cache, check=check, buffers=buffers)
 
 
@@ -383,8 +377,3 @@ def _opens_checked(check: Check, plan: Plan) -> bool:
     clip = len(plan.windows.window(0, frames=frames, draw=(0,)))
     is_mostly_read = 2 * clip * plan.windows.count(frames) >= frames
     return check == "opened" or (check == "read" and is_mostly_read)
-
-
-def open_index(data: Data) -> SceneIndex:
-    """Return the index of a folder, an index file, or an index as it is."""
-    return data if isinstance(data, SceneIndex) else SceneIndex.open(data)

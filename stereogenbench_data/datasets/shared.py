@@ -1,7 +1,7 @@
-"""What worker processes have in common with the process that starts them, in shared memory.
+"""Memory that worker processes share with the process that starts them.
 
-Workers that are forked see all of it anyway. To those that are started afresh (spawn, forkserver)
-the rows of an index travel as memory that all map; it is given back when the last of them ends.
+Forked workers see the rows of an index anyway. Workers that are spawned get them as shared memory,
+which is freed when the last of them ends.
 """
 
 from multiprocessing.reduction import ForkingPickler
@@ -32,8 +32,8 @@ def shared_full(size: tuple[int, ...], value: int) -> torch.Tensor:
 class SharedEpoch:
     """The current epoch of a dataset, in memory that all its workers see.
 
-    Whatever has an epoch (dataset, batches, loader, stream) asks here. That of a loader follows
-    that of the dataset that it was made from, until it is set itself.
+    Datasets, batches, loaders and streams read it. A loader's epoch follows that of its dataset
+    until it is set itself.
     """
 
     def __init__(self, followed: "SharedEpoch | None" = None) -> None:
@@ -75,20 +75,15 @@ class SharedEpoch:
         self._advanced_from = int(self._followed[1])
 
 
-def _shared_rows(index: SceneIndex, table: pa.Table) -> torch.Tensor:
+def _parted(index: SceneIndex) -> tuple[Any, ...]:
+    table, rest = index.parted()
     if index not in _rows:
         sink = pa.BufferOutputStream()
         with pa.ipc.new_stream(sink, table.schema) as stream:
             stream.write_table(table)
-        rows = torch.frombuffer(bytearray(sink.getvalue()), dtype=torch.uint8)
-        rows.share_memory_()
-        _rows[index] = rows
-    return _rows[index]
-
-
-def _parted(index: SceneIndex) -> tuple[Any, ...]:
-    table, rest = index.parted()
-    return _joined, (_shared_rows(index, table), rest)
+        _rows[index] = torch.frombuffer(bytearray(sink.getvalue()), dtype=torch.uint8)
+        _rows[index].share_memory_()
+    return _joined, (_rows[index], rest)
 
 
 def _joined(rows: torch.Tensor, rest: dict[str, Any]) -> SceneIndex:

@@ -13,7 +13,6 @@ from stereogenbench_data.datasets.batches import (
     State,
     require_count,
 )
-from stereogenbench_data.datasets.frameworks import require_shared_once
 from stereogenbench_data.datasets.loader import split_options
 from stereogenbench_data.datasets.mapped import Check, Data, StereoPairs
 from stereogenbench_data.datasets.shared import shared_full
@@ -122,7 +121,7 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             SelectionError: If Accelerate would share these samples among ranks a second time.
         """
-        self._require_shared_once()
+        self.batches._require_shared_once(self)
         info = get_worker_info()
         worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
         epoch, start = self.batches._next_position()
@@ -150,8 +149,8 @@ class StereoPairStream(IterableDataset[Sample]):
         if batches is None:
             if self._begun.any():
                 raise StateError(
-                    "worker processes iterate this stream, and read ahead: tell state_dict("
-                    "batches=...) how many batches the loop has taken, or use the loader of "
+                    "worker processes iterate this stream and read ahead: pass the number of "
+                    "batches the loop has taken, state_dict(batches=...), or use the loader of "
                     "StereoPairs or torchdata's StatefulDataLoader, which count them."
                 )
             batches = 0
@@ -172,15 +171,9 @@ class StereoPairStream(IterableDataset[Sample]):
         """Close the videos that this process holds open; the stream can be used again."""
         self.pairs.close()
 
-    def _require_shared_once(self) -> None:
-        batches = self.batches
-        require_shared_once(
-            self, type(self).__name__, rank=batches.rank, world_size=batches.world_size
-        )
-
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
-        self._require_shared_once()
+        self.batches._require_shared_once(self)
         return self.__dict__ | {"_latest": None}
 
 

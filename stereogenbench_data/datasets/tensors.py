@@ -49,18 +49,16 @@ def collate(samples: Sequence[Sample]) -> dict[str, Any]:
 def _stacked(values: list[Any]) -> Any:
     """Return values as one tensor: without a copy where they lie side by side in memory."""
     first = values[0]
-    if isinstance(first, torch.Tensor) and first.is_contiguous() and _are_neighbours(values):
-        return first.as_strided((len(values), *first.shape), (first.numel(), *first.stride()))
-    return default_collate(values)
-
-
-def _are_neighbours(values: list[torch.Tensor]) -> bool:
-    first = values[0]
+    if not isinstance(first, torch.Tensor):
+        return default_collate(values)
     memory, start = first.untyped_storage().data_ptr(), first.storage_offset()
-    return all(
+    are_neighbours = all(
         value.untyped_storage().data_ptr() == memory
         and value.storage_offset() == start + place * first.numel()
         and value.is_contiguous()
         and value.dtype == first.dtype
         for place, value in enumerate(values)
     )
+    if not are_neighbours:
+        return default_collate(values)
+    return first.as_strided((len(values), *first.shape), (first.numel(), *first.stride()))

@@ -1,9 +1,10 @@
-"""What a method scored: frames are averaged first, then the pairs of a scene, then scenes.
+"""The scores of a method: frames are averaged first, then the pairs of a scene, then scenes.
 
-Every scene counts once, however many frames and pairs it has, and intervals are over scenes.
+Every scene counts once, whatever the number of its frames and pairs. Intervals are over scenes.
 """
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
@@ -29,7 +30,7 @@ class Tally:
         mean: Of the finite ones; nan where there is none.
         finite: How many are finite.
         infinite: How many are infinite: identical pictures, for PSNR.
-        undefined: How many are nan: no score could be had.
+        undefined: How many are nan: frames without a score.
     """
 
     mean: float
@@ -107,11 +108,11 @@ def cell(pairs: Sequence[PairMeans], column: str) -> Cell:
         ExtraError: If scipy, which knows Student's t, is not installed.
     """
     tallies = [each.tallies[column] for each in pairs]
-    of_scene: dict[str, list[float]] = {}
-    for each in pairs:
-        if each.tallies[column].finite:
-            of_scene.setdefault(each.scene, []).append(each.tallies[column].mean)
-    means = [math.fsum(found) / len(found) for found in of_scene.values()]
+    scenes = grouped((each for each in pairs if each.tallies[column].finite), lambda p: p.scene)
+    means = [
+        math.fsum(each.tallies[column].mean for each in found) / len(found)
+        for found in scenes.values()
+    ]
     infinite = sum(found.infinite for found in tallies)
     return Cell(
         mean=math.fsum(means) / len(means) if means else None,
@@ -161,8 +162,8 @@ def grouped(
 def strata(values: Sequence[Any], *, name: str, edges: Sequence[float] = ()) -> list[str]:
     """Return the stratum of each value of a column.
 
-    Texts and up to 6 different numbers are strata themselves. Other numbers fall between the
-    edges, half-open but for the last, or where none are given into quarters of the scenes.
+    Texts and up to 6 different numbers are strata themselves. Other numbers are sorted into the
+    intervals between the edges, all but the last half-open; without edges, into quarters.
 
     Raises:
         EvaluationError: If no value is known, or edges do not ascend.
@@ -170,10 +171,9 @@ def strata(values: Sequence[Any], *, name: str, edges: Sequence[float] = ()) -> 
     >>> strata([18.0, 50.0, 85.0], name="focal_mm", edges=(18, 35, 85))
     ['[18,35)', '[35,85]', '[35,85]']
     """
-    numbers = [value for value in values if isinstance(value, int | float)]
-    known = [number for number in numbers if math.isfinite(number)]
-    if len(numbers) < len(values):
+    if not all(isinstance(value, int | float) for value in values):
         return [str(value) or "not recorded" for value in values]
+    known = sorted(number for number in values if math.isfinite(number))
     if not known:
         raise EvaluationError(
             f"{name} is not known for any scene: make the index anew (for valid_depth_ratio with "
@@ -183,13 +183,12 @@ def strata(values: Sequence[Any], *, name: str, edges: Sequence[float] = ()) -> 
         raise EvaluationError(f"edges of {name} must be two or more that ascend, got {edges}.")
     if not edges:
         if len(set(known)) <= _DISTINCT_VALUES:
-            return [f"{number:g}" if math.isfinite(number) else "not known" for number in numbers]
-        ordered = sorted(known)
-        last = len(ordered) - 1
-        quarters = (ordered[round(part * last / _QUARTERS)] for part in range(1, _QUARTERS))
+            return [f"{number:g}" if math.isfinite(number) else "not known" for number in values]
+        last = len(known) - 1
+        quarters = (known[round(part * last / _QUARTERS)] for part in range(1, _QUARTERS))
         inner = {float(f"{number:.4g}") for number in quarters}
-        edges = sorted(inner | {ordered[0], ordered[-1]})
-    return [_between(number, edges) for number in numbers]
+        edges = sorted(inner | {known[0], known[-1]})
+    return [_between(number, edges) for number in values]
 
 
 def _between(number: float, edges: Sequence[float]) -> str:
@@ -200,7 +199,7 @@ def _between(number: float, edges: Sequence[float]) -> str:
     if number > edges[-1]:
         return f"({edges[-1]:g},inf)"
     last = len(edges) - 2
-    place = next((k for k in range(last) if number < edges[k + 1]), last)
+    place = min(bisect_right(edges, number) - 1, last)
     return f"[{edges[place]:g},{edges[place + 1]:g}" + ("]" if place == last else ")")
 
 

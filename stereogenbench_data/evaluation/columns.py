@@ -1,12 +1,9 @@
 """The columns of scores: what each is called, which way is better, and the metric it belongs to."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import EvaluationError
-
-Better = Literal["higher", "lower", "neither"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +20,7 @@ class Column:
     """
 
     label: str
-    better: Better
+    better: Literal["higher", "lower", "neither"]
     digits: int
     meaning: str
     backend: Literal["", "keypoint_matcher", "stereo_matcher"] = ""
@@ -38,23 +35,14 @@ _SD_FITS: Final = {
 """The fits of SD and what tables call them; the first is the one beside the paper's numbers."""
 
 
-def _fit_columns(fit: str) -> dict[str, Column]:
-    """Return the columns that explain SD by one fit."""
-    explained: dict[str, tuple[str, int, str]] = {
-        "slope": ("a", 4, "slope of true on found disparity"),
-        "offset_px": ("b", 2, "px; offset of the fit"),
-        "valid": ("fit pixels", 3, "share of pixels in the fit"),
-        "outliers": ("outliers", 3, "share of answered pixels left out of the fit"),
-        "residual_px": ("residual", 2, "px; standard deviation of the residuals"),
-        "r2": ("R2", 3, "share of variance explained"),
-    }
-    return {
-        f"sd_{fit}_{name}": Column(
-            f"{label} {_SD_FITS[fit]}", "neither", digits, meaning, "stereo_matcher", fit
-        )
-        for name, (label, digits, meaning) in explained.items()
-    }
-
+_EXPLAIN_A_FIT: Final = {
+    "slope": ("a", 4, "slope of true on found disparity"),
+    "offset_px": ("b", 2, "px; offset of the fit"),
+    "valid": ("fit pixels", 3, "share of pixels in the fit"),
+    "outliers": ("outliers", 3, "share of answered pixels left out of the fit"),
+    "residual_px": ("residual", 2, "px; standard deviation of the residuals"),
+    "r2": ("R2", 3, "share of variance explained"),
+}
 
 COLUMNS: Final[dict[str, Column]] = {
     "psnr": Column("PSNR", "higher", 2, "dB; identical pictures are counted, not averaged"),
@@ -89,7 +77,13 @@ COLUMNS: Final[dict[str, Column]] = {
     "sd_answered": Column(
         "answered", "neither", 3, "share of visible pixels with a found disparity", "stereo_matcher"
     ),
-    **{name: column for fit in _SD_FITS for name, column in _fit_columns(fit).items()},
+    **{
+        f"sd_{fit}_{name}": Column(
+            f"{label} {words}", "neither", digits, meaning, "stereo_matcher", fit
+        )
+        for fit, words in _SD_FITS.items()
+        for name, (label, digits, meaning) in _EXPLAIN_A_FIT.items()
+    },
 }
 """Columns of frames, headline columns first."""
 
@@ -110,7 +104,7 @@ the paper leaves outliers out, though it does not state by which rule.
 """
 
 HEAVY_TAILED: Final = frozenset(f"sd_{fit}" for fit in _SD_FITS)
-"""Columns whose mean a few scenes can carry away: their median is shown and judged."""
+"""Columns whose mean a few scenes can dominate: their median is shown and judged."""
 
 IMAGE_DISTANCES: Final[dict[str, str]] = {"fid": "inception", "fd-colour": "colour-statistics"}
 """Distances between sets of frames, and the features that each is of."""
@@ -127,7 +121,7 @@ def require_metrics(names: Any) -> tuple[str, ...]:
     """Return metrics in the order of the tables.
 
     Args:
-        names: Names of `METRICS`, or one text with commas between them.
+        names: Names of `METRICS`, or one text that separates them by commas.
 
     Raises:
         EvaluationError: If one is unknown, or there is none.
@@ -139,15 +133,6 @@ def require_metrics(names: Any) -> tuple[str, ...]:
     wanted = {str(name).strip() for name in given}
     unknown = sorted(wanted - set(METRICS))
     if unknown or not wanted:
-        raise EvaluationError(
-            f"there is no metric {unknown[0]!r}: choose among {', '.join(METRICS)}."
-            if unknown
-            else f"no metric was given: choose among {', '.join(METRICS)}."
-        )
+        what = f"there is no metric {unknown[0]!r}" if unknown else "no metric was given"
+        raise EvaluationError(f"{what}: choose among {', '.join(METRICS)}.")
     return tuple(name for name in METRICS if name in wanted)
-
-
-def columns_of(metrics: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns that metrics fill, in the order of `COLUMNS`."""
-    filled = {column for name in metrics for column in FRAME_METRICS.get(name, ())}
-    return tuple(column for column in COLUMNS if column in filled)

@@ -1,12 +1,13 @@
 """Calibration controls: right views with predictable scores, which give the metrics a scale.
 
-The rendered target, the left view itself, the same scene from the wrong camera, and the right view
-of another scene. They are not methods. All are scored together: each view is decoded once.
+They are the rendered target, the left view itself, the same scene from the wrong camera, and the
+right view of another scene. All are scored together, so each view is decoded once.
 
 Source: the StereoGenBench paper, appendix on metric definitions and calibration controls.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final, Unpack
 
@@ -16,20 +17,17 @@ from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.aggregate import CONTROL, Scores, cell
 from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
-from stereogenbench_data.evaluation.predictions import PairFrames
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.evaluation.running import (
+from stereogenbench_data.evaluation.evaluate import (
     EvaluationOptions,
     Run,
     score_workload,
     select_workload,
 )
+from stereogenbench_data.evaluation.predictions import PairFrames, Read, open_frames
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
-from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.selection.plan import Address
 
 TARGET: Final = "rendered target"
 COPIED_LEFT: Final = "copied left"
@@ -46,7 +44,6 @@ class SameFrame:
     Attributes:
         name: What tables call it.
         view: "right" or "left".
-        inputs: The view.
     """
 
     name: str
@@ -61,16 +58,10 @@ class SameFrame:
         """Return what it is."""
         return f"its {self.view} view"
 
-    def open(self, index: SceneIndex) -> "SameFrame":
-        """Open a scene."""
-        return self
-
-    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
-        """Return the view of each sample."""
-        return [sample[self.view] for sample in samples]
-
-    def close(self) -> None:
-        """Nothing is kept open."""
+    @contextmanager
+    def open(self, index: SceneIndex) -> Iterator[Read]:
+        """Yield a function that returns the view of each sample."""
+        yield lambda wanted, samples: [sample[self.view] for sample in samples]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +80,7 @@ class OtherView:
     donors: Mapping[str, str] = field(default_factory=dict)
     inputs: tuple[str, ...] = ()
 
-    def source(self, wanted: PairFrames) -> tuple[str, int]:
+    def origin(self, wanted: PairFrames) -> tuple[str, int]:
         """Return the scene and the camera that the view of a pair is taken from."""
         if self.donors:
             return self.donors[wanted.scene], wanted.pair[1]
@@ -97,36 +88,24 @@ class OtherView:
 
     def stamp(self, wanted: PairFrames) -> str:
         """Return where its views are taken from."""
-        scene, camera = self.source(wanted)
+        scene, camera = self.origin(wanted)
         return f"camera {camera:02d} of {scene}"
 
-    def open(self, index: SceneIndex) -> "_OtherViewReader":
-        """Open a scene."""
-        return _OtherViewReader(self, index)
+    @contextmanager
+    def open(self, index: SceneIndex) -> Iterator[Read]:
+        """Yield a function that loads the other view; a shorter scene's last frame is repeated."""
+        rows = {str(key): row for row, key in enumerate(index.column("key"))}
+        with open_frames(index, ("right",), size=self.size) as load:
 
+            def read(wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
+                scene, camera = self.origin(wanted)
+                row = rows[scene]
+                last = int(index.column("frames")[row]) - 1
+                frames = (min(int(sample["frame_index"]), last) for sample in samples)
+                pair = (0 if camera else 1, camera)
+                return [load(row, pair, frame)["right"] for frame in frames]
 
-class _OtherViewReader:
-    def __init__(self, control: OtherView, index: SceneIndex) -> None:
-        self._control = control
-        self._index = index
-        self._rows = {str(key): row for row, key in enumerate(index.column("key"))}
-        request = Request(kind="pairs", fields=("right",), layout="single", size=control.size)
-        self._loader = SampleLoader(index, request)
-
-    def read(self, wanted: PairFrames, samples: Sequence[Sample]) -> list[Any]:
-        scene, camera = self._control.source(wanted)
-        row = self._rows[scene]
-        last = int(self._index.column("frames")[row]) - 1
-        views = []
-        for sample in samples:
-            frame = min(int(sample["frame_index"]), last)
-            address = Address(row, 0 if camera else 1, (camera,), (frame,))
-            loaded = self._loader.load(address, clip="frame", generator=np.random.default_rng(0))
-            views.append(loaded["right"])
-        return views
-
-    def close(self) -> None:
-        self._loader.close()
+            yield read
 
 
 def wrong_camera(left: int, right: int) -> int:
@@ -200,8 +179,8 @@ def score_controls(
 _SLOPE_TOLERANCE: Final = 0.1
 """How far from the ratio of baselines a matcher may put the wrong baseline's slope."""
 _TRUSTED_R2: Final = 0.8
-"""The least share of variance that a fit must explain for its slope to be judged: a matcher that
-searches too few disparities for a wide baseline answers with others."""
+"""The least share of variance that a fit must explain for its slope to be judged: a matcher whose
+search is too short for a wide baseline answers with wrong disparities."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,8 +205,7 @@ def relations(results: Sequence[Scores]) -> list[Relation]:
         results: The scores of all of `CONTROLS`.
     """
     by_name = {one.name: one for one in results}
-    target, copied = by_name[TARGET], by_name[COPIED_LEFT]
-    wrong, random = by_name[WRONG_BASELINE], by_name[RANDOM_RIGHT]
+    target, copied, wrong, random = (by_name[name] for name in CONTROLS)
     metrics = target.protocol.metrics
     judged: list[Relation] = []
     if "psnr" in metrics:
@@ -242,8 +220,11 @@ def relations(results: Sequence[Scores]) -> list[Relation]:
     if "p_psnr" in metrics:
         judged.append(_ordered("p_psnr", [random], below=[target, copied, wrong]))
     if "e_match" in metrics:
-        judged.append(_of("e_match", target, "is 0", lambda mean: mean == 0))
-        judged.append(_of("e_match", copied, "is above 0", lambda mean: mean > 0))
+        for one, what in ((target, "is 0"), (copied, "is above 0")):
+            mean = _middle("e_match", one)
+            holds = None if mean is None else mean == 0 if one is target else mean > 0
+            what = f"{_label('e_match')} of {one.name} {what}"
+            judged.append(Relation(what, holds, _means_text("e_match", [one])))
         judged.append(_ordered("e_match", [target, copied, wrong], below=[random]))
     if "sd" in metrics:
         sd = f"sd_{target.protocol.fit}"
@@ -253,23 +234,13 @@ def relations(results: Sequence[Scores]) -> list[Relation]:
     return judged
 
 
-def _of(column: str, one: Scores, what: str, holds: Callable[[float], bool]) -> Relation:
-    mean = _middle(column, one)
-    return Relation(
-        f"{_label(column)} of {one.name} {what}",
-        None if mean is None else holds(mean),
-        _means_text(column, [one]),
-    )
-
-
 def _ordered(column: str, lower: Sequence[Scores], *, below: Sequence[Scores]) -> Relation:
-    means = [[_middle(column, one) for one in side] for side in (lower, below)]
+    lows, highs = ([_middle(column, one) for one in side] for side in (lower, below))
     names = [", ".join(one.name for one in side) for side in (lower, below)]
-    low, high = ([mean for mean in side if mean is not None] for side in means)
-    whole = len(low) == len(lower) and len(high) == len(below)
+    low, high = ([mean for mean in side if mean is not None] for side in (lows, highs))
     return Relation(
         f"{_label(column)} of {names[0]} is below that of {names[1]}",
-        max(low) < min(high) if whole else None,
+        None if None in lows + highs else max(low) < min(high),
         _means_text(column, [*lower, *below]),
     )
 
@@ -280,20 +251,16 @@ def _slope(wrong: Scores) -> Relation:
     what = (
         f"the slope {_label(f'{sd}_slope')} of {WRONG_BASELINE} is the ratio of the two baselines"
     )
-    expected = []
+    off = []
     for pair in wrong.pairs:
-        rig = wrong.index.scene(pair.row).rig
-        other = rig.baseline_cm(pair.pair[0], wrong_camera(*pair.pair))
-        expected.append(pair.baseline_cm / other)
-    found = [pair.tallies[f"{sd}_slope"] for pair in wrong.pairs]
-    explained = [pair.tallies[f"{sd}_r2"] for pair in wrong.pairs]
-    off = sorted(
-        abs(slope.mean - ratio)
-        for slope, r2, ratio in zip(found, explained, expected, strict=True)
-        if slope.finite and r2.mean >= _TRUSTED_R2
-    )
+        slope, r2 = pair.tallies[f"{sd}_slope"], pair.tallies[f"{sd}_r2"]
+        if slope.finite and r2.mean >= _TRUSTED_R2:
+            rig = wrong.index.scene(pair.row).rig
+            other_cm = rig.baseline_cm(pair.pair[0], wrong_camera(*pair.pair))
+            off.append(abs(slope.mean - pair.baseline_cm / other_cm))
     if not off:
         return Relation(what, None, "no fit explains enough of the variance")
+    off.sort()
     middle = off[len(off) // 2]
     return Relation(
         what,

@@ -1,26 +1,73 @@
-"""Score a method by the paper's protocol, from the views it wrote or by calling it."""
+"""Score a method by the paper's protocol, from the views it wrote or by calling it.
 
+Scenes are scored in parallel processes, and each is kept on disk as soon as it is scored.
+"""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Final, TypedDict, Unpack
 
-from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine import LOCAL
+from stereogenbench_data.datasets.mapped import Data, StereoPairs
+from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of
 from stereogenbench_data.errors import EvaluationError
-from stereogenbench_data.evaluation.aggregate import Scores
+from stereogenbench_data.evaluation.aggregate import Labels, PairMeans, Scores, grouped, tally
+from stereogenbench_data.evaluation.columns import IMAGE_DISTANCES, VIDEO_DISTANCES
+from stereogenbench_data.evaluation.frame_metrics import fields_of, models_of
+from stereogenbench_data.evaluation.metrics.frechet import (
+    FeatureStatistics,
+    FrechetDistance,
+    frechet_distance,
+)
+from stereogenbench_data.evaluation.partial import PartialResults
 from stereogenbench_data.evaluation.predictions import (
     CalledMethod,
     Method,
+    PairFrames,
+    PredictionFault,
     PredictionFolder,
     PredictionSource,
 )
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol
-from stereogenbench_data.evaluation.running import (
-    EvaluationOptions,
-    Run,
-    score_workload,
-    select_workload,
-)
-from stereogenbench_data.evaluation.tiers import require_tier
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol, require_tier
+from stereogenbench_data.evaluation.scene_scores import SceneWork, score_scene
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.text import counted
+from stereogenbench_data.selection.plan import Selection
+from stereogenbench_data.selection.windows import Random
+
+_FAULTS_SHOWN: Final = 2
+_BRANCH: Final = ("subset", "family")
+
+
+class RunOptions(TypedDict, total=False):
+    """How an evaluation is run; none of it changes a score.
+
+    Attributes:
+        out: A folder that keeps partial results, so that a stopped evaluation goes on; without
+            it they are lost.
+        workers: How many processes score scenes, None for one a core. A callable is called, and
+            its right views scored, in this process.
+        engine: Where scenes are scored, `engine.LOCAL` or an `engine.RayCluster`; a callable
+            stays in this process.
+        allow_missing: How many right views of pairs may be missing or unusable; they are counted
+            in the tables. 0 makes the first an error.
+        progress: Called with (frames done, frames in all).
+    """
+
+    out: str | Path | None
+    workers: int | None
+    engine: Engine
+    allow_missing: int
+    progress: Progress
+
+
+class EvaluationOptions(RunOptions, Selection, total=False):
+    """How an evaluation is run, and which scenes, pairs and frames it is of.
+
+    ``pairs`` is "primary" unless given, ``frames`` "all".
+    """
 
 
 def evaluate(
@@ -65,3 +112,295 @@ def evaluate(
     workload = select_workload(data, protocol, inputs=source.inputs, options=options)
     (scores,) = score_workload(workload, Run(protocol, (source,), known.name), options)
     return scores
+
+
+@dataclass(frozen=True, slots=True)
+class Workload:
+    """What is scored: the scenes of an index with their pairs and frames.
+
+    Attributes:
+        index: The index.
+        rows: The scenes' rows, ascending.
+        pairs: For each scene, what is scored of its pairs.
+    """
+
+    index: SceneIndex
+    rows: tuple[int, ...]
+    pairs: tuple[tuple[PairFrames, ...], ...]
+
+    @property
+    def frames(self) -> int:
+        """How many frames of pairs there are."""
+        return sum(len(pair.frames) for pairs in self.pairs for pair in pairs)
+
+    def index_of(self, rows: Sequence[int]) -> SceneIndex:
+        """Return an index of a few rows, small enough to be sent to a process with its work."""
+        return SceneIndex.from_scenes(
+            [self.index.scene(row) for row in rows],
+            self.index.root,
+            shards=self.index.shards,
+            retry=self.index.retry,
+        )
+
+
+def select_workload(
+    data: Data,
+    protocol: EvaluationProtocol,
+    *,
+    inputs: Sequence[str],
+    options: Mapping[str, Any],
+) -> Workload:
+    """Return the workload of a selection, after checking that its data can be read.
+
+    Args:
+        data: What `StereoPairs` takes.
+        protocol: Which fields, at which size.
+        inputs: Fields that are needed besides those of the protocol.
+        options: The selection; `RunOptions` among it are ignored.
+
+    Raises:
+        SelectionError: If nothing matches.
+        MediaError: If depth that a metric needs cannot have been stored whole.
+        EvaluationError: If the samples are clips, random frames, sweeps or right to left.
+    """
+    selection: dict[str, Any] = {
+        key: value for key, value in options.items() if key not in RunOptions.__optional_keys__
+    }
+    selection.setdefault("frames", "all")
+    dataset = StereoPairs(
+        data,
+        fields=tuple(dict.fromkeys((*fields_of(protocol), *inputs))),
+        size=protocol.size,
+        depth=protocol.depth,
+        **selection,
+    )
+    plan, index = dataset.plan, dataset.index
+    chosen, windows = plan.pairs, plan.windows
+    if windows.is_clip or isinstance(windows, Random):
+        raise EvaluationError(
+            "frames must be 'all', 'first', numbers of frames or ('every', k): the same single "
+            "frames for every method."
+        )
+    if chosen.targets.shape[1] != 1 or (chosen.source > chosen.targets[:, 0]).any():
+        raise EvaluationError(
+            "a right view is generated from the view to its left: choose pairs='primary', "
+            "'adjacent', 'all' or (left, right) numbers."
+        )
+    rows = tuple(int(row) for row in plan.scene_rows)
+    pairs = []
+    for place, scene in enumerate(map(index.scene, rows)):
+        frames = tuple(
+            windows.window(number, frames=scene.frames, draw=(0,))[0]
+            for number in range(windows.count(scene.frames))
+        )
+        pairs.append(
+            tuple(
+                PairFrames(
+                    scene=scene.id.key,
+                    pair=(int(chosen.source[number]), int(chosen.targets[number, 0])),
+                    frames=frames,
+                    scene_frames=scene.frames,
+                    size=protocol.size,
+                    stored_size=(scene.rig.image_height_px, scene.rig.image_width_px),
+                )
+                for number in range(int(plan.first_pair[place]), int(plan.first_pair[place + 1]))
+            )
+        )
+    return Workload(index=index, rows=rows, pairs=tuple(pairs))
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """How a workload is scored, and what identifies its results.
+
+    Attributes:
+        protocol: The choices that scores depend on.
+        sources: Whose right views are scored.
+        tier: What the sources were given.
+        donors: For each scene, by key, another one that sources read views of, if any.
+        settings: What else the scores depend on, as plain values.
+    """
+
+    protocol: EvaluationProtocol
+    sources: tuple[PredictionSource, ...]
+    tier: str
+    donors: Mapping[str, str] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+def score_workload(
+    workload: Workload, run: Run, options: RunOptions | EvaluationOptions
+) -> list[Scores]:
+    """Return the scores of every source; scenes that ``out`` holds scores of are not scored again.
+
+    Raises:
+        PredictionFault: If a right view is missing or is not what it must be, and is not allowed.
+        EvaluationError: If more are than are allowed, if ``out`` holds results of other settings,
+            or if right views that were scored before have changed since.
+        StorageError: If data or results cannot be read or written.
+        ExtraError: If a package or weights that a metric needs are not there.
+    """
+    folders = [str(each.root) for each in run.sources if isinstance(each, PredictionFolder)]
+    try:
+        settings = models_of(run.protocol).settings()
+        state = {
+            "tier": run.tier,
+            "methods": [source.name for source in run.sources],
+            "data": workload.index.digest,
+            "frames": sorted({pair.frames for pairs in workload.pairs for pair in pairs}),
+            "pairs": sorted({pair.pair for pairs in workload.pairs for pair in pairs}),
+            "settings": settings,
+            **({"predictions": folders} if folders else {}),
+            **run.settings,
+        }
+        with ExitStack() as stack:
+            out = options.get("out")
+            if out is None:
+                out = stack.enter_context(tempfile.TemporaryDirectory(prefix="stereogenbench-"))
+            partial = PartialResults(Path(out), settings=state)
+            _score_missing_scenes(workload, run, partial, options)
+            results = []
+            for source in run.sources:
+                means = _pair_means(workload, partial, source.name)
+                distances = _distances(workload.index, partial, source.name, means, run.protocol)
+                results.append(
+                    Scores(
+                        name=source.name,
+                        tier=run.tier,
+                        protocol=run.protocol,
+                        settings=settings,
+                        index=workload.index,
+                        pairs=means,
+                        distances=distances,
+                    )
+                )
+        return results
+    finally:
+        models_of.cache_clear()
+
+
+def _score_missing_scenes(
+    workload: Workload,
+    run: Run,
+    partial: PartialResults,
+    options: RunOptions | EvaluationOptions,
+) -> None:
+    """Score what is not scored yet, and keep each scene's scores as soon as it is done."""
+    allowed = options.get("allow_missing", 0)
+    stamps: dict[str, dict[tuple[str, tuple[int, int]], str]] = {}
+    works: list[SceneWork] = []
+    missing: list[str] = []
+    faults: list[str] = []
+    done_frames = 0
+    rows = {str(key): row for row, key in enumerate(workload.index.column("key"))}
+    for row, pairs in zip(workload.rows, workload.pairs, strict=True):
+        scene = pairs[0].scene
+        stamps[scene] = {}
+        for source in run.sources:
+            for pair in pairs:
+                try:
+                    stamp = source.stamp(pair)
+                except PredictionFault as fault:
+                    stamp = ""
+                    missing.append(str(fault))
+                stamps[scene][source.name, pair.pair] = stamp
+        known = partial.faults(scene, stamps=stamps[scene], columns=run.protocol.columns)
+        if known is not None:
+            done_frames += sum(len(pair.frames) for pair in pairs)
+            faults.extend(known)
+            continue
+        works.append(
+            SceneWork(
+                index=workload.index_of(sorted({row, rows[run.donors.get(scene, scene)]})),
+                pairs=pairs,
+                protocol=run.protocol,
+                sources=run.sources,
+                faults="count" if allowed else "raise",
+            )
+        )
+    _require_few(missing, allowed=allowed)
+    total = workload.frames
+    advance = advance_of(options.get("progress"), done=done_frames, total=total)
+    advance(0)
+    _require_few(faults, allowed=allowed)
+    with closing(
+        options.get("engine", LOCAL).map(
+            score_scene,
+            works,
+            name=lambda work: work.scene,
+            workers=options.get("workers"),
+            advance=advance,
+        )
+    ) as results:
+        for scene, scores in results:
+            partial.write(scene, scores, stamps=stamps[scene])
+            faults.extend(found.fault for found in scores.values() if found.fault)
+            _require_few(faults, allowed=allowed)
+    advance(total)  # never more than all is reported
+
+
+def _require_few(faults: Sequence[str], *, allowed: int) -> None:
+    if len(faults) <= allowed:
+        return
+    shown = "; ".join(each.rstrip(".") for each in faults[:_FAULTS_SHOWN])
+    more = f"; and {len(faults) - _FAULTS_SHOWN} more" if len(faults) > _FAULTS_SHOWN else ""
+    raise EvaluationError(
+        f"{counted(len(faults), 'prediction')} missing or unusable, and {allowed} allowed "
+        f"(--allow-missing): {shown}{more}."
+    )
+
+
+def _pair_means(workload: Workload, partial: PartialResults, name: str) -> tuple[PairMeans, ...]:
+    """Return the averages of every pair; one scene's frames are in memory at a time."""
+    means = []
+    for row, pairs in zip(workload.rows, workload.pairs, strict=True):
+        scene = workload.index.scene(row)
+        found = partial.read(scene.id.key, [(name, each.pair) for each in pairs])
+        for each in pairs:
+            scores = found[name, each.pair]
+            means.append(
+                PairMeans(
+                    row=row,
+                    scene=each.scene,
+                    pair=each.pair,
+                    is_primary=each.pair == scene.rig.primary_pair,
+                    baseline_cm=scene.rig.baseline_cm(*each.pair),
+                    frames=len(each.frames),
+                    tallies={column: tally(numbers) for column, numbers in scores.columns.items()},
+                    fault=scores.fault,
+                )
+            )
+    return tuple(means)
+
+
+def _distances(
+    index: SceneIndex,
+    partial: PartialResults,
+    name: str,
+    pairs: Sequence[PairMeans],
+    protocol: EvaluationProtocol,
+) -> dict[Labels, dict[str, FrechetDistance]]:
+    """Return the distances between sets of each branch; features are merged scene by scene."""
+    metrics = [each for each in protocol.metrics if each in IMAGE_DISTANCES | VIDEO_DISTANCES]
+    if not metrics:
+        return {}
+
+    def branch_of(pair: PairMeans) -> Labels:
+        return tuple(str(index.column(key)[pair.row] or "") for key in _BRANCH)
+
+    distances = {}
+    scored_pairs = (pair for pair in pairs if pair.is_primary and not pair.fault)
+    for labels, group in grouped(scored_pairs, branch_of).items():
+        sides: dict[tuple[str, str], FeatureStatistics] = {}
+        for pair in group:
+            found = partial.read(pair.scene, [(name, pair.pair)])[name, pair.pair]
+            for side, statistics in (("predicted", found.predicted), ("target", found.target)):
+                for metric in metrics:
+                    new = statistics[metric]
+                    before = sides.get((metric, side), FeatureStatistics.empty(new.dim))
+                    sides[metric, side] = before.merged(new)
+        distances[labels] = {
+            metric: frechet_distance(sides[metric, "predicted"], sides[metric, "target"])
+            for metric in metrics
+        }
+    return distances

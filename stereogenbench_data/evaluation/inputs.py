@@ -7,16 +7,15 @@
     OUT/<item>/disparity/000.npy    G0: float32 (h, w), px; x_right = x_left - d; 0: not measured
     OUT/<item>/camera.json          G1: the baseline in metres, the intrinsics in pixels
 
-An item is a pair of a scene, its name a digest (`item_name`) that tells neither. What a method
-makes of it is to be called the same: ``PREDICTIONS/<item>/000.png ...`` or ``<item>.mp4``.
+An item is a pair of a scene. Its name is a digest (`item_name`) that reveals neither, and what a
+method makes of it takes the same name: ``PREDICTIONS/<item>/000.png ...`` or ``<item>.mp4``.
 """
 
 import json
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Final, Unpack
 
@@ -24,28 +23,25 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.engine import LOCAL, Advance
-from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
-from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, item_name
-from stereogenbench_data.evaluation.protocol import PAPER_SIZE, EvaluationProtocol
-from stereogenbench_data.evaluation.running import (
-    Progress,
-    frame_counter,
-    no_progress,
-    select_workload,
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
+from stereogenbench_data.errors import EvaluationError, StorageError, describe_os_error
+from stereogenbench_data.evaluation.evaluate import select_workload
+from stereogenbench_data.evaluation.predictions import PairFrames, frame_name, open_frames
+from stereogenbench_data.evaluation.protocol import (
+    PAPER_SIZE,
+    EvaluationProtocol,
+    Tier,
+    require_tier,
 )
-from stereogenbench_data.evaluation.tiers import Tier, require_tier
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.request import Request
 from stereogenbench_data.schema.records import DepthEncoding
-from stereogenbench_data.selection.plan import Address, Selection
+from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.sources.files import write_atomic
 
 INPUTS_JSON: Final = "inputs.json"
-CAMERA_JSON: Final = "camera.json"
 _FAST: Final = 1
 """zlib's level of the PNGs: three times as fast as the default, a tenth larger."""
+_ELSEWHERE: Final = "Choose another folder."
 
 
 class ExportOptions(Selection, total=False):
@@ -53,10 +49,12 @@ class ExportOptions(Selection, total=False):
 
     Attributes:
         workers: How many processes, None for one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called with (frames done, frames in all).
     """
 
     workers: int | None
+    engine: Engine
     progress: Progress
 
 
@@ -109,28 +107,27 @@ def export_inputs(
         },
     )
     works = [
-        _ItemWork(workload.index_of([row]), pair, known, depth, root / item_name(*pair.place))
+        _ItemWork(workload.index_of([row]), pair, known, depth, root / pair.item)
         for row, pairs in zip(workload.rows, workload.pairs, strict=True)
         for pair in pairs
-        if not (root / item_name(*pair.place)).is_dir()
+        if not (root / pair.item).is_dir()
     ]
-    progress = options.get("progress", no_progress)
     total = workload.frames
     done = total - sum(len(work.wanted.frames) for work in works)
-    after_frames = frame_counter(progress, done=done, total=total)
+    advance = advance_of(options.get("progress"), done=done, total=total)
+    advance(0)
     with closing(
-        LOCAL.map(
+        options.get("engine", LOCAL).map(
             _write_item,
             works,
-            name=lambda work: f"{work.wanted.scene}, pair {work.wanted.pair}",
+            name=lambda work: work.wanted.label,
             workers=options.get("workers"),
-            advance=after_frames,
+            advance=advance,
         )
     ) as written:
         for _ in written:
-            after_frames(0)
-    progress(total, total)
-    return [item_name(*pair.place) for pair in wanted]
+            advance(0)
+    return [pair.item for pair in wanted]
 
 
 def _begin(root: Path, content: Mapping[str, Any]) -> None:
@@ -145,11 +142,11 @@ def _begin(root: Path, content: Mapping[str, Any]) -> None:
                 )
             write_atomic(path, json.dumps(content).encode())
         there = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        if isinstance(error, EvaluationError):
-            raise
-        cure = cure_of(error, _ELSEWHERE) if isinstance(error, OSError) else _ELSEWHERE
-        raise StorageError(f"{path}: cannot be read or written ({error}). {cure}") from error
+    except OSError as error:
+        what = f"{path}: cannot be read or written"
+        raise StorageError(describe_os_error(what, error, _ELSEWHERE)) from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise StorageError(f"{path}: cannot be read ({error}). {_ELSEWHERE}") from error
     differing = [
         name for name in content if not isinstance(there, dict) or there.get(name) != content[name]
     ]
@@ -162,68 +159,42 @@ def _begin(root: Path, content: Mapping[str, Any]) -> None:
 def _write_item(work: _ItemWork, after_frames: Advance) -> None:
     """Write one item, whole or not at all."""
     unfinished = work.folder.with_name(f".{work.folder.name}")
-    request = Request(
-        kind="pairs",
-        fields=(*work.tier.inputs, "frame_index"),
-        layout="single",
-        size=work.wanted.size,
-        depth=work.depth,
-    )
-    source, target = work.wanted.pair
+    fields, wanted = (*work.tier.inputs, "frame_index"), work.wanted
     try:
         shutil.rmtree(unfinished, ignore_errors=True)
         unfinished.mkdir()
-        with closing(SampleLoader(work.index, request)) as loader:
-            for frame in work.wanted.frames:
-                address = Address(0, source, (target,), (frame,))
-                sample = loader.load(address, clip="frame", generator=np.random.default_rng(0))
-                _write_frame(unfinished, work.tier.inputs_of(sample), frame=frame)
+        with open_frames(work.index, fields, size=wanted.size, depth=work.depth) as load:
+            for frame in wanted.frames:
+                inputs = work.tier.inputs_of(load(0, wanted.pair, frame))
+                _write_frame(unfinished, inputs, name=frame_name(frame))
                 after_frames(1)
         unfinished.replace(work.folder)
     except OSError as error:
         if isinstance(error, StorageError):
             raise
-        raise StorageError(
-            f"{work.folder}: cannot be written ({error.strerror or error}). "
-            + cure_of(error, "Choose another folder.")
-        ) from error
+        what = f"{work.folder}: cannot be written"
+        raise StorageError(describe_os_error(what, error, _ELSEWHERE)) from error
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _write_frame(folder: Path, inputs: Mapping[str, Any], *, frame: int) -> None:
-    camera = {name: np.asarray(inputs[name]).tolist() for name in inputs if name in _OF_CAMERA}
-    if camera and not (folder / CAMERA_JSON).exists():
-        (folder / CAMERA_JSON).write_text(json.dumps(camera), encoding="utf-8")
-    for name, values in inputs.items():
-        if name not in _OF_CAMERA:
-            suffix, write = _WRITERS[name]
-            place = folder / name / f"{frame_name(frame).removesuffix('.png')}{suffix}"
-            place.parent.mkdir(exist_ok=True)
-            place.write_bytes(write(np.asarray(values)))
-
-
-def _png(values: Any) -> bytes:
-    """Return an RGB picture or a mask, (3, h, w) or (1, h, w), as PNG without any metadata."""
-    pixels = values.transpose(1, 2, 0)
-    if pixels.shape[2] == 1:
-        pixels = pixels[..., 0] * np.uint8(255)
-    out = BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels)).save(out, format="PNG", compress_level=_FAST)
-    return out.getvalue()
-
-
-def _npy(values: Any) -> bytes:
-    out = BytesIO()
-    np.save(out, values[0], allow_pickle=False)
-    return out.getvalue()
-
-
-_ELSEWHERE: Final = "Choose another folder."
-_OF_CAMERA: Final = frozenset({"baseline_m", "intrinsics"})
-_WRITERS: Final[dict[str, tuple[str, Callable[[Any], bytes]]]] = {
-    "left": (".png", _png),
-    "warped_right": (".png", _png),
-    "hole": (".png", _png),
-    "disparity": (".npy", _npy),
-}
+def _write_frame(folder: Path, inputs: Mapping[str, Any], *, name: str) -> None:
+    """Write pictures and masks as PNG without any metadata, maps as npy, cameras as JSON."""
+    camera = {}
+    for field, given in inputs.items():
+        values = np.asarray(given)
+        path = folder / field / name
+        if values.ndim != 3:
+            camera[field] = values.tolist()
+            continue
+        path.parent.mkdir(exist_ok=True)
+        if values.dtype == np.float32:
+            np.save(path.with_suffix(".npy"), values[0], allow_pickle=False)
+            continue
+        pixels = values.transpose(1, 2, 0)
+        if len(values) == 1:
+            pixels = pixels[..., 0] * np.uint8(255)
+        picture = Image.fromarray(np.ascontiguousarray(pixels))
+        picture.save(path, format="PNG", compress_level=_FAST)
+    if camera and not (folder / "camera.json").exists():
+        (folder / "camera.json").write_text(json.dumps(camera), encoding="utf-8")

@@ -1,7 +1,7 @@
 """Partial results on disk, one file a scene, from which a killed evaluation resumes.
 
-A folder belongs to one evaluation: its settings, its data and its right views. Anything else is
-refused by the name of what differs.
+A folder belongs to one evaluation: its settings, its data and its right views. Results of others
+are refused, naming what differs.
 """
 
 import hashlib
@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from stereogenbench_data.errors import EvaluationError, StorageError, cure_of
+from stereogenbench_data.errors import EvaluationError, StorageError, describe_os_error
 from stereogenbench_data.evaluation.metrics.frechet import FeatureStatistics
 from stereogenbench_data.evaluation.predictions import Pair, pair_name
 from stereogenbench_data.evaluation.scene_scores import PairScores, SceneScores
@@ -25,7 +25,8 @@ Stamps = Mapping[tuple[str, Pair], str]
 STATE_JSON: Final = "evaluation.json"
 _FORMAT: Final = 3
 _SCENES: Final = "scenes"
-_ODD: Final = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
+_PARTS: Final = ("count", "mean", "root")
+_OTHER_OUT: Final = "Choose another folder with --out."
 
 
 class PartialResults:
@@ -54,19 +55,18 @@ class PartialResults:
                         f"of. Remove the folder, or choose another."
                     )
                 write_atomic(folder / STATE_JSON, json.dumps(ours, indent=1).encode())
+                return
         except OSError as error:
-            raise StorageError(
-                f"{folder}: partial results cannot be kept there ({error.strerror or error}). "
-                + cure_of(error, "Choose another folder with --out.")
-            ) from error
-        if theirs is not None and theirs.get("format") != _FORMAT:
+            what = f"{folder}: partial results cannot be kept there"
+            raise StorageError(describe_os_error(what, error, _OTHER_OUT)) from error
+        if theirs.get("format") != _FORMAT:
             raise EvaluationError(
                 f"{folder}: holds partial results of format {theirs.get('format')}, written by "
                 f"another version of this package, and this one writes format {_FORMAT}: SD by "
                 f"two fits, each in a column of its own. Choose another folder with --out, or "
                 f"remove this one."
             )
-        if theirs is not None and theirs != ours:
+        if theirs != ours:
             name, there, here = next(_differences(theirs, ours))
             raise EvaluationError(
                 f"{folder}: holds results of another evaluation: {name} was {there} there and is "
@@ -84,81 +84,79 @@ class PartialResults:
         Raises:
             StorageError: If they cannot be written.
         """
-        document = {
-            "scene": scene,
-            "pairs": {
-                _place_name(place): {
-                    "stamp": stamps[place],
-                    "fault": found.fault,
-                    "columns": {
-                        name: [
-                            number if math.isfinite(number) else str(number) for number in numbers
-                        ]
-                        for name, numbers in found.columns.items()
-                    },
-                }
-                for place, found in scores.items()
-            },
-        }
-        arrays = {
-            f"{_place_name(place)}/{whose}/{name}/{part}": getattr(each, part)
-            for place, found in scores.items()
-            for whose, statistics in (("predicted", found.predicted), ("target", found.target))
-            for name, each in statistics.items()
-            for part in ("count", "mean", "root")
-        }
+        pairs, arrays = {}, {}
+        for place, found in scores.items():
+            columns = {
+                name: [number if math.isfinite(number) else str(number) for number in numbers]
+                for name, numbers in found.columns.items()
+            }
+            pairs[_place_name(place)] = {
+                "stamp": stamps[place], "fault": found.fault, "columns": columns
+            }  # fmt: skip
+            for side, statistics in (("predicted", found.predicted), ("target", found.target)):
+                for name, each in statistics.items():
+                    for part in _PARTS:
+                        arrays[f"{_place_name(place)}/{side}/{name}/{part}"] = getattr(each, part)
         path = self._path(scene)
         try:
             if arrays:
                 packed = BytesIO()
                 np.savez(packed, **arrays)
                 write_atomic(path.with_suffix(".npz"), packed.getvalue())
-            write_atomic(path, json.dumps(document, allow_nan=False).encode())
+            text = json.dumps({"scene": scene, "pairs": pairs}, allow_nan=False)
+            write_atomic(path, text.encode())
         except OSError as error:
-            raise StorageError(
-                f"{path}: the scores of {scene} cannot be written ({error.strerror or error}). "
-                + cure_of(error, "Choose another folder with --out.")
-            ) from error
+            what = f"{path}: the scores of {scene} cannot be written"
+            raise StorageError(describe_os_error(what, error, _OTHER_OUT)) from error
 
-    def is_done(self, scene: str, *, stamps: Stamps, columns: Collection[str]) -> bool:
-        """Return whether a scene was scored with these right views.
-
-        What had no usable right view then and has another now is to be scored again.
+    def faults(self, scene: str, *, stamps: Stamps, columns: Collection[str]) -> list[str] | None:
+        """Return why pairs of a scene have no scores, if it was scored with these right views.
 
         Args:
             scene: The scene's key.
             stamps: What identifies the right views now.
             columns: The columns that scores have.
 
+        Returns:
+            None if the scene is to be scored: it was not, or a right view that was missing or
+            unusable has changed since.
+
         Raises:
             EvaluationError: If right views that were scored have changed since, or the scores
                 have other columns.
         """
-        document = _read_json(self._path(scene))
+        path = self._path(scene)
+        document = _read_json(path)
         if document is None or document.get("scene") != scene:
-            return False
+            return None
         pairs = document["pairs"]
         if pairs.keys() != {_place_name(place) for place in stamps}:
-            return False
-        for place in stamps:
-            self._require_columns(scene, place, pairs[_place_name(place)], columns)
-        changed = [place for place in stamps if pairs[_place_name(place)]["stamp"] != stamps[place]]
-        for place in changed:
-            if not pairs[_place_name(place)]["fault"]:
+            return None
+        entries = {place: pairs[_place_name(place)] for place in stamps}
+        for (source, pair), entry in entries.items():
+            odd = sorted(set(entry["columns"]) ^ set(columns))
+            if odd and not entry["fault"]:
+                raise EvaluationError(
+                    f"{path}: the scores of {scene}, cameras {pair_name(pair)} ({source}), have "
+                    f"other columns than this evaluation: {', '.join(odd[:3])} "
+                    f"{'is' if len(odd) == 1 else 'are'} in one of the two alone. They were made "
+                    f"by another version or protocol: choose another folder with --out, or remove "
+                    f"{self.folder}."
+                )
+        changed = {
+            place: entry for place, entry in entries.items() if entry["stamp"] != stamps[place]
+        }
+        for (source, pair), entry in changed.items():
+            if not entry["fault"]:
                 raise EvaluationError(
                     f"{self.folder}: holds scores of other right views of {scene}, cameras "
-                    f"{pair_name(place[1])} ({place[0]}): they were changed since. Choose another "
+                    f"{pair_name(pair)} ({source}): they were changed since. Choose another "
                     f"folder with --out, or remove this one."
                 )
-        return not changed
-
-    def faults(self, scene: str) -> list[str]:
-        """Return why pairs of a scene that is done have no scores."""
-        document = _read_json(self._path(scene)) or {"pairs": {}}
-        return [entry["fault"] for entry in document["pairs"].values() if entry["fault"]]
+        return None if changed else [each["fault"] for each in pairs.values() if each["fault"]]
 
     def read(self, scene: str, places: Iterable[tuple[str, Pair]]) -> SceneScores:
-        """Return the scores of a scene that is done.
+        """Return the scores of a scene that was scored.
 
         Raises:
             StorageError: If they cannot be read.
@@ -172,50 +170,25 @@ class PartialResults:
             with np.load(path.with_suffix(".npz"), allow_pickle=False) as packed:
                 arrays = dict(packed)
         return {
-            place: _pair_scores(document["pairs"][_place_name(place)], arrays, _place_name(place))
-            for place in places
+            place: _pair_scores(document["pairs"], arrays, _place_name(place)) for place in places
         }
-
-    def _require_columns(
-        self,
-        scene: str,
-        place: tuple[str, Pair],
-        entry: Mapping[str, Any],
-        columns: Collection[str],
-    ) -> None:
-        """Refuse scores that another version of the package, or another protocol, has made."""
-        odd = sorted(set(entry["columns"]) ^ set(columns))
-        if odd and not entry["fault"]:
-            raise EvaluationError(
-                f"{self._path(scene)}: the scores of {scene}, cameras {pair_name(place[1])} "
-                f"({place[0]}), have other columns than this evaluation: {', '.join(odd[:3])} "
-                f"{'is' if len(odd) == 1 else 'are'} in one of the two alone. They were made by "
-                f"another version or protocol: choose another folder with --out, or remove "
-                f"{self.folder}."
-            )
 
     def _path(self, scene: str) -> Path:
         digest = hashlib.sha256(scene.encode()).hexdigest()[:24]
         return self.folder / _SCENES / f"{digest}.json"
 
 
-def _pair_scores(entry: Mapping[str, Any], arrays: Mapping[str, Any], place: str) -> PairScores:
-    scores = PairScores(
-        columns={
-            name: [_ODD[each] if isinstance(each, str) else each for each in numbers]
-            for name, numbers in entry["columns"].items()
-        },
-        fault=entry["fault"],
-    )
-    for whose, statistics in (("predicted", scores.predicted), ("target", scores.target)):
-        start = f"{place}/{whose}/"
-        for name in {
-            key.removeprefix(start).rpartition("/")[0] for key in arrays if key.startswith(start)
-        }:
-            count, mean, root = (
-                arrays[f"{start}{name}/{part}"] for part in ("count", "mean", "root")
-            )
-            statistics[name] = FeatureStatistics(int(count), mean, root)
+def _pair_scores(pairs: Mapping[str, Any], arrays: Mapping[str, Any], place: str) -> PairScores:
+    entry = pairs[place]
+    columns = {name: list(map(float, numbers)) for name, numbers in entry["columns"].items()}
+    scores = PairScores(columns, fault=entry["fault"])
+    for side, statistics in (("predicted", scores.predicted), ("target", scores.target)):
+        start = f"{place}/{side}/"
+        for key in arrays:
+            if key.startswith(start) and key.endswith("/count"):
+                name = key.removeprefix(start).removesuffix("/count")
+                count, mean, root = (arrays[f"{start}{name}/{part}"] for part in _PARTS)
+                statistics[name] = FeatureStatistics(int(count), mean, root)
     return scores
 
 
@@ -227,9 +200,7 @@ def _read_json(path: Path) -> Any:
     """Return a document; None if there is none, or if a kill cut it short."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except ValueError:
+    except (FileNotFoundError, ValueError):
         return None
     return found if isinstance(found, dict) else None
 

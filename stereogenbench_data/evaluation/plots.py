@@ -1,6 +1,6 @@
 """Each metric against the baseline: a point for each pair, bins with intervals, the paper's bins.
 
-Methods of one plot are of one tier and scored in one way.
+A plot shows methods of one tier that were scored in one way.
 """
 
 from collections.abc import Iterable, Sequence
@@ -8,7 +8,7 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
 
-from stereogenbench_data.errors import ExtraError, StorageError, cure_of
+from stereogenbench_data.errors import ExtraError, StorageError, describe_os_error
 from stereogenbench_data.evaluation.aggregate import (
     CONTROL,
     PairMeans,
@@ -40,7 +40,6 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
     """
     require_comparable(results)
     try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError:
         raise ExtraError(
@@ -51,7 +50,6 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
         if facts.better == "neither" or not any(_scored(one.pairs, column) for one in results):
             continue
         figure = Figure(figsize=_SIZE_IN, layout="constrained")
-        FigureCanvasAgg(figure)
         _draw(figure.add_subplot(), results, column)
         path = folder / f"{column}_by_baseline.png"
         try:
@@ -59,10 +57,9 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
             with open_atomic(path) as file:
                 figure.savefig(file, format="png", dpi=_DPI)
         except OSError as error:
-            raise StorageError(
-                f"{path}: the plot cannot be written ({error.strerror or error}). "
-                + cure_of(error, "Choose another folder with --out.")
-            ) from error
+            what = f"{path}: the plot cannot be written"
+            cure = "Choose another folder with --out."
+            raise StorageError(describe_os_error(what, error, cure)) from error
         written.append(path)
     return written
 
@@ -73,27 +70,28 @@ def _scored(pairs: Iterable[PairMeans], column: str) -> list[PairMeans]:
 
 def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
     protocol, facts = results[0].protocol, COLUMNS[column]
+    heights = []
     for one, colour in zip(results, cycle(_COLOURS), strict=False):
         pairs = _scored(one.pairs, column)
         if not pairs:
             axes.plot([], [], color=colour, label=f"{one.name}: no finite number")
             continue
-        _draw_sweeps(axes, pairs, column, colour)
-        axes.scatter(
-            [pair.baseline_cm for pair in pairs],
-            [pair.tallies[column].mean for pair in pairs],
-            s=14, alpha=0.45, color=colour, linewidths=0,
-        )  # fmt: skip
+        # Lines join the pairs of a scene that share their left view: same content, wider baseline.
+        for sweep in grouped(pairs, lambda pair: (pair.scene, pair.pair[0])).values():
+            if len(sweep) > 1:
+                sweep.sort(key=lambda pair: pair.baseline_cm)
+                axes.plot(*_points(sweep, column), color=colour, linewidth=0.6, alpha=0.35)
+        baselines_cm, means = _points(pairs, column)
+        axes.scatter(baselines_cm, means, s=14, alpha=0.45, color=colour, linewidths=0)
+        heights += means
         _draw_bins(axes, pairs, column, colour, name=one.name)
-    heights = [pair.tallies[column].mean for one in results for pair in _scored(one.pairs, column)]
     metric = {columns[0]: name for name, columns in FRAME_METRICS.items()}.get(column)
     if metric is not None and protocol.is_papers(column):
         heights += _draw_reference(axes, results, metric)
     _draw_edges(axes, results)
-    better = f"{facts.better} is better"
-    axes.set_ylabel(f"{protocol.label(column)} ({better})")
+    axes.set_ylabel(f"{protocol.label(column)} ({facts.better} is better)")
     axes.set_xlabel("baseline in cm")
-    # Intervals of few scenes may reach far beyond all that was seen: they are cut off.
+    # The interval of a few scenes may reach far beyond their scores: it is cut off.
     low, high = min(heights), max(heights)
     if column in HEAVY_TAILED and high > _LINEAR_SD:
         axes.set_yscale("symlog", linthresh=0.1)
@@ -105,16 +103,9 @@ def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _draw_sweeps(axes: Any, pairs: Sequence[PairMeans], column: str, colour: str) -> None:
-    """Join the pairs of one scene that share their left view: same content, wider baseline."""
-    for sweep in grouped(pairs, lambda pair: (pair.scene, pair.pair[0])).values():
-        if len(sweep) > 1:
-            ordered = sorted(sweep, key=lambda pair: pair.baseline_cm)
-            axes.plot(
-                [pair.baseline_cm for pair in ordered],
-                [pair.tallies[column].mean for pair in ordered],
-                color=colour, linewidth=0.6, alpha=0.35,
-            )  # fmt: skip
+def _points(pairs: Sequence[PairMeans], column: str) -> tuple[list[float], list[float]]:
+    """Return the baselines of pairs in cm, and their scores."""
+    return [pair.baseline_cm for pair in pairs], [pair.tallies[column].mean for pair in pairs]
 
 
 def _draw_bins(
@@ -135,15 +126,9 @@ def _draw_bins(
 
 
 def _draw_reference(axes: Any, results: Sequence[Scores], metric: str) -> list[float]:
-    """Draw the paper's bins of the tier, where Uniform scenes are among those scored.
-
-    Returns:
-        How high the points are.
-    """
-    index = results[0].index
-    if not any(
-        index.column("family")[pair.row] == "Uniform" for one in results for pair in one.pairs
-    ):
+    """Draw the paper's bins of the tier if Uniform scenes were scored; return their numbers."""
+    families = results[0].index.column("family")
+    if not any(families[pair.row] == "Uniform" for one in results for pair in one.pairs):
         return []
     rows = reference_rows("bins", tier=results[0].tier)
     for number, method in enumerate(dict.fromkeys(row["method"] for row in rows)):

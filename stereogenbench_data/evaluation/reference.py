@@ -1,12 +1,11 @@
 """The paper's reference tables as data, to be printed beside a user's own rows.
 
-Each table is a CSV file in ``reference_tables``, its numbers kept as printed: the last digit of a
-reference is part of it. An empty cell is a dash of the paper.
+Each table is a CSV file in ``reference_tables``. Numbers are kept as printed, since the last digit
+of a reference is part of it. An empty cell is a dash of the paper.
 """
 
 import csv
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Final, Literal
@@ -17,28 +16,13 @@ TableName = Literal["main", "unseen", "bins", "controls"]
 ReferenceRow = Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class ReferenceTable:
-    """One table of the paper.
-
-    Attributes:
-        name: "main", "unseen", "bins" or "controls".
-        source: Where in the paper it stands: its LaTeX label and what it is.
-        rows: Its rows, by column, as printed.
-    """
-
-    name: str
-    source: str
-    rows: tuple[ReferenceRow, ...]
-
-
 SOURCES: Final[dict[str, str]] = {
     "main": "tab:main-results, reference results on the seen-map evaluation split",
     "unseen": "tab:app-unseen-results, unseen-map evaluation",
     "bins": "tab:app-baseline-bins, baseline-stratified diagnostics of the seen-map Uniform branch",
     "controls": "tab:metric-calibration, calibration controls on the full evaluation split",
 }
-"""Where each table stands in the paper."""
+"""Where each table stands in the paper: its LaTeX label and what it is."""
 
 PAPER: Final = (
     "StereoGenBench: A Synthetic Multi-Camera Benchmark for Stereo Generation under Controlled "
@@ -82,8 +66,8 @@ DISCREPANCIES: Final[dict[str, str]] = {
 
 
 @cache
-def reference_table(name: TableName) -> ReferenceTable:
-    """Return one of the paper's tables.
+def reference_table(name: TableName) -> tuple[ReferenceRow, ...]:
+    """Return the rows of one of the paper's tables, by column, as printed.
 
     Args:
         name: "main" (seen maps), "unseen", "bins" (baseline bins of seen-map Uniform) or
@@ -92,13 +76,13 @@ def reference_table(name: TableName) -> ReferenceTable:
     Raises:
         EvaluationError: If there is no such table.
 
-    >>> reference_table("controls").rows[0]["psnr"]
+    >>> reference_table("controls")[0]["psnr"]
     'inf'
     """
     if name not in SOURCES:
         raise EvaluationError(f"there is no table {name!r}: there are {', '.join(SOURCES)}.")
     text = files(__package__).joinpath("reference_tables", f"{name}.csv").read_text("utf-8")
-    return ReferenceTable(name, SOURCES[name], tuple(csv.DictReader(text.splitlines())))
+    return tuple(csv.DictReader(text.splitlines()))
 
 
 def reference_rows(name: TableName, **where: str) -> list[ReferenceRow]:
@@ -110,7 +94,7 @@ def reference_rows(name: TableName, **where: str) -> list[ReferenceRow]:
     >>> [row["psnr"] for row in reference_rows("main", tier="G1", family="Uniform")]
     ['19.71']
     """
-    rows = reference_table(name).rows
+    rows = reference_table(name)
     unknown = set(where) - set(rows[0])
     if unknown:
         raise EvaluationError(

@@ -4,28 +4,44 @@ import csv
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from stereogenbench_data.errors import StorageError, cure_of
+from stereogenbench_data.errors import StorageError, describe_os_error
 from stereogenbench_data.evaluation.aggregate import CONTROL, Cell, PairMeans, Scores
 from stereogenbench_data.evaluation.columns import COLUMNS, HEAVY_TAILED
 from stereogenbench_data.evaluation.controls import Relation
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.predictions import pair_name
+from stereogenbench_data.evaluation.protocol import TIERS
 from stereogenbench_data.evaluation.reference import DISCREPANCIES, PAPER
 from stereogenbench_data.evaluation.tables import Table, TableRow
-from stereogenbench_data.evaluation.tiers import TIERS
 from stereogenbench_data.schema.text import counted, markdown_text
 from stereogenbench_data.sources.files import write_atomic
 
-Verdict = Mapping[bool | None, str]
-
 FORMAT: Final = 2
 _GAPS_SHOWN: Final = 20
-_VERDICTS: Final[Verdict] = {True: "holds", False: "DOES NOT HOLD", None: "cannot be told"}
+_VERDICTS: Final[Mapping[bool | None, str]] = {
+    True: "holds",
+    False: "DOES NOT HOLD",
+    None: "cannot be told",
+}
+ABSENT: Final = "-"
+_ARROWS: Final = {"higher": "↑", "lower": "↓", "neither": ""}
+_LATEX: Final = {
+    "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
+    "{": r"\{", "}": r"\}", "±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
+    "∞": r"$\infty$", "†": r"$^\dagger$", "≤": r"$\le$", "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$", "[": "{[}", "*": "{*}",
+}  # fmt: skip
+_CSV_HEAD: Final = (
+    "table", "method", "source", "group", "column", "mean", "ci95", "median", "scenes", "frames",
+    "infinite", "undefined", "missing_pairs", "printed",
+)  # fmt: skip
+_CSV_CELL: Final = ("mean", "ci95", "median", "scenes", "finite", "infinite", "undefined")
+"""The attributes of a `Cell` from "mean" to "undefined"."""
 
 
 def document(
@@ -66,24 +82,25 @@ def page(
     lines = [f"# {names}{tier}", ""]
     for one in results:
         covered = _coverage(one)
+        missing = covered["missing"]
         lines.append(
             f"- {markdown_text(one.name)}: {counted(covered['pairs'], 'pair')} of "
             f"{counted(covered['scenes'], 'scene')}, {counted(covered['frames'], 'frame')}"
-            + (
-                f", {counted(len(covered['missing']), 'pair')} missing"
-                if covered["missing"]
-                else ""
-            )
+            + (f", {counted(len(missing), 'pair')} missing" if missing else "")
         )
-        lines += [
-            f"  - missing: {markdown_text(each)}" for each in covered["missing"][:_GAPS_SHOWN]
-        ]
-    lines += ["", *(f"{markdown(table)}" for table in tables)]
+        lines += [f"  - missing: {markdown_text(each)}" for each in missing[:_GAPS_SHOWN]]
+    lines += ["", *map(markdown, tables)]
     if found:
         lines += ["### Relations between the controls", ""]
         lines += [f"- {_VERDICTS[each.holds]}: {each.what} ({each.found})" for each in found]
         lines.append("")
-    lines += ["### Every choice", "", *_choices(first.settings), ""]
+    lines += ["### Every choice", ""]
+    for name, value in first.settings.items():
+        parts = value if isinstance(value, list) else [value]
+        if isinstance(value, Mapping):
+            parts = [f"{key} {each}" for key, each in value.items()]
+        lines.append(f"- {name}: {', '.join(map(str, parts))}")
+    lines.append("")
     lines += ["### Where the paper's tables disagree", ""]
     lines += [f"- {name}: {text}" for name, text in DISCREPANCIES.items()]
     return "\n".join(lines) + "\n"
@@ -117,10 +134,9 @@ def write_report(
         for name, text in written.items():
             write_atomic(folder / name, text.encode())
     except OSError as error:
-        raise StorageError(
-            f"{folder}: the report cannot be written ({error.strerror or error}). "
-            + cure_of(error, "Choose another folder with --out.")
-        ) from error
+        what = f"{folder}: the report cannot be written"
+        cure = "Choose another folder with --out."
+        raise StorageError(describe_os_error(what, error, cure)) from error
     files = [folder / name for name in written]
     if plots == "skip":
         return files
@@ -132,21 +148,17 @@ def write_report(
 def pairs_csv(results: Sequence[Scores]) -> str:
     """Return the scores of every pair of every scene as CSV, empty where there is no score."""
     columns = list(dict.fromkeys(name for one in results for p in one.pairs for name in p.tallies))
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(
-        ["method", "scene", "cameras", "primary", "baseline_cm", "frames", "missing", *columns]
-    )
-    for one in results:
-        for pair in one.pairs:
-            writer.writerow(
-                [
-                    one.name, pair.scene, pair_name(pair.pair), int(pair.is_primary),
-                    repr(pair.baseline_cm), pair.frames, pair.fault,
-                    *(_mean_text(pair, name) for name in columns),
-                ]
-            )  # fmt: skip
-    return out.getvalue()
+    head = ["method", "scene", "cameras", "primary", "baseline_cm", "frames", "missing", *columns]
+    lines = (
+        [
+            one.name, pair.scene, pair_name(pair.pair), int(pair.is_primary),
+            repr(pair.baseline_cm), pair.frames, pair.fault,
+            *(_mean_text(pair, name) for name in columns),
+        ]
+        for one in results
+        for pair in one.pairs
+    )  # fmt: skip
+    return _csv(head, lines)
 
 
 def _mean_text(pair: PairMeans, column: str) -> str:
@@ -167,40 +179,12 @@ def _coverage(one: Scores) -> dict[str, Any]:
     }
 
 
-def _choices(settings: Mapping[str, Any]) -> list[str]:
-    lines = []
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            inner = ", ".join(f"{key} {each}" for key, each in value.items())
-            lines.append(f"- {name}: {inner}")
-        elif isinstance(value, list):
-            lines.append(f"- {name}: {', '.join(map(str, value))}")
-        else:
-            lines.append(f"- {name}: {value}")
-    return lines
-
-
-ABSENT: Final = "-"
-_ARROWS: Final = {"higher": "↑", "lower": "↓", "neither": ""}
-_LATEX: Final = {
-    "\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "$": r"\$",
-    "{": r"\{", "}": r"\}", "±": r"$\pm$", "↑": r"$\uparrow$", "↓": r"$\downarrow$",
-    "∞": r"$\infty$", "†": r"$^\dagger$", "≤": r"$\le$", "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}", "<": "$<$", ">": "$>$", "|": "$|$", "[": "{[}", "*": "{*}",
-}  # fmt: skip
-_CSV_HEAD: Final = (
-    "table", "method", "source", "group", "column", "mean", "ci95", "median", "scenes", "frames",
-    "infinite", "undefined", "missing_pairs", "printed",
-)  # fmt: skip
-
-
 def markdown(table: Table) -> str:
     """Return a table in Markdown, with its title and notes."""
     head, rows = _texts(table)
-    lines = [f"### {table.title}", ""]
-    lines.append(_pipes(head))
     texts = 1 + len(table.keys)
-    lines.append(_pipes(["---"] * texts + ["---:"] * (len(head) - texts)))
+    rule = ["---"] * texts + ["---:"] * (len(head) - texts)
+    lines = [f"### {table.title}", "", _pipes(head), _pipes(rule)]
     lines += [_pipes(list(map(markdown_text, row))) for row in rows]
     if table.notes:
         lines += ["", *(f"- {note}" for note in table.notes)]
@@ -208,11 +192,10 @@ def markdown(table: Table) -> str:
 
 
 def latex(table: Table) -> str:
-    """Return a table in LaTeX, for the package booktabs; the notes are its caption's."""
+    """Return a table in LaTeX, for the package booktabs; its caption has the notes."""
     head, rows = _texts(table)
     texts = 1 + len(table.keys)
     caption = " ".join([f"{table.title}.", *table.notes])
-    body = [" & ".join(map(_tex, row)) + r" \\" for row in rows]
     lines = [
         r"\begin{table}",
         r"  \centering",
@@ -221,7 +204,7 @@ def latex(table: Table) -> str:
         r"    \toprule",
         "    " + " & ".join(map(_tex, head)) + r" \\",
         r"    \midrule",
-        *(f"    {line}" for line in body),
+        *("    " + " & ".join(map(_tex, row)) + r" \\" for row in rows),
         r"    \bottomrule",
         r"  \end{tabular}",
         r"\end{table}",
@@ -231,12 +214,30 @@ def latex(table: Table) -> str:
 
 def csv_text(tables: Sequence[Table]) -> str:
     """Return tables as one CSV, a line for each row and column; empty where there is no number."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(_CSV_HEAD)
+    lines: list[list[Any]] = []
     for table in tables:
         for row in table.rows:
-            writer.writerows(_csv_lines(table, row))
+            group = "; ".join(f"{k}={v}" for k, v in zip(table.keys, row.labels, strict=True))
+            for name in table.columns:
+                start = [table.name, row.method, _source(row), group, heading(table, name)]
+                if row.is_papers:
+                    lines.append([*start, *[""] * 8, row.printed.get(name, "")])
+                elif name in row.distances:
+                    value = _plain_distance(row.distances[name])["value"]
+                    counts = [row.scenes, row.frames, "", "", row.missing, ""]
+                    lines.append([*start, value, "", "", *counts])
+                elif name in row.cells:
+                    cell = asdict(row.cells[name])
+                    lines.append([*start, *(cell[each] for each in _CSV_CELL), row.missing, ""])
+    return _csv(_CSV_HEAD, lines)
+
+
+def _csv(head: Sequence[str], lines: Iterable[Sequence[Any]]) -> str:
+    """Return CSV; None is an empty field."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(head)
+    writer.writerows(lines)
     return out.getvalue()
 
 
@@ -264,8 +265,7 @@ def heading(table: Table, column: str) -> str:
 def _texts(table: Table) -> tuple[list[str], list[list[str]]]:
     """Return the head and the rows of a table as texts."""
     has_gaps = any(row.missing for row in table.rows)
-    head = ["Method", *table.keys, "N_s", "N_f"]
-    head += ["missing"] if has_gaps else []
+    head = ["Method", *table.keys, "N_s", "N_f", *(["missing"] if has_gaps else [])]
     head += [heading(table, name) for name in table.columns]
     rows = []
     for row in table.rows:
@@ -313,8 +313,7 @@ def _distance_text(found: FrechetDistance) -> str:
     fewer = min(found.samples)
     if not math.isfinite(found.value):
         return f"{ABSENT} (N {fewer})"
-    compared = "≤" if found.underdetermined else ">"
-    mark = " !" if found.underdetermined else ""
+    compared, mark = ("≤", " !") if found.underdetermined else (">", "")
     return f"{found.value:.2f} (N {fewer} {compared} D {found.dim}){mark}"
 
 
@@ -326,34 +325,14 @@ def _tex(text: str) -> str:
     return "---" if text == ABSENT else "".join(_LATEX.get(letter, letter) for letter in text)
 
 
-def _csv_lines(table: Table, row: TableRow) -> list[list[Any]]:
-    group = "; ".join(f"{k}={v}" for k, v in zip(table.keys, row.labels, strict=True))
-    source = "paper" if row.is_papers else "scored"
-    lines: list[list[Any]] = []
-    for name in table.columns:
-        start = [table.name, row.method, source, group, heading(table, name)]
-        if row.is_papers:
-            lines.append([*start, *[""] * 8, row.printed.get(name, "")])
-        elif name in row.distances:
-            found = row.distances[name]
-            value = _plain_distance(found)["value"]
-            counts = [row.scenes, row.frames, "", "", row.missing, ""]
-            lines.append([*start, _blank(value), "", "", *counts])
-        elif name in row.cells:
-            each = row.cells[name]
-            numbers = [each.mean, each.ci95, each.median, each.scenes, each.finite, each.infinite]
-            lines.append([*start, *map(_blank, numbers), each.undefined, row.missing, ""])
-    return lines
-
-
-def _blank(number: float | None) -> float | str:
-    return "" if number is None else number
+def _source(row: TableRow) -> str:
+    return "paper" if row.is_papers else "scored"
 
 
 def _plain_row(table: Table, row: TableRow) -> dict[str, Any]:
     plain_row: dict[str, Any] = {
         "method": row.method,
-        "source": "paper" if row.is_papers else "scored",
+        "source": _source(row),
         "group": dict(zip(table.keys, row.labels, strict=True)),
         "scenes": row.scenes,
         "frames": row.frames,
@@ -363,9 +342,8 @@ def _plain_row(table: Table, row: TableRow) -> dict[str, Any]:
     cells = {name: asdict(row.cells[name]) for name in table.columns if name in row.cells}
     plain_row |= {"missing_pairs": row.missing, "cells": cells}
     if row.distances:
-        plain_row["distances"] = {
-            name: _plain_distance(each) for name, each in row.distances.items()
-        }
+        distances = {name: _plain_distance(each) for name, each in row.distances.items()}
+        plain_row["distances"] = distances
     return plain_row
 
 

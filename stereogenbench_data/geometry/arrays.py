@@ -5,13 +5,16 @@ against the array API standard. The arrays of one call must be of one library an
 """
 
 import math
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from array_api_compat import array_namespace, device, is_numpy_array, is_torch_array
 
 Array = Any
 """A numpy array or a torch tensor; jaxtyping checks its shape and dtype under test."""
+
+BLOCK_PIXELS: Final = 64 * 1280
+"""How many pixels of float maps stay in a processor's cache from one step to the next."""
 
 
 def pixel_centres(like: Array, *, dtype: Any) -> tuple[Array, Array]:

@@ -32,18 +32,17 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        for name in ("width_px", "height_px"):
-            if getattr(self, name) < 1:
+        for name, value in (("width_px", self.width_px), ("height_px", self.height_px)):
+            if value < 1:
                 raise GeometryError(
-                    f"{name} must be at least 1, got {getattr(self, name)!r}: "
-                    "choose a size of one pixel or more."
+                    f"{name} must be at least 1, got {value!r}: choose a size of one pixel or more."
                 )
-        for name in ("fx_px", "fy_px"):
-            require_positive(getattr(self, name), name=name)
-        for name in ("cx_px", "cy_px"):
-            if not math.isfinite(getattr(self, name)):
+        require_positive(self.fx_px, name="fx_px")
+        require_positive(self.fy_px, name="fy_px")
+        for name, place_px in (("cx_px", self.cx_px), ("cy_px", self.cy_px)):
+            if not math.isfinite(place_px):
                 raise GeometryError(
-                    f"{name} must be finite, got {getattr(self, name)!r}: "
+                    f"{name} must be finite, got {place_px!r}: "
                     "give the principal point in pixels of the image."
                 )
 

@@ -15,16 +15,18 @@ from array_api_compat import array_namespace, is_numpy_array
 from jaxtyping import Bool, Float, Float32, Integer
 
 from stereogenbench_data.errors import GeometryError
-from stereogenbench_data.geometry.arrays import as_float64, pixel_centres, quotient
+from stereogenbench_data.geometry.arrays import (
+    BLOCK_PIXELS,
+    as_float64,
+    pixel_centres,
+    quotient,
+)
 from stereogenbench_data.geometry.camera import Intrinsics, require_positive, require_size
 from stereogenbench_data.schema.records import DepthForm
 
 _EXACT_FACTORS: Final = np.arange(128.0, 256.0)
 """Whole numbers whose product with a 16-bit number is exact in the 24 bits of float32. Smaller ones
 are these divided by a power of two, and round in the same way."""
-
-_BLOCK_PIXELS: Final = 64 * 1280
-"""The number of pixels whose values stay in a processor's cache from one step to the next."""
 
 _NEARLY_EXACT: Final = 2.0**-29
 """A relative error that is at most 1/32 ulp of a float32."""
@@ -53,8 +55,12 @@ def disparity_from_depth(
     array([[40.,  0.,  0.]])
     """
     _require_pair(focal_px, baseline_m)
-    _require_float(depth_m)
     xp = array_namespace(depth_m)
+    if depth_m.dtype not in (xp.float32, xp.float64):
+        raise GeometryError(
+            f"depth in metres must be float32 or float64, got {depth_m.dtype}: convert it, or use "
+            "disparity_from_units for stored numbers."
+        )
     disparity_px = quotient(focal_px * baseline_m, as_float64(_inf_where_not_positive(depth_m)))
     return xp.astype(disparity_px, depth_m.dtype, copy=False)
 
@@ -136,8 +142,7 @@ def write_disparity(
 ) -> None:
     """Write the result of `disparity_from_units` into an array, and 0 where depth was not measured.
 
-    It works on a few rows at a time, which stay in the processor's cache through all steps, so that
-    no step allocates a map.
+    A few rows at a time go through all steps, so that they stay in the processor's cache.
 
     Args:
         out: The array to write disparity in pixels to.
@@ -150,7 +155,7 @@ def write_disparity(
     """
     product, factor, dtype = _exact_quotient(shift_units)
     dtype = "float64" if form == "inverse" else dtype
-    rows = max(1, _BLOCK_PIXELS // max(1, out.shape[-1]))
+    rows = max(1, BLOCK_PIXELS // max(1, out.shape[-1]))
     scratch = np.empty((rows, out.shape[-1]), dtype=np.float64) if dtype == "float64" else None
     blocks = [slice(top, top + rows) for top in range(0, out.shape[-2], rows)]
     with np.errstate(divide="ignore"):
@@ -260,15 +265,6 @@ def _ray_per_planar(like: Float[Any, "*batch h w"], intrinsics: Intrinsics) -> F
 def _inf_where_not_positive(values: Float[Any, "*batch h w"]) -> Float[Any, "*batch h w"]:
     xp = array_namespace(values)
     return xp.where(values > 0, values, math.inf)
-
-
-def _require_float(depth_m: Any) -> None:
-    xp = array_namespace(depth_m)
-    if depth_m.dtype not in (xp.float32, xp.float64):
-        raise GeometryError(
-            f"depth in metres must be float32 or float64, got {depth_m.dtype}: convert it, or use "
-            "disparity_from_units for stored numbers."
-        )
 
 
 def _require_pair(focal_px: float, baseline_m: float) -> None:

@@ -6,7 +6,7 @@ column floor(u). Camera axes are x right, y down, z forward; lengths are metres.
 
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace, is_numpy_array
@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 
 from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.arrays import (
+    BLOCK_PIXELS,
     as_float64,
     leading_offsets,
     pixel_centres,
@@ -37,10 +38,6 @@ class Projection:
     depth_m: Float[Any, "*batch h w"]
 
 
-_BLOCK_PIXELS: Final = 64 * 1280
-"""The number of pixels of a batch whose maps stay in a processor's cache between steps."""
-
-
 def row_blocks(projection: Projection, *, height_px: int) -> list[slice]:
     """Return the rows of a projection in blocks that can be processed one after another.
 
@@ -49,7 +46,7 @@ def row_blocks(projection: Projection, *, height_px: int) -> list[slice]:
     """
     *images, rows, columns = projection.u_px.shape
     apart = is_numpy_array(projection.u_px) and projection.v_px is None and rows == height_px
-    step = max(1, _BLOCK_PIXELS // max(1, columns * math.prod(images)) if apart else rows)
+    step = max(1, BLOCK_PIXELS // max(1, columns * math.prod(images)) if apart else rows)
     return [slice(top, top + step) for top in range(0, max(1, rows), step)]
 
 

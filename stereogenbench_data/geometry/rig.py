@@ -55,7 +55,12 @@ def rectification_residual_px(poses: CameraPoses, intrinsics: Intrinsics) -> flo
     shift_px_m = intrinsics.fx_px * (offsets_m[_RIGHT] - offsets_m[_LEFT])
     nearest_m = np.maximum(1.0, np.abs(shift_px_m) / width_px)
 
-    far, step = _homography_and_step(poses, intrinsics.matrix())
+    # K R K^-1 and K t of right_from_left, (frames, 15, 3, 3) and (frames, 15, 3).
+    camera_matrix, rotations = intrinsics.matrix(), poses.world_from_cam_rotations
+    image_from_world = camera_matrix @ np.swapaxes(rotations[:, _RIGHT], -1, -2)
+    far = image_from_world @ rotations[:, _LEFT] @ np.linalg.inv(camera_matrix)
+    steps = (poses.centres[:, _LEFT] - poses.centres[:, _RIGHT]) @ OPENCV_FROM_UNREAL.T
+    step = (image_from_world @ steps[..., None])[..., 0] * poses.unit_m
     landed_far = pixels @ np.swapaxes(far, -1, -2)
     landed_near = landed_far + (step / nearest_m[:, None])[..., None, :]
     expected_near = pixels - np.outer(shift_px_m / nearest_m, (1.0, 0.0, 0.0))[:, None, :]
@@ -66,14 +71,3 @@ def rectification_residual_px(poses: CameraPoses, intrinsics: Intrinsics) -> flo
         away_px = landed[..., :2] / landed[..., 2:] - expected[..., :2]
         largest_px = max(largest_px, float(np.linalg.norm(away_px, axis=-1).max()))
     return largest_px
-
-
-def _homography_and_step(
-    poses: CameraPoses, camera_matrix: Float64[np.ndarray, "3 3"]
-) -> tuple[Float64[np.ndarray, "frames 15 3 3"], Float64[np.ndarray, "frames 15 3"]]:
-    """Return K R K^-1 and K t of right_from_left, for all frames and pairs."""
-    rotations = poses.world_from_cam_rotations
-    image_from_world = camera_matrix @ np.swapaxes(rotations[:, _RIGHT], -1, -2)
-    steps = (poses.centres[:, _LEFT] - poses.centres[:, _RIGHT]) @ OPENCV_FROM_UNREAL.T
-    homography = image_from_world @ rotations[:, _LEFT] @ np.linalg.inv(camera_matrix)
-    return homography, (image_from_world @ steps[..., None])[..., 0] * poses.unit_m

@@ -12,12 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from stereogenbench_data.geometry.arrays import scatter_min, take_flat, values_where
-from stereogenbench_data.geometry.projection import (
-    Projection,
-    landing_pixels,
-    row_blocks,
-    rows_of,
-)
+from stereogenbench_data.geometry.projection import Projection, landing_pixels, row_blocks, rows_of
 
 
 def visible_in_target(

@@ -1,7 +1,7 @@
 """Arrow's columns as numpy arrays, and a digest of a table's content.
 
-Arrow's own conversions import pandas where it is installed, which takes longer than opening the
-index of a whole release; these do not.
+Arrow's own conversions import pandas if it is installed, which takes longer than opening the index
+of a whole release; these do not.
 """
 
 import hashlib
@@ -15,16 +15,17 @@ from stereogenbench_data.index.rows import ADDED
 
 
 def as_numpy(values: Any) -> np.ndarray:
-    """Return a column of one chunk: numbers, booleans, strings, or lists of a fixed length.
+    """Return a column of numbers, booleans, strings, or lists of a fixed length.
 
     Args:
-        values: A `pyarrow.Array`.
+        values: A `pyarrow.Array`, or a `pyarrow.ChunkedArray`.
 
     Returns:
-        Numbers of the column's own dtype, float64 with nan where some are null; bool; strings as
-        objects, None where null; (n, length) for lists of a fixed length. It may be a view of
-        Arrow's memory, and is then read-only.
+        Numbers of the column's own dtype, float64 with nan if some are null; bool; strings as
+        objects, None where null; (n, length) for lists of a fixed length. It may be a read-only
+        view of Arrow's memory.
     """
+    values = one_array(values)
     kind = values.type
     if pa.types.is_fixed_size_list(kind):
         return as_numpy(values.flatten()).reshape(-1, kind.list_size)
@@ -36,6 +37,14 @@ def as_numpy(values: Any) -> np.ndarray:
     if not values.null_count:
         return numbers
     return np.where(as_numpy(values.is_valid()), numbers.astype(np.float64), np.nan)
+
+
+def one_array(values: Any) -> Any:
+    """Return a column as one `pyarrow.Array`."""
+    if not isinstance(values, pa.ChunkedArray):
+        return values
+    values = values.combine_chunks()
+    return values.chunk(0) if isinstance(values, pa.ChunkedArray) else values
 
 
 def _stored_numbers(values: Any) -> np.ndarray:
@@ -63,7 +72,7 @@ def _stored_strings(values: Any) -> tuple[np.ndarray, bytes]:
 
 
 def table_digest(table: pa.Table) -> str:
-    """Return a sha256 of all names and values, however they are stored, as 64 hex digits.
+    """Return a sha256 of all names and values, however they are stored: 64 hex digits.
 
     Columns that came later and say nothing are left out: tables of earlier versions lack them.
     """
@@ -72,9 +81,7 @@ def table_digest(table: pa.Table) -> str:
         if name in ADDED and table.column(name).null_count == table.num_rows:
             continue
         digest.update(name.encode() + b"\0")
-        column = table.column(name).combine_chunks()
-        for chunk in column.chunks if isinstance(column, pa.ChunkedArray) else [column]:
-            _feed(digest, chunk)
+        _feed(digest, one_array(table.column(name)))
     return digest.hexdigest()
 
 

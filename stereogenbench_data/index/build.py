@@ -1,43 +1,40 @@
-"""From a released tree to its scenes: all described, in parallel, none left out in silence.
+"""From a released tree to its scenes: each one is described, or listed with what is wrong.
 
-A journal keeps what was described, so that a killed run goes on where it stopped: one JSON object a
-line, of which the first says what the work is, and each other one holds a scene's value and a stamp
-of its files. A line that a kill cut short is passed over, and its scene is read again.
+A journal keeps the described scenes, so a killed run continues where it stopped: one JSON object a
+line. The first says what the work is, each other one holds a scene's value and a digest of its
+files. A line that was cut short is ignored, and its scene is read again.
 """
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Literal, TextIO
 
-from stereogenbench_data.engine import LOCAL, Advance, Engine
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, require_workers
 from stereogenbench_data.errors import (
     MediaError,
     StereoGenBenchError,
     StorageError,
-    describe_os_error,
+    explain_os_errors,
 )
 from stereogenbench_data.index.rows import SCHEMA, row_of, scene_of
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
+    SceneFolder,
     ValidDepth,
     describe_scene,
-    open_scene_folder,
     stamp_of,
 )
 from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes, find_scene_folders
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
-from stereogenbench_data.schema.release import TRAIN_MAPS, depth_name
+from stereogenbench_data.schema.release import TRAIN_MAPS, Subset, depth_name
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.location import is_remote, shown
-
-Progress = Callable[[int, int], None]
 
 _NAMED: Final = 6
 _JOURNAL_FORMAT: Final = 2
@@ -52,10 +49,10 @@ class TreeReport:
     Attributes:
         root: The folder that was walked.
         scenes: Every whole scene, by key.
-        incomplete: Key to reason, for scenes without their mark or without any video.
+        incomplete: Key to reason, for scenes without their completion mark or without any video.
         broken: Key (or path below the root) to what is wrong and what to do.
-        notes: What was decided where the tree does not say.
-        is_part: Whether only scenes that were asked for were described.
+        notes: What was assumed where the tree is ambiguous.
+        is_part: Whether the user chose only some of the scenes.
     """
 
     root: str
@@ -63,12 +60,12 @@ class TreeReport:
     incomplete: dict[str, str]
     broken: dict[str, str]
     notes: tuple[str, ...]
-    is_part: bool = False
+    is_part: bool
 
 
 @dataclass(frozen=True, slots=True)
 class _Outcome:
-    """What became of one scene's folder: a scene and the stamp of its files, or why not."""
+    """The outcome of one scene's folder: a scene and the digest of its files, or why not."""
 
     key: str
     kind: Literal["whole", "incomplete", "broken"]
@@ -81,119 +78,75 @@ class Journal:
     """JSON values by scene, on disk; leaving its block keeps the file, `delete` removes it."""
 
     def __init__(self, path: Path, *, work: Mapping[str, Any]) -> None:
-        """Read what a journal holds; that of other work is begun anew.
-
-        Nothing is written before the first value is added.
+        """Read a journal; that of other work is ignored, and replaced by the first new value.
 
         Args:
             path: The journal's file.
-            work: What the work is, as JSON: two runs that say the same share their values.
+            work: What the work is, as JSON: runs of the same work share their values.
 
         Raises:
-            StorageError: If the file is there and cannot be read.
+            StorageError: If the file exists and cannot be read.
         """
         self._path = path
         self._file: TextIO | None = None
         self._head = json.dumps({"journal": _JOURNAL_FORMAT, **work})
-        try:
+        what = f"{path}: the journal of an earlier run cannot be read"
+        lines: list[str] = []
+        with (
+            explain_os_errors(what, "Remove it, or write the result to another folder."),
+            suppress(FileNotFoundError, NotADirectoryError),
+        ):
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        except (FileNotFoundError, NotADirectoryError):
-            lines = []
-        except OSError as error:
-            what = f"{path}: the journal of an earlier run cannot be read"
-            cure = "Remove it, or write the result to another folder."
-            raise StorageError(describe_os_error(what, error, cure)) from error
         self._is_same = bool(lines) and lines[0] == self._head
-        self._known = _parse_lines(lines[1:]) if self._is_same else {}
+        self._known: dict[str, tuple[str, Any]] = {}
+        for line in lines[1:] if self._is_same else ():
+            with suppress(ValueError, KeyError, TypeError):
+                entry: Any = json.loads(line)
+                self._known[str(entry["key"])] = (entry["stamp"], entry["value"])
 
     def __len__(self) -> int:
         """The number of scenes that earlier runs have done."""
         return len(self._known)
 
     def value(self, key: str, *, stamp: str) -> Any:
-        """Return what was noted of a scene; None if nothing was, or its files have changed."""
+        """Return a scene's value; None if there is none, or its files have changed."""
         known = self._known.get(key)
         return known[1] if known is not None and known[0] == stamp else None
 
     def note(self, key: str, value: Any, *, stamp: str) -> None:
-        """Note a scene's value, any JSON but null, so that it outlives this process.
+        """Write a scene's value, any JSON but null.
 
         Raises:
             StorageError: If the file cannot be written.
         """
         line = json.dumps({"key": key, "stamp": stamp, "value": value})
-        try:
+        what = f"{self._path}: the journal cannot be written"
+        with explain_os_errors(what, "Write the result to another folder."):
             if self._file is None:
                 self._path.parent.mkdir(parents=True, exist_ok=True)
                 self._file = self._path.open("a" if self._is_same else "w", encoding="utf-8")
                 self._file.write("\n" if self._is_same else f"{self._head}\n")
             self._file.write(f"{line}\n")
             self._file.flush()
-        except OSError as error:
-            what = f"{self._path}: the journal cannot be written"
-            cure = "Write the result to another folder."
-            raise StorageError(describe_os_error(what, error, cure)) from error
 
     def delete(self) -> None:
-        """Remove the file: what it holds was written elsewhere."""
-        self._close()
+        """Remove the file, whose values were written elsewhere."""
+        self.__exit__()
         self._path.unlink(missing_ok=True)
-
-    def _close(self) -> None:
-        if self._file is not None:
-            self._file.close()
 
     def __enter__(self) -> "Journal":
         """Return the journal itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Close the file, and keep it."""
-        self._close()
+        if self._file is not None:
+            self._file.close()
 
 
-class SceneJournal(Journal):
-    """A journal of scenes that were described."""
-
-    def __init__(self, path: Path, *, walk: str) -> None:
-        """Read what a journal of this walk holds; see `Journal`."""
-        super().__init__(path, work={"walk": walk, "columns": SCHEMA.names})
-
-    def __enter__(self) -> "SceneJournal":
-        """Return the journal itself."""
-        return self
-
-    def find(self, key: str, *, stamp: str) -> Scene | None:
-        """Return a scene described before, None if it was not or its files have changed."""
-        row = self.value(key, stamp=stamp)
-        try:
-            return None if row is None else scene_of(row)
-        except (ValueError, KeyError, TypeError, IndexError, AttributeError):
-            return None
-
-    def add(self, scene: Scene, *, stamp: str) -> None:
-        """Note a scene, so that it outlives this process.
-
-        Raises:
-            StorageError: If the file cannot be written.
-        """
-        self.note(scene.id.key, row_of(scene), stamp=stamp)
-
-
-def _parse_lines(lines: list[str]) -> dict[str, tuple[str, Any]]:
-    known: dict[str, tuple[str, Any]] = {}
-    for line in lines:
-        try:
-            entry: Any = json.loads(line)
-            known[str(entry["key"])] = (entry["stamp"], entry["value"])
-        except (ValueError, KeyError, TypeError):
-            continue
-    return known
+def scene_journal(path: Path, *, walk: str) -> Journal:
+    """Return the journal of the scenes that a walk has described; see `Journal`."""
+    return Journal(path, work={"walk": walk, "columns": SCHEMA.names})
 
 
 def walk(  # noqa: PLR0913 - each is an option of the command
@@ -202,7 +155,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     workers: int | None = None,
     engine: Engine = LOCAL,
     progress: Progress | None = None,
-    journal: SceneJournal | None = None,
+    journal: Journal | None = None,
     valid_depth: ValidDepth = "skip",
     wanted: Callable[[SceneId], bool] | None = None,
 ) -> TreeReport:
@@ -211,20 +164,19 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     Args:
         root: The folder that holds ``train`` and ``eval``, or its URL, of which folders can be
             listed (``hf://datasets/...``, ``s3://...``).
-        workers: Processes that read at the same time; None is one a core. With few scenes this
+        workers: Processes that read at the same time; None is one per core. With few scenes this
             process reads them all.
-        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
-        progress: Called with the number of scenes done and that of all, after each.
-        journal: Where described scenes are kept, and found again by a later walk.
-        valid_depth: "sample" decodes some depth pictures of each scene, to tell the share of
-            pixels that have a depth.
-        wanted: Which scenes to describe, by what their paths say; None is all.
+        engine: Where these processes run: `engine.LOCAL`, or an `engine.RayCluster`.
+        progress: Called after each scene with the number of scenes done and that of all.
+        journal: Where described scenes are kept for a later walk.
+        valid_depth: "sample" decodes some depth pictures of each scene, for the share of pixels
+            that have a depth.
+        wanted: Returns whether to describe the scene of a path; None is all.
 
     Raises:
         StorageError: If there is no such scene below the root, or a worker process died.
     """
-    if workers is not None and workers < 1:
-        raise StorageError(f"workers must be at least 1, got {workers}.")
+    require_workers(workers)
     folders = find_remote_scenes(str(root)) if is_remote(root) else find_scene_folders(root)
     if wanted is not None:
         folders = _chosen(root, folders, wanted)
@@ -233,15 +185,17 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     if progress is not None:
         progress(len(outcomes), total)
     pending = [key for key in folders.keys if key not in outcomes]
+    if engine is LOCAL and len(pending) < POOL_FROM:
+        workers = 1
     task = _DescribeTask(str(root), valid_depth)
-    for outcome in _described(task, pending, workers, engine):
+    for outcome in engine.map(task, pending, name=str, workers=workers):
         outcomes[outcome.key] = outcome
         if journal is not None and outcome.scene is not None:
-            journal.add(outcome.scene, stamp=outcome.stamp)
+            journal.note(outcome.key, row_of(outcome.scene), stamp=outcome.stamp)
         if progress is not None:
             progress(len(outcomes), total)
-    report = _report(root, folders, [outcomes[key] for key in folders.keys])
-    return replace(report, is_part=wanted is not None)
+    in_order = [outcomes[key] for key in folders.keys]
+    return _report(root, folders, in_order, is_part=wanted is not None)
 
 
 def _chosen(
@@ -252,7 +206,7 @@ def _chosen(
         there = sorted({key.rpartition("/")[0] for key in folders.keys})
         more = f" and {len(there) - _NAMED} folders more" if len(there) > _NAMED else ""
         raise StorageError(
-            f"{shown(str(root))}: none of its {counted(len(folders.keys), 'scene')} is asked for; "
+            f"{shown(root)}: none of its {counted(len(folders.keys), 'scene')} is asked for; "
             f"there are scenes in {', '.join(there[:_NAMED])}{more}. Check the filters' spelling."
         )
     return FoundScenes(keys, folders.refused)
@@ -260,14 +214,15 @@ def _chosen(
 
 @dataclass(frozen=True, slots=True)
 class _DescribeTask:
-    """Describes a scene by its key; travels to worker processes."""
+    """Describes a scene by its key, in a worker process."""
 
     root: str
     valid_depth: ValidDepth
 
-    def __call__(self, key: str) -> _Outcome:
+    def __call__(self, key: str, advance: Advance) -> _Outcome:
+        advance(0)
         try:
-            stamp = stamp_of(open_scene_folder(self.root, key).stamps())
+            stamp = stamp_of(SceneFolder(self.root, key).stamps())
             scene = describe_scene(self.root, key, valid_depth=self.valid_depth)
         except IncompleteScene as error:
             return _Outcome(key, "incomplete", reason=str(error))
@@ -276,68 +231,57 @@ class _DescribeTask:
         return _Outcome(key, "whole", scene, stamp)
 
 
-def _reused(
-    root: str | Path, keys: Iterable[str], journal: SceneJournal | None
-) -> dict[str, _Outcome]:
+def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> dict[str, _Outcome]:
+    """Return the scenes that a journal holds and whose files have not changed."""
     outcomes: dict[str, _Outcome] = {}
     for key in keys if journal is not None and len(journal) else ():
-        try:
-            stamp = stamp_of(open_scene_folder(root, key).stamps())
-        except StorageError:
-            continue
-        scene = journal.find(key, stamp=stamp) if journal is not None else None
-        if scene is not None:
-            outcomes[key] = _Outcome(key, "whole", scene, stamp)
+        with suppress(
+            StorageError, ValueError, KeyError, TypeError, IndexError, AttributeError
+        ):  # of the folder, or of a damaged row: the scene is described again
+            stamp = stamp_of(SceneFolder(root, key).stamps())
+            row = None if journal is None else journal.value(key, stamp=stamp)
+            if row is not None:
+                outcomes[key] = _Outcome(key, "whole", scene_of(row), stamp)
     return outcomes
 
 
-def _described(
-    task: _DescribeTask, keys: list[str], workers: int | None, engine: Engine
-) -> Iterator[_Outcome]:
-    items = [(task, key) for key in keys]
-    if engine is LOCAL and len(keys) < POOL_FROM:
-        workers = 1
-    return engine.map(_describe, items, name=itemgetter(1), workers=workers)
-
-
-def _describe(item: tuple[_DescribeTask, str], after_bytes: Advance) -> _Outcome:
-    task, key = item
-    after_bytes(0)
-    return task(key)
-
-
-def _report(root: str | Path, folders: FoundScenes, outcomes: list[_Outcome]) -> TreeReport:
+def _report(
+    root: str | Path, folders: FoundScenes, outcomes: list[_Outcome], *, is_part: bool
+) -> TreeReport:
     ids = [parse_scene_key(key) for key in folders.keys]
     maps = {scene.map_name for scene in ids if scene.split == "train"} | TRAIN_MAPS
     found = [outcome.scene for outcome in outcomes if outcome.scene is not None]
-    scenes = tuple(replace(scene, id=_with_subset(scene.id, maps)) for scene in found)
+    scenes, unnamed, labels = [], set(), []
+    for scene in found:
+        if scene.id.split == "eval" and scene.id.subset is None:
+            unnamed.add(scene.id.key.split("/")[1])
+            subset: Subset = "seen_map" if scene.id.map_name in maps else "unseen_map"
+            scenes.append(replace(scene, id=replace(scene.id, subset=subset)))
+        else:
+            scenes.append(scene)
+        if scene.labels.map_name not in (None, scene.id.map_name):
+            labels.append(
+                f"{scene.id.key}: its files call the map {scene.labels.map_name!r}; the folder's "
+                f"name is used"
+            )
+    subsets = [
+        f"eval/{folder} names no subset; a scene there counts as seen_map if its map occurs in "
+        f"train, of this tree or of the release, else as unseen_map"
+        for folder in sorted(unnamed)
+    ]
     broken = {out.key: out.reason for out in outcomes if out.kind == "broken"}
     return TreeReport(
         root=str(root),
-        scenes=scenes,
+        scenes=tuple(scenes),
         incomplete={out.key: out.reason for out in outcomes if out.kind == "incomplete"},
         broken=dict(sorted((folders.refused | broken).items())),
-        notes=(*_subset_notes(found), *_label_notes(found), *_depth_notes(found)),
+        notes=(*subsets, *labels, *_depth_notes(found)),
+        is_part=is_part,
     )
 
 
-def _with_subset(scene: SceneId, train_maps: frozenset[str] | set[str]) -> SceneId:
-    if scene.split == "train" or scene.subset is not None:
-        return scene
-    return replace(scene, subset="seen_map" if scene.map_name in train_maps else "unseen_map")
-
-
-def _subset_notes(scenes: list[Scene]) -> list[str]:
-    unnamed = [s.id.key.split("/")[1] for s in scenes if s.id.split == "eval" and not s.id.subset]
-    return [
-        f"eval/{folder} names no subset; a scene there counts as seen_map if its map occurs in "
-        f"train, of this tree or of the release, else as unseen_map"
-        for folder in sorted(set(unnamed))
-    ]
-
-
 def _depth_notes(scenes: list[Scene]) -> list[str]:
-    """Tell of depth that loading refuses unless the user's contract accepts it."""
+    """Describe depth that loading refuses unless the user's `DepthEncoding` accepts it."""
     first: dict[tuple[str, str], str] = {}
     others: Counter[tuple[str, str]] = Counter()
     for scene in scenes:
@@ -358,13 +302,4 @@ def _depth_notes(scenes: list[Scene]) -> list[str]:
     return [
         f"{note} ({counted(others[kind], 'other video')} likewise.)" if others[kind] else note
         for kind, note in first.items()
-    ]
-
-
-def _label_notes(scenes: list[Scene]) -> list[str]:
-    return [
-        f"{scene.id.key}: its files call the map {scene.labels.map_name!r}; the folder's name is "
-        f"used"
-        for scene in scenes
-        if scene.labels.map_name not in (None, scene.id.map_name)
     ]

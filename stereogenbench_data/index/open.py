@@ -1,17 +1,17 @@
 """Opening an index: from a place, whatever it is, to a checked table of scenes.
 
-    a file ─────────────────────┬─ read ── where its data are ── digest ── what is new there
+    a file ─────────────────────┬─ read ── root of its data ── digest ── is it stale?
     a folder with an index file ┘
-    a URL ──────── fetched ─────── read ──────────────────────── digest
+    a URL ──────── fetched ─────── read ────────────────────── digest
     a folder or URL without one ── its scenes are described
 
-An index file may come from a stranger. What it names is opened only where that can do no harm; for
-any other place the user names the root.
+An index file may come from a stranger. A place that it names is opened only if that is harmless;
+any other root is for the user to name.
 """
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -29,6 +29,7 @@ from stereogenbench_data.index.parquet import (
 )
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
 from stereogenbench_data.index.tree import find_remote_scenes
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.filesystems import MissingObject
 from stereogenbench_data.sources.location import (
     is_remote,
@@ -52,87 +53,75 @@ _SHOWN: Final = 10
 
 
 class IncompleteSceneWarning(UserWarning):
-    """Some scenes of the data cannot be used: the message names them and says why."""
+    """Some scenes of the data cannot be used; the message names them and the reasons."""
 
 
-@dataclass(frozen=True, slots=True)
-class OpenedTable:
-    """An index as it was opened.
-
-    Attributes:
-        table: One row a scene, checked; its columns are `rows.SCHEMA`.
-        head: What is known beside the rows; its root is where the data are.
-        stale: What the root holds that the index does not know, or lacks of it, and the cure.
-    """
-
-    table: pa.Table
-    head: IndexHead
-    stale: str = ""
+Opened = tuple[pa.Table, IndexHead, str]
+"""A checked table with one row per scene; what is known besides, with the root where the data are;
+and how the root differs from the index, with the cure, "" if it does not."""
 
 
-def open_table(
-    data: str | Path, *, root: str | Path | None, retry: RetryPolicy | None
-) -> OpenedTable:
+def open_table(data: str | Path, *, root: str | Path | None, retry: RetryPolicy | None) -> Opened:
     """Return the scenes of some data; `SceneIndex.open` describes the arguments and the errors.
 
-    Warns of scenes that cannot be used, and of an index that is older than its data, in the name
-    of the caller's caller.
+    Warnings name scenes that cannot be used, and an index that is older than its data; they point
+    at the caller's caller.
     """
     named_root = None if root is None else _require_root(root)
     if is_remote(data):
         where = shown(data)
-        opened = _open_url(str(data), root=named_root, retry=retry)
+        table, head, stale = _open_url(str(data), root=named_root, retry=retry)
     else:
         path = local_path(data)
         where = str(path)
         if path.is_dir() and not (path / INDEX_NAME).is_file():
             _require_no_root(path, named_root)
-            opened = _open_tree(path)
+            table, head, stale = _open_tree(path)
         elif path.is_dir() or path.is_file():
-            opened = open_file(path / INDEX_NAME if path.is_dir() else path, root=named_root)
+            file = path / INDEX_NAME if path.is_dir() else path
+            table, head, stale = _open_file(file, root=named_root)
         else:
             raise StorageError(
                 f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or "
                 f"a folder in the released layout."
             )
-    left_out = {**opened.head.incomplete, **opened.head.broken}
-    if left_out:
+    if left_out := head.incomplete | head.broken:
         warnings.warn(f"{where}: {_listed(left_out)}", IncompleteSceneWarning, stacklevel=3)
-    if opened.stale:
-        warnings.warn(opened.stale, StaleIndexWarning, stacklevel=3)
-    return opened
+    if stale:
+        warnings.warn(stale, StaleIndexWarning, stacklevel=3)
+    return table, head, stale
 
 
-def open_file(path: Path, *, root: str | None) -> OpenedTable:
-    """Return the index in a file, whose data are where the user or, within limits, the file says.
+def _open_file(path: Path, *, root: str | None) -> Opened:
+    """Return the index in a file. The user or, within limits, the file names its data's root.
 
     Raises:
-        StorageError: If it is damaged or not an index of this version, or its data are where only
-            the user may send us.
+        StorageError: If it is damaged or not an index of this version, or only the user may name
+            the place of its data.
     """
     table, head = read_index_file(path, where=str(path))
     head = replace(head, root=_recorded_root(path, head, table) if root is None else root)
     _require_digest(table, head, where=str(path))
     if is_remote(head.root):
-        return OpenedTable(table, head)
-    return OpenedTable(table, head, stale_message(table, head, index_file=path))
+        return table, head, ""
+    return table, head, stale_message(table, head, index_file=path)
 
 
 def warn_if_stale(root: str | Path) -> None:
-    """Warn if a folder has an index that does not know what was just written into it."""
+    """Warn if a folder has an index that lacks what was just written into it."""
     path = local_path(root) / INDEX_NAME
     if not path.is_file():
         return
     try:
-        stale = open_file(path, root=None).stale
+        _, _, stale = _open_file(path, root=None)
     except StorageError:
-        return  # an index that cannot be read raises an error when it is opened
+        return  # opening an index that cannot be read raises the error
     if stale:
         warnings.warn(stale, StaleIndexWarning, stacklevel=3)
 
 
-def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> OpenedTable:
-    """Fetch an index. Its data lie beside it unless the user names their root."""
+def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opened:
+    """Fetch an index. Its data are beside it, unless the user names another root."""
     beside, name = split_name(url)
     is_folder = not name.endswith(".parquet")
     if is_folder:
@@ -144,21 +133,27 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
         if not is_folder:
             raise
         _require_no_root(shown(beside), root)
-        _require_few_scenes(beside)
+        count = len(find_remote_scenes(beside).keys)
+        if count > MOST_REMOTE_SCENES:
+            raise StorageError(
+                f"{shown(beside)}: has no {INDEX_NAME}, and {count} scenes are too many to fetch "
+                f"their headers each time. Index it once, or the part you need: `stereogenbench "
+                f"index {shown(beside)} -o index.parquet --split eval`, and open that file."
+            ) from None
         return _open_tree(beside)
     if size > MAX_INDEX_BYTES:
         raise StorageError(
             f"{remote.where}: an index may have {MAX_INDEX_BYTES:,} bytes, this one has "
-            f"{size:,}. It was not read: is it another file?"
+            f"{size:,}. It was not read: pass the index."
         )
     content = pa.BufferReader(remote.read(0, size))
     table, head = read_index_file(content, where=remote.where)
     head = replace(head, root=root or beside)
     _require_digest(table, head, where=remote.where)
-    return OpenedTable(table, head)
+    return table, head, ""
 
 
-def _open_tree(root: str | Path) -> OpenedTable:
+def _open_tree(root: str | Path) -> Opened:
     """Describe the scenes of a folder or URL in the released layout."""
     # In this process: a script without `if __name__ == "__main__"` could start no others.
     report, where = walk(root, workers=1), shown(root)
@@ -170,25 +165,13 @@ def _open_tree(root: str | Path) -> OpenedTable:
     if not report.scenes:
         raise StorageError(f"{where}: no scene is finished: {_listed(report.incomplete)}")
     head = IndexHead(root=report.root, incomplete=report.incomplete, is_part=report.is_part)
-    return OpenedTable(table_of_scenes(report.scenes, where=where), head)
-
-
-def _require_few_scenes(root: str) -> None:
-    """Refuse a tree behind a URL that is too large to be described each time it is opened."""
-    found = find_remote_scenes(root)
-    if len(found.keys) > MOST_REMOTE_SCENES:
-        raise StorageError(
-            f"{shown(root)}: has no {INDEX_NAME}, and the headers of {len(found.keys)} scenes "
-            "are too many to be fetched each time. Index it once, or the part you need: "
-            f"`stereogenbench index {shown(root)} -o index.parquet --split eval`, and open "
-            "that file."
-        )
+    return table_of_scenes(report.scenes, where=where), head, ""
 
 
 def _require_digest(table: pa.Table, head: IndexHead, *, where: str) -> None:
     if table_digest(table) != head.digest:
         raise StorageError(
-            f"{where}: its rows are not those that were written. {made_again(where)}"
+            f"{where}: its rows were changed after they were written. {made_again(where)}"
         )
 
 
@@ -199,8 +182,8 @@ def _require_root(root: str | Path) -> str:
     folder = local_path(root)
     if not str(root) or not folder.is_dir():
         raise StorageError(
-            f"{str(root)!r}: is no folder, and was named as the root of an index's data. Name the "
-            f"folder, or the URL, to which the paths in the index are relative."
+            f"{str(root)!r}: not a folder, and was named as the root of an index's data. Name the "
+            f"folder or URL to which the paths in the index are relative."
         )
     return str(folder)
 
@@ -216,14 +199,16 @@ def _require_no_root(where: str | Path, root: str | None) -> None:
 def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
     """Return the data's root: the index's own folder if the data are there, else the recorded one.
 
-    A recorded root is opened only below the index's own folder, or at a URL that
-    `why_not_from_a_file` allows.
+    A recorded root must be below the index's own folder, or a URL that `why_not_from_a_file`
+    allows.
 
     Raises:
         StorageError: If the user must name the root, or it is not a folder.
     """
     beside, recorded = path.parent, head.root
-    if recorded == "." or not table.num_rows or _are_beside(table, beside):
+    if recorded == "." or not table.num_rows:
+        return str(beside)
+    if any((beside / file["path"]).exists() for file in table.column("members")[0].as_py()):
         return str(beside)
     if is_remote(recorded):
         reason = why_not_from_a_file(recorded)
@@ -235,20 +220,14 @@ def _recorded_root(path: Path, head: IndexHead, table: pa.Table) -> str:
         raise _must_be_named(path, recorded, "it is outside the index's own folder")
     if not folder.is_dir():
         raise StorageError(
-            f"{path}: its data were at {folder}, which is no folder now. Move the index into "
+            f"{path}: its data were at {folder}, which is not a folder now. Move the index into "
             f"the data's root, or run `stereogenbench index` again."
         )
     return str(folder)
 
 
-def _are_beside(table: pa.Table, folder: Path) -> bool:
-    """Return whether a file of the first scene lies below a folder."""
-    members = table.column("members")[0].as_py()
-    return any((folder / member["path"]).exists() for member in members)
-
-
 def _recorded_folder(recorded: str, beside: Path) -> Path | None:
-    """Return the folder that a recorded path means, links followed; None if there is none."""
+    """Return the folder of a recorded path, with links resolved; None if the path is invalid."""
     try:
         folder = local_path(recorded) if recorded[:5].lower() == "file:" else Path(recorded)
         return (beside / folder).resolve()
@@ -274,5 +253,4 @@ def _listed(left_out: Mapping[str, str]) -> str:
     ]
     if len(lines) > _SHOWN:
         lines[_SHOWN:] = [f"and {len(lines) - _SHOWN} more"]
-    count = f"{len(left_out)} scene{'s' if len(left_out) > 1 else ''} cannot be used:"
-    return "\n  ".join([count, *lines])
+    return "\n  ".join([f"{counted(len(left_out), 'scene')} cannot be used:", *lines])

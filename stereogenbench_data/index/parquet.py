@@ -1,7 +1,7 @@
-"""The index file: Parquet rows with a description of themselves, checked before they are believed.
+"""The index file: Parquet rows with a description of themselves, all checked before use.
 
-It is read from untrusted places: rows that are not the index's columns, or whose paths would lead
-out of the data's root, are refused.
+The file may come from a stranger: other columns, and paths that lead out of the data's root, are
+refused.
 """
 
 import itertools
@@ -20,8 +20,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from stereogenbench_data.errors import StorageError, cure_of, describe_os_error
-from stereogenbench_data.index.arrow import as_numpy
+from stereogenbench_data.errors import StorageError, cure_of, describe_os_error, explain_os_errors
+from stereogenbench_data.index.arrow import as_numpy, one_array
 from stereogenbench_data.index.rows import ADDED, SCHEMA, row_of
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -31,30 +31,17 @@ from stereogenbench_data.sources.members import UNSAFE_PATH
 
 INDEX_NAME: Final = "index.parquet"
 
-_OF_RELEASE: Final = "Run `stereogenbench index ROOT` again."
-_OF_SHARDS: Final = (
-    "It is the index of shards: fetch it again or, where they were packed, run the same "
-    "`stereogenbench pack` again, which keeps finished shards."
-)
-
 _FORMAT: Final = 1
 _LARGEST: Final = 2**63
-_UNSAFE: Final = re.compile(UNSAFE_PATH)
 _METADATA_KEY: Final = b"stereogenbench_data.index"
 
 
 @dataclass(frozen=True, slots=True)
 class IndexHead:
-    """What an index file says beside its rows.
+    """What an index file says besides its rows; `SceneIndex` says what the attributes mean.
 
     Attributes:
-        root: The folder or URL to which the members' paths are relative.
-        digest: The sha256 of the rows, 64 hex digits; empty where it is not known yet.
-        incomplete: Key to reason, for scenes that were not finished when the index was made.
-        broken: Key to what is wrong, for scenes that were left out for it.
-        shards: What is known of each shard, by its path below the root; empty for folders.
-        is_part: Whether it was made of a part of the root on purpose.
-        passed_over: Keys of scenes that the root holds and the index leaves out on purpose.
+        digest: The sha256 of the rows, 64 hex digits; empty if it is not known yet.
     """
 
     root: str
@@ -67,18 +54,23 @@ class IndexHead:
 
 
 def made_again(where: str) -> str:
-    """Return what to do about an index, found there, that cannot be used."""
+    """Return what to do about an index file that cannot be used."""
     if is_remote(where):
         return "Fetch it again; if it is damaged there, too, tell who published it."
     shards = local_path(where).parent.glob("*.tar")
-    return _OF_RELEASE if next(shards, None) is None else _OF_SHARDS
+    if next(shards, None) is None:
+        return "Run `stereogenbench index ROOT` again."
+    return (
+        "It is the index of shards: fetch it again or, where they were packed, run the same "
+        "`stereogenbench pack` again, which keeps finished shards."
+    )
 
 
 def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Table, IndexHead]:
-    """Return the rows of an index file, in one chunk, and its head as it stands there.
+    """Return the rows of an index file, in one chunk, and its head as it is stored.
 
     Raises:
-        StorageError: If it is no index of this version, or was altered.
+        StorageError: If it is not an index of this version, or was altered.
     """
     try:
         with pq.ParquetFile(file) as parquet:
@@ -90,12 +82,11 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
         raise
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         if isinstance(error, OSError) and error.errno and cure_of(error):
-            raise StorageError(
-                f"{where}: cannot be read ({os.strerror(error.errno)}). {cure_of(error)}"
-            ) from error
+            error = OSError(error.errno, os.strerror(error.errno))  # Arrow's text is long
+            raise StorageError(describe_os_error(f"{where}: cannot be read", error)) from error
         raise StorageError(
-            f"{where}: is no Parquet file that can be read ({error}). It was cut short or is "
-            f"something else. {made_again(where)}"
+            f"{where}: not a readable Parquet file ({error}). It was cut short or is something "
+            f"else. {made_again(where)}"
         ) from error
     require_sound(table, where=where)
     return table, head
@@ -127,23 +118,18 @@ def write_index_file(path: Path, table: pa.Table, head: IndexHead) -> None:
         "shards": {name: asdict(facts) for name, facts in sorted(head.shards.items())},
     }
     described = table.replace_schema_metadata({_METADATA_KEY: json.dumps(description)})
-    try:
+    what = f"{path}: the index cannot be written"
+    with explain_os_errors(what, "Choose another place with --out."):
         path.parent.mkdir(parents=True, exist_ok=True)
         with open_atomic(path) as file:
             pq.write_table(described, file, compression="zstd")
-    except OSError as error:
-        raise StorageError(
-            describe_os_error(
-                f"{path}: the index cannot be written", error, "Choose another place with --out."
-            )
-        ) from error
 
 
 def recorded_root(root: str, *, beside: Path) -> str:
     """Return the root as an index file in a folder records it: "." for that folder.
 
     Raises:
-        StorageError: If it is a URL with a login or a query, which may be secret.
+        StorageError: If it is a URL with a login or a query, which may be secrets.
     """
     if not is_remote(root):
         whole = local_path(root).resolve()
@@ -151,7 +137,7 @@ def recorded_root(root: str, *, beside: Path) -> str:
     if shown(root) != root:
         raise StorageError(
             f"{shown(root)}: the URL has a login or a query, which an index file does not keep: "
-            f"copy the index that lies beside the data."
+            f"copy the index that is beside the data."
         )
     return root
 
@@ -160,7 +146,7 @@ def table_of_scenes(scenes: Iterable[Scene], *, where: str) -> pa.Table:
     """Return a checked table of scenes, one row each, sorted by key.
 
     Raises:
-        StorageError: If two scenes have one key, or a path leaves the root.
+        StorageError: If two scenes have the same key, or a path leads out of the root.
     """
     rows = sorted((row_of(scene) for scene in scenes), key=lambda row: str(row["key"]))
     try:
@@ -172,14 +158,14 @@ def table_of_scenes(scenes: Iterable[Scene], *, where: str) -> pa.Table:
 
 
 def _parse_head(metadata: bytes | None, *, where: str) -> IndexHead:
-    """Return what an index file says beside its rows, if it is one of this version."""
+    """Return what an index file says besides its rows, if it is of this version."""
     try:
         head = json.loads(metadata or b"null")
     except (ValueError, RecursionError):
         head = None
     if not isinstance(head, dict):
         raise StorageError(
-            f"{where}: is a Parquet file, but no index of this package. Pass another file, or "
+            f"{where}: a Parquet file, but not an index of this package. Pass another file, or "
             f"make one with `stereogenbench index ROOT`."
         )
     if head.get("format") != _FORMAT:
@@ -193,7 +179,7 @@ def _parse_head(metadata: bytes | None, *, where: str) -> IndexHead:
         or not isinstance(head.get("shards"), dict)
         or not isinstance(head.get("root"), str)
         or not all(map(_are_shard_facts, head["shards"].values()))
-        or any(map(_UNSAFE.search, head["shards"]))
+        or any(re.search(UNSAFE_PATH, path) for path in head["shards"])
         or not isinstance(head.get("passed_over", []), list)
     ):
         raise StorageError(f"{where}: its description of itself was altered. {made_again(where)}")
@@ -224,7 +210,7 @@ def _are_shard_facts(value: Any) -> bool:
 
 
 def require_sound(table: pa.Table, *, where: str) -> None:
-    """Refuse a table that is no index, or whose rows could lead out of the root."""
+    """Refuse a table that is not an index, or whose paths could lead out of the root."""
     if not table.schema.equals(SCHEMA):
         odd = [
             field.name
@@ -240,7 +226,7 @@ def require_sound(table: pa.Table, *, where: str) -> None:
     for key, following in itertools.pairwise(keys):
         if key >= following:
             raise StorageError(
-                f"{where}: scene {following!r} is there twice or out of order. {made_again(where)}"
+                f"{where}: scene {following!r} is listed twice or out of order. {made_again(where)}"
             )
     members = pc.list_flatten(table.column("members"))
     for paths, unfit in (
@@ -251,7 +237,7 @@ def require_sound(table: pa.Table, *, where: str) -> None:
         unsafe = paths.filter(pc.match_substring_regex(paths, unfit))
         if len(unsafe):
             raise StorageError(
-                f"{where}: {unsafe[0].as_py()!r} is no path inside the data's root. The index "
+                f"{where}: {unsafe[0].as_py()!r} is not a path inside the data's root. The index "
                 f"was altered. {made_again(where)}"
             )
     _require_texts(table, where=where)
@@ -269,38 +255,34 @@ def _require_texts(table: pa.Table, *, where: str) -> None:
         texts = table.column(name)
         odd = texts.filter(pc.match_substring_regex(texts, r"^$|[/\\\x00-\x1f]"))
         if len(odd):
-            raise _odd(where, name, odd[0].as_py(), "no name of a folder")
+            raise _odd(where, name, odd[0].as_py(), "not a folder's name")
 
 
 def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
     # In numpy: compared with a number, Arrow would import pandas.
     columns = {name: table.column(name) for name in _BOUNDS}
     columns |= {name: pc.struct_field(members, name) for name in ("offset", "size")}
-    numbers = {
-        name: as_numpy(column.combine_chunks().drop_null()) for name, column in columns.items()
-    }
-    units = as_numpy(table.column("depth_unit_m").combine_chunks())
-    sources = as_numpy(table.column("depth_unit_source").combine_chunks())
-    numbers["depth_unit_m"] = units[sources != "unreadable"]
+    numbers = {name: as_numpy(column.drop_null()) for name, column in columns.items()}
+    sources = as_numpy(table.column("depth_unit_source"))
+    numbers["depth_unit_m"] = as_numpy(table.column("depth_unit_m"))[sources != "unreadable"]
     for name, (least, most) in (_BOUNDS | _MEMBER_BOUNDS).items():
         flat = numbers[name].ravel()
         odd = flat[~((flat >= least) & (flat <= most))]
         if len(odd):
             raise _odd(where, name, odd[0].item(), f"not {least:g} to {most:g}")
     if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
-        raise StorageError(f"{where}: a primary pair has one camera twice. {made_again(where)}")
+        raise StorageError(f"{where}: a primary pair has a camera twice. {made_again(where)}")
     _require_key_frames(table, where=where)
     halves = [pc.is_null(table.column(f"principal_{axis}_px")) for axis in "xy"]
     if pc.any(pc.not_equal(*halves)).as_py():
-        raise StorageError(f"{where}: a principal point has one number. {made_again(where)}")
+        raise StorageError(f"{where}: a principal point has one number only. {made_again(where)}")
 
 
 def _require_key_frames(table: pa.Table, *, where: str) -> None:
-    lists = table.column("key_frames").combine_chunks()
-    lists = lists.chunk(0) if isinstance(lists, pa.ChunkedArray) else lists
+    lists = one_array(table.column("key_frames"))
     flat = as_numpy(lists.flatten()).astype(np.int64)
     scenes = as_numpy(pc.list_parent_indices(lists))
-    frames = as_numpy(table.column("frames").combine_chunks())
+    frames = as_numpy(table.column("frames"))
     is_first = np.diff(scenes, prepend=-1) != 0
     fits = np.where(is_first, flat == 0, flat > np.roll(flat, 1)) & (flat < frames[scenes])
     is_empty = (as_numpy(pc.fill_null(pc.list_value_length(lists), 1)) == 0).any()
@@ -342,5 +324,5 @@ _BOUNDS: Final = {
     "principal_y_px": _FINITE,
     "valid_depth_ratio": (0, 1),
 }
-"""The least and the greatest number of a column; nan is not between, what is unknown is null."""
+"""The least and the greatest number of a column. Nan is refused; unknown values are null."""
 _MEMBER_BOUNDS: Final = {"offset": _OF_BYTES, "size": _OF_BYTES, "depth_unit_m": _ABOVE}

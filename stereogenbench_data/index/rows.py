@@ -1,7 +1,6 @@
-"""A scene as one row of the index: the columns, and the way there and back.
+"""A scene as one row of the index: the table of columns, and the conversion both ways.
 
-Every column is named after the record's field that it holds; `Scene` and its parts say what they
-mean. A column of several numbers a scene is a list of fixed length.
+`Scene` and its parts say what the values mean.
 """
 
 from collections.abc import Mapping
@@ -24,145 +23,116 @@ _MEMBER: Final = pa.struct(
 )
 
 
-def _numbers(count: int) -> pa.DataType:
-    return pa.list_(pa.field("item", pa.float64(), nullable=False), count)
+def _list(kind: pa.DataType, count: int = -1) -> pa.DataType:
+    return pa.list_(pa.field("item", kind, nullable=False), count)
 
 
-def _texts(count: int) -> pa.DataType:
-    return pa.list_(pa.field("item", pa.string(), nullable=False), count)
+_TEXT: Final = pa.string()
+_INTEGER: Final = pa.int64()
+_NUMBER: Final = pa.float64()
+_TEXTS: Final = _list(_TEXT, CAMERA_COUNT)
+_NUMBERS: Final = _list(_NUMBER, CAMERA_COUNT)
 
-
-_REQUIRED: Final = {
-    "key": pa.string(),
-    "split": pa.string(),
-    "family": pa.string(),
-    "map_name": pa.string(),
-    "caption": pa.string(),
-    "focal_mm": pa.float64(),
-    "sensor_width_mm": pa.float64(),
-    "sensor_height_mm": pa.float64(),
-    "image_width_px": pa.int64(),
-    "image_height_px": pa.int64(),
-    "image_size_source": pa.string(),
-    "baselines_cm": _numbers(len(CAMERA_PAIRS)),
-    "primary_left": pa.int64(),
-    "primary_right": pa.int64(),
-    "frames": pa.int64(),
-    "frame_rate_hz": pa.float64(),
-    "lateral_m": _numbers(CAMERA_COUNT),
-    "rig_residual_px": pa.float64(),
-    "depth_unit_m": _numbers(CAMERA_COUNT),
-    "depth_unit_source": _texts(CAMERA_COUNT),
-    "depth_codec": _texts(CAMERA_COUNT),
-    "depth_pixel_format": _texts(CAMERA_COUNT),
-    "members": pa.list_(pa.field("item", _MEMBER, nullable=False)),
+_REQUIRED: Final = False
+_NULLABLE: Final = True
+_COLUMNS: Final[dict[str, tuple[pa.DataType, bool, tuple[str | int, ...]]]] = {
+    "key": (_TEXT, _REQUIRED, ("id", "key")),
+    "split": (_TEXT, _REQUIRED, ("id", "split")),
+    "subset": (_TEXT, _NULLABLE, ("id", "subset")),
+    "family": (_TEXT, _REQUIRED, ("id", "family")),
+    "map_name": (_TEXT, _REQUIRED, ("id", "map_name")),
+    "scene_label": (_TEXT, _NULLABLE, ("labels", "scene_label")),
+    "scene_index": (_INTEGER, _NULLABLE, ("labels", "scene_index")),
+    "label_map_name": (_TEXT, _NULLABLE, ("labels", "map_name")),
+    "map_path": (_TEXT, _NULLABLE, ("labels", "map_path")),
+    "character": (_TEXT, _NULLABLE, ("labels", "character")),
+    "animation": (_TEXT, _NULLABLE, ("labels", "animation")),
+    "aperture_fstop": (_NUMBER, _NULLABLE, ("labels", "aperture_fstop")),
+    "caption": (_TEXT, _REQUIRED, ("caption",)),
+    "focal_mm": (_NUMBER, _REQUIRED, ("rig", "focal_mm")),
+    "sensor_width_mm": (_NUMBER, _REQUIRED, ("rig", "sensor_width_mm")),
+    "sensor_height_mm": (_NUMBER, _REQUIRED, ("rig", "sensor_height_mm")),
+    "image_width_px": (_INTEGER, _REQUIRED, ("rig", "image_width_px")),
+    "image_height_px": (_INTEGER, _REQUIRED, ("rig", "image_height_px")),
+    "image_size_source": (_TEXT, _REQUIRED, ("rig", "image_size_source")),
+    "principal_x_px": (_NUMBER, _NULLABLE, ("rig", "principal_point_px", 0)),
+    "principal_y_px": (_NUMBER, _NULLABLE, ("rig", "principal_point_px", 1)),
+    "baselines_cm": (_list(_NUMBER, len(CAMERA_PAIRS)), _REQUIRED, ("rig", "baselines_cm")),
+    "primary_left": (_INTEGER, _REQUIRED, ("rig", "primary_pair", 0)),
+    "primary_right": (_INTEGER, _REQUIRED, ("rig", "primary_pair", 1)),
+    "frames": (_INTEGER, _REQUIRED, ("frames",)),
+    "frame_rate_hz": (_NUMBER, _REQUIRED, ("frame_rate_hz",)),
+    "lateral_m": (_NUMBERS, _REQUIRED, ("lateral_m",)),
+    "rig_residual_px": (_NUMBER, _REQUIRED, ("rig_residual_px",)),
+    "depth_unit_m": (_NUMBERS, _REQUIRED, ("depth_unit_m",)),
+    "depth_unit_source": (_TEXTS, _REQUIRED, ("depth_unit_source",)),
+    "depth_codec": (_TEXTS, _REQUIRED, ("depth_codec",)),
+    "depth_pixel_format": (_TEXTS, _REQUIRED, ("depth_pixel_format",)),
+    "valid_depth_ratio": (_NUMBER, _NULLABLE, ("valid_depth_ratio",)),
+    "key_frames": (_list(pa.int32()), _NULLABLE, ("key_frames",)),
+    "members": (_list(_MEMBER), _REQUIRED, ("members",)),
 }
-_OPTIONAL: Final = {
-    "subset": pa.string(),
-    "scene_label": pa.string(),
-    "scene_index": pa.int64(),
-    "label_map_name": pa.string(),
-    "map_path": pa.string(),
-    "character": pa.string(),
-    "animation": pa.string(),
-    "aperture_fstop": pa.float64(),
-    "principal_x_px": pa.float64(),
-    "principal_y_px": pa.float64(),
-    "valid_depth_ratio": pa.float64(),
-    "key_frames": pa.list_(pa.field("item", pa.int32(), nullable=False)),
-}
+"""Name of a column to its type, whether it may be null, and where `Scene` holds its value."""
+
 ADDED: Final = ("key_frames",)
 """Columns that indexes of earlier versions lack: null means what these knew."""
+
 SCHEMA: Final = pa.schema(
-    [pa.field(name, kind, nullable=False) for name, kind in _REQUIRED.items()]
-    + [pa.field(name, kind) for name, kind in _OPTIONAL.items()]
+    pa.field(name, kind, nullable=nullable)
+    for wanted in (_REQUIRED, _NULLABLE)
+    for name, (kind, nullable, _) in _COLUMNS.items()
+    if nullable == wanted
 )
-"""The columns of an index. Those at the end may be null."""
+"""The columns of an index; those at the end may be null."""
 
 
 def row_of(scene: Scene) -> dict[str, Any]:
     """Return a scene as plain values, one for each column."""
-    rig, labels = scene.rig, scene.labels
-    point = rig.principal_point_px or (None, None)
-    return {
-        "key": scene.id.key,
-        "split": scene.id.split,
-        "subset": scene.id.subset,
-        "family": scene.id.family,
-        "map_name": scene.id.map_name,
-        "scene_label": labels.scene_label,
-        "scene_index": labels.scene_index,
-        "label_map_name": labels.map_name,
-        "map_path": labels.map_path,
-        "character": labels.character,
-        "animation": labels.animation,
-        "aperture_fstop": labels.aperture_fstop,
-        "caption": scene.caption,
-        "focal_mm": rig.focal_mm,
-        "sensor_width_mm": rig.sensor_width_mm,
-        "sensor_height_mm": rig.sensor_height_mm,
-        "image_width_px": rig.image_width_px,
-        "image_height_px": rig.image_height_px,
-        "image_size_source": rig.image_size_source,
-        "principal_x_px": point[0],
-        "principal_y_px": point[1],
-        "baselines_cm": list(rig.baselines_cm),
-        "primary_left": rig.primary_pair[0],
-        "primary_right": rig.primary_pair[1],
-        "frames": scene.frames,
-        "frame_rate_hz": scene.frame_rate_hz,
-        "lateral_m": list(scene.lateral_m),
-        "rig_residual_px": scene.rig_residual_px,
-        "depth_unit_m": list(scene.depth_unit_m),
-        "depth_unit_source": list(scene.depth_unit_source),
-        "depth_codec": list(scene.depth_codec),
-        "depth_pixel_format": list(scene.depth_pixel_format),
-        "valid_depth_ratio": scene.valid_depth_ratio,
-        "key_frames": None if scene.key_frames == (0,) else list(scene.key_frames),
-        "members": [
-            {"name": name, **asdict(member)} for name, member in sorted(scene.members.items())
-        ],
-    }
+    row: dict[str, Any] = {}
+    for name, (_, _, place) in _COLUMNS.items():
+        value: Any = scene
+        for part in place:
+            if isinstance(part, str):
+                value = getattr(value, part)
+            elif value is not None:
+                value = value[part]
+        row[name] = list(value) if isinstance(value, tuple) else value
+    if scene.key_frames == (0,):
+        row["key_frames"] = None
+    row["members"] = [
+        {"name": name, **asdict(member)} for name, member in sorted(scene.members.items())
+    ]
+    return row
+
+
+_FIELDS: Final[dict[tuple[str, ...], dict[str, str]]] = {
+    owner: {str(place[-1]): name for name, (_, _, place) in _COLUMNS.items() if place[:-1] == owner}
+    for owner in [(), ("id",), ("labels",), ("rig",)]
+}
+"""A part of `Scene` to its fields and their columns."""
 
 
 def scene_of(row: Mapping[str, Any]) -> Scene:
-    """Return the scene that a row's plain values mean."""
+    """Return the scene of a row's plain values."""
+
+    def values(*owner: str) -> dict[str, Any]:
+        found = ((field, row[name]) for field, name in _FIELDS[owner].items())
+        return {field: tuple(value) if type(value) is list else value for field, value in found}
+
     x_px, y_px = row["principal_x_px"], row["principal_y_px"]
+    scene = values()
+    scene["key_frames"] = scene["key_frames"] or (0,)
+    scene["members"] = {
+        item["name"]: Member(item["path"], item["offset"], item["size"], item["crc32"])
+        for item in row["members"]
+    }
     return Scene(
-        id=SceneId(row["key"], row["split"], row["subset"], row["family"], row["map_name"]),
-        labels=SceneLabels(
-            scene_label=row["scene_label"],
-            scene_index=row["scene_index"],
-            map_name=row["label_map_name"],
-            map_path=row["map_path"],
-            character=row["character"],
-            animation=row["animation"],
-            aperture_fstop=row["aperture_fstop"],
-        ),
-        caption=row["caption"],
+        id=SceneId(**values("id")),
+        labels=SceneLabels(**values("labels")),
         rig=Rig(
-            focal_mm=row["focal_mm"],
-            sensor_width_mm=row["sensor_width_mm"],
-            sensor_height_mm=row["sensor_height_mm"],
-            image_width_px=row["image_width_px"],
-            image_height_px=row["image_height_px"],
             principal_point_px=None if x_px is None else (x_px, y_px),
-            baselines_cm=tuple(row["baselines_cm"]),
             primary_pair=(row["primary_left"], row["primary_right"]),
-            image_size_source=row["image_size_source"],
+            **values("rig"),
         ),
-        frames=row["frames"],
-        frame_rate_hz=row["frame_rate_hz"],
-        lateral_m=tuple(row["lateral_m"]),
-        rig_residual_px=row["rig_residual_px"],
-        depth_unit_m=tuple(row["depth_unit_m"]),
-        depth_unit_source=tuple(row["depth_unit_source"]),
-        depth_codec=tuple(row["depth_codec"]),
-        depth_pixel_format=tuple(row["depth_pixel_format"]),
-        valid_depth_ratio=row["valid_depth_ratio"],
-        key_frames=tuple(row["key_frames"] or (0,)),
-        members={
-            item["name"]: Member(item["path"], item["offset"], item["size"], item["crc32"])
-            for item in row["members"]
-        },
+        **scene,
     )

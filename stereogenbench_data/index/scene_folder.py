@@ -1,8 +1,8 @@
 """One scene's folder: whether it is finished, whole and consistent, and its row of the index.
 
-All that an index says of a scene comes from here: from its JSON files and the headers of its
-videos. No picture is decoded unless the share of measured depth is asked for. The same files are
-compared with a row that was made before by `metadata_differences`.
+Everything that an index says of a scene comes from its JSON files and the headers of its videos. No
+picture is decoded unless the share of measured depth is asked for. `metadata_differences` compares
+the same files with an existing row.
 """
 
 import hashlib
@@ -10,14 +10,14 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol, runtime_checkable
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.errors import MediaError, SchemaError, StorageError, describe_os_error
+from stereogenbench_data.errors import MediaError, SchemaError, StorageError, explain_os_errors
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import (
@@ -49,7 +49,6 @@ from stereogenbench_data.schema.records import (
     Rig,
     Scene,
     SceneLabels,
-    Trajectory,
 )
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
@@ -71,19 +70,22 @@ from stereogenbench_data.sources.members import read_text_file
 from stereogenbench_data.sources.ranged_file import MemberFile, RangedFile
 from stereogenbench_data.sources.remote import RemoteObject
 
+_T = TypeVar("_T")
+
 ValidDepth = Literal["skip", "sample"]
 
+_DESCRIPTIONS: Final = (DESCRIPTION_JSON, DESCRIPTION_TXT)
 _NEEDED: Final = (COMPLETE_JSON, BASELINE_JSON, TRAJECTORY_JSON, *VIDEO_FILES)
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
 _LEAST_BESIDE: Final = 0.9
-"""How much of a baseline must lie along camera 0's x axis: a rig turned by more than 25 degrees
-against the line on which its cameras stand is no lateral rig."""
+"""How much of a baseline must lie along camera 0's x axis; in a lateral rig the cameras turn by at
+most 25 degrees from the line on which they stand."""
 _FILES: Final = frozenset({*METADATA_FILES, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
-"""Files of a release; others in a scene's folder are passed over."""
+"""Files of a release; others in a scene's folder are ignored."""
 
 Difference = tuple[str, str]
-"""The file's name, empty for the scene's own path, and what it tells against the index."""
+"""The file's name, empty for the scene's own path, and how it contradicts the index."""
 
 _SAME_M: Final = 1e-6
 _SAME_PX: Final = 1e-3
@@ -91,20 +93,40 @@ _SHOWN_LETTERS: Final = 60
 
 
 class IncompleteScene(StorageError):
-    """A scene that is not finished, or of which only the metadata were fetched."""
+    """A scene that is not finished, or of which only metadata were fetched."""
 
 
-@runtime_checkable
-class SceneFolder(Protocol):
-    """A scene's folder, on this machine or behind a URL, as describing the scene reads it."""
+class SceneFolder:
+    """A scene's folder on this machine or behind a URL, which is fetched as it is read."""
+
+    def __init__(self, root: str | Path, key: str) -> None:
+        """Name the folder by the data's root and the scene's key; nothing is read yet."""
+        self._root = root
+        self._key = key
+        self._sizes: dict[str, int] = {}
 
     def stamps(self) -> dict[str, tuple[int, int]]:
-        """Return the size in bytes and the time of change in ns (0 if unknown) of each file.
+        """Return the size in bytes and the modification time in ns (0 if unknown) of each file.
 
         Raises:
             StorageError: If the folder cannot be read.
         """
-        ...
+        if is_remote(self._root):
+            if not self._sizes:
+                listed = RemoteObject(joined(str(self._root), self._key)).entries()
+                self._sizes = {
+                    name: size
+                    for name, size in sorted(listed.items())
+                    if name in _FILES and size is not None
+                }
+            return {name: (size, 0) for name, size in self._sizes.items()}
+        folder = Path(self._root, self._key)
+        with (
+            explain_os_errors(f"{folder}: cannot be read", "Fetch the scene again."),
+            os.scandir(folder) as entries,
+        ):
+            found = {entry.name: entry.stat() for entry in entries if entry.name in _FILES}
+        return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
 
     def read(self, name: str) -> bytes:
         """Return a metadata file, whole.
@@ -113,83 +135,29 @@ class SceneFolder(Protocol):
             StorageError: If it cannot be read.
             SchemaError: If it is too large for a metadata file.
         """
-        ...
+        where = f"{self._key}/{name}"
+        if not is_remote(self._root):
+            return read_text_file(Path(self._root, where), where=where)
+        size, _ = self.stamps()[name]
+        require_text_size(size, where=where)
+        return RemoteObject(joined(str(self._root), where)).read(0, size)
 
     def video(self, name: str) -> Path | MemberFile:
-        """Return a video: its path, or an open file that is the caller's to close.
+        """Return a video: its path, or an open file that the caller closes.
 
         Raises:
             StorageError: If it cannot be read.
         """
-        ...
-
-
-def open_scene_folder(root: str | Path, key: str) -> SceneFolder:
-    """Return the files of the scene with a key below a root, which may be a URL."""
-    return RemoteSceneFolder(str(root), key) if is_remote(root) else LocalSceneFolder(root, key)
-
-
-class LocalSceneFolder:
-    """A scene's folder on this machine."""
-
-    def __init__(self, root: str | Path, key: str) -> None:
-        """Name the folder."""
-        self._folder = Path(root, key)
-        self._key = key
-
-    def stamps(self) -> dict[str, tuple[int, int]]:
-        """Return size and time of change of each file."""
-        try:
-            with os.scandir(self._folder) as entries:
-                found = {entry.name: entry.stat() for entry in entries if entry.name in _FILES}
-        except OSError as error:
-            what = f"{self._folder}: cannot be read"
-            raise StorageError(describe_os_error(what, error, "Fetch the scene again.")) from error
-        return {name: (found[name].st_size, found[name].st_mtime_ns) for name in sorted(found)}
-
-    def read(self, name: str) -> bytes:
-        """Return a metadata file."""
-        return read_text_file(self._folder / name, where=f"{self._key}/{name}")
-
-    def video(self, name: str) -> Path:
-        """Return a video's path."""
-        return self._folder / name
-
-
-class RemoteSceneFolder:
-    """A scene's folder behind a URL, of which only what is asked for is fetched."""
-
-    def __init__(self, root: str, key: str) -> None:
-        """Name the folder; nothing is asked of it yet."""
-        self._url = joined(root, key)
-        self._key = key
-        self._sizes: dict[str, int] = {}
-
-    def stamps(self) -> dict[str, tuple[int, int]]:
-        """Return the size of each file; the time of change is not known."""
-        if not self._sizes:
-            entries = RemoteObject(self._url).entries()
-            self._sizes = {
-                name: size
-                for name, size in sorted(entries.items())
-                if name in _FILES and size is not None
-            }
-        return {name: (size, 0) for name, size in self._sizes.items()}
-
-    def read(self, name: str) -> bytes:
-        """Fetch a metadata file."""
+        if not is_remote(self._root):
+            return Path(self._root, self._key, name)
         size, _ = self.stamps()[name]
-        require_text_size(size, where=f"{self._key}/{name}")
-        return RemoteObject(joined(self._url, name)).read(0, size)
-
-    def video(self, name: str) -> MemberFile:
-        """Return a video that is fetched as it is read."""
-        size, _ = self.stamps()[name]
-        return RangedFile(RemoteObject(joined(self._url, name)).read, size=size)
+        return RangedFile(
+            RemoteObject(joined(str(self._root), f"{self._key}/{name}")).read, size=size
+        )
 
 
 def stamp_of(files: Mapping[str, tuple[int, int]]) -> str:
-    """Return a short text that changes when one of a scene's files does."""
+    """Return a digest of a scene's files that changes when one of them does."""
     return hashlib.sha256(repr(sorted(files.items())).encode()).hexdigest()[:32]
 
 
@@ -199,8 +167,8 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     Args:
         root: The folder that holds ``train`` and ``eval``, or its URL.
         key: The scene's path below it.
-        valid_depth: "sample" decodes the first, the middle and the last depth picture of each
-            camera, to tell the share of pixels that have a depth.
+        valid_depth: "sample" decodes the first, middle and last depth picture of each camera, for
+            the share of pixels that have a depth.
 
     Raises:
         IncompleteScene: If the scene is not marked as complete or has no video at all.
@@ -208,19 +176,19 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         SchemaError: If a metadata file does not follow the format.
         MediaError: If a video is not what its header says.
     """
-    folder = open_scene_folder(root, key)
+    folder = SceneFolder(root, key)
     files = folder.stamps()
     _require_finished(key, files)
     rig, labels = parse_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
     marked = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
     trajectory = parse_trajectory(folder.read(TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}")
-    described: dict[str, bytes] = {
-        name: folder.read(name) for name in (DESCRIPTION_JSON, DESCRIPTION_TXT) if name in files
-    }
-    caption = caption_of(described, key=key)
+    texts: dict[str, bytes] = {name: folder.read(name) for name in _DESCRIPTIONS if name in files}
+    caption = _caption(texts, key=key)
     depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
     facts = {name: _probed(folder, key, _held(files, name)) for name in VIDEO_FILES}
-    frames = _common_frames(key, facts, trajectory)
+    counts = {name: fact.frames for name, fact in facts.items()}
+    counts[TRAJECTORY_JSON] = trajectory.frame_count
+    frames = _common(key, counts, what="number of frames", unit="frames")
     rig = _sized_as_videos(key, rig, facts)
     _require_kinds(key, rig, facts)
     poses = CameraPoses.from_trajectory(trajectory)
@@ -232,7 +200,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
     return Scene(
         id=parse_scene_key(key),
-        labels=merged_labels(labels, marked),
+        labels=_merged_labels(labels, marked),
         caption=caption,
         rig=rig,
         frames=frames,
@@ -250,7 +218,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
 
 
 def _held(files: Mapping[str, object], name: str) -> str:
-    """Return by what name a folder has one of the release's files: depth may be packed."""
+    """Return the name under which a folder holds a released file: depth may be packed."""
     return name if name in files else PACKED_DEPTH_NAMES.get(name, name)
 
 
@@ -282,16 +250,8 @@ def _require_finished(key: str, files: Mapping[str, object]) -> None:
         )
 
 
-def caption_of(texts: Mapping[str, bytes], *, key: str) -> str:
-    """Return a scene's caption from its files: the detailed one, else the short one.
-
-    Args:
-        texts: File name to bytes, with the descriptions that there are.
-        key: The scene's, for messages.
-
-    Raises:
-        SchemaError: If a description does not follow the format.
-    """
+def _caption(texts: Mapping[str, bytes], *, key: str) -> str:
+    """Return a scene's caption from its files: the detailed one, else the short one, else ""."""
     if DESCRIPTION_JSON in texts:
         description = parse_description(texts[DESCRIPTION_JSON], where=f"{key}/{DESCRIPTION_JSON}")
         written = description.detailed_caption or description.short_caption
@@ -302,22 +262,10 @@ def caption_of(texts: Mapping[str, bytes], *, key: str) -> str:
     return ""
 
 
-def merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
-    """Return the labels of baseline.json, and for those it lacks the ones of the mark."""
-    missing = {
-        name: getattr(marked, name)
-        for name in SceneLabels.__slots__
-        if getattr(labels, name) is None
-    }
-    return replace(labels, **missing)
-
-
-def _common_frames(key: str, facts: Mapping[str, StreamFacts], trajectory: Trajectory) -> int:
-    counts = {name: fact.frames for name, fact in facts.items()}
-    counts[TRAJECTORY_JSON] = trajectory.frame_count
-    common = Counter(counts.values()).most_common(1)[0][0]
-    _require_equal(key, counts, common, what="number of frames", unit="frames")
-    return common
+def _merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
+    """Return the labels of baseline.json; those it lacks come from the completion mark."""
+    known = {name: value for name, value in asdict(labels).items() if value is not None}
+    return SceneLabels(**(asdict(marked) | known))
 
 
 def _common_key_frames(facts: Mapping[str, StreamFacts], *, frames: int) -> tuple[int, ...]:
@@ -327,22 +275,22 @@ def _common_key_frames(facts: Mapping[str, StreamFacts], *, frames: int) -> tupl
     return tuple(sorted(common | {0}))
 
 
-def _require_equal(
-    key: str, found: Mapping[str, object], common: object, *, what: str, unit: str
-) -> None:
+def _common(key: str, found: Mapping[str, _T], *, what: str, unit: str) -> _T:
+    """Return what all files of a scene must have in common, given what each has."""
+    common = Counter(found.values()).most_common(1)[0][0]
     others = [f"{name} has {value}" for name, value in found.items() if value != common]
     if others:
         raise StorageError(
             f"{key}: its files must have one {what}: {len(found) - len(others)} have {common} "
             f"{unit}, but {', '.join(others)}. Fetch those again."
         )
+    return common
 
 
 def _sized_as_videos(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> Rig:
     """Return the rig for pictures of the videos' size, where baseline.json records no size."""
     sizes = {name: f"{fact.width_px}x{fact.height_px}" for name, fact in facts.items()}
-    common = Counter(sizes.values()).most_common(1)[0][0]
-    _require_equal(key, sizes, common, what="picture size", unit="pixels")
+    common = _common(key, sizes, what="picture size", unit="pixels")
     width_px, height_px = facts[rgb_name(0)].width_px, facts[rgb_name(0)].height_px
     if (width_px, height_px) == (rig.image_width_px, rig.image_height_px):
         return rig
@@ -356,9 +304,9 @@ def _sized_as_videos(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> Ri
 
 
 def _require_kinds(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> None:
-    """Refuse views that are no colours, and depth that is none or unlike the other cameras'.
+    """Refuse views without colours, and depth videos that hold colours.
 
-    Depth that lost something is let pass: a user's own `DepthEncoding` may accept it.
+    Lossy depth passes: a user's own `DepthEncoding` may accept it.
     """
     for name, fact in facts.items():
         where = f"{key}/{name}"
@@ -400,7 +348,7 @@ def _require_recorded_baselines(key: str, rig: Rig, poses: CameraPoses) -> None:
 def _require_lateral_rig(
     key: str, rig: Rig, lateral_m: Float64[np.ndarray, "6"], *, residual_px: float
 ) -> None:
-    """Refuse poses by which the cameras do not stand beside each other and look the same way."""
+    """Refuse poses in which the cameras are not side by side, or do not look the same way."""
     for (camera_a, camera_b), recorded_cm in zip(CAMERA_PAIRS, rig.baselines_cm, strict=True):
         beside_cm = abs(float(lateral_m[camera_b] - lateral_m[camera_a])) * 100
         if not math.isfinite(residual_px) or beside_cm < _LEAST_BESIDE * recorded_cm:
@@ -414,9 +362,9 @@ def _require_lateral_rig(
 
 
 def _depth_unit(facts: StreamFacts, *, name: str) -> tuple[float, DepthUnitSource]:
-    """Return metres in a stored unit and where that stands; nan where the tags contradict.
+    """Return metres in a stored unit and their source; nan where the tags contradict.
 
-    Such a scene can be used all the same, for its colours, or with the user's own unit.
+    Such a scene can still be used, for its colours or with the user's own unit.
     """
     try:
         encoding = resolve_encoding(facts, name=name)
@@ -442,11 +390,11 @@ def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Diffe
     """Return where a scene's metadata files differ from its row of an index.
 
     Compared are path, split, family, map, rig, baselines, labels, caption, number of frames, the
-    cameras' places and the rig's residual; not what the videos alone tell.
+    cameras' places and the rig's residual; not what is known from the videos alone.
 
     Args:
         scene: The row.
-        texts: File name to bytes; files that are not given are not compared.
+        texts: File name to bytes; missing files are not compared.
     """
     found = [*_differing_place(scene)]
     for names, compare in (
@@ -501,7 +449,7 @@ def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diff
     key = scene.id.key
     _, labels = parse_rig(texts[BASELINE_JSON], where=f"{key}/{BASELINE_JSON}")
     marked = parse_complete(texts[COMPLETE_JSON], where=f"{key}/{COMPLETE_JSON}")
-    merged = merged_labels(labels, marked)
+    merged = _merged_labels(labels, marked)
     for each in fields(SceneLabels):
         found, indexed = getattr(merged, each.name), getattr(scene.labels, each.name)
         if found != indexed:
@@ -528,14 +476,14 @@ def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diffe
 
 
 def _differing_caption(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
-    names = [name for name in (DESCRIPTION_JSON, DESCRIPTION_TXT) if name in texts]
-    caption = caption_of(texts, key=scene.id.key)
+    names = [name for name in _DESCRIPTIONS if name in texts]
+    caption = _caption(texts, key=scene.id.key)
     if names and caption != scene.caption:
         yield _difference(names[0], "the caption", caption, scene.caption)
 
 
 def _same(found: Any, indexed: Any) -> bool:
-    """Return whether two values are equal, numbers as far as a sum may round them."""
+    """Return whether two values are equal; numbers may differ by rounding."""
     if isinstance(found, tuple) and isinstance(indexed, tuple):
         return len(found) == len(indexed) and all(map(_same, found, indexed))
     if isinstance(found, float) and isinstance(indexed, float):

@@ -1,7 +1,7 @@
-"""The index: one row a scene, with all that selection and loading need before a video is opened.
+"""The index: one row per scene, with all that selection and loading need before opening a video.
 
 On disk it is one Parquet file; in memory one Arrow table, sorted by key. Paths are relative to the
-data's root and never leave it.
+data's root and never lead out of it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index.arrow import as_numpy, table_digest
+from stereogenbench_data.index.arrow import as_numpy, one_array, table_digest
 from stereogenbench_data.index.build import TreeReport
 from stereogenbench_data.index.open import open_table
 from stereogenbench_data.index.parquet import IndexHead, table_of_scenes, write_index_file
@@ -28,15 +28,15 @@ class SceneIndex:
 
     Attributes:
         root: The folder or URL to which the members' paths are relative, with its login if it has
-            one; `where` is what may be shown.
+            one; `where` is the version for display.
         retry: How reading from a URL is retried; None for the defaults.
         incomplete: Key to reason, for scenes that were not finished when the index was made.
-        broken: Key to what is wrong, for scenes that were left out for it.
+        broken: Key to what is wrong, for scenes that were left out because of it.
         shards: What is known of each shard, by its path below the root; empty for folders.
         is_part: Whether it was made of a part of the root on purpose.
-        passed_over: Keys of scenes that the root holds and the index leaves out on purpose.
-        stale: What the root holds that the index does not know, or lacks of it, and the cure;
-            empty where nothing of that can be seen. A URL is not looked at.
+        passed_over: Keys of scenes that the root holds and the index omits on purpose.
+        stale: How the root differs from the index, and the cure; empty if no difference was found.
+            URLs are not checked.
     """
 
     def __init__(
@@ -66,27 +66,27 @@ class SceneIndex:
         """Open the index of some data.
 
         The data are looked for beside the index first. An index that was written elsewhere records
-        where its data are, but the file may be anybody's: without ``root`` it is believed only if
-        it names a folder below its own, or a plain URL (``https://``, ``http://``, ``hf://``,
-        ``s3://``) without a login that is not of this machine's own network.
+        where its data are, but the file may be a stranger's: without ``root``, that place is used
+        only if it is a folder below the index's own, or a plain URL (``https://``, ``http://``,
+        ``hf://``, ``s3://``) without a login and outside this machine's own network.
 
         Args:
-            data: An index file; a folder that holds ``index.parquet``, such as one of shards; the
-                URL of either (``https://``, ``hf://datasets/``, ``s3://`` or whatever fsspec
-                opens), of which only the index is fetched; or a folder in the released layout,
-                whose scenes are then described (seconds for hundreds of scenes, minutes for all:
+            data: An index file; a folder with an ``index.parquet``, such as one of shards; the URL
+                of either (``https://``, ``hf://datasets/``, ``s3://`` or whatever fsspec opens),
+                of which only the index is fetched; or a folder in the released layout, whose
+                scenes are then described (seconds for hundreds of scenes, minutes for all:
                 ``stereogenbench index`` keeps the result).
             root: Where the data of an index file are, whatever the file says: any folder or URL
                 that you trust.
             retry: How often reading from a server is retried, and how slow it may be.
 
         Raises:
-            StorageError: If there is no such data, it holds no scene, the index is damaged or of
-                another version, its data are where only you may say to open them, or scenes of a
-                tree are broken.
+            StorageError: If there are no such data, they hold no scene, the index is damaged or of
+                another version, only you may name the place of its data, or scenes of a tree are
+                broken.
         """
-        opened = open_table(data, root=root, retry=retry)
-        return cls(opened.table, opened.head, retry=retry, stale=opened.stale)
+        table, head, stale = open_table(data, root=root, retry=retry)
+        return cls(table, head, retry=retry, stale=stale)
 
     @classmethod
     def from_scenes(
@@ -97,38 +97,38 @@ class SceneIndex:
         shards: Mapping[str, ShardFacts] | None = None,
         retry: RetryPolicy | None = None,
     ) -> "SceneIndex":
-        """Return the index of some scenes, in whatever order they come.
+        """Return the index of some scenes, in any order.
 
         Args:
             scenes: The scenes, with the places of their members.
             root: The folder to which these places are relative.
-            shards: What is known of each shard, where the members lie in shards.
+            shards: What is known of each shard, if the members are in shards.
             retry: As for `open`.
 
         Raises:
             StorageError: If two scenes have one key, or a path leaves the root.
         """
-        table = table_of_scenes(scenes, where=shown(str(root)))
+        table = table_of_scenes(scenes, where=shown(root))
         return cls(table, IndexHead(str(root), shards=dict(shards or {})), retry=retry)
 
     @classmethod
     def from_report(cls, report: TreeReport) -> "SceneIndex":
-        """Return the index of the scenes that a walk found, with those that it left out."""
+        """Return the index of the scenes that a walk found, and of those that it left out."""
         head = IndexHead(
             report.root, incomplete=report.incomplete, broken=report.broken, is_part=report.is_part
         )
         return cls(table_of_scenes(report.scenes, where=shown(report.root)), head)
 
     def __repr__(self) -> str:
-        """Return the root, as messages may show it, and what there is."""
+        """Return the root without secrets, and the number of scenes and shards."""
         shards = f", {len(self.shards)} shards" if self.shards else ""
         return f"<SceneIndex of {self.where!r}: {len(self)} scenes{shards}>"
 
     def write(self, path: str | Path) -> None:
         """Write the index as one Parquet file, whole or not at all.
 
-        Where the file lies in the root itself, data and index can be moved together; else it
-        records where the root is.
+        If the file is in the root itself, data and index can be moved together; else it records
+        where the root is.
 
         Raises:
             StorageError: If the file cannot be written.
@@ -146,7 +146,7 @@ class SceneIndex:
 
     @property
     def where(self) -> str:
-        """The root as messages, reports and other files show it: without login and query."""
+        """The root for messages, reports and other files: without login and query."""
         return shown(self.root)
 
     def __len__(self) -> int:
@@ -169,9 +169,8 @@ class SceneIndex:
         ``members`` and ``key_frames`` are not among them: see `scene` and `key_frames`.
 
         Returns:
-            (n,) numbers or, for texts, objects (None where a text is not known; nan where a
-            number is not); (n, 15) float64 for ``baselines_cm``, (n, 6) for the columns with one
-            value a camera.
+            (n,) numbers (nan where unknown) or, for texts, objects (None where unknown); (n, 15)
+            float64 for ``baselines_cm``, (n, 6) for the columns with one value per camera.
 
         Raises:
             StorageError: If there is no such column.
@@ -181,7 +180,8 @@ class SceneIndex:
             if name not in columns:
                 known = ", ".join(columns)
                 raise StorageError(f"the index has no column {name!r}; it has {known}.")
-            self._columns[name] = _array(self._table.column(name).combine_chunks())
+            self._columns[name] = as_numpy(self._table.column(name))
+            self._columns[name].setflags(write=False)
         return self._columns[name]
 
     def key_frames(self) -> tuple[list[tuple[int, ...]], np.ndarray]:
@@ -208,8 +208,7 @@ class SceneIndex:
 
     def video_counts(self) -> np.ndarray:
         """Return how many videos each scene has, (n,) int64: below 12 in a part of a release."""
-        lists = self._table.column("members").combine_chunks()
-        lists = lists.chunk(0) if isinstance(lists, pa.ChunkedArray) else lists
+        lists = one_array(self._table.column("members"))
         names = pc.struct_field(lists.flatten(), "name")
         is_video = as_numpy(pc.starts_with(names, "cam_"))
         rows = as_numpy(pc.list_parent_indices(lists))
@@ -217,19 +216,19 @@ class SceneIndex:
 
     @property
     def digest(self) -> str:
-        """A sha256 of the rows, the same wherever and by whatever version they were written."""
+        """A sha256 of the rows: the same wherever, and by whatever version, they were written."""
         if not self._digest:
             self._digest = table_digest(self._table)
         return self._digest
 
     def parted(self) -> tuple[pa.Table, dict[str, Any]]:
-        """Return the rows, and all else that `of_parts` needs: for who shares the rows."""
+        """Return the rows, and the rest that `of_parts` needs, to share the rows."""
         rest = self.__getstate__()
         return rest.pop("_table"), rest
 
     @classmethod
     def of_parts(cls, table: pa.Table, rest: Mapping[str, Any]) -> "SceneIndex":
-        """Return the index that was `parted`, over the same rows wherever they lie."""
+        """Return the index that was `parted`, over the same rows wherever they are."""
         index = cls.__new__(cls)
         index.__dict__.update(rest, _table=table)
         return index
@@ -237,10 +236,3 @@ class SceneIndex:
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
         return self.__dict__ | {"_columns": {}}
-
-
-def _array(values: Any) -> np.ndarray:
-    values = values.chunk(0) if isinstance(values, pa.ChunkedArray) else values
-    array = as_numpy(values)
-    array.setflags(write=False)
-    return array

@@ -3,8 +3,8 @@
     ROOT/train/<family>/<map>/<scene>/
     ROOT/eval/<subset>/<family>/<map>/<scene>/
 
-`find_scene_folders` searches a folder of this machine and says where misplaced scenes should be;
-`find_remote_scenes` and `ListedTree` list the folders where scenes should be.
+`find_scene_folders` searches a folder of this machine and says where misplaced scenes belong;
+`find_remote_scenes` and `ListedTree` list only folders where scenes belong.
 """
 
 import os
@@ -30,12 +30,11 @@ _SCENE_DEPTH: Final = {"train": 4, "eval": 5}
 """How many parts a scene's path has, by its split."""
 _DEEPEST: Final = 8
 """How many levels below the root are searched."""
-_SEARCHABLE: Final = "Check the disk, then run it again."
 
 
 @dataclass(frozen=True, slots=True)
 class FoundScenes:
-    """What a search found: the keys of scenes, and path to reason and cure for other folders."""
+    """The keys of scenes, and for other folders path to reason and cure."""
 
     keys: tuple[str, ...]
     refused: dict[str, str]
@@ -44,12 +43,12 @@ class FoundScenes:
 def find_scene_folders(root: str | Path) -> FoundScenes:
     """Return the scenes below a root, sorted by key, and the folders that hold misplaced ones.
 
-    A folder is a scene if it holds one of a scene's files, or if it stands where a scene should
-    and has no folder in it. Folders whose names start with a dot are passed over. Nothing below a
-    scene's folder is looked at, and no folder is entered twice on one way down.
+    A folder is a scene if it holds one of a scene's files, or if it is where a scene belongs and
+    has no subfolder. Folders whose names start with a dot are ignored. A scene's folder is not
+    searched further, and a link to a folder above itself is not followed.
 
     Raises:
-        StorageError: If the root is no readable folder, or no scene is where it should be.
+        StorageError: If the root is not a readable folder, or no scene is where it belongs.
     """
     root = Path(root)
     if not root.is_dir():
@@ -75,7 +74,7 @@ def find_scene_folders(root: str | Path) -> FoundScenes:
 
 
 def _search(root: Path) -> Iterator[tuple[Path, str]]:
-    """Yield every scene's folder, and with a complaint each folder that cannot be searched."""
+    """Yield each scene's folder, and with a complaint each folder that cannot be searched."""
     waiting: list[tuple[Path, tuple[str, ...], frozenset[tuple[int, int]]]] = [
         (root, (), frozenset())
     ]
@@ -93,7 +92,8 @@ def _search(root: Path) -> Iterator[tuple[Path, str]]:
             files = {entry.name for entry in listed}
             folders = [e.name for e in listed if not e.name.startswith(".") and _is_folder(e)]
         except OSError as error:
-            yield folder, describe_os_error("cannot be searched", error, _SEARCHABLE)
+            cure = "Check the disk, then run it again."
+            yield folder, describe_os_error("cannot be searched", error, cure)
             continue
         if files & _SCENE_FILES or (is_place_of_scene and not folders):
             yield folder, ""
@@ -111,24 +111,27 @@ def _is_folder(entry: os.DirEntry[str]) -> bool:
 
 def release_root_of(folder: Path) -> Path | None:
     """Return the root below which a folder would be a scene of the release, None if none is."""
-    parts = Path(os.path.abspath(folder)).parts  # noqa: PTH100 (resolve would follow links)
+    parts = _absolute(folder).parts
     for name, depth in _SCENE_DEPTH.items():
         if len(parts) > depth and parts[-depth] == name:
             return Path(*parts[:-depth])
     return None
 
 
+def _absolute(path: Path) -> Path:
+    return Path(os.path.abspath(path))  # noqa: PTH100 (resolve would follow links)
+
+
 def _where_to_point(folder: Path, *, root: Path) -> str:
     other = release_root_of(folder)
-    if other == Path(os.path.abspath(root)):  # noqa: PTH100 (resolve would follow links)
-        return ""  # the folder's name is at fault, and the error says so
+    if other == _absolute(root):
+        return ""  # the folder's name is wrong, and the error says so
     return f" Move it, or point at {other} instead." if other else " Move it to such a path."
 
 
 def _nothing_found(root: Path, refused: dict[str, str]) -> str:
-    here = Path(os.path.abspath(root))  # noqa: PTH100 (resolve would follow links)
     roots = {release_root_of(root / path) for path in refused}
-    suggested = {str(found) for found in roots if found not in (None, here)}
+    suggested = {str(found) for found in roots if found not in (None, _absolute(root))}
     looked = f"{root}: holds no scene; looked for folders {_LAYOUT}"
     if suggested:
         return f"{looked}. Point at {' or '.join(sorted(suggested)[:3])} instead."
@@ -140,11 +143,11 @@ def _nothing_found(root: Path, refused: dict[str, str]) -> str:
 
 
 def find_remote_scenes(url: str) -> FoundScenes:
-    """Return the keys of all scenes behind a URL, sorted; nothing of a scene's is looked at.
+    """Return the keys of all scenes behind a URL, sorted; scenes' own folders are not listed.
 
     Raises:
-        StorageError: If it cannot be listed, or holds no scene where one should be.
-        SchemaError: If a folder where a scene should be has a name that no scene can have.
+        StorageError: If it cannot be listed, or no scene is where it belongs.
+        SchemaError: If a folder where a scene belongs has a name that no scene can have.
     """
 
     def folders(path: str) -> list[str]:
@@ -162,20 +165,20 @@ def find_remote_scenes(url: str) -> FoundScenes:
 
 
 class ListedTree:
-    """The folders of this machine that stand where scenes should, finished or not.
+    """The folders of this machine where scenes belong, finished or not.
 
     Attributes:
         keys: Their paths below the root.
     """
 
     def __init__(self, root: Path) -> None:
-        """List them; folders that may not be listed are passed over."""
+        """List them; folders that may not be listed are ignored."""
         self._root = root
         self._unlisted: list[str] = []
         self.keys = {key for split in _SCENE_DEPTH for key in _keys_of(split, self._names)}
 
     def may_hold(self, key: str) -> bool:
-        """Return whether a scene lies below a folder that could not be listed."""
+        """Return whether a scene is below a folder that could not be listed."""
         return any(key.startswith(f"{folder}/") for folder in self._unlisted)
 
     def _names(self, folder: str, is_last: bool) -> list[str]:  # noqa: FBT001 - as `_keys_of` calls

@@ -63,8 +63,8 @@ Clock = SteadyClock | TableClock
 def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | None:
     """Return the clock that the header describes, None if it contradicts itself or ``frames``.
 
-    An MP4 header lists every sample: their number and their decoding times must be those of
-    ``frames`` frames at one rate. Of Matroska only the duration can be compared.
+    An MP4 header lists all samples: their number and decoding times must be those of ``frames``
+    frames at one rate. A Matroska header gives only the duration.
     """
     stream = container.streams.video[0]
     rate, time_base = exact(stream.average_rate), exact(stream.time_base)
@@ -74,18 +74,13 @@ def steady_clock(container: InputContainer, *, frames: int) -> SteadyClock | Non
     if stream.frames == 0:
         agrees = frames_by_duration(container) == frames
     else:
-        agrees = stream.frames == frames and _is_steady(container, step=step)
+        entries = list(stream.index_entries)
+        agrees = (
+            stream.frames == frames == len(entries)
+            and not any(entry.is_discard for entry in entries)
+            and all(abs(b.timestamp - a.timestamp - step) <= 1 for a, b in pairwise(entries))
+        )
     return SteadyClock(stream.start_time, step) if agrees else None
-
-
-def _is_steady(container: InputContainer, *, step: Fraction) -> bool:
-    stream = container.streams.video[0]
-    entries = list(stream.index_entries)
-    return (
-        len(entries) == stream.frames
-        and not any(entry.is_discard for entry in entries)
-        and all(abs(b.timestamp - a.timestamp - step) <= 1 for a, b in pairwise(entries))
-    )
 
 
 INTRA_ONLY: Final = frozenset(

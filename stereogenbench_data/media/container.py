@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal, Protocol, runtime_checkable
+from typing import Any, Final, Literal, NoReturn, Protocol, TypeVar, runtime_checkable
 
 import av
 from av.container import InputContainer
@@ -36,6 +36,52 @@ class BinaryFile(Protocol):
 VideoFile = str | Path | BinaryFile
 
 
+Reader = TypeVar("Reader", bound="FrameReader")
+
+
+class FrameReader:
+    """What readers of frames have in common.
+
+    A reader belongs to the thread and the process that opened it.
+
+    Attributes:
+        name: What messages call the file.
+        frames: How many frames it has.
+    """
+
+    name: str
+    frames: int
+
+    def close(self) -> None:
+        """Close the reader; closing twice does nothing."""
+
+    def require_frame(self, index: int) -> None:
+        """Refuse the number of a frame that there is not.
+
+        Raises:
+            MediaError: If so.
+        """
+        if not 0 <= index < self.frames:
+            raise MediaError(
+                f"{self.name}: has no frame {index}: ask for one of 0 to {self.frames - 1}."
+            )
+
+    def __enter__(self: Reader) -> Reader:
+        """Return the reader itself."""
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Close the reader."""
+        self.close()
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse to be pickled: an open file belongs to its process."""
+        raise TypeError(
+            f"{self.name}: an open {type(self).__name__} cannot be pickled: "
+            f"pass the path to the other process and open it there."
+        )
+
+
 @runtime_checkable
 class Ratio(Protocol):
     """A `Fraction`, or the `AVRational` that PyAV 19 gives in its place."""
@@ -57,11 +103,6 @@ _UNDECODED: Final = {**_OPTIONS, "probesize": "32", "skip_frame": "all"}
 _TAG_ERRORS: Final[dict[str, Any]] = (
     {"metadata_errors": "replace"} if int(av.__version__.partition(".")[0]) < 19 else {}
 )
-
-_COLOURS: Final = 3
-_LEAST_BITS: Final = 8
-_MICROSECONDS: Final = 1_000_000
-_OUT_OF_FILES: Final = (errno.EMFILE, errno.ENFILE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +164,7 @@ def open_container(
     except PermissionError as error:
         raise StorageError(f"{name}: may not be read: give read permission.") from error
     except av.FFmpegError as error:
-        if isinstance(error, OSError) and error.errno in _OUT_OF_FILES:
+        if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
             raise StorageError(
                 f"{name}: cannot be opened ({error.strerror}). {cure_of(error)}"
             ) from error
@@ -181,11 +222,11 @@ def text_tags(metadata: Mapping[str, str]) -> dict[str, str]:
 
     PyAV 19 gives such bytes as surrogates, which cannot be printed.
     """
-    return {_text(key): _text(value) for key, value in metadata.items()}
 
+    def text(tag: str) -> str:
+        return tag.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
 
-def _text(tag: str) -> str:
-    return tag.encode("utf-8", "surrogateescape").decode("utf-8", "replace")
+    return {text(key): text(value) for key, value in metadata.items()}
 
 
 def stream_facts(
@@ -249,9 +290,9 @@ def is_colour_format(pixel_format: str) -> bool:
     """
     layout = av.VideoFormat(pixel_format)
     return (
-        len(layout.components) == _COLOURS
+        len(layout.components) == 3
         and not layout.has_palette
-        and all(each.bits >= _LEAST_BITS and not each.is_alpha for each in layout.components)
+        and all(each.bits >= 8 and not each.is_alpha for each in layout.components)
     )
 
 
@@ -275,16 +316,16 @@ def frames_by_duration(container: InputContainer) -> int | None:
     start = stream.start_time
     if container.duration is None or start is None or rate is None or time_base is None:
         return None
-    count = rate * (Fraction(container.duration, _MICROSECONDS) - start * time_base)
+    count = rate * (Fraction(container.duration, 1_000_000) - start * time_base)
     whole = round(count)
     return whole if whole > 0 and abs(count - whole) <= Fraction(1, 10) else None
 
 
 def require_whole_payload(container: InputContainer, *, name: str) -> None:
-    """Raise where the header's own table of samples (MP4) reaches beyond the end of the file.
+    """Refuse a file that ends before the last sample of its header's table (MP4).
 
     Raises:
-        MediaError: If so; the message has the size that the header claims and the file's own.
+        MediaError: If so, with both sizes.
     """
     entries = container.streams.video[0].index_entries
     end = max((entry.pos + entry.size for entry in entries), default=0)

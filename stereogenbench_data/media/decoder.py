@@ -33,7 +33,6 @@ _SKIPS_EXACTLY: Final = frozenset({"h264", "hevc", "mpeg4"})
 _BLIND_JUMP: Final = 8
 """Frames to decode through rather than to seek, while a file's key frames are not known."""
 
-
 _SIZE_BYTES: Final = 3
 _FOOTER_BYTES: Final = 8
 """A footer with a checksum: three bytes of size, one of error status, four of checksum."""
@@ -53,19 +52,18 @@ class UnexpectedPicture(Exception):
 class Decoder:
     """The decoder of an open container's first video stream; it closes the container.
 
-    Damage is an error (``err_detect=explode``), never concealed. Threads work on slices of one
-    picture: frame threads would run ahead of the frame asked for, and blur which one failed.
+    Damage is an error (``err_detect=explode``), never concealed. There is one thread: frame threads
+    would run ahead of the frame asked for, and blur which one failed.
     """
 
-    def __init__(self, container: InputContainer, *, clock: Clock, threads: int) -> None:
+    def __init__(self, container: InputContainer, *, clock: Clock) -> None:
         """Take over a container that was just opened."""
         self._container = container
         self._clock = clock
         self._stream: VideoStream = container.streams.video[0]
         self._context = self._stream.codec_context
         self._context.options = {"err_detect": "explode"}
-        self._context.thread_count = threads
-        self._context.thread_type = "SLICE"
+        self._context.thread_count = 1
         self._can_skip = self._context.codec.canonical_name in _SKIPS_EXACTLY
         # FFV1 before version 3 keeps no record beside its packets, and no checksums in them.
         is_ffv1 = self._context.codec.canonical_name == "ffv1"
@@ -132,7 +130,7 @@ class Decoder:
         return key >= 0 and entries[key].timestamp > self._clock.latest(self._newest)
 
     def _seek(self, index: int) -> None:
-        """Go to a key frame that is shown, not only decoded, at or before a frame."""
+        """Go to a key frame that is shown at or before a frame."""
         # The time of one packet may have been altered: of two that follow each other, it shows.
         pts = self._clock.latest(max(0, index - 1) if self._is_intra_only else index)
         self._stored_before = None
@@ -216,7 +214,7 @@ class Decoder:
         self._pending.extend((self._index(frame), frame) for frame in packet.decode())
 
     def _register(self, packet: VideoPacket) -> None:
-        """Take note of a packet that is to be decoded."""
+        """Check a packet that is about to be decoded, and record its frame."""
         index = self._index(packet)
         if self._is_intra_only:
             if self._stored_before is not None and index != self._stored_before + 1:

@@ -1,4 +1,4 @@
-"""Stored depth: which streams keep it whole, its numbers untouched, and what they mean in metres.
+"""Stored depth: which streams keep it whole, its numbers as stored, and what they mean in metres.
 
 A depth picture is read in the pixel format in which it is stored. No conversion is ever asked of
 FFmpeg: its conversion to 8 bits drops the low byte, and one between 10, 12 and 16 bits rescales.
@@ -40,8 +40,8 @@ def resolve_encoding(
     """Return how a depth stream's numbers become metres: as the user says, else as it is tagged.
 
     A tag is one whose key contains "scale", in any case, of the container or of the stream; its
-    value is metres in a stored unit. Without one the release's default holds, 0.1 m. Beside a tag
-    that is a number, one that is none is taken to speak of something else.
+    value is metres in a stored unit. Without such a tag the release's default holds, 0.1 m. If one
+    such tag is a number, others that are not numbers are ignored.
 
     Args:
         facts: What `probe` found.
@@ -77,20 +77,8 @@ def _unit_m(value: str) -> float | None:
     return unit_m if math.isfinite(unit_m) and unit_m > 0 else None
 
 
-def require_depth_stream(
-    *, codec: str, pixel_format: str, encoding: DepthEncoding, name: str
-) -> None:
-    """Refuse a stream that cannot have kept 16-bit depth whole, unless the encoding accepts it.
-
-    Raises:
-        MediaError: If the stream stores colours, or has a risk (fewer than 16 bits, a lossy codec,
-            chroma planes) that ``encoding.accept`` does not name.
-    """
-    _accepted_layout(codec, pixel_format, encoding, name=name)
-
-
 @dataclass(frozen=True, slots=True)
-class _Layout:
+class DepthLayout:
     """How a pixel format stores depth: ``bits`` a number, in a plane of ``dtype``."""
 
     bits: int
@@ -98,19 +86,25 @@ class _Layout:
     dtype: str
 
 
-def _layout(pixel_format: str) -> _Layout | None:
+def _layout(pixel_format: str) -> DepthLayout | None:
     """Return where a pixel format holds one number a pixel, None where it stores colours."""
     match = _NUMBER_FORMAT.fullmatch(pixel_format)
     if match is None:
         return None
     bits = int(match["bits"] or 8)
     dtype = "u1" if bits == 8 else ">u2" if match["order"] == "be" else "<u2"
-    return _Layout(bits, has_chroma=match["kind"] != "gray", dtype=dtype)
+    return DepthLayout(bits, has_chroma=match["kind"] != "gray", dtype=dtype)
 
 
-def _accepted_layout(
-    codec: str, pixel_format: str, encoding: DepthEncoding, *, name: str
-) -> _Layout:
+def require_depth_stream(
+    *, codec: str, pixel_format: str, encoding: DepthEncoding, name: str
+) -> DepthLayout:
+    """Return how a stream stores 16-bit depth whole, or otherwise if the encoding accepts it.
+
+    Raises:
+        MediaError: If the stream stores colours, or has a risk (fewer than 16 bits, a lossy codec,
+            chroma planes) that ``encoding.accept`` does not name.
+    """
     layout = _layout(pixel_format)
     stored = f"{name}: depth is stored by codec {codec} as {pixel_format}"
     if layout is None:
@@ -118,12 +112,8 @@ def _accepted_layout(
             f"{stored}, which is not one number of 8 to 16 bits a pixel: no DepthEncoding accepts "
             f"it. Store depth as gray16le with FFV1."
         )
-    risks: dict[DepthRisk, bool] = {
-        "8-bit": layout.bits == 8,
-        "9-bit": layout.bits == 9,
-        "10-bit": layout.bits == 10,
-        "12-bit": layout.bits == 12,
-        "14-bit": layout.bits == 14,
+    risks = {
+        f"{layout.bits}-bit": layout.bits < 16,
         "lossy": codec not in _LOSSLESS_CODECS,
         "chroma": layout.has_chroma,
     }
@@ -132,7 +122,7 @@ def _accepted_layout(
         accept = ", ".join(repr(risk) for risk in sorted({*encoding.accept, *refused}))
         raise MediaError(
             f"{stored} ({', '.join(refused)}), which does not keep depth whole. Store it as "
-            f"gray16le with FFV1; if it is meant so, pass "
+            f"gray16le with FFV1; if this is intended, pass "
             f"DepthEncoding(accept=frozenset({{{accept}}})), with unit_m=... if the file does not "
             f"tell its unit."
         )
@@ -169,7 +159,9 @@ def read_depth_units(
         MediaError: If the stream is refused (see `require_depth_stream`) or does not decode.
     """
     facts = reader.facts
-    layout = _accepted_layout(facts.codec, facts.pixel_format, encoding, name=reader.name)
+    layout = require_depth_stream(
+        codec=facts.codec, pixel_format=facts.pixel_format, encoding=encoding, name=reader.name
+    )
     if isinstance(reader, DepthFrames):
         return reader.units(index)
     numbers = plane_numbers(reader.frame(index), 0, dtype=layout.dtype)

@@ -18,8 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Literal, NoReturn
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import UInt16
@@ -27,6 +26,7 @@ from jaxtyping import UInt16
 from stereogenbench_data.errors import ExtraError, MediaError
 from stereogenbench_data.media.container import (
     BinaryFile,
+    FrameReader,
     StreamFacts,
     VideoFile,
     merged_tags,
@@ -37,7 +37,7 @@ PACKED_SUFFIX: Final = ".b2frame"
 LAYER: Final = "stereogenbench_depth"
 UNIT_BYTES: Final = 2
 FIXED_BYTES: Final = 4096
-"""What a header may have beside 64 bytes a frame; so much is read at first, too."""
+"""How much a header may have beside 64 bytes a frame; also how much is read at first."""
 
 _FORMAT: Final = 1
 _BYTES_A_FRAME: Final = 64
@@ -68,7 +68,7 @@ LARGEST_FRAME_BYTES: Final = 512 * 2**20
 
 @dataclass(frozen=True, slots=True)
 class StoredClip:
-    """What a depth video was, so that it can be written again.
+    """Facts of a depth video, from which it can be written again.
 
     Attributes:
         width_px: Width of every frame.
@@ -103,7 +103,7 @@ class FrameHeader:
     """What a file's header says: the clip, and where each chunk lies.
 
     Attributes:
-        clip: What the depth video was.
+        clip: Facts of the depth video that was packed.
         offsets: The first byte of each chunk.
         sizes: How many bytes each has; 0 for a frame of zeros, which has none.
         crc32s: zlib's checksum of each.
@@ -194,7 +194,7 @@ def header_bytes(start: bytes, *, frames: int, name: str) -> int:
 
 
 def parse_header(header: bytes, *, file_bytes: int, name: str) -> FrameHeader:
-    """Return what a whole header says, once it is known to be one that was written here.
+    """Return what a whole header says, after checking that this module wrote it.
 
     Args:
         header: All bytes of the header.
@@ -202,7 +202,7 @@ def parse_header(header: bytes, *, file_bytes: int, name: str) -> FrameHeader:
         name: What messages call the file.
 
     Raises:
-        MediaError: If it was damaged, or is another's.
+        MediaError: If it is damaged, or was not written by this module.
     """
     _, size, frame_bytes, units, chunks, typesize, _, chunk_bytes, *_ = _FIXED.unpack_from(header)
     if frame_bytes != file_bytes:
@@ -210,10 +210,7 @@ def parse_header(header: bytes, *, file_bytes: int, name: str) -> FrameHeader:
     description = _description(header, name=name)
     try:
         clip = _clip(description["clip"])
-        sizes, crc32s = (
-            tuple(map(int, description["sizes"])),
-            tuple(map(int, description["crc32s"])),
-        )
+        sizes, crc32s = (tuple(map(int, description[key])) for key in ("sizes", "crc32s"))
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise _unfit(
             name, f"its description of itself is malformed or incomplete ({error!r})"
@@ -285,7 +282,7 @@ def _clip(description: Mapping[str, Any]) -> StoredClip:
 
 
 def require_chunk(chunk: bytes, *, clip: StoredClip, crc32: int, name: str) -> None:
-    """Refuse a chunk before blosc2 sees it, unless it is one that was written here.
+    """Refuse a chunk that this module did not write, before blosc2 sees it.
 
     Raises:
         MediaError: If it was damaged, claims another size, or asks for another codec.
@@ -317,28 +314,23 @@ def _unfit(name: str, why: str) -> MediaError:
     )
 
 
-class DepthFrames:
+class DepthFrames(FrameReader):
     """An open file of packed depth, whose frames are read by number in any order.
 
     Whatever the file claims is checked before it is used, and no more is decompressed than a
-    frame has. A reader belongs to the thread and the process that opened it.
+    frame has.
 
     Attributes:
-        name: What messages call the file.
-        frames: How many frames it has.
         facts: What the header says, as of a video; the codec is "blosc2".
     """
 
-    def __init__(
-        self, file: VideoFile, *, name: str, frames: int | Literal["any"], threads: int = 1
-    ) -> None:
+    def __init__(self, file: VideoFile, *, name: str, frames: int | Literal["any"]) -> None:
         """Open a file that must hold so many frames.
 
         Args:
             file: A path, or a seekable binary file; the latter stays the caller's to close.
             name: What messages call the file.
             frames: How many frames it must have; "any" trusts the header.
-            threads: How many blocks of one frame to decompress at once.
 
         Raises:
             ExtraError: If blosc2 is not installed.
@@ -346,7 +338,6 @@ class DepthFrames:
             MediaError: If it is not such a file, is damaged or has another number of frames.
         """
         self.name = name
-        self._threads = threads
         self._blosc2: Any = blosc2_module()
         self._own = Path(file).open("rb", buffering=0) if isinstance(file, str | Path) else None  # noqa: SIM115
         self._file: BinaryFile = self._own if isinstance(file, str | Path) else file  # type: ignore[assignment]  # its own if a path
@@ -356,23 +347,29 @@ class DepthFrames:
             self.close()
             raise
         self.frames = len(self._header.sizes)
-        self.facts = _facts(self._header.clip, frames=self.frames)
+        self.facts = StreamFacts(
+            codec=CODEC_NAME,
+            pixel_format=self.clip.pixel_format,
+            width_px=self.clip.width_px,
+            height_px=self.clip.height_px,
+            frames=self.frames,
+            frame_rate_hz=self.clip.rate[0] / self.clip.rate[1],
+            tags=merged_tags(self.clip.tags, self.clip.stream_tags),
+            is_colour=False,
+        )
 
     @property
     def clip(self) -> StoredClip:
-        """What the depth video was."""
+        """Facts of the depth video that was packed."""
         return self._header.clip
 
     def chunk(self, index: int) -> bytes:
-        """Return the compressed bytes of a frame, empty for one of zeros.
+        """Return the compressed bytes of a frame, empty for a frame of zeros.
 
         Raises:
             MediaError: If there is no such frame, or its bytes are not those that were packed.
         """
-        if not 0 <= index < self.frames:
-            raise MediaError(
-                f"{self.name}: has no frame {index}: ask for one of 0 to {self.frames - 1}."
-            )
+        self.require_frame(index)
         size = self._header.sizes[index]
         if size == 0:
             return b""
@@ -398,7 +395,7 @@ class DepthFrames:
             return np.zeros(shape, dtype=np.uint16)
         units = np.empty(shape, dtype=np.uint16)
         try:
-            self._blosc2.decompress2(chunk, dst=units, nthreads=self._threads)
+            self._blosc2.decompress2(chunk, dst=units, nthreads=1)
         except (RuntimeError, ValueError) as error:
             raise MediaError(
                 f"{self.name}: frame {index} does not decompress ({error}). The file is damaged: "
@@ -410,26 +407,6 @@ class DepthFrames:
         """Close the file, if it was opened here; closing twice does nothing."""
         if self._own is not None:
             self._own.close()
-
-    def __enter__(self) -> "DepthFrames":
-        """Return the reader itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the reader."""
-        self.close()
-
-    def __reduce__(self) -> NoReturn:
-        """Refuse to be pickled: an open file belongs to its process."""
-        raise TypeError(
-            f"{self.name}: an open DepthFrames cannot be pickled: "
-            f"pass the path to the other process and open it there."
-        )
 
     def _read_header(self, frames: int | Literal["any"]) -> FrameHeader:
         file_bytes = self._file.seek(0, 2)
@@ -458,27 +435,3 @@ class DepthFrames:
                 f"{LARGEST_FRAME_BYTES:,} are read: it is not depth of this release."
             )
         return header
-
-
-def probe_packed(file: VideoFile, *, name: str) -> StreamFacts:
-    """Return what packed depth is, from its header.
-
-    Raises:
-        ExtraError: If blosc2 is not installed.
-        MediaError: If the header was damaged.
-    """
-    with DepthFrames(file, name=name, frames="any") as depth:
-        return depth.facts
-
-
-def _facts(clip: StoredClip, *, frames: int) -> StreamFacts:
-    return StreamFacts(
-        codec=CODEC_NAME,
-        pixel_format=clip.pixel_format,
-        width_px=clip.width_px,
-        height_px=clip.height_px,
-        frames=frames,
-        frame_rate_hz=clip.rate[0] / clip.rate[1],
-        tags=merged_tags(clip.tags, clip.stream_tags),
-        is_colour=False,
-    )

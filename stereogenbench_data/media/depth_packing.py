@@ -68,10 +68,18 @@ def packed_depth(
             units = read_depth_units(reader, index, encoding=_ANY_BITS)
             chunk = compressed_chunk(units.tobytes())
             frame = reader.frame(index)
-            pts.append(_ticks(frame, name=name))
+            if frame.pts is None:
+                raise MediaError(
+                    f"{name}: a frame has no time, so the video could not be written again. Pack "
+                    f"with --depth-codec released."
+                )
+            pts.append(frame.pts)
             time_base = exact(frame.time_base) or time_base
             chunks.append(chunk)
-            _require_same(units, chunk, index=index, name=name)
+            found = np.empty_like(units)
+            blosc2_module().decompress2(chunk, dst=found, nthreads=1)
+            if not np.array_equal(found, units):
+                raise _not_whole(name, index)
             after_frame()
     with open_container(video, name=name) as container:
         stream = container.streams.video[0]
@@ -93,23 +101,6 @@ def packed_depth(
             if packed.chunk(index) != (b"" if is_zeros(chunk) else chunk):
                 raise _not_whole(name, index)
     return content
-
-
-def _ticks(frame: av.VideoFrame, *, name: str) -> int:
-    if frame.pts is None:
-        raise MediaError(
-            f"{name}: a frame has no time, so the video could not be written again. Pack with "
-            f"--depth-codec released."
-        )
-    return frame.pts
-
-
-def _require_same(units: UInt16[np.ndarray, "h w"], chunk: bytes, *, index: int, name: str) -> None:
-    """Decompress a frame right after it was compressed, and compare."""
-    found = np.empty_like(units)
-    blosc2_module().decompress2(chunk, dst=found, nthreads=1)
-    if not np.array_equal(found, units):
-        raise _not_whole(name, index)
 
 
 def _not_whole(name: str, index: int) -> MediaError:
@@ -147,7 +138,7 @@ def write_depth_video(
         stream.codec_context.time_base = time_base
         stream.time_base = time_base
         for index, pts in enumerate(clip.pts):
-            frame = _grey_frame(packed.units(index), pixel_format=clip.pixel_format)
+            frame = grey_frame(packed.units(index), pixel_format=clip.pixel_format)
             frame.pts, frame.time_base = pts, time_base
             container.mux(stream.encode(frame))
             after_frame()
@@ -155,7 +146,8 @@ def write_depth_video(
     _require_same_video(packed, target)
 
 
-def _grey_frame(units: UInt16[np.ndarray, "h w"], *, pixel_format: str) -> av.VideoFrame:
+def grey_frame(units: UInt16[np.ndarray, "h w"], *, pixel_format: str) -> av.VideoFrame:
+    """Return depth in stored units as a frame, whose rows may be longer than the array's."""
     height, width = units.shape
     frame = av.VideoFrame(width, height, pixel_format)
     plane = frame.planes[0]
@@ -183,8 +175,11 @@ def _require_same_video(packed: DepthFrames, target: Path) -> None:
             (text_tags(container.metadata), clip.tags),
             (text_tags(container.streams.video[0].metadata), clip.stream_tags),
         ):
-            lost = {key for key in stored if found.get(key) != stored[key]}
-            lost -= {key for key in lost if key.lower() in _WRITERS_TAGS}
+            lost = {
+                key
+                for key in stored
+                if found.get(key) != stored[key] and key.lower() not in _WRITERS_TAGS
+            }
             if lost:
                 raise _not_unpacked(name, f"the tags {sorted(lost)} are lost")
 

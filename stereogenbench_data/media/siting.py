@@ -1,4 +1,4 @@
-"""Where the chroma samples of a video lie between its pixels, and converting by that place.
+"""Where the chroma samples of a video lie between its pixels, and conversions that respect it.
 
 Subsampled chroma is read as lying in the middle of its pixels ("center") unless the file says
 otherwise: that is what FFmpeg's conversion at the stored size does. FFmpeg's decoders of H.264 and
@@ -27,8 +27,6 @@ _SAYS_NOTHING: Final = frozenset(
 
 _HIGH_PROFILES: Final = frozenset({44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244})
 _EXTENDED_ASPECT: Final = 255
-_H264_SPS: Final = 7
-_HEVC_SPS: Final = 33
 _GREY: Final = 0
 _SEPARATE_PLANES: Final = 3
 _PROFILE_BITS: Final = 88
@@ -97,8 +95,8 @@ def is_subsampled(frame: VideoFrame) -> bool:
 def picture_siting(frame: VideoFrame) -> str:
     """Return where a picture's chroma lies by its own tag, "center" for one without.
 
-    PyAV does not show the tag, but its reformatter follows it. So a small picture that is given
-    the same tag is converted by it, and compared with conversions by each place.
+    PyAV does not show the tag, but its reformatter follows it. So a small picture with the same
+    tag is converted by the reformatter, and compared with conversions for each place.
     """
     small = frame.reformat(width=16, height=16, format="yuv420p", threads=1)
     ramp = np.arange(64, dtype=np.uint8).reshape(8, 8)
@@ -163,8 +161,8 @@ def _sequence_parameters(codec: str, extradata: bytes | None) -> "_Bits | None":
     if codec not in ("h264", "hevc"):
         return None
     for unit in _units(codec, extradata or b""):
-        kind = unit[0] & 31 if codec == "h264" else unit[0] >> 1 & 63
-        if kind == (_H264_SPS if codec == "h264" else _HEVC_SPS):
+        kind, wanted = (unit[0] & 31, 7) if codec == "h264" else (unit[0] >> 1 & 63, 33)
+        if kind == wanted:
             return _Bits(unit.replace(b"\0\0\3", b"\0\0"))
     return None
 
@@ -303,19 +301,15 @@ def _skip_to_hevc_chroma(bits: _Bits) -> int:
     """Pass over all before chroma_format_idc; return how many layers there are beside the first."""
     bits.skip(16, 4)
     layers = bits.take(3)
-    _skip_profiles(bits, layers)
-    bits.skip(0)
-    return layers
-
-
-def _skip_profiles(bits: _Bits, layers: int) -> None:
-    """Pass over profile, tier and level, of the whole and of so many layers."""
+    # Profile, tier and level, of the whole and of each layer.
     bits.skip(1, _PROFILE_BITS, 8)
     present = [(bits.take(), bits.take()) for _ in range(layers)]
     if layers:
         bits.skip(2 * (8 - layers))
     for has_profile, has_level in present:
         bits.skip(*[_PROFILE_BITS] * has_profile, *[8] * has_level)
+    bits.skip(0)
+    return layers
 
 
 def _skip_hevc_scaling_lists(bits: _Bits) -> None:

@@ -1,13 +1,12 @@
 """Frames of a video by number, exact: frame i is the i-th in the order of presentation.
 
-Nothing is guessed: where the pictures of a file are not those that its header and its caller
-expect (a gap, a cut, a damaged packet), reading is an error, never a neighbouring frame.
+Nothing is guessed: a gap, a cut or a damaged packet is an error. A neighbouring frame is never
+returned instead.
 """
 
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Literal, NoReturn
+from typing import Any, Final, Literal
 
 import av
 import numpy as np
@@ -26,6 +25,7 @@ from stereogenbench_data.media.clock import (
     table_clock,
 )
 from stereogenbench_data.media.container import (
+    FrameReader,
     StreamFacts,
     VideoFile,
     exact,
@@ -36,7 +36,7 @@ from stereogenbench_data.media.container import (
     stream_facts,
 )
 from stereogenbench_data.media.decoder import Decoder, UnexpectedPicture
-from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, probe_packed
+from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
 from stereogenbench_data.media.siting import (
     CENTRE,
     Converter,
@@ -54,7 +54,7 @@ NO_COLOUR: Final = (
 """How the refusal of a video that should hold colours ends."""
 
 _ASPECT_SHARE: Final = 0.01
-"""By how much a tagged shape of pixels, kept as a small fraction, may be off the rig's."""
+"""How far a tagged pixel aspect, which is stored as a small fraction, may be off the rig's."""
 
 _RED_GREEN_BLUE: Final = (2, 0, 1)
 """Where the planes of FFmpeg's gbrp are."""
@@ -66,22 +66,23 @@ def probe(
     """Return what a video file is, from its header where the header can be trusted.
 
     Frames are counted by the header of an MP4 file, and by duration and rate of a Matroska file
-    if its last frame is found where they place it. Else all packets are counted. The times of all
-    packets of an intra-only codec are held against their order, where a path is given.
+    if its last frame is found where they place it. Else all packets are counted. For an intra-only
+    codec and a path, the times of all packets are compared with their order.
 
     Args:
         file: A path, or a seekable binary file; the latter stays the caller's to close.
-        name: What messages call the file. One that ends in ``.b2frame`` is of depth that blosc2
-            packed.
-        pixel_format: "later" spares the decoding of a picture (tens of milliseconds of large
-            H.264), where only that would show the pixel format.
+        name: What messages call the file. A name that ends in ``.b2frame`` is of depth packed by
+            blosc2.
+        pixel_format: "later" decodes no picture where only that would show the pixel format (tens
+            of milliseconds for large H.264).
 
     Raises:
         StorageError: If the file cannot be read.
         MediaError: If it is not an MP4 or Matroska video, is cut short or holds no frame.
     """
     if name.endswith(PACKED_SUFFIX):
-        return probe_packed(file, name=name)
+        with DepthFrames(file, name=name, frames="any") as depth:
+            return depth.facts
     with open_container(file, name=name, pixel_format=pixel_format) as container:
         require_whole_payload(container, name=name)
         frames = _frames_in_header(container)
@@ -118,46 +119,39 @@ def _frames_in_header(container: InputContainer) -> int:
     return frames if shown and clock.index(max(shown)) == frames - 1 else 0
 
 
-class VideoReader:
+class VideoReader(FrameReader):
     """An open video whose frames are read by number, fastest in ascending order.
 
     A frame ahead within the same group of pictures is reached by decoding on; any other by
     seeking to the key frame before it. On the way, pictures that no other is predicted from are
     skipped. The last frame is kept, so that asking for it again costs nothing.
 
-    A reader belongs to the thread and the process that opened it.
-
     Attributes:
-        name: What messages call the file.
-        frames: How many frames it has.
         scaler: The scaler of pictures whose chroma lies where FFmpeg takes it to be.
-        converter: The scaler of all others; both keep their tables from frame to frame. Neither
-            has threads of its own: freed in a fork, FFmpeg would wait for them for ever.
+        converter: The scaler of all others. Both keep their tables from frame to frame. Neither
+            has threads: FFmpeg would wait for them for ever when a fork frees the scaler.
     """
 
-    def __init__(self, file: VideoFile, *, name: str, frames: int, threads: int = 1) -> None:
+    def __init__(self, file: VideoFile, *, name: str, frames: int) -> None:
         """Open a video that must hold so many frames.
 
         Args:
             file: A path, or a seekable binary file; the latter stays the caller's to close.
             name: What messages call the file.
             frames: How many frames the video must have.
-            threads: How many slices of one picture to decode at once.
 
         Raises:
             StorageError: If the file cannot be read.
             MediaError: If it is not a video, is cut short or has another number of frames, as far
                 as the header shows. Other faults are raised by the frames that they concern.
         """
-        for what, value in (("frames", frames), ("threads", threads)):
-            if value < 1:
-                raise MediaError(f"{name}: {what} must be at least 1, got {value}.")
+        if frames < 1:
+            raise MediaError(f"{name}: frames must be at least 1, got {frames}.")
         self.name = name
         self.frames = frames
         self.scaler = VideoReformatter()
         self.converter = Converter()
         self._file = file
-        self._threads = threads
         self._picture: tuple[str, int, int] | None = None
         self._current: tuple[int, VideoFrame] | None = None
         self._is_closed = False
@@ -185,7 +179,7 @@ class VideoReader:
         if steady is None:
             container.close()
         else:
-            self._decoder = Decoder(container, clock=steady, threads=threads)
+            self._decoder = Decoder(container, clock=steady)
 
     @property
     def facts(self) -> StreamFacts:
@@ -209,10 +203,7 @@ class VideoReader:
         """
         if self._is_closed:
             raise MediaError(f"{self.name}: is closed, so frame {index} cannot be read: reopen it.")
-        if not 0 <= index < self.frames:
-            raise MediaError(
-                f"{self.name}: has no frame {index}: ask for one of 0 to {self.frames - 1}."
-            )
+        self.require_frame(index)
         if self._current is None or self._current[0] != index:
             self._current = None
             frame = self._reach(index)
@@ -226,21 +217,14 @@ class VideoReader:
         Raises:
             MediaError: If it cannot be read, or is not a colour picture.
         """
-        return self.require_colour(self.frame(index), index)
-
-    def require_colour(self, frame: VideoFrame, index: int) -> VideoFrame:
-        """Return a frame of this video, if it is a colour picture.
-
-        Raises:
-            MediaError: If it is none.
-        """
+        frame = self.frame(index)
         if self._is_coded_grey or not is_colour_format(frame.format.name):
             found = "coded as grey" if self._is_coded_grey else f"stored as {frame.format.name}"
             raise MediaError(f"{self.name}: frame {index} is {found}{NO_COLOUR}")
         return frame
 
     def siting(self, frame: VideoFrame) -> str:
-        """Return where the chroma of this video lies: as it is tagged, else "center"."""
+        """Return where the chroma of this video lies by its tag, "center" without a tag."""
         if self._siting is None:
             self._siting = picture_siting(frame) if is_subsampled(frame) else CENTRE
         return self._siting
@@ -250,26 +234,6 @@ class VideoReader:
         self._is_closed = True
         self._current = None
         self._drop_decoder()
-
-    def __enter__(self) -> "VideoReader":
-        """Return the reader itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the reader."""
-        self.close()
-
-    def __reduce__(self) -> NoReturn:
-        """Refuse to be pickled: a decoder belongs to its process."""
-        raise TypeError(
-            f"{self.name}: an open VideoReader cannot be pickled: "
-            f"pass the path to the other process and open it there."
-        )
 
     def _reach(self, index: int) -> VideoFrame:
         if self._decoder is None:
@@ -298,7 +262,7 @@ class VideoReader:
 
     def _opened(self, *, pixel_format: Literal["needed", "later"]) -> Decoder:
         container = open_container(self._file, name=self.name, pixel_format=pixel_format)
-        return Decoder(container, clock=self._clock, threads=self._threads)
+        return Decoder(container, clock=self._clock)
 
     def _survey(self, container: InputContainer) -> TableClock:
         steady = steady_clock(container, frames=self.frames)
@@ -335,7 +299,10 @@ class VideoReader:
             frame, 16, 16, format="gray", interpolation=Interpolation.POINT, threads=1
         )
         matrix: Any = tiny.side_data.get("DISPLAYMATRIX")
-        if matrix is not None and not _is_upright(bytes(matrix)):
+        if matrix is None:
+            return
+        x_x, x_y, _, y_x, y_y, *_ = np.frombuffer(bytes(matrix), "=i4")
+        if not (x_x > 0 and y_y > 0 and x_y == 0 and y_x == 0):
             raise MediaError(
                 f"{self.name}: frame {index} is tagged to be turned or mirrored when it is shown "
                 f"(rotation {frame.rotation} degrees), and the cameras are those of the stored "
@@ -370,12 +337,6 @@ def require_pixel_aspect(pixel_aspect: float, rig: Rig, *, name: str) -> None:
         )
 
 
-def _is_upright(matrix: bytes) -> bool:
-    """Return whether FFmpeg's display matrix shows a picture as it is stored."""
-    x_x, x_y, _, y_x, y_y, *_ = np.frombuffer(matrix, "=i4")
-    return bool(x_x > 0 and y_y > 0 and x_y == 0 and y_x == 0)
-
-
 def plane_numbers(
     frame: VideoFrame, plane: int, *, dtype: str, per_pixel: int = 1
 ) -> UInt8[np.ndarray, "h w"] | UInt16[np.ndarray, "h w"]:
@@ -408,7 +369,7 @@ def read_rgb(
 
     At the stored size the numbers equal those of ``ffmpeg -pix_fmt rgb24``, bit for bit for
     progressive 8-bit video, its colour matrix and range as the file gives them. Chroma lies where
-    the file is tagged to have it, and in the middle of its pixels without a tag. At another size
+    the file's tag says, or in the middle of its pixels without a tag. At another size
     they are scaled before the conversion, antialiased, with pixel centres kept (u' = s u, where
     the first pixel's centre is 0.5): by area where the picture shrinks, else bicubic. The scaled
     conversion of yuv420p rounds, where ffmpeg's unscaled one cuts off: it is 1.1 grey levels
@@ -428,9 +389,7 @@ def read_rgb(
         MediaError: If the frame cannot be decoded or is not what it must be, or size or ``out``
             does not fit.
     """
-    frame = reader.frame(index)
-    if content == "colour":
-        reader.require_colour(frame, index)
+    frame = reader.colour_frame(index) if content == "colour" else reader.frame(index)
     height, width = size or (frame.height, frame.width)
     if height < 1 or width < 1:
         raise MediaError(

@@ -1,7 +1,6 @@
 """Checks before the first sample: missing videos, lossy depth, unusual rigs and units."""
 
 import warnings
-from collections.abc import Iterator
 from typing import Any, NoReturn
 
 import numpy as np
@@ -82,19 +81,16 @@ def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> Non
     usable = whole & (units_told | (encoding.unit_m is not None))
     if usable.all():
         return
-    for row, camera in _depth_reads(plan, request):
-        if not usable[row, camera]:
-            _refuse_depth(index.scene(row), camera, encoding=encoding)
-
-
-def _depth_reads(plan: Plan, request: Request) -> Iterator[tuple[int, int]]:
-    """Yield the (row, camera) of every depth video that samples need."""
     pairs = plan.pairs
-    if "source_depth" in request.streams:
-        yield from zip(pairs.row.tolist(), pairs.source.tolist(), strict=True)
-    if "target_depth" in request.streams:
-        for row, targets in zip(pairs.row.tolist(), pairs.targets.tolist(), strict=True):
-            yield from ((row, target) for target in targets if target >= 0)
+    for stream, cameras in (
+        ("source_depth", pairs.source[:, None]),
+        ("target_depth", pairs.targets),
+    ):
+        refused = np.argwhere((cameras >= 0) & ~usable[pairs.row[:, None], cameras])
+        if stream in request.streams and len(refused):
+            pair, place = refused[0]
+            scene = index.scene(int(pairs.row[pair]))
+            _refuse_depth(scene, int(cameras[pair, place]), encoding=encoding)
 
 
 def _refuse_depth(scene: Scene, camera: int, *, encoding: DepthEncoding) -> NoReturn:

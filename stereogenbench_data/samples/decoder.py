@@ -4,7 +4,7 @@ import copy
 from collections import OrderedDict
 from collections.abc import Mapping
 from functools import partial
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.selection.plan import Address
+from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.members import MemberSource
 
 KEPT_POSES: Final = 32
@@ -38,7 +39,7 @@ class SampleDecoder:
     """Decodes what a request needs of a sample.
 
     Rows of the index, poses, open videos and their current frames are kept for later samples.
-    Threads may share a decoder.
+    Threads may share a decoder. Files that it opens stay in this process.
     """
 
     def __init__(
@@ -46,20 +47,29 @@ class SampleDecoder:
         index: SceneIndex,
         request: Request,
         *,
-        source: MemberSource,
-        frames: Literal["shared", "used once"],
+        cache: ShardCache | None = None,
+        check: Literal["opened", "metadata"] = "metadata",
+        frames: Literal["shared", "used once"] = "shared",
     ) -> None:
         """Prepare to decode; nothing is opened yet.
 
         Args:
             index: The scenes.
             request: What is needed of them.
-            source: Where their files are.
+            cache: Where to keep what comes from a URL, or None.
+            check: What is compared with its checksum, as `MemberSource` says.
             frames: Whether several samples may show a frame of a camera, which is kept for them.
         """
         self._index = index
         self._request = request
-        self._source = source
+        self._source = MemberSource(
+            index.root,
+            shards=index.shards,
+            revision=index.digest,
+            cache=cache,
+            check=check,
+            retry=index.retry,
+        )
         self._frames = frames
         self._needs = request.streams
         poses = {request.known[name].needs_poses for name in request.fields}
@@ -69,7 +79,7 @@ class SampleDecoder:
         # A transform may write into what it is given.
         self._is_changed = request.transform is not None
         self._most_depths = OPEN_STREAMS
-        self._streams = Streams(source)
+        self._streams = Streams(self._source)
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
         self._depths: OrderedDict[tuple[int, ...], StoredDepth] = OrderedDict()
@@ -81,13 +91,10 @@ class SampleDecoder:
 
     @property
     def decodes_in_place(self) -> bool:
-        """Whether pictures can be decoded where they will stay: nobody else needs or changes them.
-
-        Then `decode` takes ``out``.
-        """
+        """Whether `decode` takes ``out``: each picture is used once, and nothing changes it."""
         return self._frames == "used once" and not self._is_changed
 
-    def copy(self) -> "SampleDecoder":
+    def copy(self) -> Self:
         """Return a decoder of the same samples with open videos of its own."""
         twin = copy.copy(self)
         twin._streams = Streams(self._source)
@@ -124,7 +131,7 @@ class SampleDecoder:
         return scene
 
     def decode(
-        self, address: Address, *, frames: slice, out: Mapping[int, Any] | None = None
+        self, address: Address, *, frames: slice, out: Mapping[int, Any]
     ) -> tuple[Views, SceneFacts]:
         """Return the views of a sample, of some of its frames, and what is known of its scene.
 
@@ -133,7 +140,8 @@ class SampleDecoder:
         Args:
             address: The sample.
             frames: Which of its frames: one, or with a transform any number.
-            out: Where `decodes_in_place`: by camera, the (t, 3, h, w) uint8 arrays to decode into.
+            out: By camera, the (t, 3, h, w) uint8 arrays to decode into; none unless
+                `decodes_in_place`.
 
         Raises:
             StorageError: If a file is missing or is not the one that was indexed.
@@ -142,7 +150,7 @@ class SampleDecoder:
         """
         scene = self.scene(address.row)
         try:
-            return self._decode(scene, address, frames=frames, out=out or {})
+            return self._decode(scene, address, frames=frames, out=out)
         except (MediaError, SchemaError, ShardError):
             names = [
                 *(rgb_name(camera) for camera in self._cameras(address, "rgb")),
@@ -152,7 +160,7 @@ class SampleDecoder:
             if not self._source.drop_damaged(scene, map(scene.held_name, names)):
                 raise
             self.close()
-            return self._decode(scene, address, frames=frames, out=out or {})
+            return self._decode(scene, address, frames=frames, out=out)
 
     def _decode(
         self, scene: Scene, address: Address, *, frames: slice, out: Mapping[int, Any]
@@ -222,9 +230,8 @@ class SampleDecoder:
             for camera in cameras:
                 name = rgb_name(camera)
                 if self._frames == "used once" and camera in pictures:
-                    self._streams.write_rgb(
-                        scene, name, frame, out=pictures[camera][number], run=run
-                    )
+                    place = pictures[camera][number]
+                    self._streams.write_rgb(scene, name, frame, out=place, run=run)
                     continue
                 kept = self._streams.rgb(scene, name, frame, size=self._request.size, run=run)
                 if camera in pictures:

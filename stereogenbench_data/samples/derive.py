@@ -131,28 +131,23 @@ class PairGeometry:
             np.multiply(disparity_from_depth(self.depth_m, **rig), np.float32(sign), out=out)
         else:
             shift_m = self._views.intrinsics.fx_px * self.baseline_m
+            measured = self.stored.measured
+            if 0 not in self._encoding.no_depth and self._encoding.form == "depth":
+                # By this contract a stored 0 was measured; its disparity is 0.
+                measured = measured & (self.stored.units != 0)
             write_disparity(
                 out,
                 self.stored.units,
-                measured=self._nonzero_measured,
+                measured=measured,
                 shift_units=sign * shift_m / self._encoding.known_unit_m,
                 form=self._encoding.form,
             )
-
-    @property
-    def _nonzero_measured(self) -> MapBool:
-        """Where disparity is not 0: a contract may say that a stored 0 was measured."""
-        if 0 in self._encoding.no_depth or self._encoding.form == "inverse":
-            return self.stored.measured
-        nonzero: MapBool = self.stored.measured & (self.stored.units != 0)
-        return nonzero
 
     @cached_property
     def projection(self) -> Projection:
         """Where each source pixel lands in the target."""
         if self._facts.is_rectified:
             return project_rectified(self.depth_m, self.disparity)
-        target_from_source = self.target_from_source
         parts = [
             project_through_poses(
                 depth_m.astype(np.float64),
@@ -160,7 +155,7 @@ class PairGeometry:
                 target_intrinsics=self._views.intrinsics,
                 target_from_source=transform,
             )
-            for depth_m, transform in zip(self.depth_m, target_from_source, strict=True)
+            for depth_m, transform in zip(self.depth_m, self.target_from_source, strict=True)
         ]
         return Projection(
             u_px=np.stack([part.u_px for part in parts]),
@@ -204,7 +199,7 @@ class PairGeometry:
 
     @cached_property
     def visible_from_source(self) -> MapBool:
-        """Visible in the target, as far as the source's own depth can tell."""
+        """What is visible in the target, decided by the source's own depth alone."""
         visible: MapBool = visible_from_source(
             self.projection,
             measured=self.stored.measured,
@@ -259,14 +254,13 @@ def _as_seen(transforms: Motions, views: Views) -> Motions:
     return mirrored
 
 
+@dataclass(eq=False)
 class PairSample:
     """One source and one target of a sample, with the way there and the way back."""
 
-    def __init__(self, views: Views, facts: SceneFacts, *, target: int) -> None:
-        """Take the views of both cameras; nothing is computed yet."""
-        self.views = views
-        self.facts = facts
-        self.target = target
+    views: Views
+    facts: SceneFacts
+    target: int
 
     @cached_property
     def ahead(self) -> PairGeometry:

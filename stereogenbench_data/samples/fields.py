@@ -4,13 +4,12 @@ Shapes are of one frame. A clip puts a time axis T in front; a sweep puts an axi
 front of that, in the fields that depend on the target. A new field is a new row here.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 import numpy as np
 
-from stereogenbench_data.errors import FieldError
 from stereogenbench_data.samples.derive import MapF32, PairSample
 
 Sample = dict[str, Any]
@@ -251,23 +250,3 @@ DEFAULT_VIEW_FIELDS: Final = (
     "image", "depth", "valid", "intrinsics", "world_from_cam", "camera", "frame_index", "scene",
     "__key__",
 )  # fmt: skip
-
-
-def require_fields(names: Iterable[str], *, known: dict[str, Field]) -> tuple[str, ...]:
-    """Return field names as a tuple, in the order given.
-
-    Raises:
-        FieldError: If there is none, one is unknown, or one is named twice.
-    """
-    asked = (names,) if isinstance(names, str) else tuple(names)
-    unknown = [name for name in asked if name not in known]
-    if unknown:
-        raise FieldError(f"there is no field {unknown[0]!r}; the fields are {', '.join(known)}.")
-    if not asked or len(set(asked)) < len(asked):
-        raise FieldError(f"fields must be at least one and each only once, got {asked!r}.")
-    return asked
-
-
-def streams_of(names: Iterable[str], *, known: dict[str, Field]) -> frozenset[Stream]:
-    """Return the videos that the named fields are made from."""
-    return frozenset().union(*(known[name].streams for name in names))

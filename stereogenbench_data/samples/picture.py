@@ -1,4 +1,4 @@
-"""Samples as pictures, for people who would rather look than read."""
+"""Samples as pictures to look at: contact sheets, coloured maps, anaglyphs."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,18 +31,14 @@ def coloured(
     *,
     measured: Bool[np.ndarray, "h w"],
     largest: float,
-    smallest: float = 0.0,
 ) -> Picture:
-    """Return the sizes of a map's values as colours, grey where not measured.
+    """Return the absolute values of a map as colours, grey where not measured.
 
-    From ``smallest`` (dark blue) to ``largest`` (red); what lies beyond has the colour of the end.
+    Colours run from 0 (dark blue) to ``largest`` (red), which also stands for larger values.
     """
-    span = max(largest - smallest, 1e-12)
-    place = np.clip((np.abs(values) - smallest) / span, 0, 1) * (len(COLOUR_STOPS) - 1)
-    channels = [
-        np.interp(place, np.arange(len(COLOUR_STOPS)), COLOUR_STOPS[:, channel])
-        for channel in range(3)
-    ]
+    place = np.clip(np.abs(values) / max(largest, 1e-12), 0, 1) * (len(COLOUR_STOPS) - 1)
+    stops = np.arange(len(COLOUR_STOPS))
+    channels = [np.interp(place, stops, colours) for colours in COLOUR_STOPS.T]
     picture = np.stack(channels, axis=-1).round().astype(np.uint8)
     picture[~measured] = NOT_MEASURED
     return picture
@@ -70,7 +66,6 @@ def contact_sheet(samples: Sequence[Sample]) -> Picture:
     rows = [_row(sample) for sample in samples]
     if not rows or not rows[0]:
         raise FieldError(f"a contact sheet needs one of the fields {', '.join(_TILES)}.")
-    rows = [[(caption, _enlarged(tile)) for caption, tile in row] for row in rows]
     width = max(tile.shape[1] for row in rows for _, tile in row) + _GAP_PX
     heights = [_CAPTION_PX + _GAP_PX + max(tile.shape[0] for _, tile in row) for row in rows]
     sheet = Image.new("RGB", (max(map(len, rows)) * width, sum(heights)), (255, 255, 255))
@@ -85,12 +80,6 @@ def contact_sheet(samples: Sequence[Sample]) -> Picture:
     return np.asarray(sheet)
 
 
-def _enlarged(tile: Picture) -> Picture:
-    """Return a tile that is wide enough for its caption."""
-    factor = math.ceil(_NARROWEST_PX / tile.shape[1])
-    return tile.repeat(factor, axis=0).repeat(factor, axis=1)
-
-
 def write_png(path: Path, picture: Picture) -> None:
     """Write an (h, w, 3) uint8 picture as PNG, whole or not at all.
 
@@ -102,11 +91,18 @@ def write_png(path: Path, picture: Picture) -> None:
 
 
 def _row(sample: Sample) -> list[tuple[str, Picture]]:
+    """Return a caption and a tile, wide enough for it, of each picture and map."""
     arrays = {name: np.asarray(value) for name, value in sample.items()}
     timed = [name for name in _TILES if name in arrays and arrays[name].ndim != 3]
     if timed:
         raise FieldError(f"{timed[0]} is {arrays[timed[0]].shape}: show one pair of one frame.")
-    return [tile(name, arrays) for name, tile in _TILES.items() if name in arrays]
+    tiles = []
+    for name, make in _TILES.items():
+        if name in arrays:
+            caption, tile = make(name, arrays)
+            factor = math.ceil(_NARROWEST_PX / tile.shape[1])
+            tiles.append((caption, tile.repeat(factor, axis=0).repeat(factor, axis=1)))
+    return tiles
 
 
 def _rgb(name: str, sample: dict[str, Any]) -> tuple[str, Picture]:

@@ -1,4 +1,4 @@
-"""What a dataset requests of every sample, and the interface of transforms."""
+"""What a dataset asks of every sample, and the interface of transforms."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -7,14 +7,7 @@ from typing import Any, Final, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from stereogenbench_data.errors import FieldError
-from stereogenbench_data.samples.fields import (
-    PAIR_FIELDS,
-    VIEW_FIELDS,
-    Field,
-    Stream,
-    require_fields,
-    streams_of,
-)
+from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS, Field, Stream
 from stereogenbench_data.samples.size import require_size
 from stereogenbench_data.samples.views import Views
 from stereogenbench_data.schema.records import DepthEncoding
@@ -26,20 +19,14 @@ Layout = Literal["single", "stacked"]
 
 @runtime_checkable
 class Transform(Protocol):
-    """A function that changes pictures and cameras together.
-
-    ``swaps_views`` says whether source and target may change places, so that what one view needs
-    must be read of both.
-    """
+    """A function that changes pictures and cameras together."""
 
     @property
     def swaps_views(self) -> bool:
-        """Whether source and target may change places."""
-        ...
+        """Whether source and target may change places: what one needs is then read of both."""
 
     def __call__(self, views: Views, generator: np.random.Generator) -> Views:
         """Return the changed views."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,8 +36,7 @@ class Request:
     Attributes:
         kind: "pairs" (fields of `PAIR_FIELDS`) or "views" (of `VIEW_FIELDS`).
         fields: The fields, in order.
-        layout: "single": what each target has stands for itself; "stacked": with an axis of
-            targets in front.
+        layout: "single": of one target; "stacked": with an axis of targets in front.
         size: (height, width) to which the decoder scales, None for the stored size.
         depth: A depth contract that overrides what the index says, or None.
         transform: What changes the views before fields are derived, or None.
@@ -70,8 +56,9 @@ class Request:
 
     @property
     def streams(self) -> frozenset[Stream]:
-        """The videos that the fields are made from, whichever way the transform turns."""
-        streams = streams_of(self.fields, known=self.known)
+        """The videos that the fields are made from, before or after a swap of the views."""
+        none: frozenset[Stream] = frozenset()
+        streams = none.union(*(self.known[name].streams for name in self.fields))
         if self.transform is not None and self.transform.swaps_views:
             streams |= {SWAPPED[stream] for stream in streams}
         return streams
@@ -97,29 +84,28 @@ def parse_request(
     """Return what a user asks of every sample.
 
     Raises:
-        FieldError: If a field does not exist; if the size is not two whole numbers of 1 to 16384;
-            if depth is not a `DepthEncoding`; or if the transform cannot be called, lacks
-            ``swaps_views``, or swaps the views of samples that are not pairs.
+        FieldError: If a field does not exist, is named twice, or none is named; if the size is not
+            two whole numbers of 1 to 16384; if depth is not a `DepthEncoding`; or if the transform
+            cannot be called, lacks ``swaps_views``, or swaps the views of samples that are not
+            pairs.
     """
-    return Request(
-        kind=kind,
-        fields=require_fields(fields, known=PAIR_FIELDS if kind == "pairs" else VIEW_FIELDS),
-        layout=layout,
-        size=None if size is None else require_size(size),
-        depth=_require_depth(depth),
-        transform=_require_transform(transform, kind=kind),
-    )
-
-
-def _require_depth(depth: Any) -> DepthEncoding | None:
+    known = PAIR_FIELDS if kind == "pairs" else VIEW_FIELDS
+    names = (fields,) if isinstance(fields, str) else tuple(fields)
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise FieldError(f"there is no field {unknown[0]!r}; the fields are {', '.join(known)}.")
+    if not names or len(set(names)) < len(names):
+        raise FieldError(f"fields must be at least one and each only once, got {names!r}.")
+    if size is not None:
+        size = require_size(size)
     if depth is not None and not isinstance(depth, DepthEncoding):
         raise FieldError(f"depth must be a DepthEncoding(...), got {depth!r}.")
-    return depth
+    if transform is not None:
+        _require_transform(transform, kind=kind)
+    return Request(kind, names, layout, size, depth, transform)
 
 
-def _require_transform(transform: Any, *, kind: Kind) -> Transform | None:
-    if transform is None:
-        return None
+def _require_transform(transform: Any, *, kind: Kind) -> None:
     says = isinstance(getattr(transform, "swaps_views", None), bool)
     if not says or not callable(transform) or isinstance(transform, type):
         raise FieldError(
@@ -128,5 +114,3 @@ def _require_transform(transform: Any, *, kind: Kind) -> Transform | None:
         )
     if kind == "views" and transform.swaps_views:
         raise FieldError("SceneViews takes no flip: it swaps the two views of a pair.")
-    checked: Transform = transform
-    return checked

@@ -60,11 +60,11 @@ def require_size(size: Any) -> tuple[int, int]:
 
 
 def warn_if_swapped(size: tuple[int, int], *, stored: tuple[int, int]) -> None:
-    """Warn of a size that turns pictures from wide to high, or back, and stretches them by it.
+    """Warn if a size turns wide pictures into high ones, or high into wide, by stretching them.
 
     Args:
-        size: (height, width) in pixels that is asked for.
-        stored: (height, width) in pixels of the pictures as they are stored.
+        size: The requested (height, width) in pixels.
+        stored: (height, width) in pixels of the stored pictures.
 
     A square picture counts as wide: the usual sizes are.
     """

@@ -1,8 +1,7 @@
 """The open videos of one process: opened when first needed, decoded forwards, closed in turn.
 
 Samples that share a frame (pairs of one moment, fields of one pair) share its decoding: each
-stream keeps the last picture that it returned. A stream that fails is closed, and opened again when
-it is next needed.
+stream keeps its last picture. A stream that fails is closed, and opened again when next needed.
 """
 
 import os
@@ -52,11 +51,11 @@ class StreamStats(NamedTuple):
 
 
 class _PictureMemory:
-    """Memory for one picture at a time, written again once nobody has the picture before.
+    """Memory for one picture at a time, reused once nobody holds the previous picture.
 
-    New memory costs more than what is written into it: the system clears it first. That nobody has
-    a picture, or a view or tensor of it, is told by a weak reference, on every interpreter. Where
-    an interpreter frees objects late, the next picture gets memory of its own.
+    New memory costs more than what is written into it: the system clears it first. A weak reference
+    shows whether anybody holds a picture, or a view or tensor of it. Where an interpreter frees
+    objects late, the next picture gets memory of its own.
     """
 
     def __init__(self) -> None:
@@ -222,7 +221,7 @@ class Streams:
 
     @contextmanager
     def _stream(self, scene: Scene, name: str, run: int) -> Iterator[_Stream]:
-        """Give an open video, to be read within; it stays open unless it fails."""
+        """Yield an open video; it stays open unless reading it fails."""
         self._drop_inherited()
         with self._lock:
             member, name = scene.member(name), scene.held_name(name)
@@ -263,7 +262,7 @@ class Streams:
 
 
 def _require_size(reader: Any, scene: Scene, *, name: str) -> None:
-    """Refuse a video whose pictures or pixels have not the size that the index says."""
+    """Refuse a video whose picture size or pixel aspect differs from the index."""
     if isinstance(reader, VideoReader) and all(reader.size_px):
         found = reader.size_px
     else:
@@ -286,7 +285,7 @@ def _read_only(picture: Any) -> Any:
 
 @contextmanager
 def _cause_raised(file: Path | MemberFile) -> Iterator[None]:
-    """Raise the failed fetch that made a video fail, if one did, and close the file."""
+    """Raise the failed fetch that made a video fail, if there was one, and close the file."""
     try:
         yield
     except (MediaError, StorageError) as error:

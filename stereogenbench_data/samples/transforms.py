@@ -7,8 +7,9 @@ no more measured than the padding. Every frame and camera of a sample is treated
 docstring says otherwise.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -174,7 +175,7 @@ class RandomScale:
         """Require ascending ranges, a probability and at least one pixel."""
         _require_range(self, -8.0, "low", "high")
         _require_range(self, 0.0, "stretch")
-        _require_probability(self, "stretch_probability")
+        _require_probabilities(self, "stretch_probability")
         _require_size(*self.at_least)
 
     def __call__(self, views: Views, generator: Generator) -> Views:
@@ -203,7 +204,7 @@ class HorizontalFlip:
 
     def __post_init__(self) -> None:
         """Require a probability."""
-        _require_probability(self, "probability")
+        _require_probabilities(self, "probability")
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return the views, or their mirror image."""
@@ -214,24 +215,20 @@ class HorizontalFlip:
                 f"HorizontalFlip swaps the two views of a pair; this sample has one view and "
                 f"{len(views.targets)} others. Use it with single pairs."
             )
-        return replace(
+
+        def mirrored(maps: Any) -> Any:
+            return maps[..., ::-1].copy()
+
+        return _mapped(
             views,
+            pictures=mirrored,
+            maps=mirrored,
+            marks=mirrored,
             source=views.targets[0],
             targets=(views.source,),
-            pictures={
-                camera: pictures[..., ::-1].copy() for camera, pictures in views.pictures.items()
-            },
-            depths={
-                camera: StoredDepth(
-                    depth.units[..., ::-1].copy(),
-                    depth.measured[..., ::-1].copy(),
-                )
-                for camera, depth in views.depths.items()
-            },
             intrinsics=views.intrinsics.flipped(),
             world="mirrored" if views.world == "as filmed" else "as filmed",
-            padded=None if views.padded is None else views.padded[..., ::-1].copy(),
-            erased={camera: erased[..., ::-1].copy() for camera, erased in views.erased.items()},
+            padded=None if views.padded is None else mirrored(views.padded),
         )
 
 
@@ -253,9 +250,9 @@ class ColorJitter:
 
     def __post_init__(self) -> None:
         """Require factors and a probability of 0 to 1."""
-        for name in ("brightness", "contrast", "saturation", "hue"):
-            _require_probability(self, name)
-        _require_probability(self, "asymmetric_probability")
+        _require_probabilities(
+            self, "brightness", "contrast", "saturation", "hue", "asymmetric_probability"
+        )
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return views with other colours."""
@@ -269,11 +266,11 @@ class ColorJitter:
         }
         return replace(views, pictures=pictures)
 
-    def _draw(self, generator: Generator) -> tuple[float, float, float, float]:
-        low = np.array([1 - self.brightness, 1 - self.contrast, 1 - self.saturation, -self.hue])
-        high = np.array([1 + self.brightness, 1 + self.contrast, 1 + self.saturation, self.hue])
-        brightness, contrast, saturation, hue = generator.uniform(low, high)
-        return float(brightness), float(contrast), float(saturation), float(hue)
+    def _draw(self, generator: Generator) -> Any:
+        """Return the factors of brightness, contrast and saturation, and the turn of hue."""
+        middle = np.array([1.0, 1.0, 1.0, 0.0])
+        spread = np.array([self.brightness, self.contrast, self.saturation, self.hue])
+        return generator.uniform(middle - spread, middle + spread)
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,7 +289,7 @@ class Eraser:
 
     def __post_init__(self) -> None:
         """Require a probability, and boxes of at least one pixel."""
-        _require_probability(self, "probability")
+        _require_probabilities(self, "probability")
         _require_range(self, 1, "low", "high")
         _require_size(self.most_boxes, 1)
 
@@ -324,14 +321,15 @@ def _require_size(height: Any, width: Any) -> None:
     whole = all(isinstance(side, int | np.integer) for side in (height, width))
     if not whole or min(height, width) < 1:
         raise FieldError(
-            f"{width!r} x {height!r} pixels cannot be: sizes are whole numbers and start at 1."
+            f"a size must be whole numbers of pixels from 1, got {width!r} x {height!r}."
         )
 
 
-def _require_probability(transform: Any, name: str) -> None:
-    value = getattr(transform, name)
-    if not isinstance(value, int | float) or not 0 <= value <= 1:
-        raise FieldError(f"{name} of {type(transform).__name__} must be 0 to 1, got {value!r}.")
+def _require_probabilities(transform: Any, *names: str) -> None:
+    for name in names:
+        value = getattr(transform, name)
+        if not isinstance(value, int | float) or not 0 <= value <= 1:
+            raise FieldError(f"{name} of {type(transform).__name__} must be 0 to 1, got {value!r}.")
 
 
 def _require_range(transform: Any, least: float, *names: str) -> None:
@@ -351,30 +349,42 @@ def _own(maps: Any, views: Views) -> Any:
     return maps[..., ~views.padded, None]
 
 
+def _mapped(
+    views: Views,
+    *,
+    pictures: Callable[[Any], Any],
+    maps: Callable[[Any], Any],
+    marks: Callable[[Any], Any],
+    **changes: Any,
+) -> Views:
+    """Return views with all pictures, stored depth maps and marks of erased pixels mapped."""
+    return replace(
+        views,
+        pictures={camera: pictures(found) for camera, found in views.pictures.items()},
+        depths={
+            camera: StoredDepth(maps(depth.units), maps(depth.measured))
+            for camera, depth in views.depths.items()
+        },
+        erased={camera: marks(erased) for camera, erased in views.erased.items()},
+        **changes,
+    )
+
+
 def _resized(views: Views, *, height: int, width: int) -> Views:
     size = (height, width)
     padded = None if views.padded is None else _resized_marks(views.padded, size=size)
-    measured = {
-        camera: resized_nearest(depth.measured, size=size) for camera, depth in views.depths.items()
-    }
-    return replace(
+
+    def nearest(maps: Any) -> Any:
+        resized = resized_nearest(maps, size=size)
+        return resized if padded is None or maps.dtype != bool else resized & ~padded
+
+    return _mapped(
         views,
-        pictures={
-            camera: _resized_pictures(pictures, size=size)
-            for camera, pictures in views.pictures.items()
-        },
-        depths={
-            camera: StoredDepth(
-                resized_nearest(depth.units, size=size),
-                measured[camera] if padded is None else measured[camera] & ~padded,
-            )
-            for camera, depth in views.depths.items()
-        },
+        pictures=partial(_resized_pictures, size=size),
+        maps=nearest,
+        marks=partial(_resized_marks, size=size),
         intrinsics=views.intrinsics.resized(width_px=width, height_px=height),
         padded=padded,
-        erased={
-            camera: _resized_marks(erased, size=size) for camera, erased in views.erased.items()
-        },
     )
 
 
@@ -396,13 +406,10 @@ def _resized_pictures(pictures: Any, *, size: tuple[int, int]) -> Any:
 
 
 def _averaged(pictures: Any, size: tuple[int, int]) -> Any:
-    averaged = torch.nn.functional.interpolate(
-        torch.from_numpy(np.ascontiguousarray(pictures)),
-        size=size,
-        mode="bilinear",
-        antialias=True,
-    )
-    return averaged.numpy()
+    tensor = torch.from_numpy(np.ascontiguousarray(pictures))
+    return torch.nn.functional.interpolate(
+        tensor, size=size, mode="bilinear", antialias=True
+    ).numpy()
 
 
 def _windowed(views: Views, *, top: int, left: int, size: tuple[int, int]) -> Views:
@@ -410,27 +417,14 @@ def _windowed(views: Views, *, top: int, left: int, size: tuple[int, int]) -> Vi
     old, padded = views.intrinsics, views.padded
     if min(top, left) < 0 or top + height > old.height_px or left + width > old.width_px:
         padded = np.zeros((old.height_px, old.width_px), dtype=bool) if padded is None else padded
-    return replace(
+    window = partial(_window, top=top, left=left, size=size)
+    return _mapped(
         views,
-        pictures={
-            camera: _window(pictures, top=top, left=left, size=size)
-            for camera, pictures in views.pictures.items()
-        },
-        depths={
-            camera: StoredDepth(
-                _window(depth.units, top=top, left=left, size=size),
-                _window(depth.measured, top=top, left=left, size=size),
-            )
-            for camera, depth in views.depths.items()
-        },
-        intrinsics=views.intrinsics.cropped(
-            left_px=left, top_px=top, width_px=width, height_px=height
-        ),
-        padded=None if padded is None else ~_window(~padded, top=top, left=left, size=size),
-        erased={
-            camera: _window(erased, top=top, left=left, size=size)
-            for camera, erased in views.erased.items()
-        },
+        pictures=window,
+        maps=window,
+        marks=window,
+        intrinsics=old.cropped(left_px=left, top_px=top, width_px=width, height_px=height),
+        padded=None if padded is None else ~window(~padded),
     )
 
 
@@ -452,20 +446,20 @@ def _luma(pictures: Any) -> Any:
     return np.einsum("c,tchw->thw", weights, pictures, dtype=np.float32)[:, None]
 
 
-def _recoloured(pictures: Any, factors: tuple[float, float, float, float], *, grey: float) -> Any:
+def _recoloured(pictures: Any, factors: Any, *, grey: float) -> Any:
     """Return (t, 3, h, w) uint8 pictures of another brightness, contrast, saturation and hue.
 
     Contrast stretches about ``grey``, the mean luma, which all views share.
     """
-    brightness, contrast, saturation, hue = (np.float32(factor) for factor in factors)
+    brightness, contrast, saturation, hue = factors.astype(np.float32)
     middle = np.float32(grey) * brightness
     colours = middle + (pictures * brightness - middle) * contrast
     luma = _luma(colours)
-    turned = np.einsum("ij,tjhw->tihw", _hue_rotation(float(hue)), colours - luma)
+    turned = np.einsum("ij,tjhw->tihw", hue_rotation(float(hue)), colours - luma)
     return np.clip(np.rint(luma + turned * saturation), 0, 255).astype(np.uint8)
 
 
-def _hue_rotation(turns: float) -> Any:
+def hue_rotation(turns: float) -> Any:
     """Return the matrix that turns colours about the grey axis by a part of a full circle.
 
     Source: Rodrigues' formula for the axis (1, 1, 1).

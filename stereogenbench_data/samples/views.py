@@ -1,7 +1,7 @@
 """What is decoded for one sample, before anything is derived from it.
 
-Transforms map one `Views` to another: they move pictures, stored depth and cameras together and
-never see a disparity, so that all that is derived afterwards fits by construction.
+Transforms map one `Views` to another: they move pictures, stored depth and cameras together.
+Disparity and the like are derived afterwards, so they fit.
 """
 
 from dataclasses import dataclass, field
@@ -43,10 +43,9 @@ class Views:
         depths: Stored depth for each camera whose depth is wanted.
         intrinsics: Of every camera, after what was done to the pictures.
         world: "as filmed", or "mirrored" (x negated) after a horizontal flip.
-        padded: (h, w) bool, pixels of every view that are not made of its camera's own pixels
-            alone: padding, and what was averaged with it. They are never `measured`. None where
-            there are none.
-        erased: (h, w) bool for each camera whose picture was painted over: where it was.
+        padded: (h, w) bool, pixels of every view that are padding or were averaged with padding.
+            They are never `measured`. None where there are none.
+        erased: (h, w) bool for each camera whose picture was painted over: where.
 
     Raises:
         FieldError: If ``padded`` or ``erased`` is not of the pictures' size.

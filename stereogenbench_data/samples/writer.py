@@ -51,7 +51,7 @@ class SampleWriter:
         self._allocate = allocate
 
     def pictures(self, frames: slice, *, size: tuple[int, int]) -> dict[int, Any]:
-        """Return by camera, for pictures that are a field just as decoded, where they belong.
+        """Return by camera where to decode pictures that are a field exactly as decoded.
 
         Args:
             frames: Which frames of the sample.
@@ -77,7 +77,7 @@ class SampleWriter:
             frames: Where they lie on the sample's time axis.
         """
         pairs = [
-            PairSample(views, facts, target=target)
+            PairSample(views, facts, target)
             for target in self._target_cameras(views.source, views.targets)
         ]
         for field in self._fields:
@@ -110,7 +110,7 @@ class SampleWriter:
             field: The field, which is allocated if it is not yet.
             number: The place of the target on the axis of targets.
             frames: Which frames of the sample.
-            shape: What is written: of a field with one value a frame, with a time axis in front.
+            shape: The shape of what is written, with a time axis in front if it is per frame.
             dtype: Its dtype.
 
         Returns:

@@ -9,7 +9,7 @@ import json
 import math
 import re
 from dataclasses import dataclass
-from typing import Any, Final, NoReturn, TypeGuard
+from typing import Any, Final, TypeGuard
 
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.release import CAMERA_COUNT
@@ -87,8 +87,18 @@ def parse_object(text: bytes, *, where: str) -> dict[str, Any]:
             f"{where}: lists or objects are nested hundreds of levels deep; the release's files "
             f"have six levels. Copy the file from the release again."
         ) from error
+    except json.JSONDecodeError as error:
+        length = len(decoded.rstrip())
+        truncated = error.pos >= length or error.msg.startswith("Unterminated")
+        guess = "The file looks truncated: c" if truncated else "C"
+        raise SchemaError(
+            f"{where}: not valid JSON: {error.msg} at line {error.lineno}, column {error.colno} "
+            f"(character {error.pos} of {length}). {guess}opy it from the release again."
+        ) from error
     except ValueError as error:
-        _raise_not_json(error, length=len(decoded.rstrip()), where=where)
+        raise SchemaError(
+            f"{where}: not valid JSON: {error}. Copy the file from the release again."
+        ) from error
     if not isinstance(document, dict):
         raise SchemaError(
             f"{where}: $ must be an object, found {brief(document)}. "
@@ -101,19 +111,6 @@ def parse_object(text: bytes, *, where: str) -> dict[str, Any]:
             f"and only one of its values can be read. Remove the wrong one."
         )
     return document
-
-
-def _raise_not_json(error: ValueError, *, length: int, where: str) -> NoReturn:
-    if not isinstance(error, json.JSONDecodeError):
-        raise SchemaError(
-            f"{where}: not valid JSON: {error}. Copy the file from the release again."
-        ) from error
-    truncated = error.pos >= length or error.msg.startswith("Unterminated")
-    guess = "The file looks truncated: c" if truncated else "C"
-    raise SchemaError(
-        f"{where}: not valid JSON: {error.msg} at line {error.lineno}, column {error.colno} "
-        f"(character {error.pos} of {length}). {guess}opy it from the release again."
-    ) from error
 
 
 def _path_of(document: object, wanted: object) -> str:
@@ -228,9 +225,24 @@ class JsonValue:
         An unknown key that may hold the quantity (`LOOKALIKES`) is recorded as a problem.
         """
         found = self._known(quantity)
-        if found is None and quantity in LOOKALIKES:
-            self._complain_of_lookalikes(quantity)
-        return found
+        if found is not None or quantity not in LOOKALIKES:
+            return found
+        inner = [self.child(key) for key in self.value if isinstance(self.value[key], dict)]
+        for holder in (self, *inner):
+            for key, value in holder.value.items():
+                snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", key).lower()
+                looks_alike = key not in KNOWN_KEYS and LOOKALIKES[quantity].search(snake)
+                if value is not None and looks_alike:
+                    holder.child(key).complain(
+                        f"is not a known key and may stand for {SPELLINGS[quantity][0]}. Rename "
+                        f"or remove it; the keys here are: {_keys(holder.value)}"
+                    )
+        return None
+
+    def find_text(self, quantity: str) -> str | None:
+        """Return a text of this object, None where it is absent."""
+        found = self.find(quantity)
+        return None if found is None else found.text()
 
     def require(self, quantity: str) -> "JsonValue | None":
         """Return a quantity of this object; where it is absent, record that with the keys found."""
@@ -255,21 +267,6 @@ class JsonValue:
                 return self.child(*keys)
         return None
 
-    def _complain_of_lookalikes(self, quantity: str) -> None:
-        inner = [self.child(key) for key in self.value if isinstance(self.value[key], dict)]
-        for holder in (self, *inner):
-            for key, value in holder.value.items():
-                snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", key).lower()
-                if (
-                    value is not None
-                    and key not in KNOWN_KEYS
-                    and LOOKALIKES[quantity].search(snake)
-                ):
-                    holder.child(key).complain(
-                        f"is not a known key and may stand for {SPELLINGS[quantity][0]}. Rename "
-                        f"or remove it; the keys here are: {_keys(holder.value)}"
-                    )
-
     def objects(self) -> "list[JsonValue]":
         """Return the elements of this list, each of which must be an object."""
         if not isinstance(self.value, list):
@@ -291,10 +288,10 @@ class JsonValue:
     def positive(self) -> float:
         """Return this value as a finite number above zero."""
         number = self.number()
-        if number <= 0:
-            self.complain(f"must be a number above zero, found {brief(self.value)}")
-            return 1.0
-        return number
+        if number > 0:
+            return number
+        self.complain(f"must be a number above zero, found {brief(self.value)}")
+        return 1.0
 
     def integer(self) -> int:
         """Return this value as an integer; 3.0 counts as 3."""
@@ -330,9 +327,9 @@ class JsonValue:
 
     def axes(self, names: tuple[str, ...]) -> list[Any] | None:
         """Return the named components of this object, unchecked; None where one is missing."""
-        if not (isinstance(self.value, dict) and all(name in self.value for name in names)):
-            return None
-        return [self.value[name] for name in names]
+        if isinstance(self.value, dict) and all(name in self.value for name in names):
+            return [self.value[name] for name in names]
+        return None
 
 
 def is_number(value: object) -> TypeGuard[int | float]:

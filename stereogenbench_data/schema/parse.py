@@ -6,7 +6,7 @@ and the JSON path of each problem. ``trajectory.json`` has a module of its own.
 
 import math
 import re
-from typing import Final, Literal
+from typing import Final
 
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.document import JsonValue, brief
@@ -72,20 +72,14 @@ def parse_scene_key(key: str) -> SceneId:
 
 def _labels(root: JsonValue) -> SceneLabels:
     """Return the identifiers in a file; each is optional."""
-
-    def text(quantity: str) -> str | None:
-        found = root.find(quantity)
-        return None if found is None else found.text()
-
-    index = root.find("scene_index")
-    fstop = root.find("aperture_fstop")
+    index, fstop = root.find("scene_index"), root.find("aperture_fstop")
     return SceneLabels(
-        scene_label=text("scene_label"),
+        scene_label=root.find_text("scene_label"),
         scene_index=None if index is None else index.integer(),
-        map_name=text("map_name"),
-        map_path=text("map_path"),
-        character=text("character"),
-        animation=text("animation"),
+        map_name=root.find_text("map_name"),
+        map_path=root.find_text("map_path"),
+        character=root.find_text("character"),
+        animation=root.find_text("animation"),
         aperture_fstop=None if fstop is None else fstop.positive(),
     )
 
@@ -114,30 +108,17 @@ def parse_description(text: bytes, *, where: str) -> Description:
     Source: the paper's appendix on the file schema.
     """
     root = JsonValue.parse(text, where=where)
-
-    def words(quantity: str) -> str:
-        found = root.find(quantity)
-        return "" if found is None else found.text()
-
-    description = Description(
-        short_caption=words("short_caption"),
-        detailed_caption=words("detailed_caption"),
-        scene_type=words("scene_type"),
-        setting=words("setting"),
-        tags=_tags(root),
+    short, detailed, scene_type, setting = (
+        root.find_text(quantity) or ""
+        for quantity in ("short_caption", "detailed_caption", "scene_type", "setting")
     )
-    root.problems.require_none()
-    return description
-
-
-def _tags(root: JsonValue) -> tuple[str, ...]:
-    tags = root.find("tags")
-    if tags is None:
-        return ()
-    if not isinstance(tags.value, list):
+    tags, texts = root.find("tags"), []
+    if tags is not None and isinstance(tags.value, list):
+        texts = [tags.child(place).text() for place in range(len(tags.value))]
+    elif tags is not None:
         tags.complain(f"must be a list of texts, found {brief(tags.value)}")
-        return ()
-    return tuple(tags.child(place).text() for place in range(len(tags.value)))
+    root.problems.require_none()
+    return Description(short, detailed, scene_type, setting, tuple(texts))
 
 
 def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels]:
@@ -159,7 +140,8 @@ def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels]:
     root = JsonValue.parse(text, where=where)
     unit_m(root)
     require_six_cameras(root)
-    width_px, height_px, size_source = _image_size(root)
+    width, height = root.find("image_width_px"), root.find("image_height_px")
+    width_px, height_px = _side_px(width), _side_px(height)
     sensor_width_mm = _required_positive(root, "sensor_width_mm")
     sensor_height = root.find("sensor_height_mm")
     baselines_cm = _pairwise(root)
@@ -177,7 +159,7 @@ def parse_rig(text: bytes, *, where: str) -> tuple[Rig, SceneLabels]:
         principal_point_px=_principal_point(root, size_px=(width_px, height_px)),
         baselines_cm=tuple(baselines_cm.get(pair, math.nan) for pair in CAMERA_PAIRS),
         primary_pair=_primary_pair(root),
-        image_size_source=size_source,
+        image_size_source="default" if width is None and height is None else "recorded",
     )
     labels = _labels(root)
     root.problems.require_none()
@@ -189,14 +171,7 @@ def _required_positive(root: JsonValue, quantity: str) -> float:
     return 1.0 if found is None else found.positive()
 
 
-def _image_size(root: JsonValue) -> tuple[int, int, Literal["recorded", "default"]]:
-    width, height = root.find("image_width_px"), root.find("image_height_px")
-    if width is None and height is None:
-        return IMAGE_SIZE_PX, IMAGE_SIZE_PX, "default"
-    return _size(width), _size(height), "recorded"
-
-
-def _size(side: JsonValue | None) -> int:
+def _side_px(side: JsonValue | None) -> int:
     if side is None:
         return IMAGE_SIZE_PX
     size_px = side.integer()

@@ -154,7 +154,9 @@ class DepthEncoding:
 
     def __post_init__(self) -> None:
         """Refuse values out of range."""
-        if self.unit_m is not None and not _is_positive(self.unit_m):
+        unit_m: object = self.unit_m
+        is_number = isinstance(unit_m, int | float) and math.isfinite(unit_m) and unit_m > 0
+        if unit_m is not None and not is_number:
             raise SchemaError(f"unit_m must be a positive number of metres, got {self.unit_m!r}.")
         for name, numbers in (
             ("frame_lag", (self.frame_lag,)),
@@ -193,10 +195,6 @@ class DepthEncoding:
     ) -> "DepthEncoding":
         """Return the encoding with the file's unit, unless it has its own."""
         return self if self.unit_m is not None else replace(self, unit_m=unit_m, source=source)
-
-
-def _is_positive(number: object) -> bool:
-    return isinstance(number, int | float) and math.isfinite(number) and number > 0
 
 
 @dataclass(frozen=True, slots=True)

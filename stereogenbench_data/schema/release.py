@@ -5,6 +5,7 @@ counts and the baseline bins.
 """
 
 import itertools
+import math
 import re
 from typing import Final, Literal
 
@@ -71,7 +72,6 @@ TRAIN_MAPS: Final = frozenset(
 )
 UNSEEN_MAPS: Final = frozenset({"DeepWaterStation_DemoMapScalabilityEpic", "STF_TestMap"})
 
-INFINITY: Final = float("inf")
 BASELINE_BINS: Final[dict[str, tuple[float, float]]] = {
     "[0,1)": (0.0, 1.0),
     "[1,10)": (1.0, 10.0),
@@ -79,7 +79,7 @@ BASELINE_BINS: Final[dict[str, tuple[float, float]]] = {
     "[30,60)": (30.0, 60.0),
     "[60,100)": (60.0, 100.0),
     "[100,150]": (100.0, 150.0),
-    "(150,inf)": (150.0, INFINITY),
+    "(150,inf)": (150.0, math.inf),
 }
 """Baseline bins in cm. The five in the middle are the paper's. The outer two are for the baselines
 beyond them: all pairs of a Pairwise_Uniform rig reach 200 cm, those of a Uniform rig 750 cm. Bins

@@ -78,9 +78,11 @@ def parse_trajectory(text: bytes, *, where: str) -> Trajectory:
     metres = unit_m(root)
     require_six_cameras(root)
     representation = _representation(root.find("rotation_representation"))
-    poses: list[_Pose] = []
-    for frame, node in enumerate(_frames(root)):
-        poses += _poses(node, frame=frame, representation=representation)
+    poses = [
+        pose
+        for frame, node in enumerate(_frames(root))
+        for pose in _poses(node, frame=frame, representation=representation)
+    ]
     centres = _numbers([(pose.location, pose.centre) for pose in poses], count=3)
     rotations = _rotations(poses, representation)
     root.problems.require_none()
@@ -102,10 +104,10 @@ def _frozen(values: np.ndarray) -> np.ndarray:
 def _representation(name: JsonValue | None) -> _Representation:
     if name is None:
         return _ROTATOR
-    known = REPRESENTATIONS.get(name.value) if isinstance(name.value, str) else None
-    if known is None:
-        name.complain(f"must be one of {', '.join(REPRESENTATIONS)}, found {brief(name.value)}")
-    return known or _ROTATOR
+    if isinstance(name.value, str) and name.value in REPRESENTATIONS:
+        return REPRESENTATIONS[name.value]
+    name.complain(f"must be one of {', '.join(REPRESENTATIONS)}, found {brief(name.value)}")
+    return _ROTATOR
 
 
 def _frames(root: JsonValue) -> list[JsonValue]:
@@ -229,14 +231,11 @@ def _rotations(poses: list[_Pose], representation: _Representation) -> np.ndarra
     values = _numbers(
         [(pose.rotation, pose.turn) for pose in poses], count=int(np.prod(representation.shape))
     )
-    if (
-        representation.kind == "rotator_deg"
-        or not poses
-        or len(poses[0].rotation.problems) > before
-    ):
+    is_checked = poses and len(poses[0].rotation.problems) == before
+    if representation.kind == "rotator_deg" or not is_checked:
         return values
-    is_matrix = representation.kind == "matrix"
-    checked, bad = (_rotation_matrices if is_matrix else _unit_quaternions)(values)
+    check = _rotation_matrices if representation.kind == "matrix" else _unit_quaternions
+    checked, bad = check(values)
     for row, complaint in bad.items():
         poses[row].rotation.complain(complaint)
     return checked

@@ -20,33 +20,41 @@ LOG_STRATA = 16
 def balanced(
     baselines_cm: Float64[np.ndarray, " n"], *, by: Balance, limit: int | None, seed: int
 ) -> Int64[np.ndarray, " m"]:
-    """Return places of a subsample that holds equally many baselines of every stratum, ascending.
+    """Return the places, ascending, of a subsample with equally many baselines of each stratum.
 
     Args:
         baselines_cm: Baselines in cm.
         by: "bins": the strata are the paper's baseline bins; "log_baseline": 16 equally wide
-            intervals of log-baseline over the range at hand. Strata without any baseline at all
-            do not count.
-        limit: How many to draw in all; the strata's shares then differ by one at the most.
-            None draws as many from each stratum as the poorest one has.
+            intervals of log-baseline over the range at hand. Empty strata do not count.
+        limit: How many to draw in all; the strata's shares differ by at most one. None draws as
+            many from each stratum as the smallest one has.
         seed: The draw's seed.
 
     Raises:
-        SelectionError: If a stratum is poorer than its share of the limit.
+        SelectionError: If a stratum has fewer baselines than its share of the limit, or the limit
+            is less than one for each.
     """
     strata = _strata(baselines_cm, by=by)
-    names, stratum = np.unique(strata, return_inverse=True)
-    members = [np.flatnonzero(stratum == number) for number in range(len(names))]
+    found = np.unique(strata).tolist()
+    members = [np.flatnonzero(strata == stratum) for stratum in found]
     poorest = min(map(len, members))
-    shares = [poorest] * len(members) if limit is None else _shares(limit, len(members))
+    if limit is None:
+        limit = poorest * len(found)
+    if limit < len(found):
+        raise SelectionError(
+            f"limit={limit} is less than one pair for each of {len(found)} strata."
+        )
     generator = np.random.default_rng(np.random.SeedSequence((seed, 0xBA1A)))
     drawn = []
-    for name, places, share in zip(names, members, shares, strict=True):
+    for number, (stratum, places) in enumerate(zip(found, members, strict=True)):
+        share = limit // len(found) + (number < limit % len(found))
         if share > len(places):
+            name = f"stratum {stratum + 1} of {LOG_STRATA} of log-baseline"
+            if by == "bins":
+                name = f"the bin {list(BASELINE_BINS)[stratum]} cm"
             raise SelectionError(
-                f"balance={by!r}, limit={limit}: {share} pairs are wanted of "
-                f"{_stratum_name(name, by=by)}, which has {len(places)}; the most that balances is "
-                f"{poorest * len(members)}."
+                f"balance={by!r}, limit={limit}: {share} pairs are wanted of {name}, which has "
+                f"{len(places)}; the most that balances is {poorest * len(found)}."
             )
         drawn.append(generator.choice(places, size=share, replace=False))
     return np.sort(np.concatenate(drawn))
@@ -63,15 +71,3 @@ def _strata(baselines_cm: Float64[np.ndarray, " n"], *, by: Balance) -> Int64[np
     strata: Int64[np.ndarray, " n"] = ((logs - logs.min()) // width).astype(np.int64)
     strata[strata == LOG_STRATA] = LOG_STRATA - 1
     return strata
-
-
-def _shares(limit: int, strata: int) -> list[int]:
-    if limit < strata:
-        raise SelectionError(f"limit={limit} is less than one pair for each of {strata} strata.")
-    return [limit // strata + (number < limit % strata) for number in range(strata)]
-
-
-def _stratum_name(stratum: int, *, by: Balance) -> str:
-    if by == "bins":
-        return f"the bin {list(BASELINE_BINS)[stratum]} cm"
-    return f"stratum {stratum + 1} of {LOG_STRATA} of log-baseline"

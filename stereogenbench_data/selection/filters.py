@@ -55,7 +55,7 @@ _TEXT_COLUMNS = {
     "animation": "animation",
     "scenes": "key",
 }
-_RANGE_COLUMNS = {"focal_mm": "focal_mm", "valid_depth_ratio": "valid_depth_ratio"}
+_RANGE_COLUMNS = ("focal_mm", "valid_depth_ratio")
 _MOST_VALUES = 12
 _MOST_KEYS = 6
 
@@ -77,7 +77,7 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
             before = f" of those left by {', '.join(applied)}" if applied else ""
             raise SelectionError(
                 f"{name}={wanted!r} matches none of {counted(len(rows), 'scene')}{before}; "
-                f"{name} there is {there()}.{stale_note(index)}"
+                f"found {there()}.{stale_note(index)}"
             )
         rows = rows[keep]
         applied.append(f"{name}={wanted!r}")
@@ -94,7 +94,7 @@ def stale_note(index: SceneIndex) -> str:
 def _apply(
     index: SceneIndex, name: str, wanted: Any, *, rows: Int64[np.ndarray, " n"]
 ) -> tuple[Bool[np.ndarray, " n"], Callable[[], str]]:
-    """Return which rows one filter keeps, and a way to say what values they have."""
+    """Return which rows one filter keeps, and what describes the values that there are."""
     if name in _TEXT_COLUMNS:
         column = index.column(_TEXT_COLUMNS[name])
         values = column[rows]
@@ -103,12 +103,11 @@ def _apply(
         if nowhere and len(nowhere) < len(set(names)):
             raise SelectionError(
                 f"{name}={nowhere[0]!r} matches none of {counted(len(column), 'scene')} of the "
-                f"index; {name} "
-                f"there is {_listed(column, near=nowhere)}.{stale_note(index)}"
+                f"index; found {_listed(column, near=nowhere)}.{stale_note(index)}"
             )
         return np.isin(values.astype(str), names), lambda: _listed(values, near=names)
     if name in _RANGE_COLUMNS:
-        numbers = index.column(_RANGE_COLUMNS[name])[rows].astype(np.float64)
+        numbers = index.column(name)[rows].astype(np.float64)
         low, high = require_range(name, wanted)
         if np.isnan(numbers).all():
             raise SelectionError(
@@ -116,7 +115,8 @@ def _apply(
                 f"{counted(len(rows), 'scene')}. "
                 "Make the index with `stereogenbench index ROOT --valid-depth`."
             )
-        return (numbers >= low) & (numbers <= high), lambda: _spanned(numbers)
+        keep = (numbers >= low) & (numbers <= high)
+        return keep, lambda: f"{np.nanmin(numbers):g} to {np.nanmax(numbers):g}"
     if name == "caption":
         return _caption_filter(index, wanted, rows=rows)
     known = [*_TEXT_COLUMNS, *_RANGE_COLUMNS, "caption"]
@@ -136,7 +136,7 @@ def _caption_filter(
     captions = [str(caption).lower() for caption in index.column("caption")[rows]]
     keep = np.array([all(word in caption for word in words) for caption in captions], dtype=bool)
     written = sum(map(bool, captions))
-    return keep, lambda: f"written for {written} scenes, without all of {words}"
+    return keep, lambda: f"captions of {counted(written, 'scene')}, none with all of {words}"
 
 
 def require_range(name: str, wanted: Any) -> Range:
@@ -164,21 +164,17 @@ def _texts(name: str, wanted: Any) -> list[str]:
 def _listed(values: Any, *, near: list[str]) -> str:
     found = sorted({str(value) for value in values if value is not None and str(value)})
     if not found:
-        return "not recorded for any"
+        return "no value"
     close = [match for name in near for match in difflib.get_close_matches(name, found, n=2)]
     first = list(dict.fromkeys([*close, *found]))[:_MOST_VALUES]
     more = f" and {len(found) - len(first)} more" if len(found) > len(first) else ""
     return ", ".join(map(repr, first)) + more
 
 
-def _spanned(numbers: Any) -> str:
-    return f"{np.nanmin(numbers):g} to {np.nanmax(numbers):g}"
-
-
 def find_scene(index: SceneIndex, text: str) -> int:
-    """Return the row of the one scene whose key is a text, or ends in it, or holds it.
+    """Return the row of the one scene whose key is a text, or ends in it, or contains it.
 
-    A text that is whole folders of one key is that scene's, whatever other keys it is a part of.
+    Matches of whole folder names win over matches of parts of names.
 
     Args:
         index: Where to look.

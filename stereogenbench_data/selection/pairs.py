@@ -177,7 +177,7 @@ def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairLis
     if isinstance(names, Sequence) and names and isinstance(names[0], str):
         keep = np.zeros(found.shape, dtype=bool)
         for name in names:
-            keep |= _in_bin(found, str(name))
+            keep |= in_bin(found, str(name))
     else:
         low, high = require_range("baseline_cm", wanted)
         keep = (found >= low) & (found <= high)
@@ -185,14 +185,19 @@ def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairLis
         bins = sorted({baseline_bin(value) for value in found[~np.isnan(found)]})
         raise SelectionError(
             f"baseline_cm={wanted!r} matches none of {counted(len(pairs), 'pair')}; "
-            f"baselines there are {np.nanmin(found):g} to {np.nanmax(found):g} cm, in the bins "
+            f"found {np.nanmin(found):g} to {np.nanmax(found):g} cm, in the bins "
             f"{', '.join(bins)}."
         )
     kept = PairList(pairs.row, pairs.source, _packed(pairs.targets, keep))
     return kept[keep.any(axis=1)]
 
 
-def _in_bin(found: Float64[np.ndarray, "n k"], name: str) -> Bool[np.ndarray, "n k"]:
+def in_bin(found: Float64[np.ndarray, "*any"], name: str) -> Bool[np.ndarray, "*any"]:
+    """Return which baselines in cm lie in a bin of `BASELINE_BINS`.
+
+    Raises:
+        SelectionError: If there is no such bin.
+    """
     if name not in BASELINE_BINS:
         raise SelectionError(
             f"there is no baseline bin {name!r}; the bins are {', '.join(BASELINE_BINS)}."

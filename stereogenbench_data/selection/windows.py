@@ -5,7 +5,7 @@ A window is the frames of one sample: one frame, or a clip of several.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,24 +19,6 @@ FramesSpec = (
     | tuple[Literal["random"], int]
     | tuple[Literal["clips"], int, int, int]
 )
-
-
-@runtime_checkable
-class Windows(Protocol):
-    """A rule that gives the windows of a scene with a known number of frames."""
-
-    @property
-    def is_clip(self) -> bool:
-        """Whether a sample holds a time axis."""
-        ...
-
-    def count(self, frames: int) -> int:
-        """Return how many windows a scene of so many frames has."""
-        ...
-
-    def window(self, number: int, *, frames: int, draw: Sequence[int]) -> tuple[int, ...]:
-        """Return the frames of one window; ``draw`` seeds what is drawn at random."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +107,15 @@ class Clips:
         return tuple(range(start, start + self.length * self.stride, self.stride))
 
 
+Windows = Chosen | Every | Random | Clips
+"""A rule that gives the windows of a scene with a known number of frames.
+
+``is_clip`` says whether a sample has a time axis, ``count(frames)`` how many windows a scene of so
+many frames has, and ``window(number, frames=, draw=)`` the frames of one; ``draw`` seeds what is
+drawn at random.
+"""
+
+
 def run_starts(
     windows: Windows, *, frames: int, key_frames: Sequence[int], least: int
 ) -> tuple[int, ...]:
@@ -159,7 +150,7 @@ def parse_frames(spec: Any) -> Windows:
     Raises:
         SelectionError: If it is none of these, or a number in it is out of range.
     """
-    if isinstance(spec, Chosen | Every | Random | Clips):
+    if isinstance(spec, Windows):
         return spec
     if isinstance(spec, str):
         named: dict[str, Windows] = {"first": Chosen((0,)), "all": Every(1)}

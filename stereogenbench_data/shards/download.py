@@ -1,7 +1,7 @@
-"""A part of a release onto this disk: only the files that a selection needs, each one checked.
+"""Download a part of a release: only the files that a selection needs, each one checked.
 
-Files are laid out as they were released, whatever they came from, with an index beside them that
-names those that are there. A run that was stopped goes on: files that are whole are kept.
+Files are laid out as they were released, whether they come from shards or not. The index beside
+them lists only what is there. Whole files are kept, so a run that was stopped continues.
 """
 
 import shutil
@@ -13,29 +13,30 @@ from pathlib import Path
 from threading import Event
 from typing import Final
 
-from stereogenbench_data.engine import Progress
+from stereogenbench_data.engine import Progress, advance_of
 from stereogenbench_data.errors import StorageError, describe_os_error
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.index.tree import ListedTree
 from stereogenbench_data.schema.records import Member, Scene
 from stereogenbench_data.schema.release import METADATA_FILES
+from stereogenbench_data.shards.tar import read_chunks
 from stereogenbench_data.sources.files import copy_with_crc32, open_atomic
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.members import open_local, require_own_files
+from stereogenbench_data.sources.ranged_file import require_crc32
 from stereogenbench_data.sources.remote import RemoteObject
 
-_CHUNK: Final = 1024 * 1024
 _SPARE_BYTES: Final = 16 * 1024 * 1024
 
 
 class _Cancelled(Exception):
-    """Another file failed, so this one is not fetched to its end."""
+    """Another file failed, so this one is not fetched any further."""
 
 
 @dataclass(frozen=True, slots=True)
 class WantedFile:
-    """One file of a scene: its key, its name, and where it lies now."""
+    """One file of a scene: the scene's key, the file's name, and where it is now."""
 
     key: str
     name: str
@@ -44,35 +45,38 @@ class WantedFile:
 
 @dataclass(frozen=True, slots=True)
 class Download:
-    """What is to be fetched.
-
-    Attributes:
-        scenes: The scenes, each with just the members that are wanted.
-        files: All their files.
-    """
+    """What to download: scenes, each with only the members that are wanted."""
 
     scenes: tuple[Scene, ...]
-    files: tuple[WantedFile, ...]
+
+    @property
+    def files(self) -> list[WantedFile]:
+        """The files of all scenes."""
+        return [
+            WantedFile(scene.id.key, name, member)
+            for scene in self.scenes
+            for name, member in scene.members.items()
+        ]
 
     @property
     def size_bytes(self) -> int:
-        """The bytes of all files."""
+        """The size of all files."""
         return sum(wanted.member.size for wanted in self.files)
 
 
 def plan_download(
     index: SceneIndex, rows: Sequence[int], *, cameras: Sequence[int], streams: Sequence[str]
 ) -> Download:
-    """Return what must be fetched for some scenes.
+    """Return what to download.
 
     Args:
-        index: Of the data.
-        rows: The scenes, by row.
+        index: The index of the data.
+        rows: The rows of the scenes.
         cameras: Numbers of the cameras whose videos are wanted.
         streams: "rgb", "depth" or both.
 
     Raises:
-        StorageError: If the index itself lacks a wanted file.
+        StorageError: If the index lacks a wanted file.
     """
     scenes = []
     for row in rows:
@@ -82,18 +86,13 @@ def plan_download(
         missing = [stem for stem in stems if stem not in videos]
         if missing:
             raise StorageError(
-                f"{scene.id.key}: the index has no {', '.join(missing)}: it is of a part. Download "
-                "from the whole."
+                f"{scene.id.key}: the index has no {', '.join(missing)}: it is of a partial "
+                f"download. Download from the whole release."
             )
         names = [name for name in METADATA_FILES if name in scene.members]
         names += [videos[stem] for stem in stems]
         scenes.append(replace(scene, members={name: scene.members[name] for name in names}))
-    files = [
-        WantedFile(scene.id.key, name, member)
-        for scene in scenes
-        for name, member in scene.members.items()
-    ]
-    return Download(tuple(scenes), tuple(files))
+    return Download(tuple(scenes))
 
 
 def download(
@@ -104,46 +103,44 @@ def download(
     workers: int = 8,
     progress: Progress | None = None,
 ) -> SceneIndex:
-    """Fetch files into a folder, and write an index of them there.
+    """Download files into a folder, and write an index of them there.
 
     Args:
-        index: Of the data, for where they lie.
-        wanted: What to fetch, of `plan_download`.
-        dest: The folder; made if it is not there.
-        workers: How many files are fetched at a time.
-        progress: Called with the bytes done and those of all.
+        index: The index of the data.
+        wanted: What to download, from `plan_download`.
+        dest: The folder; created if it does not exist.
+        workers: How many files are fetched at the same time.
+        progress: Called repeatedly with the bytes done, and all of them.
 
     Returns:
-        The index of what is there now. Scenes of an earlier download into the same folder that are
-        not wanted now stay on the disk but not in the index.
+        The index of the wanted scenes. Other scenes that an earlier download left in the folder
+        stay on the disk but are not in the index.
 
     Raises:
-        StorageError: If a file cannot be fetched or stored, has not its checksum, or the disk has
-            no room.
+        StorageError: If a file cannot be fetched or stored, its checksum differs, or the disk is
+            too small.
     """
     dest = local_path(dest)
-    if not is_remote(index.root) and dest == local_path(index.root):
-        raise StorageError(f"{dest}: is where the data are. Name another folder.")
     if not is_remote(index.root):
+        if dest == local_path(index.root):
+            raise StorageError(f"{dest}: is the folder of the data. Choose another folder.")
         require_own_files(index.root, sorted({each.member.path for each in wanted.files}))
     missing = [each for each in wanted.files if not _is_whole(each, dest)]
     needed = sum(each.member.size for each in missing)
-    done = wanted.size_bytes - needed
     _require_room(dest, needed)
-    if progress is not None:
-        progress(done, wanted.size_bytes)
+    total = wanted.size_bytes
+    advance = advance_of(progress, done=total - needed, total=total)
     stop = Event()
     with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
         futures = {pool.submit(_fetch, index, each, dest, stop): each for each in missing}
         waiting = set(futures)
         try:
+            advance(0)
             while waiting:
                 finished, waiting = wait(waiting, timeout=0.5, return_when=FIRST_EXCEPTION)
                 for future in finished:
                     future.result()
-                    done += futures[future].member.size
-                if progress is not None:
-                    progress(done, wanted.size_bytes)
+                advance(sum(futures[future].member.size for future in finished))
         finally:
             stop.set()
             pool.shutdown(wait=True, cancel_futures=True)
@@ -164,9 +161,9 @@ def download(
 
 
 def _is_whole(wanted: WantedFile, dest: Path) -> bool:
-    """Return whether a file was fetched before: it is moved into place only once it is checked.
+    """Return whether a file was fetched before; files get their name only once they are checked.
 
-    Metadata files of another revision may have the same size, so they are compared whole.
+    Metadata files of another revision may have the same size, so their bytes are compared.
     """
     path, member = dest / wanted.key / wanted.name, wanted.member
     if not path.is_file() or path.stat().st_size != member.size:
@@ -181,43 +178,39 @@ def _require_room(dest: Path, needed: int) -> None:
         dest.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(dest).free
     except OSError as error:
-        raise StorageError(_why_not_written(dest, error)) from error
+        raise _not_written(dest, error) from error
     if needed + _SPARE_BYTES > free:
         raise StorageError(
-            f"{dest}: {needed} bytes are to come, and the disk has room for {free}. Take fewer "
-            "scenes or cameras, or another disk."
+            f"{dest}: needs {needed} bytes, and the disk has {free} left. Choose fewer scenes or "
+            f"cameras, or another disk."
         )
 
 
-def _why_not_written(place: Path, error: OSError) -> str:
-    return describe_os_error(f"{place}: cannot be written", error, "Choose another folder.")
+def _not_written(place: Path, error: OSError) -> StorageError:
+    what = f"{place}: cannot be written"
+    return StorageError(describe_os_error(what, error, "Choose another folder."))
 
 
 def _fetch(index: SceneIndex, wanted: WantedFile, dest: Path, stop: Event) -> None:
     place = dest / wanted.key / wanted.name
-    member = wanted.member
+
+    def write(chunk: bytes) -> None:
+        if stop.is_set():
+            raise _Cancelled
+        file.write(chunk)
+
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         with open_atomic(place) as file:
-            crc32 = copy_with_crc32(_until(stop, _chunks(index, member)), file.write)
-            if member.crc32 not in (None, crc32):
-                raise StorageError(
-                    f"{wanted.key}/{wanted.name}: came with crc32 {crc32:08x}, and the index says "
-                    f"{member.crc32:08x}. The source is damaged, or not the one that was indexed."
-                )
+            crc32 = copy_with_crc32(_chunks(index, wanted.member), write)
+            name = f"{wanted.key}/{wanted.name}"
+            require_crc32(crc32, expected=wanted.member.crc32, name=name)
     except _Cancelled:
         return
     except OSError as error:
         if isinstance(error, StorageError):
             raise
-        raise StorageError(_why_not_written(place, error)) from error
-
-
-def _until(stop: Event, chunks: Iterator[bytes]) -> Iterator[bytes]:
-    for data in chunks:
-        if stop.is_set():
-            raise _Cancelled
-        yield data
+        raise _not_written(place, error) from error
 
 
 def _chunks(index: SceneIndex, member: Member) -> Iterator[bytes]:
@@ -227,5 +220,4 @@ def _chunks(index: SceneIndex, member: Member) -> Iterator[bytes]:
         return
     opened = open_local(index.root, member, shard=index.shards.get(member.path))
     with opened.open("rb") if isinstance(opened, Path) else opened as file:
-        while data := file.read(_CHUNK):
-            yield data
+        yield from read_chunks(file, member.size)

@@ -1,19 +1,19 @@
-"""Pack a release into shards: the plan, this part's shards, and the index once all are there.
+"""Pack a release into shards: the plan, the shards of one part, and the index once all are there.
 
-Any number of processes on any number of machines may pack parts of one plan into one folder: they
-need to agree on nothing but the plan, and that is a function of the release and the target size.
+Any number of processes on any number of machines may pack parts of one plan into one folder. They
+share nothing but the plan, which is a function of the release and the target size.
 """
 
 import json
 import warnings
-import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of, no_advance
-from stereogenbench_data.errors import ShardError, cure_of
+from stereogenbench_data.errors import ShardError, describe_os_error
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
@@ -21,47 +21,40 @@ from stereogenbench_data.media.depth_frames import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT, METADATA_FILES, PACKED_DEPTH_NAMES
 from stereogenbench_data.shards.companion_files import write_companion_files
-from stereogenbench_data.shards.manifest import (
-    PackedShard,
+from stereogenbench_data.shards.plan import DEFAULT_SHARD_BYTES, DepthCodec, ShardPlan, plan_shards
+from stereogenbench_data.shards.tar import CHUNK_BYTES, read_members
+from stereogenbench_data.shards.writer import (
+    PARTS,
+    UNFINISHED,
     ShardManifest,
     ShardTask,
     SourceStamp,
     find_packed,
+    find_touched,
+    not_of_plan,
+    pack_task,
     read_manifest,
+    readable,
+    require_indexed_metadata,
     row_digest,
 )
-from stereogenbench_data.shards.plan import (
-    DEFAULT_SHARD_BYTES,
-    DepthCodec,
-    PlannedShard,
-    ShardPlan,
-    plan_shards,
-)
-from stereogenbench_data.shards.tar import read_members
-from stereogenbench_data.shards.writer import (
-    UNFINISHED,
-    found_whole,
-    pack_task,
-    require_indexed_metadata,
-)
-from stereogenbench_data.sources.files import PARTS, write_atomic
+from stereogenbench_data.sources.files import copy_with_crc32, write_atomic
 from stereogenbench_data.sources.members import require_own_files
 
 _PLAN_FILE: Final = "plan.json"
-_CHUNK_BYTES: Final = 4 * 1024 * 1024
 
 
 class OversizedSceneWarning(UserWarning):
-    """Some scenes alone exceed the size that shards were to have: the message says which."""
+    """Some scenes alone exceed the size of a shard; the message names the largest."""
 
 
 @dataclass(frozen=True, slots=True)
 class PackReport:
-    """What a run of packing came to.
+    """What a run of packing did.
 
     Attributes:
         part: Names of the shards of this part, all of which are finished.
-        packed: Names of those that this run packed, and not another before it or beside it.
+        packed: Names of those that this run packed, not an earlier or a concurrent one.
         missing: Names of the plan's shards that other parts have not finished yet.
         index: The index file; None while shards are missing.
     """
@@ -74,27 +67,21 @@ class PackReport:
 
 @dataclass(frozen=True, slots=True)
 class PackJob:
-    """One part of a plan, in the folder that it is packed into; `prepare` makes it."""
+    """One part of a plan, in the folder that it is packed into; `prepare` makes it.
+
+    Attributes:
+        tasks: All shards of the plan.
+        part: The shards of this part.
+    """
 
     index: SceneIndex
-    plan: ShardPlan
     out: Path
-    part: tuple[int, int]
-
-    def task(self, shard: PlannedShard) -> ShardTask:
-        """Return a shard as work for any process."""
-        return ShardTask(shard, self.plan.root, str(self.out), self.plan.digest)
-
-    @property
-    def shards(self) -> tuple[PlannedShard, ...]:
-        """The shards of this part: every N-th, from the I-th on."""
-        number, count = self.part
-        return self.plan.shards[number - 1 :: count]
+    tasks: tuple[ShardTask, ...]
+    part: tuple[ShardTask, ...]
 
     def unfinished(self) -> list[ShardTask]:
-        """Return this part's tasks, without those that are done."""
-        tasks = [self.task(shard) for shard in self.shards]
-        return [task for task in tasks if find_packed(task) is None]
+        """Return the shards of this part that are not finished."""
+        return [task for task in self.part if find_packed(task) is None]
 
 
 def pack(  # noqa: PLR0913 - each is an option of the command
@@ -110,33 +97,33 @@ def pack(  # noqa: PLR0913 - each is an option of the command
 ) -> PackReport:
     """Pack a release into tar shards, or one part of it.
 
-    Shards that are finished are kept, so that a run that was stopped goes on if it is run again.
-    The same release and target give the same bytes, whatever the parts and the workers.
+    Finished shards are kept, so a run that was stopped continues when it is run again. The same
+    release and target size give the same bytes, whatever the parts and the workers.
 
     Args:
         data: The release: its folder or index.
-        out: Folder for the shards; made if need be.
-        target_bytes: The size that a shard does not exceed, unless one scene alone does; depth
-            that is packed anew counts with its released size.
-        depth_codec: "released" keeps depth as it is; "blosc2" packs it so that each frame stands
-            alone and decodes faster, bit for bit (extra ``blosc2``).
-        part: (I, N): pack every N-th shard, from the I-th on; I is 1 to N.
-        workers: Processes that pack at the same time; None is one a core.
-        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`, of which all nodes find
-            release and folder at the same paths.
-        progress: Called now and then with the bytes packed of this part, and all there are.
+        out: Folder for the shards; created if it does not exist.
+        target_bytes: The largest size of a shard, unless one scene alone exceeds it; packed depth
+            counts with its released size.
+        depth_codec: "released" keeps depth as it is. "blosc2" packs it losslessly, so that each
+            frame decodes by itself and faster (extra ``blosc2``).
+        part: (I, N): pack every N-th shard, starting at the I-th; I is 1 to N.
+        workers: The number of processes; None is one a core.
+        engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster` whose nodes all find the
+            release and the folder at the same paths.
+        progress: Called repeatedly with the bytes of this part that are packed, and all of them.
 
     Returns:
-        What was packed; the index is written by whichever part is finished last.
+        What was packed. The part that finishes last writes the index.
 
     Raises:
         StorageError: If the release cannot be read or scenes of it are broken, or a worker died.
-        ShardError: If a shard cannot be packed, or the folder lies in the release, or it holds
-            anything else than this plan or shards that were packed from other files.
+        ShardError: If a shard cannot be packed; or the folder is in the release, or holds another
+            plan, other shards, or shards that were packed from other files.
     """
     job = prepare(data, out, target_bytes=target_bytes, depth_codec=depth_codec, part=part)
     tasks = job.unfinished()
-    total = sum(shard.source_bytes for shard in job.shards)
+    total = sum(task.shard.source_bytes for task in job.part)
     left = sum(task.shard.source_bytes for task in tasks)
     advance = advance_of(progress, done=total - left, total=total)
     advance(0)
@@ -147,7 +134,7 @@ def pack(  # noqa: PLR0913 - each is an option of the command
         workers=workers,
         advance=advance,
     )
-    return _finish(job, packed=[each.shard.name for each in outcomes if each.work == "packed"])
+    return _finish(job, packed={shard.name for shard, work in outcomes if work == "packed"})
 
 
 def prepare(
@@ -158,14 +145,13 @@ def prepare(
     part: tuple[int, int],
     depth_codec: DepthCodec = "released",
 ) -> PackJob:
-    """Make the plan and take the folder for it.
+    """Make the plan and claim the folder for it.
 
     Raises:
         StorageError: If the release cannot be read or scenes of it are broken.
-        ShardError: If the folder lies in the release, holds anything else than this plan or
-            shards that were packed from other files; if no scene fits into a shard, or there is
-            no such part.
-        ExtraError: If the codec needs something that is not installed.
+        ShardError: As `pack` says of the folder; if no scene fits into a shard; or if the part is
+            not one of 1 to N.
+        ExtraError: If the codec needs a package that is not installed.
     """
     number, count = part
     if not 1 <= number <= count:
@@ -177,112 +163,104 @@ def prepare(
     require_own_files(
         plan.root, (member.source for shard in plan.shards for member in shard.members)
     )
-    job = PackJob(index, plan, Path(out), part)
-    _require_fitting(job.plan)
+    _require_fitting(plan)
+    out = Path(out)
+    tasks = tuple(ShardTask(shard, plan.root, str(out), plan.digest) for shard in plan.shards)
     try:
-        _claim_folder(job.plan, job.out)
-        for task, manifest in _finished(job):
-            _require_same_sources(task, manifest)
-            _require_same_rows(task, manifest)
+        _claim_folder(plan, out)
+        for task in tasks:
+            manifest = read_manifest(task)
+            if manifest is not None and task.target.is_file():
+                _require_same_sources(task, manifest)
+                _require_same_rows(task, manifest)
     except OSError as error:
         if isinstance(error, ShardError):
             raise
-        raise ShardError(
-            f"{out}: cannot be written to ({error.strerror or error}). "
-            + cure_of(error, "Pack into another folder.")
-        ) from error
-    return job
+        what = f"{out}: cannot be written to"
+        raise ShardError(describe_os_error(what, error, "Pack into another folder.")) from error
+    return PackJob(index, out, tasks, tasks[number - 1 :: count])
 
 
 def _require_fitting(plan: ShardPlan) -> None:
-    """Warn of scenes that exceed the size of a shard; refuse a size that none fits into."""
-    above = plan.oversized
-    if not above:
-        return
-    sizes = {shard.size: shard.keys[0] for shard in above}
-    least, most = min(sizes), max(sizes)
-    if len(above) == len(plan.shards):
+    """Warn of scenes that exceed the size of a shard; refuse a size that no scene fits into."""
+    above = sorted(
+        (shard.size, shard.keys[0]) for shard in plan.shards if shard.size > plan.target_bytes
+    )
+    if above and len(above) == len(plan.shards):
         raise ShardError(
             f"no scene fits into a shard of {plan.target_bytes} bytes: the smallest, "
-            f"{sizes[least]}, needs {least}. Choose a larger size of shards."
+            f"{above[0][1]}, needs {above[0][0]}. Choose a larger size."
         )
-    warnings.warn(
-        f"{len(above)} of {len(plan.shards)} shards exceed {plan.target_bytes} bytes, each by the "
-        f"one scene it holds: the largest, {sizes[most]}, needs {most}",
-        OversizedSceneWarning,
-        stacklevel=3,
-    )
+    if above:
+        warnings.warn(
+            f"{len(above)} of {len(plan.shards)} shards exceed {plan.target_bytes} bytes, because "
+            f"each holds one scene that does: the largest, {above[-1][1]}, needs {above[-1][0]}",
+            OversizedSceneWarning,
+            stacklevel=3,
+        )
 
 
-def _finish(job: PackJob, *, packed: list[str]) -> PackReport:
-    """Write the index, if all shards of the plan are there by now.
+def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
+    """Write the index, if all shards of the plan are finished by now.
 
     Raises:
         StorageError: If the index cannot be written.
         ShardError: If it would contradict the metadata in the shards.
     """
-    done = {
-        task.shard.name: find_packed(task) or found_whole(task, no_advance)
-        for task in map(job.task, job.plan.shards)
-    }
-    missing = tuple(name for name, found in done.items() if found is None)
-    target = None if missing else job.out / INDEX_NAME
-    if target is not None:
-        for task, manifest in _finished(job):
-            _require_same_rows(task, manifest)
-        shards = {name: found for name, found in done.items() if found is not None}
-        index = _packed_index(job, shards)
-        # The index comes last: where there is one, everything is.
-        write_companion_files(index, out=job.out)
-        index.write(target)
-        warn_if_stale(job.out)
-    part = tuple(shard.name for shard in job.shards)
-    return PackReport(part, tuple(name for name in part if name in packed), missing, target)
+    found = [find_packed(task) or find_touched(task, no_advance) for task in job.tasks]
+    shards = [manifest for manifest in found if manifest is not None]
+    part = tuple(task.shard.name for task in job.part)
+    here = {manifest.name for manifest in shards}
+    report = PackReport(
+        part=part,
+        packed=tuple(name for name in part if name in packed),
+        missing=tuple(task.shard.name for task in job.tasks if task.shard.name not in here),
+        index=None,
+    )
+    if report.missing:
+        return report
+    for task, manifest in zip(job.tasks, shards, strict=True):
+        _require_same_rows(task, manifest)
+    index = SceneIndex.from_scenes(
+        [
+            scene
+            for task, manifest in zip(job.tasks, shards, strict=True)
+            for scene in _scenes_in(task.shard.scenes, manifest)
+        ],
+        job.out,
+        shards={
+            manifest.name: ShardFacts(manifest.size, manifest.sha256, len(manifest.members))
+            for manifest in shards
+        },
+    )
+    # The index is written last: where it exists, everything else does, too.
+    write_companion_files(index, out=job.out)
+    index.write(job.out / INDEX_NAME)
+    warn_if_stale(job.out)
+    return replace(report, index=job.out / INDEX_NAME)
 
 
-def _packed_index(job: PackJob, shards: dict[str, PackedShard]) -> SceneIndex:
-    """Return the index of finished shards: the scenes of the release, at their new places."""
-    facts = {
-        shard.name: ShardFacts(
-            size=shards[shard.name].size,
-            sha256=shards[shard.name].sha256,
-            members=len(shard.members),
-        )
-        for shard in job.plan.shards
-    }
-    moved = [scene for shard in job.plan.shards for scene in _moved(shard, shards[shard.name])]
-    return SceneIndex.from_scenes(moved, job.out, shards=facts)
-
-
-def _moved(shard: PlannedShard, packed: PackedShard) -> Iterator[Scene]:
-    places: dict[str, dict[str, Member]] = {key: {} for key in shard.keys}
-    placed = zip(packed.offsets, packed.sizes, packed.crc32s, strict=True)
-    for member, (offset, size, crc32) in zip(shard.members, placed, strict=True):
+def _scenes_in(scenes: tuple[Scene, ...], shard: ShardManifest) -> Iterator[Scene]:
+    """Yield scenes of the release with the places of their files in a shard."""
+    places: dict[str, dict[str, Member]] = {scene.id.key: {} for scene in scenes}
+    for member, crc32 in zip(shard.tar_members, shard.crc32s, strict=True):
         key, _, name = member.name.partition(".")
-        places[key][name] = Member(shard.name, offset, size, crc32)
-    for scene in shard.scenes:
+        places[key][name] = Member(shard.name, member.offset, member.size, crc32)
+    for scene in scenes:
         members = places[scene.id.key]
         is_packed = not members.keys().isdisjoint(PACKED_DEPTH_NAMES.values())
         codec = (CODEC_NAME,) * CAMERA_COUNT if is_packed else scene.depth_codec
         yield replace(scene, members=members, depth_codec=codec)
 
 
-def _finished(job: PackJob) -> Iterator[tuple[ShardTask, ShardManifest]]:
-    """Yield every finished shard of the plan, of whatever part, with its manifest."""
-    for task in map(job.task, job.plan.shards):
-        manifest = read_manifest(task)
-        if manifest is not None and task.target.is_file():
-            yield task, manifest
-
-
-# The folder that shards are packed into: which plan it is for, and that nothing else is in it.
+# The folder of the shards: which plan it is for, and that it holds nothing else.
 
 
 def _claim_folder(plan: ShardPlan, out: Path) -> None:
-    """Write the plan into the folder, unless it is there; refuse before anything is written.
+    """Write the plan into the folder, unless it was; refuse before anything is written.
 
     Raises:
-        ShardError: If the folder lies in the release, or holds what other plans left.
+        ShardError: If the folder is in the release, or holds files of other plans.
         OSError: If it cannot be written to.
     """
     place = out / PARTS / _PLAN_FILE
@@ -291,7 +269,7 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
         "target_bytes": plan.target_bytes,
         "shards": len(plan.shards),
     } | ({} if plan.depth_codec == "released" else {"depth": plan.depth_codec})
-    _require_beside_release(plan, out)
+    _require_outside_release(plan, out)
     if not place.exists():
         _require_own_shards(plan, out)
         place.parent.mkdir(parents=True, exist_ok=True)
@@ -302,9 +280,9 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
         found = None
     if found != expected:
         raise ShardError(
-            f"{place}: this folder was begun with another plan ({_brief(found)}, and this one is "
-            f"{_brief(expected)}): the release, the size of the shards or the depth codec was "
-            f"another. Pack into an empty folder, or remove what is in {out}."
+            f"{place}: this folder is for another plan ({_brief(found)}, and this one is "
+            f"{_brief(expected)}): the release, the size of the shards or the depth codec differs. "
+            f"Pack into an empty folder, or remove what is in {out}."
         )
     _require_no_others(plan, out)
 
@@ -312,28 +290,28 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
 def _brief(content: object) -> str:
     if not isinstance(content, dict):
         return "unreadable"
-    plan, size = str(content.get("plan"))[:12], content.get("target_bytes")
+    digest, size = str(content.get("plan"))[:12], content.get("target_bytes")
     depth = content.get("depth", "released")
-    return f"{content.get('shards')} shards of {size} bytes, depth {depth}, {plan}"
+    return f"{content.get('shards')} shards of {size} bytes, depth {depth}, {digest}"
 
 
-def _require_beside_release(plan: ShardPlan, out: Path) -> None:
+def _require_outside_release(plan: ShardPlan, out: Path) -> None:
     root, place = Path(plan.root).resolve(), out.resolve()
     if place == root:
         raise ShardError(f"{out}: is the release itself. Pack into another folder.")
     for split in ("train", "eval"):
         if any(place.is_relative_to(each) for each in (root / split, (root / split).resolve())):
             raise ShardError(
-                f"{out}: lies in {plan.root}/{split}, among the scenes of the release. "
+                f"{out}: is in {plan.root}/{split}, among the scenes of the release. "
                 f"Pack into a folder outside it."
             )
 
 
 def _require_own_shards(plan: ShardPlan, out: Path) -> None:
-    """Refuse a folder without a plan that holds anything else than the plan's shards.
+    """Refuse a folder without a plan that holds anything but shards of this plan.
 
-    Shards that hold the plan's files by name may be finished ones without their manifests: they
-    are compared byte for byte when their turn comes.
+    A shard with the same members may be a finished one without its manifest: its bytes are compared
+    later, by the worker that packs it.
     """
     _require_no_others(plan, out)
     ours = [shard for shard in plan.shards if (out / shard.name).exists()]
@@ -342,58 +320,60 @@ def _require_own_shards(plan: ShardPlan, out: Path) -> None:
         try:
             with path.open("rb") as file:
                 found = read_members(file, path.stat().st_size, where=str(path))
-            is_ours = [each.name for each in found] == [each.name for each in shard.members]
         except ShardError:
-            is_ours = False
-        if not is_ours:
-            raise _not_ours(path)
+            found = []
+        if [each.name for each in found] != [each.name for each in shard.members]:
+            raise not_of_plan(path)
     if not ours and (out / INDEX_NAME).exists():
-        raise _not_ours(out / INDEX_NAME)
-
-
-def _not_ours(path: Path) -> ShardError:
-    return ShardError(
-        f"{path}: is there, and was not packed here by this plan. Move it away, or pack into an "
-        f"empty folder."
-    )
+        raise not_of_plan(out / INDEX_NAME)
 
 
 def _require_no_others(plan: ShardPlan, out: Path) -> None:
-    """Refuse a folder with a shard that is none of the plan's."""
+    """Refuse a folder that holds a shard of another plan."""
     known = {shard.name for shard in plan.shards}
     for path in sorted(out.iterdir()) if out.exists() else []:
         name = path.name.removesuffix(UNFINISHED)
         if name.endswith(".tar") and name not in known:
-            raise ShardError(
-                f"{path}: is there, and is no shard of this plan. Move it away, or pack into an "
-                f"empty folder."
-            )
+            raise not_of_plan(path)
 
 
-# Whether a finished shard is still what packing it now would give. Files that have gone since do
-# not contradict it.
+# Whether a finished shard is what packing it now would give. Files that were removed since do not
+# contradict it.
 
 
 def _require_same_sources(task: ShardTask, manifest: ShardManifest) -> None:
-    """Refuse to keep a finished shard if the files that it was made from are others now.
+    """Refuse to keep a finished shard whose source files have changed.
 
-    Metadata files are read, of videos the size and the time of change are looked at; where these
-    differ they are read too.
+    Metadata files are read. Videos are read only if their size or modification time has changed.
 
     Raises:
         ShardError: Naming the first such file, and what to do.
     """
-    for member, seen, _ in manifest.members(task):
+    for member, stamp in zip(task.shard.members, manifest.sources, strict=True):
         key, _, name = member.name.partition(".")
-        found = _stamp_now(Path(task.root, member.source), seen, is_text=name in METADATA_FILES)
-        if found is not None and found != (seen.size, seen.crc32):
+        found = _contents_now(Path(task.root, member.source), stamp, read=name in METADATA_FILES)
+        if found is not None and found != (stamp.size, stamp.crc32):
             raise ShardError(
                 f"{key}: its {member.source.rpartition('/')[2]} is not the one that "
                 f"{task.target} was packed from: it has {found[0]} bytes with crc32 "
-                f"{found[1]:08x}, and had {seen.size} with {seen.crc32:08x}. Remove that shard to "
-                f"have it packed anew and run the same command again, or put the file back, or "
-                f"pack into an empty folder."
+                f"{found[1]:08x}, and had {stamp.size} with {stamp.crc32:08x}. Remove that shard "
+                f"to pack it again and run the same command again, or restore the file, or pack "
+                f"into an empty folder."
             )
+
+
+def _contents_now(source: Path, stamp: SourceStamp, *, read: bool) -> tuple[int, int] | None:
+    """Return a source's size and crc32, as stamped if it was not touched; None if it is gone."""
+    with readable(source):
+        try:
+            status = source.stat()
+            if not read and (status.st_size, status.st_mtime_ns) == stamp[:2]:
+                return stamp.size, stamp.crc32
+            with source.open("rb", buffering=0) as file:
+                chunks = iter(partial(file.read, CHUNK_BYTES), b"")
+                return status.st_size, copy_with_crc32(chunks, lambda chunk: None)
+        except (FileNotFoundError, NotADirectoryError):
+            return None
 
 
 def _require_same_rows(task: ShardTask, manifest: ShardManifest) -> None:
@@ -403,35 +383,13 @@ def _require_same_rows(task: ShardTask, manifest: ShardManifest) -> None:
         ShardError: Naming the first such scene, and what to do.
     """
     for scene in task.shard.scenes:
-        key = scene.id.key
-        if manifest.rows.get(key) == row_digest(scene):
+        if manifest.rows.get(scene.id.key) == row_digest(scene):
             continue
         texts = {}
         with task.target.open("rb") as file:
-            for member, seen, offset in manifest.members(task):
-                of_scene, _, name = member.name.partition(".")
-                if of_scene == key and name in METADATA_FILES:
-                    file.seek(offset)
-                    texts[name] = file.read(seen.size)
+            for member in manifest.tar_members:
+                key, _, name = member.name.partition(".")
+                if key == scene.id.key and name in METADATA_FILES:
+                    file.seek(member.offset)
+                    texts[name] = file.read(member.size)
         require_indexed_metadata(scene, texts, root=task.root)
-
-
-def _stamp_now(source: Path, seen: SourceStamp, *, is_text: bool) -> tuple[int, int] | None:
-    """Return a source's size and crc32, of the manifest if it was not touched; None if gone."""
-    try:
-        status = source.stat()
-        is_untouched = (status.st_size, status.st_mtime_ns) == (seen.size, seen.modified_ns)
-        if is_untouched and not is_text:
-            return seen.size, seen.crc32
-        crc32 = 0
-        with source.open("rb", buffering=0) as file:
-            while chunk := file.read(_CHUNK_BYTES):
-                crc32 = zlib.crc32(chunk, crc32)
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except OSError as error:
-        raise ShardError(
-            f"{source}: cannot be read ({error.strerror}). "
-            + cure_of(error, "Check the disk, then run the same command again.")
-        ) from error
-    return status.st_size, crc32

@@ -1,6 +1,7 @@
-"""Which scene goes into which shard: decided before a byte is written, the same every time.
+"""The plan of a pack: which scene goes into which shard. It is made before anything is written.
 
-A shard holds whole scenes of one split, subset and family, in the order of their keys.
+A shard holds whole scenes of one split, subset and family, in the order of their keys. The same
+release and target size always give the same plan.
 """
 
 import hashlib
@@ -24,7 +25,7 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.shards.tar import BLOCK_BYTES, END_OF_ARCHIVE, member_header, padded
 
 DepthCodec = Literal["released", "blosc2"]
-"""How depth lies in shards: in the released videos, or in blosc2's frames, which decode faster."""
+"""How shards store depth: as the released videos, or as blosc2 frames, which decode faster."""
 
 DEFAULT_SHARD_BYTES: Final = 2_000_000_000
 
@@ -32,7 +33,7 @@ MEMBER_ORDER: Final = (
     *METADATA_FILES,
     *(name(camera) for camera in range(CAMERA_COUNT) for name in (rgb_name, depth_name)),
 )
-"""The order of a scene's files in a shard: small texts first, then camera by camera."""
+"""The order of a scene's files in a shard: metadata first, then camera by camera."""
 
 _UNITS: Final = {"": 1, "k": 1000, "m": 1000**2, "g": 1000**3, "t": 1000**4}
 _BINARY_UNITS: Final = {"ki": 1024, "mi": 1024**2, "gi": 1024**3, "ti": 1024**4}
@@ -41,9 +42,10 @@ _SIZE: Final = re.compile(r"(\d+(?:\.\d+)?) ?([kmgt]?i?)b?", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class PlannedMember:
-    """A file of a scene: its name in the shard, and the file below the root that it is made from.
+    """A file of a scene: its name in the shard, and the released file that it is made from.
 
-    ``size`` is that of the source; so is the member's, if it is the released file unchanged.
+    ``source`` is relative to the release's root. ``size`` is that of the source, which is also the
+    member's unless depth is packed.
     """
 
     name: str
@@ -54,7 +56,7 @@ class PlannedMember:
 
 @dataclass(frozen=True, slots=True)
 class PlannedShard:
-    """A shard to be: its file's name and size in bytes, its scenes and their files in order."""
+    """A planned shard: its file's name and size in bytes, and its scenes and their files."""
 
     name: str
     size: int
@@ -77,12 +79,11 @@ class ShardPlan:
     """All shards of a release.
 
     Attributes:
-        root: The folder below which the files lie.
-        target_bytes: The size that a shard does not exceed, unless one scene alone does; depth
-            that is packed anew counts with its released size.
-        digest: sha256 of what goes where: of the target, and of all names and sizes. It does not
-            depend on where the files lie.
-        depth_codec: How depth lies in the shards.
+        root: The release's folder.
+        target_bytes: The largest size of a shard, unless one scene alone exceeds it; packed depth
+            counts with its released size.
+        digest: sha256 of the target size and of all names and sizes. It does not depend on the
+            root.
     """
 
     root: str
@@ -90,11 +91,6 @@ class ShardPlan:
     shards: tuple[PlannedShard, ...]
     digest: str
     depth_codec: DepthCodec = "released"
-
-    @property
-    def oversized(self) -> tuple[PlannedShard, ...]:
-        """The shards that exceed the target because their one scene does."""
-        return tuple(shard for shard in self.shards if shard.size > self.target_bytes)
 
 
 def plan_shards(
@@ -106,19 +102,28 @@ def plan_shards(
     """Return the plan that packs the scenes of an index.
 
     Raises:
-        ShardError: If the data are packed already or far away, scenes were left out of the index
-            as broken, the target is no size, or two files would have one name.
+        ShardError: If the data are packed already or remote, scenes were left out of the index as
+            broken, the target is below 1, or two shards would have the same name.
     """
     _require_released(index)
     if target_bytes < 1:
         raise ShardError(f"the size of a shard must be at least 1 byte, got {target_bytes}.")
-    scenes = sorted((index.scene(row) for row in range(len(index))), key=_group_and_key)
+    scenes = sorted(
+        map(index.scene, range(len(index))), key=lambda scene: (_group_of(scene), scene.id.key)
+    )
     shards = tuple(
         shard
         for group, members in groupby(scenes, key=_group_of)
         for shard in _filled(group, members, target_bytes=target_bytes, depth_codec=depth_codec)
     )
-    _require_distinct(shard.name for shard in shards)
+    names: dict[str, str] = {}
+    for shard in shards:
+        other = names.setdefault(shard.name.casefold(), shard.name)
+        if other != shard.name:
+            raise ShardError(
+                f"{shard.name} and {other} would be the same file on a disk that ignores case. "
+                f"Rename one of the two families' folders."
+            )
     content = [
         [shard.name, shard.size, [[member.name, member.size] for member in shard.members]]
         for shard in shards
@@ -129,10 +134,10 @@ def plan_shards(
 
 
 def parse_size(text: str) -> int:
-    """Return a number of bytes: ``500MB`` is in powers of 1000, ``2GiB`` in powers of 1024.
+    """Return a size in bytes: ``500MB`` is in powers of 1000, ``2GiB`` in powers of 1024.
 
     Raises:
-        ShardError: If the text is no size, or less than a byte.
+        ShardError: If the text is not a size, or less than a byte.
 
     >>> parse_size("2GB"), parse_size("1.5 GiB"), parse_size("4096")
     (2000000000, 1610612736, 4096)
@@ -141,18 +146,18 @@ def parse_size(text: str) -> int:
     unit = (_UNITS | _BINARY_UNITS).get(match[2].lower()) if match else None
     size = int(float(match[1]) * unit) if match and unit else 0
     if size < 1:
-        raise ShardError(f"{text!r} is no size of a shard: write one such as 500MB, 2GB or 2GiB.")
+        raise ShardError(f"{text!r} is not a size: write one such as 500MB, 2GB or 2GiB.")
     return size
 
 
 def _require_released(index: SceneIndex) -> None:
     if index.shards:
         raise ShardError(
-            f"{index.where}: holds shards already. To pack again, run `stereogenbench unpack`, and "
+            f"{index.where}: already holds shards. To pack again, run `stereogenbench unpack`, and "
             f"pass the folder that it made."
         )
     if "://" in index.root:
-        raise ShardError(f"{index.where}: is far away. Fetch the release, and pass its folder.")
+        raise ShardError(f"{index.where}: is remote. Download the release, and pass its folder.")
     if index.broken:
         names = ", ".join(sorted(index.broken)[:3])
         raise ShardError(
@@ -162,25 +167,19 @@ def _require_released(index: SceneIndex) -> None:
 
 
 def _group_of(scene: Scene) -> str:
+    """Return what the names of the scene's shards begin with."""
     place = scene.id
-    parts = [place.split, place.family]
-    if place.split == "eval":
-        parts.insert(1, place.subset or "unnamed")
-    return "-".join(parts)
-
-
-def _group_and_key(scene: Scene) -> tuple[str, str]:
-    return _group_of(scene), scene.id.key
+    subset = [place.subset or "unnamed"] if place.split == "eval" else []
+    return "-".join([place.split, *subset, place.family])
 
 
 def _filled(
     group: str, scenes: Iterable[Scene], *, target_bytes: int, depth_codec: DepthCodec
 ) -> Iterator[PlannedShard]:
-    """Yield shards of one group, each as full as the order allows."""
-    number = 0
+    """Yield the shards of one group, each as full as the order of scenes allows."""
+    number, size = 0, len(END_OF_ARCHIVE)
     held: list[Scene] = []
     members: list[PlannedMember] = []
-    size = len(END_OF_ARCHIVE)
     for scene in scenes:
         added = _members_of(scene, depth_codec)
         added_bytes = sum(BLOCK_BYTES + padded(member.size) for member in added)
@@ -197,12 +196,12 @@ def _members_of(scene: Scene, depth_codec: DepthCodec) -> list[PlannedMember]:
     unknown = sorted(set(scene.members) - set(MEMBER_ORDER))
     if not scene.members.keys().isdisjoint(PACKED_DEPTH_NAMES.values()):
         raise ShardError(
-            f"{scene.id.key}: its depth is packed by blosc2, and shards are packed from released "
+            f"{scene.id.key}: its depth is packed by blosc2, but shards are made from released "
             f"videos. Run `stereogenbench unpack` on its shards, and pass the folder that it made."
         )
     if unknown:
         raise ShardError(
-            f"{scene.id.key}: its index names {', '.join(unknown)}, which is no file of a scene. "
+            f"{scene.id.key}: its index names {', '.join(unknown)}, which no scene has. "
             f"Run `stereogenbench index` again."
         )
     packed = {} if depth_codec == "released" else PACKED_DEPTH_NAMES
@@ -217,17 +216,5 @@ def _members_of(scene: Scene, depth_codec: DepthCodec) -> list[PlannedMember]:
         if name in scene.members
     ]
     for member in planned:
-        member_header(member.name, member.size)
+        member_header(member.name, member.size)  # refuses what a tar cannot hold
     return planned
-
-
-def _require_distinct(names: Iterable[str]) -> None:
-    """Refuse names that one file would have on a disk that ignores case."""
-    known: dict[str, str] = {}
-    for name in names:
-        other = known.setdefault(name.casefold(), name)
-        if other != name:
-            raise ShardError(
-                f"{name} and {other} would be one file where case does not count. Rename one of "
-                f"the two families' folders."
-            )

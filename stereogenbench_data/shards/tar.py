@@ -1,24 +1,24 @@
-"""Plain tar, the strict subset that shards are made of: POSIX ustar, regular files, ascii names.
+"""Tar files as shards use them: POSIX ustar with regular files and ASCII names only.
 
-Packing writes these bytes itself, so that they depend on names, sizes and contents alone. Reading
-takes in nothing else: whatever a tar can hold beyond files is refused, and nothing is extracted.
+Headers are written here, so a shard's bytes depend on the names, sizes and contents of its members
+alone. Reading refuses everything else that a tar can hold, and extracts nothing.
 
 A member is a header of one block of 512 bytes, its bytes, and zeros up to a whole block. The
-archive ends with two blocks of zeros; tar pads further, to 10,240 bytes, which is read and not
-written.
+archive ends with two blocks of zeros. The further zeros with which tar fills 10,240 bytes are
+accepted but not written.
 
 Source: POSIX.1-2017, pax, "ustar Interchange Format".
 """
 
 import hashlib
 import re
-import zlib
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Iterator, Sequence
+from typing import Final, NamedTuple
 
+from stereogenbench_data.engine import Advance, no_advance
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.media.container import BinaryFile
+from stereogenbench_data.sources.files import copy_with_crc32
 from stereogenbench_data.sources.members import UNSAFE_PATH
 
 BLOCK_BYTES: Final = 512
@@ -31,15 +31,17 @@ CODE_SUFFIXES: Final = frozenset(
     {"pickle", "pkl", "pk", "pyd", "pyc", "py", "so", "dill", "joblib"}
     | {"pt", "pth", "ckpt", "npy", "npz"}
 )
-"""Suffixes of files that loaders unpickle, load or may be made to: no shard holds such a member."""
+"""Suffixes of files that loaders may unpickle or run. No shard holds such a member."""
 
-_CHUNK_BYTES: Final = 4 * 1024 * 1024
+CHUNK_BYTES: Final = 4 * 1024 * 1024
+"""How much of a file is read at a time."""
+
 _NAME_BYTES: Final = 100
 _PREFIX_BYTES: Final = 155
 _CHECKSUM: Final = slice(148, 156)
 _UNSAFE_NAME: Final = re.compile(rf"{UNSAFE_PATH}|[^ -~]")
 _OCTAL: Final = re.compile(rb"([0-7]+)[ \0]*")
-_AGAIN: Final = "Fetch the shard again, or pack it again."
+FETCH_AGAIN: Final = "Fetch the shard again, or pack it again."
 _REFUSED_KINDS: Final = {
     "\0": "a file of the kind before POSIX",
     "1": "a hard link",
@@ -57,9 +59,8 @@ _REFUSED_KINDS: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class TarMember:
-    """A file in a tar: ``size`` bytes from byte ``offset`` of the tar on."""
+class TarMember(NamedTuple):
+    """A file in a tar: ``size`` bytes that start at byte ``offset`` of the tar."""
 
     name: str
     offset: int
@@ -72,7 +73,7 @@ def padded(size: int) -> int:
 
 
 def member_header(name: str, size: int) -> bytes:
-    """Return the block that stands before a member: mode 0644, owner 0, time 0.
+    """Return the header block of a member, with mode 0644, owner 0 and time 0.
 
     Raises:
         ShardError: If ustar cannot hold such a member.
@@ -86,45 +87,44 @@ def member_header(name: str, size: int) -> bytes:
             f"Split the file."
         )
     prefix, base = _split_name(name)
-    header = b"".join(
-        (
-            base.ljust(_NAME_BYTES, b"\0"),
-            b"0000644\0" + b"0000000\0" * 2,
-            b"%011o\0" % size,
-            b"%011o\0" % 0,
-            b" " * 8,
-            b"0".ljust(1 + _NAME_BYTES, b"\0"),
-            b"ustar\x0000".ljust(8 + 2 * 32, b"\0"),
-            b"0000000\0" * 2,
-            prefix.ljust(BLOCK_BYTES - 345, b"\0"),
-        )
+    header = (
+        base.ljust(_NAME_BYTES, b"\0")
+        + b"0000644\0"
+        + b"0000000\0" * 2
+        + b"%011o\0" % size
+        + b"%011o\0" % 0
+        + b" " * 8
+        + b"0".ljust(1 + _NAME_BYTES, b"\0")
+        + b"ustar\x0000".ljust(8 + 2 * 32, b"\0")
+        + b"0000000\0" * 2
+        + prefix.ljust(BLOCK_BYTES - 345, b"\0")
     )
     return header[:148] + b"%06o\0 " % sum(header) + header[156:]
 
 
 def _split_name(name: str) -> tuple[bytes, bytes]:
-    """Return ustar's two fields of a name, of which the first is empty for short names."""
+    """Return the prefix and name fields of a name; the prefix of a short name is empty."""
     if len(name) <= _NAME_BYTES:
         return b"", name.encode("ascii")
     for cut in (place for place, letter in enumerate(name) if letter == "/"):
         if cut <= _PREFIX_BYTES and len(name) - cut - 1 <= _NAME_BYTES:
             return name[:cut].encode("ascii"), name[cut + 1 :].encode("ascii")
     raise ShardError(
-        f"member {name!r}: has {len(name)} letters, and ustar holds {_NAME_BYTES} or, divided at "
-        f"a slash, {_PREFIX_BYTES} and {_NAME_BYTES}. Shorten its folders' names."
+        f"member {name!r}: has {len(name)} characters, and ustar holds {_NAME_BYTES}, or "
+        f"{_PREFIX_BYTES} before a slash and {_NAME_BYTES} after it. Shorten its folders' names."
     )
 
 
 def _unfit_name(name: str) -> str:
-    """Return why a member may not have such a name, nothing if it may."""
+    """Return why a member may not have this name, or an empty text."""
     if _UNSAFE_NAME.search(name):
-        return "its name is no relative path of plain ascii that stays inside its folder"
+        return "its name is not a relative path in ASCII that stays inside its folder"
     code = sorted(CODE_SUFFIXES & set(name.rpartition("/")[2].lower().split(".")[1:]))
     return f"may hold code that runs when it is loaded (.{code[0]})" if code else ""
 
 
 def read_members(file: BinaryFile, size: int, *, where: str) -> list[TarMember]:
-    """Return what an open tar of a known size holds, having read its headers and its end.
+    """Return the members of an open tar. Its headers and its end are read, not its contents.
 
     Args:
         file: Open for reading, seekable.
@@ -133,7 +133,7 @@ def read_members(file: BinaryFile, size: int, *, where: str) -> list[TarMember]:
 
     Raises:
         ShardError: If it is cut short or damaged, or holds anything but regular files with plain
-            names. The message tells the member, the byte and the cure.
+            names. The message names the member and the byte.
     """
     members: dict[str, TarMember] = {}
     last, at = "its start", 0
@@ -144,8 +144,8 @@ def read_members(file: BinaryFile, size: int, *, where: str) -> list[TarMember]:
         if len(block) < BLOCK_BYTES:
             what = f"only {len(block)} of the {BLOCK_BYTES} bytes" if block else "nothing"
             raise ShardError(
-                f"{place} {what} of a header or of the end of the archive is there: the shard is "
-                f"cut short. {_AGAIN}"
+                f"{place} there is {what} of a header or of the end of the archive: the shard is "
+                f"cut short. {FETCH_AGAIN}"
             )
         if not any(block):
             _require_end(file, size - at, place=place)
@@ -153,13 +153,13 @@ def read_members(file: BinaryFile, size: int, *, where: str) -> list[TarMember]:
         name, length = _parse_header(block, place=place)
         member = TarMember(name, at + BLOCK_BYTES, length)
         if name in members:
-            raise ShardError(f"{place} member {name!r} is there a second time. {_AGAIN}")
+            raise ShardError(f"{place} member {name!r} occurs a second time. {FETCH_AGAIN}")
         following = member.offset + padded(length)
         if following > size:
             raise ShardError(
-                f"{place} member {name!r} claims {length} bytes, which with padding end at byte "
-                f"{following}, and the shard has {size}: it is cut short, or the size is false. "
-                f"{_AGAIN}"
+                f"{place} member {name!r} claims {length} bytes. With padding they end at byte "
+                f"{following}, and the shard has {size}: it is cut short, or the size is wrong. "
+                f"{FETCH_AGAIN}"
             )
         members[name] = member
         last, at = repr(name), following
@@ -168,25 +168,25 @@ def read_members(file: BinaryFile, size: int, *, where: str) -> list[TarMember]:
 def _require_end(file: BinaryFile, left: int, *, place: str) -> None:
     if left < len(END_OF_ARCHIVE):
         raise ShardError(
-            f"{place} only {left} of the {len(END_OF_ARCHIVE)} zeros are there that end the "
-            f"archive: the shard is cut short. {_AGAIN}"
+            f"{place} there are only {left} of the {len(END_OF_ARCHIVE)} zeros that end the "
+            f"archive: the shard is cut short. {FETCH_AGAIN}"
         )
-    for chunk in _chunks(file, left - BLOCK_BYTES):
+    for chunk in read_chunks(file, left - BLOCK_BYTES):
         if chunk.strip(b"\0"):
             raise ShardError(
-                f"{place} zeros end the archive and other bytes follow them: a header was wiped "
-                f"out, or something was appended. {_AGAIN}"
+                f"{place} zeros end the archive, but other bytes follow them: a header was "
+                f"overwritten, or something was appended. {FETCH_AGAIN}"
             )
 
 
 def _parse_header(block: bytes, *, place: str) -> tuple[str, int]:
-    """Return name and size of the regular file that a header announces."""
+    """Return the name and size in a header, which must be that of a regular file."""
     stated = _OCTAL.fullmatch(block[_CHECKSUM])
     real = sum(block) - sum(block[_CHECKSUM]) + 8 * ord(" ")
     if stated is None or int(stated[1], 8) != real:
         raise ShardError(
             f"{place} the header is damaged: its checksum is {block[_CHECKSUM]!r}, and its bytes "
-            f"sum up to {real:06o}. {_AGAIN}"
+            f"add up to {real:06o}. {FETCH_AGAIN}"
         )
     parts = (block[345:500].rstrip(b"\0"), block[:_NAME_BYTES].rstrip(b"\0"))
     name = b"/".join(part for part in parts if part).decode("latin-1")
@@ -194,13 +194,13 @@ def _parse_header(block: bytes, *, place: str) -> tuple[str, int]:
     kind = chr(block[156])
     if kind != "0":
         raise ShardError(
-            f"{refused} is {_REFUSED_KINDS.get(kind, f'of the unknown kind {kind!r}')}, and a "
+            f"{refused} is {_REFUSED_KINDS.get(kind, f'of the unknown kind {kind!r}')}, but a "
             f"shard holds regular files only. Use a shard that this package packed."
         )
     if block[257:265] != b"ustar\x0000":
         raise ShardError(
-            f"{refused} has the mark {block[257:265]!r}, not that of POSIX ustar. Use a shard "
-            f"that this package packed."
+            f"{refused} has the magic {block[257:265]!r}, which is not that of POSIX ustar. Use a "
+            f"shard that this package packed."
         )
     unfit = _unfit_name(name)
     if unfit:
@@ -208,15 +208,14 @@ def _parse_header(block: bytes, *, place: str) -> tuple[str, int]:
     length = _OCTAL.fullmatch(block[124:136])
     if length is None:
         raise ShardError(
-            f"{refused} has the size {block[124:136]!r}, which is no octal number as in POSIX "
-            f"ustar. Do not use this shard."
+            f"{refused} has the size {block[124:136]!r}, which is not an octal number. Do not use "
+            f"this shard."
         )
     return name, int(length[1], 8)
 
 
-@dataclass(frozen=True, slots=True)
-class Checksums:
-    """sha256 of a whole file in hex, and zlib's crc32 of parts of it, in the order asked for."""
+class Checksums(NamedTuple):
+    """The sha256 of a whole file in hex, and zlib's crc32 of parts of it."""
 
     sha256: str
     crc32s: tuple[int, ...]
@@ -227,7 +226,7 @@ def read_checksums(
     size: int,
     *,
     parts: Sequence[tuple[int, int]],
-    after_bytes: Callable[[int], None],
+    after_bytes: Advance,
 ) -> Checksums:
     """Return the checksums of an open file, read once from start to end.
 
@@ -244,30 +243,33 @@ def read_checksums(
     crc32s, at = [], 0
     file.seek(0)
 
-    def feed(length: int) -> int:
-        crc32 = 0
-        for chunk in _chunks(file, length):
-            whole.update(chunk)
-            crc32 = zlib.crc32(chunk, crc32)
-            after_bytes(len(chunk))
-        return crc32
+    def crc32_of_next(length: int) -> int:
+        return copy_with_crc32(read_chunks(file, length, after_bytes=after_bytes), whole.update)
 
     for offset, length in parts:
-        feed(offset - at)
-        crc32s.append(feed(length))
+        crc32_of_next(offset - at)
+        crc32s.append(crc32_of_next(length))
         at = offset + length
-    feed(size - at)
+    crc32_of_next(size - at)
     return Checksums(whole.hexdigest(), tuple(crc32s))
 
 
-def _chunks(file: BinaryFile, length: int) -> Iterator[bytes]:
-    """Yield so many bytes of a file, from where it stands."""
-    while length > 0:
-        chunk = file.read(min(length, _CHUNK_BYTES))
+def read_chunks(
+    file: BinaryFile, length: int, *, after_bytes: Advance = no_advance
+) -> Iterator[bytes]:
+    """Yield the next ``length`` bytes of a file, a few megabytes at a time.
+
+    Raises:
+        ShardError: If the file ends before.
+    """
+    left = length
+    while left > 0:
+        chunk = file.read(min(left, CHUNK_BYTES))
         if not chunk:
             raise ShardError(
-                f"{getattr(file, 'name', 'the shard')}: ends {length} bytes before its size. It "
-                f"is being changed: wait until that is over, then try again."
+                f"{getattr(file, 'name', 'the shard')}: ends {left} bytes before its size. It is "
+                f"being changed: wait until that is over, then try again."
             )
-        length -= len(chunk)
+        left -= len(chunk)
         yield chunk
+        after_bytes(len(chunk))

@@ -1,4 +1,4 @@
-"""Shards back into a tree in the released layout: each scene's folder whole, or not there.
+"""Unpack shards into a tree in the released layout: each scene's folder whole, or absent.
 
 What was packed unchanged comes out unchanged, byte for byte. Depth that blosc2 packed becomes an
 FFV1 video again, whose pictures, times and tags are compared with what was packed.
@@ -8,32 +8,33 @@ import io
 import shutil
 import zlib
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Final, Literal
 
-from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
-from stereogenbench_data.errors import DISK_FULL, MediaError, ShardError, describe_os_error
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
+from stereogenbench_data.errors import MediaError, ShardError, describe_os_error
 from stereogenbench_data.index.open import warn_if_stale
+from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.depth_packing import write_depth_video
 from stereogenbench_data.media.video import probe
-from stereogenbench_data.schema.records import Member, Scene, ShardFacts
+from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
+from stereogenbench_data.shards.tar import read_chunks
+from stereogenbench_data.shards.writer import PARTS
 from stereogenbench_data.sources.files import copy_with_crc32, try_locked
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.members import open_local
-from stereogenbench_data.sources.ranged_file import MemberFile
+from stereogenbench_data.sources.ranged_file import require_crc32
 
 _RELEASED_NAMES: Final = {packed: name for name, packed in PACKED_DEPTH_NAMES.items()}
 _LOCK: Final = ".unpacking"
-_CHUNK_BYTES: Final = 4 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
 class UnpackReport:
-    """What became of the scenes, by key: written just now, or there before and kept."""
+    """The keys of the scenes that were unpacked now, or were there before and kept."""
 
     out: Path
     unpacked: tuple[str, ...]
@@ -42,7 +43,7 @@ class UnpackReport:
 
 @dataclass(frozen=True, slots=True)
 class _UnpackTask:
-    """A scene to be unpacked."""
+    """A scene to unpack; ``shards`` are those that hold its files."""
 
     root: str
     out: str
@@ -51,12 +52,12 @@ class _UnpackTask:
 
     @property
     def folder(self) -> Path:
-        """Where the scene is to lie."""
+        """The scene's folder."""
         return Path(self.out, self.scene.id.key)
 
     @property
     def unfinished(self) -> Path:
-        """Where it lies until it is whole; walks of a tree pass such names over."""
+        """Its name until it is whole; walks of a tree ignore such names."""
         return self.folder.with_name(f".{self.folder.name}.unpacking")
 
 
@@ -66,27 +67,29 @@ def unpack(
     *,
     root: str | Path | None = None,
     workers: int | None = None,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
 ) -> UnpackReport:
     """Turn shards back into a tree in the released layout.
 
-    Scenes that are there already are kept, so that a run that was stopped goes on if it is run
-    again. Nothing is overwritten.
+    Existing scenes are kept, so a run that was stopped continues when it is run again. Nothing is
+    overwritten.
 
     Args:
         data: The folder of the shards, or its index file.
-        root: The folder of the shards, by your word, where an index file does not lie in it.
-        out: Folder for the tree; made if need be.
-        workers: Processes that work at the same time; None is one a core.
-        progress: Called now and then with the bytes of members done, and all there are.
+        root: The folder of the shards, if the index file is elsewhere.
+        out: Folder for the tree; created if it does not exist.
+        workers: The number of processes; None is one a core.
+        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
+        progress: Called repeatedly with the bytes of members done, and all of them.
 
     Raises:
         StorageError: If there is no index of shards, or a worker died.
-        ShardError: If a member is not the one that was packed, a scene's folder holds anything
-            else, another process unpacks into this folder, or it cannot be written.
+        ShardError: If a member is not the one that was packed, a scene's folder exists and holds
+            something else, another process unpacks into this folder, or it cannot be written.
         ExtraError: If blosc2 is needed and not installed.
     """
-    index = _opened(data, root)
+    index = open_shards(data, root)
     scenes = [index.scene(row) for row in range(len(index))]
     out = Path(out)
     if out.resolve() == Path(index.root).resolve():
@@ -101,30 +104,31 @@ def unpack(
         for scene in scenes
     ]
     total = sum(member.size for scene in scenes for member in scene.members.values())
-    found: dict[str, str] = {}
     try:
         out.mkdir(parents=True, exist_ok=True)
         with try_locked(out / _LOCK) as is_ours:
             if not is_ours:
                 raise ShardError(
                     f"{out}: another process is unpacking into this folder. Wait for it, or "
-                    f"unpack into another."
+                    f"unpack into another folder."
                 )
             try:
-                outcomes = LOCAL.map(
-                    unpack_scene,
-                    tasks,
-                    name=lambda task: task.scene.id.key,
-                    workers=workers,
-                    advance=advance_of(progress, total=total),
+                found = dict(
+                    engine.map(
+                        unpack_scene,
+                        tasks,
+                        name=lambda task: task.scene.id.key,
+                        workers=workers,
+                        advance=advance_of(progress, total=total),
+                    )
                 )
-                found.update(outcomes)
             finally:
                 (out / _LOCK).unlink(missing_ok=True)
     except OSError as error:
         if error.errno is None:
             raise
-        raise ShardError(_why_not_written(out, error)) from error
+        what = f"{error.filename or out}: cannot be written"
+        raise ShardError(describe_os_error(what, error, "Unpack into another folder.")) from error
     warn_if_stale(out)
     return UnpackReport(
         out,
@@ -133,26 +137,37 @@ def unpack(
     )
 
 
-def _opened(data: str | Path, root: str | Path | None) -> SceneIndex:
+def open_shards(data: str | Path, root: str | Path | None) -> SceneIndex:
+    """Return the index of shards on this machine.
+
+    Args:
+        data: The folder of the shards, or its index file.
+        root: The folder of the shards, if the index file is elsewhere.
+
+    Raises:
+        StorageError: If there is no index of shards, or it cannot be opened.
+    """
     if "://" in str(data):
-        raise ShardError(f"{shown(data)}: is far away. Fetch the shards, and pass their folder.")
-    index = SceneIndex.open(data, root=root)
+        raise ShardError(f"{shown(data)}: is remote. Download the shards, and pass their folder.")
+    path = Path(data)
+    if path.is_dir() and not (path / INDEX_NAME).is_file():
+        cure = "Pass a folder that `stereogenbench pack` made."
+        if (path / PARTS).is_dir():
+            cure = "Packing was not finished: run `stereogenbench pack` again."
+        raise ShardError(f"{path}: holds no {INDEX_NAME}. {cure}")
+    index = SceneIndex.open(path, root=root)
     if not index.shards:
-        raise ShardError(f"{data}: is a released tree already, and no folder of shards.")
+        raise ShardError(
+            f"{path}: is the index of a released folder, not of shards. Pack it with "
+            f"`stereogenbench pack`, or pass a folder of shards."
+        )
     return index
-
-
-def _why_not_written(out: Path, error: OSError) -> str:
-    if error.errno in DISK_FULL:
-        return f"{out}: the disk is full. Make room, then run the same command again to go on."
-    what = f"{error.filename or out}: cannot be written"
-    return describe_os_error(what, error, "Unpack into another folder.")
 
 
 def unpack_scene(
     task: _UnpackTask, after_bytes: Advance
 ) -> tuple[str, Literal["unpacked", "kept"]]:
-    """Unpack one scene, unless it is there; a worker process calls this.
+    """Unpack one scene, unless it exists; a worker process calls this.
 
     Raises:
         ShardError: As `unpack` says.
@@ -168,43 +183,25 @@ def unpack_scene(
         for name, member in sorted(scene.members.items(), key=lambda item: item[1].offset):
             where = f"{Path(task.root, member.path)}: {scene.id.key}.{name}"
             target = task.unfinished / _RELEASED_NAMES.get(name, name)
-            with _member_of(task, member) as file:
+            opened = open_local(task.root, member, shard=task.shards[member.path])
+            with opened.open("rb") if isinstance(opened, Path) else opened as file:
                 if name in _RELEASED_NAMES:
-                    _write_video(file, member, target, frames=scene.frames, where=where)
+                    content = file.read()
+                    require_crc32(zlib.crc32(content), expected=member.crc32, name=where)
+                    _write_video(content, target, frames=scene.frames, where=where)
                     after_bytes(member.size)
-                else:
-                    _copy(file, member, target, where=where, after_bytes=after_bytes)
+                    continue
+                chunks = read_chunks(file, member.size, after_bytes=after_bytes)
+                with target.open("xb") as output:
+                    crc32 = copy_with_crc32(chunks, output.write)
+                require_crc32(crc32, expected=member.crc32, name=where)
         task.unfinished.rename(task.folder)
     finally:
         shutil.rmtree(task.unfinished, ignore_errors=True)
     return scene.id.key, "unpacked"
 
 
-def _member_of(task: _UnpackTask, member: Member) -> MemberFile:
-    opened = open_local(task.root, member, shard=task.shards[member.path])
-    if isinstance(opened, Path):
-        raise ShardError(f"{opened}: is no member of a shard. Use a folder of shards.")
-    return opened
-
-
-def _copy(
-    file: MemberFile, member: Member, target: Path, *, where: str, after_bytes: Advance
-) -> None:
-    with target.open("xb") as output:
-
-        def write(chunk: bytes) -> None:
-            output.write(chunk)
-            after_bytes(len(chunk))
-
-        crc32 = copy_with_crc32(iter(partial(file.read, _CHUNK_BYTES), b""), write)
-    _require_crc32(crc32, member, where=where)
-
-
-def _write_video(
-    file: MemberFile, member: Member, target: Path, *, frames: int, where: str
-) -> None:
-    content = file.read()
-    _require_crc32(zlib.crc32(content), member, where=where)
+def _write_video(content: bytes, target: Path, *, frames: int, where: str) -> None:
     try:
         with DepthFrames(io.BytesIO(content), name=where, frames=frames) as packed:
             write_depth_video(packed, target)
@@ -212,34 +209,26 @@ def _write_video(
         raise ShardError(str(error)) from error
 
 
-def _require_crc32(crc32: int, member: Member, *, where: str) -> None:
-    if member.crc32 not in (None, crc32):
-        raise ShardError(
-            f"{where}: has crc32 {crc32:08x}, and the index says {member.crc32:08x}. The shard was "
-            f"damaged or replaced: fetch it again."
-        )
-
-
 def _require_unpacked(task: _UnpackTask) -> None:
-    """Refuse a scene's folder that does not hold what unpacking would write, as far as sizes tell.
+    """Refuse a scene's folder that does not hold what unpacking would write.
 
-    Of a depth video that was written anew, the header tells.
+    Sizes are compared; of a depth video that was packed, the facts in its header.
     """
     scene, folder = task.scene, task.folder
     expected = {_RELEASED_NAMES.get(name, name): name for name in scene.members}
     there = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     odd = sorted(there ^ expected.keys())
     for name in sorted(there & expected.keys()):
-        packed = expected[name]
-        if packed == name:
-            is_same = (folder / name).stat().st_size == scene.members[name].size
+        member = scene.members[expected[name]]
+        if expected[name] == name:
+            is_same = (folder / name).stat().st_size == member.size
         else:
             is_same = _has_frames(folder / name, scene)
         odd += [] if is_same else [name]
     if odd:
         raise ShardError(
-            f"{folder}: is there, and is not what the shards hold ({', '.join(odd[:3])} differ). "
-            f"Move it away, or unpack into another folder."
+            f"{folder}: already exists, and is not what the shards hold ({', '.join(odd[:3])} "
+            f"differ). Move it away, or unpack into another folder."
         )
 
 

@@ -1,6 +1,6 @@
-"""Compare shards with their index: every byte, and with "decode" every picture.
+"""Compare shards with their index: every byte, and on request every frame.
 
-A wrong shard does not stop the rest: all problems are gathered, each with its cure.
+A damaged shard does not stop the others: all problems are listed, each with its cure.
 """
 
 import io
@@ -13,7 +13,6 @@ from typing import Final, Literal
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
-from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.index.stale import StaleIndexWarning
 from stereogenbench_data.index.table import SceneIndex
@@ -30,25 +29,19 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.companion_files import companion_files
-from stereogenbench_data.shards.tar import TarMember, read_checksums, read_members
+from stereogenbench_data.shards.tar import FETCH_AGAIN, TarMember, read_checksums, read_members
+from stereogenbench_data.shards.unpack import open_shards
 from stereogenbench_data.shards.writer import UNFINISHED
-from stereogenbench_data.sources.files import PARTS
-from stereogenbench_data.sources.location import shown
-
-_FETCH: Final = "Fetch the shard again, or pack it again."
 
 _WRONG_INDEX: Final = "Put the index beside the shards that it was packed with."
-
 _FETCH_BOTH: Final = "Fetch the shard and its index again, or pack them again."
-
+_WRITE_AGAIN: Final = "Fetch it again, or run `stereogenbench pack` again to write it."
 _SHOWN: Final = 3
 
-_WRITE_AGAIN: Final = "Fetch it again, or write it anew: run `stereogenbench pack` again."
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, order=True)
 class Problem:
-    """What is wrong, and what to do; texts that do not apply are empty."""
+    """What is wrong where, and what to do; a scene or member that does not apply is empty."""
 
     shard: str
     scene: str
@@ -64,31 +57,23 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class _ExpectedShard:
-    """What the index says of one shard: facts, scenes, and members by their whole name."""
+    """What the index says of one shard; members are by their whole name in it."""
 
-    root: str
+    path: Path
     shard: str
     facts: ShardFacts
     scenes: list[Scene] = field(default_factory=list)
     members: dict[str, Member] = field(default_factory=dict)
 
-    def problem(self, name: str, found: str, cure: str = _FETCH) -> Problem:
-        """Return a problem of the member of that name, or of the shard for an empty one."""
+    def problem(self, name: str, found: str, cure: str = FETCH_AGAIN) -> Problem:
+        """Return a problem of a member by its whole name, or of the shard for an empty name."""
         scene, _, member = name.partition(".")
         return Problem(self.shard, scene, member, found, cure)
 
 
-@dataclass(slots=True)
-class _CheckedShard:
-    """What was found out about a shard; ``sound`` names the members that are as they were."""
-
-    problems: list[Problem] = field(default_factory=list)
-    sound: set[str] = field(default_factory=set)
-
-
 @dataclass(frozen=True, slots=True)
 class _DecodeTask:
-    """Videos of one scene that are to be decoded."""
+    """Videos of one scene to decode."""
 
     root: str
     scene: Scene
@@ -97,7 +82,7 @@ class _DecodeTask:
 
 @dataclass(frozen=True, slots=True)
 class VerifyReport:
-    """What was looked at and what is wrong, in the order of shards, scenes and members."""
+    """What was checked, and what is wrong in the order of shards, scenes and members."""
 
     root: str
     shards: int
@@ -117,36 +102,44 @@ def verify(
     engine: Engine = LOCAL,
     progress: Progress | None = None,
 ) -> VerifyReport:
-    """Compare shards, and what was packed beside them, with their index.
+    """Compare shards, and the files that were packed beside them, with their index.
 
-    The index itself is held against the metadata that the shards hold.
+    The index itself is compared with the metadata in the shards.
 
     Args:
         data: The folder of the shards, or its index file.
-        root: The folder of the shards, by your word, where an index file does not lie in it.
-        mode: "bytes" reads all bytes; "decode" then decodes all frames of all videos, too.
-        workers: Processes that work at the same time; None is one a core.
-        engine: Where they are: `engine.LOCAL`, or an `engine.RayCluster`.
-        progress: Called now and then with the bytes done, and all there are; with "decode" those
-            of videos count twice.
+        root: The folder of the shards, if the index file is elsewhere.
+        mode: "bytes" reads all bytes; "decode" then also decodes all frames of all videos.
+        workers: The number of processes; None is one a core.
+        engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster`.
+        progress: Called repeatedly with the bytes done, and all of them; with "decode" those of
+            videos count twice.
 
     Raises:
-        StorageError: If there is no index, it is not one of shards, or a worker died.
+        StorageError: If there is no index of shards, or a worker died.
     """
-    index = _opened(data, root)
+    with warnings.catch_warnings():
+        # A stale index is a problem, reported with the others.
+        warnings.simplefilter("ignore", StaleIndexWarning)
+        index = open_shards(data, root)
     expected = _expected_of(index)
     problems = list(_folder_problems(index, expected))
-    checks = [each for each in expected.values() if Path(each.root, each.shard).is_file()]
+    checks = [each for each in expected.values() if each.path.is_file()]
     scenes = [index.scene(row) for row in range(len(index))] if mode == "decode" else []
-    total = sum(each.facts.size for each in checks) + sum(map(_video_bytes, scenes))
+    video_bytes = sum(scene.members[name].size for scene in scenes for name in scene.held_videos)
+    total = sum(each.facts.size for each in checks) + video_bytes
     advance = advance_of(progress, total=total)
     sound: set[str] = set()
-    for checked in engine.map(
+    for wrong, right in engine.map(
         _check_shard, checks, name=lambda each: each.shard, workers=workers, advance=advance
     ):
-        problems += checked.problems
-        sound |= checked.sound
-    tasks = _decode_tasks(scenes, index.root, sound)
+        problems += wrong
+        sound |= right
+    tasks = []
+    for scene in scenes:
+        names = tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound)
+        if names:
+            tasks.append(_DecodeTask(index.root, scene, names))
     for found in engine.map(
         _decode_scene,
         tasks,
@@ -162,44 +155,21 @@ def verify(
         members=sum(len(each.members) for each in expected.values()),
         bytes=sum(each.facts.size for each in expected.values()),
         videos_decoded=sum(len(task.names) for task in tasks),
-        problems=tuple(sorted(problems, key=lambda p: (p.shard, p.scene, p.member, p.found))),
+        problems=tuple(sorted(problems)),
     )
-
-
-def _opened(data: str | Path, root: str | Path | None) -> SceneIndex:
-    if "://" in str(data):
-        raise ShardError(f"{shown(data)}: is far away. Fetch the shards, and pass their folder.")
-    path = Path(data)
-    if path.is_dir() and not (path / INDEX_NAME).is_file():
-        begun = (path / PARTS).is_dir()
-        raise ShardError(
-            f"{path}: holds no {INDEX_NAME}. "
-            + ("Packing was not finished: run `stereogenbench pack` again." if begun else
-               "Point at a folder that `stereogenbench pack` made.")
-        )  # fmt: skip
-    with warnings.catch_warnings():
-        # What does not fit the index is a problem, reported with the others.
-        warnings.simplefilter("ignore", StaleIndexWarning)
-        index = SceneIndex.open(path, root=root)
-    if not index.shards:
-        raise ShardError(
-            f"{path}: is the index of a released folder, not of shards. Pack it with "
-            f"`stereogenbench pack`, or point at the shards."
-        )
-    return index
 
 
 def _expected_of(index: SceneIndex) -> dict[str, _ExpectedShard]:
     expected = {
-        name: _ExpectedShard(index.root, name, facts)
+        name: _ExpectedShard(Path(index.root, name), name, facts)
         for name, facts in sorted(index.shards.items())
     }
     for scene in map(index.scene, range(len(index))):
         for name, member in scene.members.items():
             if member.path not in expected:
                 raise ShardError(
-                    f"{index.where}: its index places {scene.id.key}.{name} in {member.path} and "
-                    f"knows no such shard. The index was altered: fetch it again."
+                    f"{index.where}: its index places {scene.id.key}.{name} in {member.path}, but "
+                    f"does not list this shard. The index was altered: fetch it again."
                 )
             expected[member.path].members[f"{scene.id.key}.{name}"] = member
         for path in {member.path for member in scene.members.values()}:
@@ -208,68 +178,58 @@ def _expected_of(index: SceneIndex) -> dict[str, _ExpectedShard]:
 
 
 def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> Iterator[Problem]:
+    """Yield files that are missing, unknown, or differ from what the index says."""
     there = {path.name for path in Path(index.root).iterdir()}
     for each in expected.values():
-        if not Path(each.root, each.shard).is_file():
-            scenes = len({name.partition(".")[0] for name in each.members})
-            what = "is no file" if each.shard in there else "is missing"
-            yield each.problem("", f"{what}, with {counted(scenes, 'scene')}", _FETCH)
+        if not each.path.is_file():
+            scenes = counted(len(each.scenes), "scene")
+            what = "is not a file" if each.shard in there else "is missing"
+            yield each.problem("", f"{what}, with {scenes}")
     for name in sorted(there - expected.keys()):
         if name.endswith(".tar"):
-            yield Problem(name, "", "", "is there, and the index does not know it", _WRONG_INDEX)
+            yield Problem(name, "", "", "is not in the index", _WRONG_INDEX)
         elif name.endswith(f".tar{UNFINISHED}"):
             cure = "Run `stereogenbench pack` again, or remove it."
             yield Problem(name, "", "", "is an unfinished shard", cure)
-    yield from _companion_problems(index)
-
-
-def _companion_problems(index: SceneIndex) -> Iterator[Problem]:
-    """Yield what is wrong with the files that pack writes for other readers."""
     for name, content in companion_files(index).items():
         try:
-            found = Path(index.root, name).read_bytes()
+            if Path(index.root, name).read_bytes() != content:
+                yield Problem(name, "", "", "contradicts the index", _WRITE_AGAIN)
         except FileNotFoundError:
             yield Problem(name, "", "", "is missing, and pack wrote it", _WRITE_AGAIN)
         except OSError as error:
-            cure = cure_of(error, _WRITE_AGAIN)
-            yield Problem(name, "", "", f"cannot be read ({error.strerror})", cure)
-        else:
-            if found != content:
-                yield Problem(name, "", "", "contradicts the index", _WRITE_AGAIN)
+            found = f"cannot be read ({error.strerror})"
+            yield Problem(name, "", "", found, cure_of(error, _WRITE_AGAIN))
 
 
 # One shard: its structure, every byte, and its metadata.
 
 
-def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> _CheckedShard:
-    """Read a shard through and return what is wrong with it; a worker process calls this."""
-    path = Path(expected.root, expected.shard)
+def _check_shard(expected: _ExpectedShard, after_bytes: Advance) -> tuple[list[Problem], set[str]]:
+    """Return what is wrong with a shard, and its sound members; a worker process calls this."""
     try:
-        with path.open("rb", buffering=0) as file:
-            return _checked(expected, file, path.stat().st_size, after_bytes)
+        with expected.path.open("rb", buffering=0) as file:
+            return _check_contents(expected, file, expected.path.stat().st_size, after_bytes)
     except OSError as error:
         found = f"cannot be read ({error.strerror or error})"
-        return _CheckedShard([expected.problem("", found, cure_of(error, _FETCH))])
+        return [expected.problem("", found, cure_of(error, FETCH_AGAIN))], set()
 
 
-def _checked(
+def _check_contents(
     expected: _ExpectedShard, file: io.FileIO, size: int, after_bytes: Advance
-) -> _CheckedShard:
-    checked = _CheckedShard()
+) -> tuple[list[Problem], set[str]]:
+    members = expected.members
     try:
         found = {each.name: each for each in read_members(file, size, where=expected.shard)}
     except ShardError as error:
-        reason = str(error).removeprefix(f"{expected.shard}: ").removesuffix(f" {_FETCH}")
-        checked.problems.append(expected.problem("", reason.rstrip(".")))
-        checked.problems += _cut_off(expected, size)
-        placed = {
-            name: each for name, each in expected.members.items() if each.offset + each.size <= size
-        }
+        reason = str(error).removeprefix(f"{expected.shard}: ").removesuffix(f" {FETCH_AGAIN}")
+        problems = [expected.problem("", reason.rstrip(".")), *_cut_off(expected, size)]
+        placed = {name: each for name, each in members.items() if each.offset + each.size <= size}
     else:
-        checked.problems += _differing(expected, found)
+        problems = list(_differing(expected, found))
         placed = {
             name: each
-            for name, each in expected.members.items()
+            for name, each in members.items()
             if found.get(name) == TarMember(name, each.offset, each.size)
         }
     parts = _apart(placed)
@@ -279,26 +239,29 @@ def _checked(
         parts=[(each.offset, each.size) for each in parts.values()],
         after_bytes=after_bytes,
     )
+    sound = set()
     for (name, member), crc32 in zip(parts.items(), checksums.crc32s, strict=True):
         if crc32 == member.crc32:
-            checked.sound.add(name)
+            sound.add(name)
             continue
-        indexed = "none is" if member.crc32 is None else f"{member.crc32:08x} is"
-        found_crc = f"its bytes have crc32 {crc32:08x}, and by the index {indexed} right"
-        checked.problems.append(expected.problem(name, found_crc))
-    checked.problems += _misindexed(expected, file, checked.sound)
-    facts = expected.facts
-    if not checked.problems and (size, checksums.sha256) != (facts.size, facts.sha256):
-        differing = (
-            f"all members are whole, and yet the file has {size} bytes with sha256 "
-            f"{checksums.sha256[:16]}..., and by the index {facts.size} with {facts.sha256[:16]}..."
+        indexed = "has none" if member.crc32 is None else f"says {member.crc32:08x}"
+        problems.append(
+            expected.problem(name, f"its bytes have crc32 {crc32:08x}, and the index {indexed}")
         )
-        checked.problems.append(expected.problem("", differing))
-    return checked
+    problems += _misindexed(expected, file, sound)
+    facts = expected.facts
+    if not problems and (size, checksums.sha256) != (facts.size, facts.sha256):
+        differing = (
+            f"all members are sound, but the file has {size} bytes with sha256 "
+            f"{checksums.sha256[:16]}..., and the index says {facts.size} with "
+            f"{facts.sha256[:16]}..."
+        )
+        problems.append(expected.problem("", differing))
+    return problems, sound
 
 
 def _cut_off(expected: _ExpectedShard, size: int) -> Iterator[Problem]:
-    """Yield a problem for each scene of which members lie beyond the end of the file."""
+    """Yield a problem for each scene with members beyond the end of the file."""
     of_scene = defaultdict(list)
     for name, member in expected.members.items():
         if member.offset + member.size > size:
@@ -325,12 +288,12 @@ def _few(names: list[str]) -> str:
 
 
 def _differing(expected: _ExpectedShard, found: dict[str, TarMember]) -> Iterator[Problem]:
-    """Yield what differs between the members that are there and those of the index."""
+    """Yield what differs between the members of the tar and those of the index."""
     scenes, indexed = (
         {name.partition(".")[0] for name in names} for names in (found, expected.members)
     )
     if indexed < scenes:
-        added = sorted(name for name in found if name not in expected.members)
+        added = sorted(found.keys() - expected.members.keys())
         text = (
             f"holds {counted(len(added), 'member')} that the index does not place in it "
             f"({_few(added)}): something was appended, or the index is of another pack"
@@ -340,7 +303,7 @@ def _differing(expected: _ExpectedShard, found: dict[str, TarMember]) -> Iterato
     if scenes != indexed:
         text = (
             f"holds other scenes than the index says: {len(scenes - indexed)} unknown, "
-            f"{len(indexed - scenes)} not there ({_few(sorted(scenes ^ indexed))}); shard and "
+            f"{len(indexed - scenes)} missing ({_few(sorted(scenes ^ indexed))}); shard and "
             f"index are of different packs"
         )
         yield expected.problem("", text, _WRONG_INDEX)
@@ -350,19 +313,20 @@ def _differing(expected: _ExpectedShard, found: dict[str, TarMember]) -> Iterato
         if here is None:
             yield expected.problem(name, "is missing")
         elif member is None:
-            yield expected.problem(name, "is there, and the index does not know it")
+            yield expected.problem(name, "is not in the index")
         elif (here.offset, here.size) != (member.offset, member.size):
-            yield expected.problem(
-                name,
-                f"has {here.size} bytes from byte {here.offset} on, and by the index "
-                f"{member.size} from {member.offset} on",
+            text = (
+                f"has {here.size} bytes from byte {here.offset}, and the index says "
+                f"{member.size} from byte {member.offset}"
             )
+            yield expected.problem(name, text)
 
 
 def _apart(members: dict[str, Member]) -> dict[str, Member]:
     """Return members in the order of their bytes, without any that begins inside another.
 
-    Only an altered index has such, and only beside a tar that cannot be read: that is reported.
+    Only an altered index has such members, and only an unreadable tar, which is reported, lets them
+    come this far.
     """
     apart: dict[str, Member] = {}
     end = 0
@@ -376,21 +340,6 @@ def _apart(members: dict[str, Member]) -> dict[str, Member]:
 # The videos of one scene: every frame is decoded.
 
 
-def _video_bytes(scene: Scene) -> int:
-    """Return how many bytes a scene's videos have."""
-    return sum(scene.members[name].size for name in scene.held_videos)
-
-
-def _decode_tasks(scenes: list[Scene], root: str, sound: set[str]) -> list[_DecodeTask]:
-    """Return what to decode: all videos whose bytes are those that were packed."""
-    tasks = []
-    for scene in scenes:
-        names = tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound)
-        if names:
-            tasks.append(_DecodeTask(root, scene, names))
-    return tasks
-
-
 def _decode_scene(task: _DecodeTask, after_bytes: Advance) -> list[Problem]:
     """Decode all frames of a scene's videos; return what is wrong with any."""
     problems = []
@@ -400,7 +349,7 @@ def _decode_scene(task: _DecodeTask, after_bytes: Advance) -> list[Problem]:
             _decode(task, name)
         except (MediaError, OSError) as error:
             reason = str(error).removeprefix(f"{name}: ").rstrip(".")
-            cure = "Pack the scene again from a video that is whole."
+            cure = "Pack the scene again from an undamaged video."
             if isinstance(error, OSError):
                 cure = cure_of(error, cure)
             problems.append(Problem(member.path, task.scene.id.key, name, reason, cure))
@@ -409,7 +358,7 @@ def _decode_scene(task: _DecodeTask, after_bytes: Advance) -> list[Problem]:
 
 
 def _decode(task: _DecodeTask, name: str) -> None:
-    """Decode all frames of a video from its place in the shard, and hold it against the index."""
+    """Decode all frames of a video in a shard, and compare its header with the index."""
     scene, member = task.scene, task.scene.members[name]
     with Path(task.root, member.path).open("rb") as shard:
         shard.seek(member.offset)
@@ -427,12 +376,12 @@ def _decode(task: _DecodeTask, name: str) -> None:
 
 
 def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
-    """Hold a video's header against the index."""
+    """Compare a video's header with the index."""
     size = (scene.rig.image_width_px, scene.rig.image_height_px)
     if (facts.frames, (facts.width_px, facts.height_px)) != (scene.frames, size):
         raise MediaError(
             f"{name}: has {facts.frames} frames of {facts.width_px}x{facts.height_px} pixels, and "
-            f"by the index {scene.frames} of {size[0]}x{size[1]}."
+            f"the index says {scene.frames} of {size[0]}x{size[1]}."
         )
     require_pixel_aspect(facts.pixel_aspect, scene.rig, name=name)
     depth_names = [scene.held_name(depth_name(camera)) for camera in range(CAMERA_COUNT)]
@@ -447,7 +396,7 @@ def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
         scene.depth_unit_m[camera],
     )
     if found != indexed:
-        raise MediaError(f"{name}: is stored as {found}, and by the index as {indexed}.")
+        raise MediaError(f"{name}: is stored as {found}, and the index says {indexed}.")
     require_depth_stream(
         codec=facts.codec, pixel_format=facts.pixel_format, encoding=encoding, name=name
     )

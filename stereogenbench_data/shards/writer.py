@@ -1,88 +1,158 @@
-"""One shard on disk, whole or not there: written beside its place, read back, then renamed.
+"""One shard on disk, whole or absent: written beside its place, read back, then renamed.
 
-Its members are made from files of the release that are as they were planned and do not change
-meanwhile.
+The manifest of a shard, ``OUT/.parts/<shard>.json``, is written just before the rename. A shard
+whose manifest fits it is finished, and later runs keep it. Source files must be as they were when
+the plan was made, and must not change while they are read.
 """
 
 import hashlib
 import io
+import json
 import os
 import stat
 import zlib
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, fields, replace
 from io import FileIO
 from itertools import groupby
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from stereogenbench_data.engine import Advance, no_advance
-from stereogenbench_data.errors import DISK_FULL, MediaError, ShardError, cure_of, describe_os_error
+from stereogenbench_data.errors import DISK_FULL, MediaError, ShardError, describe_os_error
+from stereogenbench_data.index.rows import row_of
 from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.schema.records import Scene
 from stereogenbench_data.schema.release import METADATA_FILES
-from stereogenbench_data.shards.manifest import (
-    PackedShard,
-    ShardManifest,
-    ShardTask,
-    SourceStamp,
-    find_packed,
-    read_manifest,
-    row_digest,
-    write_manifest,
-)
-from stereogenbench_data.shards.plan import PlannedMember
+from stereogenbench_data.shards.plan import PlannedMember, PlannedShard
 from stereogenbench_data.shards.tar import (
+    BLOCK_BYTES,
     END_OF_ARCHIVE,
     Checksums,
     TarMember,
     member_header,
-    padded,
     read_checksums,
+    read_chunks,
     read_members,
 )
-from stereogenbench_data.sources.files import open_exclusive
+from stereogenbench_data.sources.files import copy_with_crc32, try_locked, write_atomic
 
 UNFINISHED: Final = ".tmp"
 
-_CHUNK_BYTES: Final = 4 * 1024 * 1024
+PARTS: Final = ".parts"
+"""The folder beside the shards that holds their manifests and locks."""
 
 
 @dataclass(frozen=True, slots=True)
-class ShardOutcome:
-    """What became of a shard: packed just now, or found finished and kept."""
+class ShardTask:
+    """A shard to pack, with all that another process needs for it."""
 
-    shard: PackedShard
-    work: Literal["packed", "kept"]
+    shard: PlannedShard
+    root: str
+    out: str
+    plan_digest: str
+
+    @property
+    def target(self) -> Path:
+        """The path of the shard."""
+        return Path(self.out, self.shard.name)
+
+    @property
+    def unfinished(self) -> Path:
+        """The path of the shard until it is finished."""
+        return self.target.with_name(self.target.name + UNFINISHED)
+
+    @property
+    def manifest(self) -> Path:
+        """The path of its manifest."""
+        return self.target.parent / PARTS / f"{self.target.stem}.json"
 
 
-def pack_task(task: ShardTask, after_bytes: Advance) -> ShardOutcome:
-    """Pack one shard into its folder, unless it is there already; a worker calls this.
+class SourceStamp(NamedTuple):
+    """A source file when it was packed: its size, modification time and crc32."""
 
-    Raises:
-        ShardError: If a source is missing, unreadable, changes meanwhile or contradicts the index;
-            the disk is full; the shard does not read back as written; a file that was not packed
-            here has its name; or another process is packing it.
+    size: int
+    modified_ns: int
+    crc32: int
+
+
+@dataclass(frozen=True, slots=True)
+class ShardManifest:
+    """A finished shard: its checksums, its members in order, and what they were made from.
+
+    Attributes:
+        plan: The digest of its plan.
+        modified_ns: The shard's modification time.
+        rows: Each scene's key, with the digest of its row in the index.
     """
-    done = find_packed(task)
-    if done is not None:
-        return ShardOutcome(done, "kept")
+
+    name: str
+    size: int
+    sha256: str
+    offsets: tuple[int, ...]
+    sizes: tuple[int, ...]
+    crc32s: tuple[int, ...]
+    plan: str
+    modified_ns: int
+    members: tuple[str, ...]
+    sources: tuple[SourceStamp, ...]
+    rows: dict[str, str]
+
+    @property
+    def tar_members(self) -> list[TarMember]:
+        """The members and their places in the shard."""
+        return list(map(TarMember, self.members, self.offsets, self.sizes))
+
+
+def row_digest(scene: Scene) -> str:
+    """Return a digest of a scene's row in the index, without the places of its files."""
+    row = row_of(scene)
+    del row["members"], row["valid_depth_ratio"]
+    if row["key_frames"] is None:
+        del row["key_frames"]  # so that shards packed before there were such are kept
+    return hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()
+
+
+def read_manifest(task: ShardTask) -> ShardManifest | None:
+    """Return the manifest that this plan wrote for a shard, None if there is no usable one."""
     try:
-        with open_exclusive(_unfinished_of(task)) as file:
-            done = find_packed(task) or found_whole(task, after_bytes)
-            if done is not None:
-                return ShardOutcome(done, "kept")
-            return _pack(task, file, after_bytes)
-    except OSError as error:
-        if isinstance(error, ShardError):
-            raise
-        raise ShardError(_why_not_written(task, error)) from error
+        found = json.loads(task.manifest.read_bytes())
+        found |= {name: tuple(found[name]) for name in ("offsets", "sizes", "crc32s", "members")}
+        found["sources"] = tuple(SourceStamp(*stamp) for stamp in found["sources"])
+        found["rows"] = dict(found["rows"])
+        manifest = ShardManifest(**{each.name: found[each.name] for each in fields(ShardManifest)})
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    is_ours = (manifest.plan, manifest.name) == (task.plan_digest, task.shard.name)
+    listed = (manifest.offsets, manifest.sizes, manifest.crc32s, manifest.members, manifest.sources)
+    is_whole = set(map(len, listed)) == {len(task.shard.members)}
+    return manifest if is_ours and is_whole else None
 
 
-def found_whole(task: ShardTask, after_bytes: Advance) -> PackedShard | None:
-    """Return a finished shard that was touched and still holds the bytes of its manifest.
+def _write_manifest(task: ShardTask, manifest: ShardManifest) -> None:
+    write_atomic(task.manifest, json.dumps(asdict(manifest)).encode())
+
+
+def find_packed(task: ShardTask) -> ShardManifest | None:
+    """Return the manifest of a finished shard, None if it must be packed or its bytes compared.
+
+    A shard whose size or modification time differs from its manifest may be another file.
+    """
+    manifest = read_manifest(task)
+    try:
+        status = task.target.stat()
+    except OSError:
+        return None
+    if manifest is None:
+        return None
+    found = (status.st_size, status.st_mtime_ns)
+    return manifest if found == (manifest.size, manifest.modified_ns) else None
+
+
+def find_touched(task: ShardTask, after_bytes: Advance) -> ShardManifest | None:
+    """Return the manifest of a finished shard that was touched but holds the same bytes.
 
     Raises:
         OSError: If it cannot be read.
@@ -90,125 +160,164 @@ def found_whole(task: ShardTask, after_bytes: Advance) -> PackedShard | None:
     manifest = read_manifest(task)
     if manifest is None or not task.target.is_file():
         return None
-    with task.target.open("rb", buffering=0) as file:
+    manifest = _with_bytes_of(task.target, manifest, after_bytes)
+    if manifest is not None:
+        _write_manifest(task, manifest)
+        after_bytes(task.shard.source_bytes)
+    return manifest
+
+
+def _with_bytes_of(
+    path: Path, manifest: ShardManifest, after_bytes: Advance
+) -> ShardManifest | None:
+    """Return the manifest with a file's modification time, None if the file's bytes differ."""
+    with path.open("rb", buffering=0) as file:
         status = os.fstat(file.fileno())
-        if status.st_size != manifest.packed.size:
+        if status.st_size != manifest.size:
             return None
         found = read_checksums(
             file, status.st_size, parts=[], after_bytes=lambda count: after_bytes(0)
         )
-    if found.sha256 != manifest.packed.sha256:
-        return None
-    write_manifest(task, replace(manifest, modified_ns=status.st_mtime_ns))
-    after_bytes(task.shard.source_bytes)
-    return manifest.packed
+    is_same = found.sha256 == manifest.sha256
+    return replace(manifest, modified_ns=status.st_mtime_ns) if is_same else None
 
 
-def _unfinished_of(task: ShardTask) -> Path:
-    return task.target.with_name(task.target.name + UNFINISHED)
+def pack_task(
+    task: ShardTask, after_bytes: Advance
+) -> tuple[ShardManifest, Literal["packed", "kept"]]:
+    """Pack one shard into its folder, unless it is finished; a worker process calls this.
+
+    Raises:
+        ShardError: If a source is missing, unreadable, changes meanwhile or contradicts the index;
+            the disk is full; the shard does not read back as written; another file has its name;
+            or another process is packing it.
+    """
+    done = find_packed(task)
+    if done is not None:
+        return done, "kept"
+    try:
+        with _open_exclusive(task.unfinished) as file:
+            done = find_packed(task) or find_touched(task, after_bytes)
+            return (done, "kept") if done is not None else _pack(task, file, after_bytes)
+    except OSError as error:
+        if isinstance(error, ShardError):
+            raise
+        if error.errno in DISK_FULL:
+            raise ShardError(
+                f"{task.target}: the disk is full; the shard needs {task.shard.size} bytes. The "
+                f"unfinished shard is removed: make room, then run the same command again to "
+                f"continue."
+            ) from error
+        what = f"{task.target}: cannot be written"
+        raise ShardError(describe_os_error(what, error, "Pack into another folder.")) from error
 
 
-def _why_not_written(task: ShardTask, error: OSError) -> str:
-    if error.errno in DISK_FULL:
-        return (
-            f"{task.target}: the disk is full; the shard needs {task.shard.size} bytes. What was "
-            f"begun is removed: make room, then run the same command again to go on from here."
-        )
-    what = f"{task.target}: cannot be written"
-    return describe_os_error(what, error, "Pack into another folder.")
+@contextmanager
+def _open_exclusive(path: Path) -> Iterator[FileIO]:
+    """Open a new, empty shard for this process alone; it is removed unless it was renamed.
+
+    The lock is a file in ``.parts``, which stays. On a file system without locks nothing keeps two
+    processes from writing one file; one of them will find it altered or gone.
+
+    Raises:
+        ShardError: If another process has it.
+    """
+    lock = path.parent / PARTS / f"{path.name}.lock"
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with try_locked(lock) as is_ours:
+        if not is_ours:
+            raise ShardError(
+                f"{path}: another process is packing this shard. Give each process a part of its "
+                f"own (--part I/N), or wait for that one."
+            )
+        try:
+            with FileIO(path, "w+") as file:
+                yield file
+        finally:
+            path.unlink(missing_ok=True)
+
+
+def _pack(
+    task: ShardTask, file: FileIO, after_bytes: Advance
+) -> tuple[ShardManifest, Literal["packed", "kept"]]:
+    # A shard whose manifest was removed is kept if it holds the bytes that packing gives.
+    is_unknown = read_manifest(task) is None and task.target.exists()
+    manifest = _write_shard(task, file, after_bytes)
+    _require_read_back(task, file, manifest)
+    if is_unknown:
+        same = _with_bytes_of(task.target, manifest, after_bytes)
+        if same is None:
+            raise not_of_plan(task.target)
+        _write_manifest(task, same)
+        return same, "kept"
+    _write_manifest(task, manifest)
+    task.unfinished.replace(task.target)
+    # The rename outlives a power cut where folders can be synchronised.
+    folder = os.open(task.target.parent, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            os.fsync(folder)
+    finally:
+        os.close(folder)
+    return manifest, "packed"
+
+
+def not_of_plan(path: Path) -> ShardError:
+    """Return the error about a file in the folder of shards that this plan did not pack."""
+    return ShardError(
+        f"{path}: already exists and was not packed by this plan. Move it away, or pack into an "
+        f"empty folder."
+    )
 
 
 class _Output:
-    """What is written, with its size, its sha256 so far and the places of its members."""
+    """A shard while it is written, with what its manifest lists of each member."""
 
     def __init__(self, file: FileIO) -> None:
         self._file = file
-        self._sha256 = hashlib.sha256()
+        self.sha256 = hashlib.sha256()
         self.size = 0
-        self.offsets: list[int] = []
-        self.sizes: list[int] = []
-        self.crc32s: list[int] = []
-        self.sources: list[SourceStamp] = []
-
-    @property
-    def sha256(self) -> str:
-        return self._sha256.hexdigest()
+        self.members: list[tuple[int, int, int, SourceStamp]] = []
 
     def write(self, content: bytes) -> None:
-        self._sha256.update(content)
+        self.sha256.update(content)
         self.size += len(content)
         left = memoryview(content)
         while left:
             left = left[self._file.write(left) :]
 
-    def begin_member(self, name: str, size: int) -> None:
-        self.write(member_header(name, size))
-        self.offsets.append(self.size)
-        self.sizes.append(size)
-        self.crc32s.append(0)
+    def end_member(self, size: int, crc32: int, source: SourceStamp) -> None:
+        """Pad the member whose last byte was just written, and note its place."""
+        self.members.append((self.size - size, size, crc32, source))
+        self.write(bytes(-self.size % BLOCK_BYTES))
 
-    def write_member(self, content: bytes) -> None:
+    def write_member(self, name: str, content: bytes, source: SourceStamp) -> None:
+        self.write(member_header(name, len(content)))
         self.write(content)
-        self.crc32s[-1] = zlib.crc32(content, self.crc32s[-1])
-
-    def end_member(self, source: SourceStamp) -> None:
-        self.write(bytes(padded(self.sizes[-1]) - self.sizes[-1]))
-        self.sources.append(source)
+        self.end_member(len(content), zlib.crc32(content), source)
 
 
-def _pack(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardOutcome:
-    # A shard whose manifest was removed is kept if it is what packing gives.
-    is_unknown = read_manifest(task) is None and task.target.exists()
-    manifest = _written(task, file, after_bytes)
-    _require_read_back(task, file, manifest.packed)
-    if is_unknown:
-        manifest = _require_same_shard(task, manifest)
-    write_manifest(task, manifest)
-    if is_unknown:
-        return ShardOutcome(manifest.packed, "kept")
-    _unfinished_of(task).replace(task.target)
-    _sync_folder(task.target.parent)
-    return ShardOutcome(manifest.packed, "packed")
-
-
-def _require_same_shard(task: ShardTask, manifest: ShardManifest) -> ShardManifest:
-    """Return the manifest of a shard that is there, which must hold the bytes just written."""
-    with task.target.open("rb", buffering=0) as file:
-        status = os.fstat(file.fileno())
-        found = read_checksums(file, status.st_size, parts=[], after_bytes=no_advance)
-    if found.sha256 != manifest.packed.sha256:
-        raise ShardError(
-            f"{task.target}: is there and was not packed here by this plan. Move it away, or pack "
-            f"into an empty folder."
-        )
-    return replace(manifest, modified_ns=status.st_mtime_ns)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Have a rename outlive a power cut, where folders can be synchronised."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):
-            os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def _written(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardManifest:
-    """Write a shard's bytes; return its manifest."""
+def _write_shard(task: ShardTask, file: FileIO, after_bytes: Advance) -> ShardManifest:
     output = _Output(file)
     scenes = {scene.id.key: scene for scene in task.shard.scenes}
     for key, members in groupby(task.shard.members, key=lambda each: each.name.partition(".")[0]):
         _write_scene(task, list(members), output, scene=scenes.get(key), after_bytes=after_bytes)
     output.write(END_OF_ARCHIVE)
     os.fsync(file.fileno())
-    packed = PackedShard(
-        task.shard.name, output.size, output.sha256, tuple(output.offsets), tuple(output.sizes),
-        tuple(output.crc32s),
-    )  # fmt: skip
-    modified_ns = os.fstat(file.fileno()).st_mtime_ns
-    rows = {key: row_digest(scene) for key, scene in scenes.items()}
-    return ShardManifest(packed, modified_ns, tuple(output.sources), rows)
+    offsets, sizes, crc32s, sources = zip(*output.members, strict=True)
+    return ShardManifest(
+        name=task.shard.name,
+        size=output.size,
+        sha256=output.sha256.hexdigest(),
+        offsets=offsets,
+        sizes=sizes,
+        crc32s=crc32s,
+        plan=task.plan_digest,
+        modified_ns=os.fstat(file.fileno()).st_mtime_ns,
+        members=tuple(member.name for member in task.shard.members),
+        sources=sources,
+        rows={key: row_digest(scene) for key, scene in scenes.items()},
+    )
 
 
 def _write_scene(
@@ -219,59 +328,44 @@ def _write_scene(
     scene: Scene | None,
     after_bytes: Advance,
 ) -> None:
-    """Write a scene's files, its metadata first; these must be what the index was made from."""
+    """Write a scene's files: its metadata first, which must be what the index was made from."""
     texts: dict[str, bytes] = {}
+    videos = []
     for member in members:
         name = member.name.partition(".")[2]
-        source = Path(task.root, member.source)
-        if name in METADATA_FILES:
-            parts: list[bytes] = []
-            seen = read_released(source, member.size, take=parts.append, after_bytes=after_bytes)
-            texts[name] = b"".join(parts)
-            output.begin_member(member.name, member.size)
-            output.write_member(texts[name])
-            output.end_member(seen)
+        if name not in METADATA_FILES:
+            videos.append(member)
             continue
-        _require_indexed(scene, texts, task=task)
-        if member.form == "released" or scene is None:
-            output.begin_member(member.name, member.size)
-            take = output.write_member
-            seen = read_released(source, member.size, take=take, after_bytes=after_bytes)
-        else:
-            content, seen = read_packed_depth(
-                source, member.size, frames=scene.frames, after_bytes=after_bytes
-            )
-            output.begin_member(member.name, len(content))
-            output.write_member(content)
-        output.end_member(seen)
-    _require_indexed(scene, texts, task=task)
-
-
-def _require_indexed(scene: Scene | None, texts: dict[str, bytes], *, task: ShardTask) -> None:
-    """Compare once, when all of a scene's metadata have been read."""
+        texts[name], stamp = _read_whole(Path(task.root, member.source), member.size, after_bytes)
+        output.write_member(member.name, texts[name], stamp)
     if scene is not None and texts:
         require_indexed_metadata(scene, texts, root=task.root)
-        texts.clear()
+    for member in videos:
+        source = Path(task.root, member.source)
+        if member.form == "released" or scene is None:
+            output.write(member_header(member.name, member.size))
+            stamp = _copy_source(source, member.size, output.write, after_bytes)
+            output.end_member(member.size, stamp.crc32, stamp)
+        else:
+            content, stamp = _packed_depth(
+                source, member.size, frames=scene.frames, after_bytes=after_bytes
+            )
+            output.write_member(member.name, content, stamp)
 
 
-def _require_read_back(task: ShardTask, file: FileIO, packed: PackedShard) -> None:
+def _require_read_back(task: ShardTask, file: FileIO, manifest: ShardManifest) -> None:
     """Read a shard from the disk, not from memory where the system allows, and compare."""
     if hasattr(os, "posix_fadvise"):
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-    planned = [
-        TarMember(member.name, offset, size)
-        for member, offset, size in zip(
-            task.shard.members, packed.offsets, packed.sizes, strict=True
-        )
-    ]
-    found = read_members(file, packed.size, where=str(task.target))
+    found = read_members(file, manifest.size, where=str(task.target))
     checksums = read_checksums(
         file,
         os.fstat(file.fileno()).st_size,
-        parts=[(member.offset, member.size) for member in planned],
+        parts=list(zip(manifest.offsets, manifest.sizes, strict=True)),
         after_bytes=no_advance,
     )
-    if (found, checksums) != (planned, Checksums(packed.sha256, packed.crc32s)):
+    expected = (manifest.tar_members, Checksums(manifest.sha256, manifest.crc32s))
+    if (found, checksums) != expected:
         raise ShardError(
             f"{task.target}: does not read back as it was written. Check the disk and the memory "
             f"of this machine, then run the same command again."
@@ -292,36 +386,36 @@ def require_indexed_metadata(scene: Scene, texts: Mapping[str, bytes], *, root: 
         )
 
 
-def read_released(
-    source: Path, size: int, *, take: Callable[[bytes], object], after_bytes: Advance
+def _copy_source(
+    source: Path, size: int, write: Callable[[bytes], object], after_bytes: Advance
 ) -> SourceStamp:
-    """Hand over all bytes of a file, in pieces of a few megabytes.
-
-    Args:
-        source: The file.
-        size: How many bytes it had when the plan was made.
-        take: Called with each piece, in order.
-        after_bytes: Called with the number of bytes, after each piece.
-
-    Returns:
-        The file as it was while it was read.
+    """Pass on all bytes of a released file of the planned size, and return its stamp.
 
     Raises:
         ShardError: If it is missing, unreadable, has another size or changes meanwhile.
     """
-    with _opened(source) as file:
+
+    def take(chunk: bytes) -> None:
+        write(chunk)
+        after_bytes(len(chunk))
+
+    with readable(source):
+        if not stat.S_ISREG(source.stat().st_mode):
+            raise ShardError(f"{source}: is not a file. Put the release's own file in its place.")
+        file = FileIO(source)
+    with file:
         before = os.fstat(file.fileno())
-        _require_planned_size(source, size, before.st_size)
-        crc32, left = 0, size
-        while left:
-            chunk = _read(source, file, min(left, _CHUNK_BYTES))
-            if not chunk:
-                _require_planned_size(source, size, size - left)
-            take(chunk)
-            crc32 = zlib.crc32(chunk, crc32)
-            left -= len(chunk)
-            after_bytes(len(chunk))
-        if _identity(_status(source)) != _identity(before):
+        if before.st_size != size:
+            raise ShardError(
+                f"{source}: has {before.st_size} bytes, and had {size} when the plan was made. Let "
+                f"nothing write to the release; run `stereogenbench index` again if it has an "
+                f"index."
+            )
+        crc32 = copy_with_crc32(_source_chunks(source, file, size), take)
+        with readable(source):
+            after = source.stat()
+        found = (after.st_size, after.st_mtime_ns)
+        if found != (size, before.st_mtime_ns) or not os.path.samestat(after, before):
             raise ShardError(
                 f"{source}: was changed while it was packed. Let nothing write to the release, "
                 f"then run the same command again."
@@ -329,76 +423,47 @@ def read_released(
     return SourceStamp(size, before.st_mtime_ns, crc32)
 
 
-def read_packed_depth(
+def _source_chunks(source: Path, file: FileIO, size: int) -> Iterator[bytes]:
+    with readable(source):
+        yield from read_chunks(file, size)
+
+
+def _read_whole(source: Path, size: int, after_bytes: Advance) -> tuple[bytes, SourceStamp]:
+    parts: list[bytes] = []
+    stamp = _copy_source(source, size, parts.append, after_bytes)
+    return b"".join(parts), stamp
+
+
+def _packed_depth(
     source: Path, size: int, *, frames: int, after_bytes: Advance
 ) -> tuple[bytes, SourceStamp]:
-    """Return a released depth video as blosc2's frames, and the file as it was.
-
-    Args:
-        source: The video.
-        size: How many bytes it had when the plan was made.
-        frames: How many frames it must have.
-        after_bytes: Called with the number of the video's bytes that each frame stands for.
+    """Return a released depth video as blosc2's frames, with the stamp of the video.
 
     Raises:
         ShardError: If it cannot be read, or not be packed bit for bit.
     """
-    parts: list[bytes] = []
-    seen = read_released(source, size, take=parts.append, after_bytes=lambda count: after_bytes(0))
-    left = size
-
-    def after_frame() -> None:
-        nonlocal left
-        after_bytes(min(size // frames, left))
-        left -= min(size // frames, left)
-
+    video, stamp = _read_whole(source, size, lambda count: after_bytes(0))
+    share = size // frames
     try:
         content = packed_depth(
-            io.BytesIO(b"".join(parts)), name=str(source), frames=frames, after_frame=after_frame
+            io.BytesIO(video),
+            name=str(source),
+            frames=frames,
+            after_frame=lambda: after_bytes(share),
         )
     except MediaError as error:
         raise ShardError(str(error)) from error
-    after_bytes(left)
-    return content, seen
+    after_bytes(size - share * frames)
+    return content, stamp
 
 
-def _opened(source: Path) -> FileIO:
-    if not stat.S_ISREG(_status(source).st_mode):
-        raise ShardError(f"{source}: is no file. Put the release's own file in its place.")
+@contextmanager
+def readable(source: Path) -> Iterator[None]:
+    """Turn errors of the system about a source file into a ShardError that names it."""
     try:
-        return FileIO(source)
+        yield
     except OSError as error:
-        raise _unreadable(source, error) from error
-
-
-def _status(source: Path) -> os.stat_result:
-    try:
-        return source.stat()
-    except OSError as error:
-        raise _unreadable(source, error) from error
-
-
-def _read(source: Path, file: FileIO, size: int) -> bytes:
-    try:
-        return file.read(size)
-    except OSError as error:
-        raise _unreadable(source, error) from error
-
-
-def _unreadable(source: Path, error: OSError) -> ShardError:
-    return ShardError(
-        f"{source}: cannot be read ({error.strerror}). "
-        + cure_of(error, "Fetch it again, then run the same command again.")
-    )
-
-
-def _identity(status: os.stat_result) -> tuple[int, int, int]:
-    return status.st_ino, status.st_size, status.st_mtime_ns
-
-
-def _require_planned_size(source: Path, planned: int, size: int) -> None:
-    if size != planned:
-        raise ShardError(
-            f"{source}: has {size} bytes, and had {planned} when the plan was made. Let nothing "
-            f"write to the release; run `stereogenbench index` again if it has an index."
-        )
+        if isinstance(error, ShardError):
+            raise
+        cure = "Fetch it again, then run the same command again."
+        raise ShardError(describe_os_error(f"{source}: cannot be read", error, cure)) from error

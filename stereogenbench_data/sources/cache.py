@@ -1,10 +1,10 @@
 """A cache of members on a local disk, shared by the processes of a machine.
 
-An item is one member. Its name is a hash of the dataset's revision, the shard's path and the
-member's place, size and checksum. It is written beside its place and renamed, so that no reader
-sees half of one; one process fetches it under a lock while others wait. When the limit is reached,
-the least recently used items are deleted; a file that a reader has open stays whole until it is
-closed. A read-only cache serves what it holds.
+An item is one member, named by a hash of the dataset's revision, the shard's path and the member's
+place, size and checksum. It is written beside its place and renamed, so no reader sees a partial
+one; one process fetches it under a lock while others wait. At the limit, the least recently used
+items are deleted; a file that a reader has open stays readable. A read-only cache serves what it
+holds.
 
 The modification time of an item follows from its name, and its access time is its last use. Writing
 into an item changes the modification time; then its checksum decides whether it is still valid.
@@ -18,7 +18,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from stereogenbench_data.errors import (
     DISK_FULL,
@@ -40,7 +40,7 @@ _TAG_TEXT: Final = _SIGNATURE + (
 )
 _OWN_FILE: Final = re.compile(r"([0-9a-f]{64})\.(member|part)")
 _FULL: Final = 0.9
-"""The share of the limit to which a full cache is emptied, so that not every item empties it."""
+"""The share of the limit to which a full cache is emptied, so it is not emptied for each item."""
 
 _FIRST_STAMP_S: Final = 1_000_000_000
 
@@ -48,21 +48,22 @@ _FIRST_STAMP_S: Final = 1_000_000_000
 class ShardCache:
     """Keeps the members of remote shards that were read once.
 
-    Any number of processes may use one folder, each with its own `ShardCache`; the smallest of
-    their limits counts. Members that others fetch at that moment may come on top of it. Only files
-    that a cache wrote are ever deleted.
+    Any number of processes may use one folder, each with its own `ShardCache`; the smallest limit
+    applies. Members that others are fetching may exceed it for that time. Only files that a cache
+    wrote are deleted.
     """
 
     def __init__(self, folder: str | Path, *, limit_bytes: int) -> None:
-        """Use a folder, in which the cache makes one of its own.
+        """Use a folder, in which the cache creates its own.
 
         Args:
-            folder: Where to keep members; made if it is not there.
-            limit_bytes: The bytes that all members together may take.
+            folder: Where to keep members; created if it is missing.
+            limit_bytes: The most bytes of all members together.
 
         Raises:
-            StorageError: If there is no folder or no limit, the folder holds shards or cannot be
-                written, or what has the cache's name in it was not made by one.
+            StorageError: If the folder has no name or the limit is not a whole number above 0; or
+                the folder holds shards, cannot be written, or holds something else under the
+                cache's name.
         """
         if not str(folder):
             raise StorageError("a cache needs a folder, got '': name one, such as 'cache/'.")
@@ -79,15 +80,15 @@ class ShardCache:
         return f"ShardCache({str(self.folder.parent)!r}, limit_bytes={self.limit_bytes})"
 
     def open(self, member: Member, *, remote: RemoteObject, revision: str) -> FileSlice:
-        """Return a member, fetched if it is not here; it is the caller's to close.
+        """Return a member, fetched if it is not stored; the caller closes it.
 
         Args:
             member: What to open.
             remote: The shard or file that holds it.
-            revision: What tells the dataset from its other versions.
+            revision: What distinguishes the dataset from its other versions.
 
         Raises:
-            ShardError: If what is fetched has not the member's checksum, twice.
+            ShardError: If the fetched bytes have another checksum than the member, twice.
             StorageError: If it cannot be fetched or stored, or the limit is below its size.
         """
         key = _key(member, where=remote.where, revision=revision)
@@ -95,14 +96,18 @@ class ShardCache:
             found = self._find(key, member)
             if found is not None:
                 return found
-            self._require_room(member, where=remote.where)
+            if member.size > self.limit_bytes:
+                raise StorageError(
+                    f"{self.folder}: its limit of {self.limit_bytes} bytes is below the "
+                    f"{member.size} bytes of a member of {remote.where}. Give the cache a larger "
+                    f"limit."
+                )
             with self._locked(key[:2]):
                 # Another process may have fetched it meanwhile.
-                found = self._find(key, member)
-                return found or self._fill(key, member, remote=remote)
+                return self._find(key, member) or self._fill(key, member, remote=remote)
 
     def drop_damaged(self, member: Member, *, where: str, revision: str) -> bool:
-        """Drop a member whose bytes are not those that were stored; say whether it was one."""
+        """Drop a member if its bytes have changed since they were stored; return whether so."""
         key = _key(member, where=where, revision=revision)
         with _named_errors(self.folder), _where_writable(), self._locked(key[:2]):
             place = self._place(key)
@@ -132,13 +137,13 @@ class ShardCache:
         names = sorted(
             each.name for each in self.folder.iterdir() if not each.name.startswith(begun)
         )
-        if names and _TAG not in names:
-            raise StorageError(
-                f"{self.folder}: holds {names[0]} and is no cache of this package. Choose another "
-                f"folder, or delete it."
-            )
         if not names:
             write_atomic(tag, _TAG_TEXT)
+        elif _TAG not in names:
+            raise StorageError(
+                f"{self.folder}: holds {names[0]} and is not a cache of this package. Choose "
+                f"another folder, or delete it."
+            )
         if not tag.read_bytes().startswith(_SIGNATURE):
             raise StorageError(
                 f"{tag}: was not written by this package. Choose another folder, or delete it."
@@ -147,14 +152,14 @@ class ShardCache:
         self._locks.mkdir(exist_ok=True)
 
     def _find(self, key: str, member: Member) -> FileSlice | None:
-        """Return an item that is stored and is what was fetched; it counts as used now."""
+        """Return an item that is stored and unchanged; it counts as used now."""
         place = self._place(key)
         try:
             found = FileSlice(place, Member(key, 0, member.size))
         except FileNotFoundError:
             return None
         except IsADirectoryError:
-            with suppress(FileNotFoundError):  # another process may have met it too
+            with suppress(FileNotFoundError):  # another process may have renamed it
                 place.rename(place.with_suffix(f".not-a-member.{os.getpid()}"))
             return None
         status = found.status()
@@ -167,7 +172,7 @@ class ShardCache:
         return None
 
     def _fill(self, key: str, member: Member, *, remote: RemoteObject) -> FileSlice:
-        """Fetch a member, store it and open it; a wrong checksum is given a second try."""
+        """Fetch a member, store it and open it; after a wrong checksum it is fetched once more."""
         part = self._items / f"{key}.part"
         self._drop(self._place(key))
         self._make_room(member.size, part=part)
@@ -182,26 +187,19 @@ class ShardCache:
                     f"damaged or replaced: use the index that was made with it."
                 )
             _mark_used(part, key)
-            # Opened before others may see it, for they may evict it at once.
+            # Opened before others can see it, as they may evict it at once.
             found = FileSlice(part, Member(key, 0, member.size))
             with self._locked("size"):
-                # So that who counts meets it under one name.
+                # Whoever counts must find it under one name.
                 part.replace(self._place(key))
             return found
         finally:
             self._drop(part)
 
-    def _require_room(self, member: Member, *, where: str) -> None:
-        if member.size > self.limit_bytes:
-            raise StorageError(
-                f"{self.folder}: its limit of {self.limit_bytes} bytes is below the "
-                f"{member.size} bytes of a member of {where}. Give the cache a larger limit."
-            )
-
     def _make_room(self, size: int, *, part: Path) -> None:
-        """Count an item in, once others have made way for it where they must.
+        """Reserve room for an item, and evict others if needed.
 
-        Its part is made at full size at once, so that all who count see it.
+        Its part gets its full size at once, so other processes count it.
         """
         with self._locked("size") as ledger:
             recorded = ledger.read_bytes()
@@ -213,14 +211,14 @@ class ShardCache:
             os.truncate(part, size)
 
     def _drop(self, path: Path) -> None:
-        """Delete an item or a part, if it is there; all are counted anew the next time."""
+        """Delete an item or a part if it exists; then all are counted anew."""
         if path.exists():
             with self._locked("size") as ledger:
                 path.unlink(missing_ok=True)
                 ledger.write_bytes(b"")
 
     def _evict(self, *, down_to: int) -> int:
-        """Delete what was not used for longest until so many bytes are left; return how many."""
+        """Delete the least recently used items; return how many bytes are left."""
         files = sorted(self._own_files())
         used = sum(size for _, size, _ in files)
         for _, size, path in files:
@@ -230,7 +228,7 @@ class ShardCache:
                 path.unlink(missing_ok=True)
                 used -= size
                 continue
-            # A part is left alone while someone writes it, that is while its lock is taken.
+            # A part whose lock is taken is being written.
             with try_locked(self._locks / path.name[:2]) as is_held:
                 if is_held:
                     path.unlink(missing_ok=True)
@@ -258,14 +256,13 @@ class ShardCache:
             yield path
 
 
-def require_limit(limit_bytes: Any, *, folder: str | Path) -> None:
-    """Refuse what is no number of bytes.
+def require_limit(limit_bytes: object, *, folder: str | Path) -> None:
+    """Refuse a limit that is not a whole number of bytes above 0.
 
     Raises:
-        StorageError: If it is not a whole number above 0.
+        StorageError: If it is not.
     """
-    whole = isinstance(limit_bytes, int) and not isinstance(limit_bytes, bool)
-    if not whole or limit_bytes < 1:
+    if type(limit_bytes) is not int or limit_bytes < 1:
         raise StorageError(
             f"{folder}: a cache needs a limit in whole bytes above 0, got {limit_bytes!r}: give a "
             f"number, such as limit_bytes=50_000_000_000."
@@ -273,21 +270,22 @@ def require_limit(limit_bytes: Any, *, folder: str | Path) -> None:
 
 
 def _stamp_ns(key: str) -> int:
-    """Return an item's time of change: even seconds, which every file system can keep."""
+    """Return an item's modification time: even seconds, which every file system can store."""
     return (_FIRST_STAMP_S + 2 * int(key[:6], 16)) * 1_000_000_000
 
 
 def _mark_used(path: Path, key: str) -> None:
-    """Set when an item was used last, and its own time of change."""
-    # Of another user's item, or on a disk that is read-only now, neither can be set: it goes as if
-    # it had not been used.
+    """Set an item's last use, and its own modification time.
+
+    Neither can be set of another user's item, or on a read-only disk: its last use stays unknown.
+    """
     with _where_writable():
         os.utime(path, ns=(time.time_ns(), _stamp_ns(key)))
 
 
 @contextmanager
 def _where_writable() -> Iterator[None]:
-    """Pass over what a cache that may only be read cannot do."""
+    """Ignore the errors of a read-only cache."""
     try:
         yield
     except OSError as error:
@@ -296,9 +294,9 @@ def _where_writable() -> Iterator[None]:
 
 
 def _key(member: Member, *, where: str, revision: str) -> str:
-    """Return what an item is stored under: equal only for equal bytes.
+    """Return an item's name: equal only for equal bytes.
 
-    Where no checksum is known, that takes the address too.
+    Without a known checksum, the address is part of it.
     """
     where = where if member.crc32 is None else ""
     parts = [revision, where, member.path, member.offset, member.size, member.crc32]
@@ -308,8 +306,9 @@ def _key(member: Member, *, where: str, revision: str) -> str:
 def _fetch(part: Path, member: Member, *, remote: RemoteObject) -> int:
     """Write a member's bytes to the disk and return their crc32."""
     with part.open("r+b") as file:
-        chunks = remote.chunks(member.offset, member.offset + member.size)
-        crc32 = copy_with_crc32(chunks, file.write)
+        crc32 = copy_with_crc32(
+            remote.chunks(member.offset, member.offset + member.size), file.write
+        )
         file.flush()
         os.fsync(file.fileno())
     return crc32
@@ -317,7 +316,7 @@ def _fetch(part: Path, member: Member, *, remote: RemoteObject) -> int:
 
 @contextmanager
 def _named_errors(folder: Path) -> Iterator[None]:
-    """Turn what the disk raises into an error that names the cache."""
+    """Raise errors of the disk as errors that name the cache."""
     try:
         yield
     except StorageError:

@@ -1,4 +1,4 @@
-"""Writing files of this machine: whole or not at all, one process at a time, with their checksum.
+"""Files of this machine: atomic writes, locks between processes, copies with a checksum.
 
 An atomic write goes to a temporary file beside the target, which is renamed over the target at the
 end. The writer holds a lock on its temporary file. A free lock therefore means that the writer was
@@ -10,19 +10,15 @@ import os
 import stat
 import zlib
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
-from io import FileIO
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import BinaryIO, Final, Literal
 
-from stereogenbench_data.errors import ShardError, StorageError
-
-PARTS: Final = ".parts"
-"""Folder beside the shards that holds their manifests and locks."""
+from stereogenbench_data.errors import StorageError
 
 _USUAL_WRITERS: Final = 8
-"""Temporary file names of one target that are searched for files of killed writers."""
+"""How many temporary names of a target are searched for files of killed writers."""
 
 _NO_LOCKS: Final = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP})
 _LOCK_POLL_S: Final = 0.01
@@ -49,11 +45,19 @@ def open_atomic(path: Path) -> Iterator[BinaryIO]:
         OSError: If it cannot be written; the file that was there stays as it was.
     """
     try:
-        with closing(_TemporaryFile(path)) as temporary:
-            yield temporary.file
-            temporary.file.flush()
-            os.fsync(temporary.file.fileno())
-            temporary.path.replace(path)
+        temporary, file = _open_temporary(path)
+        try:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+            temporary.replace(path)
+        finally:
+            # Unless it was renamed, it is removed before it is closed: closing frees its lock, and
+            # another writer may take the name.
+            if _is_at(temporary, file.fileno()):
+                temporary.unlink()
+            with suppress(OSError):  # flushing has raised the error of a full disk already
+                file.close()
     except OSError as error:
         if str(error.filename).startswith(str(path.with_name(_temporary_name(path, 0)))):
             error.filename = str(path)
@@ -74,28 +78,19 @@ def open_output(path: Path) -> Iterator[BinaryIO]:
         yield file
 
 
-class _TemporaryFile:
-    """A new file beside its target, locked while it is open, and removed unless it was renamed."""
-
-    def __init__(self, target: Path) -> None:
-        for number in range(_USUAL_WRITERS):
-            _remove_abandoned(target.with_name(_temporary_name(target, number)))
-        for number in count():
-            self.path = target.with_name(_temporary_name(target, number))
-            with suppress(FileExistsError):
-                self.file: BinaryIO = self.path.open("xb")
-                handle = self.file.fileno()
-                if _try_lock(handle) != "taken" and _is_at(self.path, handle):
-                    break
-                # Another process locked it first, as the file of a killed writer, and removes it.
-                self.file.close()
-
-    def close(self) -> None:
-        # It is removed before it is closed: closing frees its lock, and others may take the name.
-        if _is_at(self.path, self.file.fileno()):
-            self.path.unlink()
-        with suppress(OSError):  # flushing has raised the error of a full disk already
-            self.file.close()
+def _open_temporary(target: Path) -> tuple[Path, BinaryIO]:
+    """Return a new, locked file beside its target, once those of killed writers are removed."""
+    for number in range(_USUAL_WRITERS):
+        _remove_abandoned(target.with_name(_temporary_name(target, number)))
+    numbers = count()
+    while True:
+        path = target.with_name(_temporary_name(target, next(numbers)))
+        with suppress(FileExistsError):
+            file: BinaryIO = path.open("xb")
+            if _try_lock(file.fileno()) != "taken" and _is_at(path, file.fileno()):
+                return path, file
+            # Another process took it for a killed writer's, has locked it and removes it.
+            file.close()
 
 
 def _temporary_name(target: Path, number: int) -> str:
@@ -107,7 +102,7 @@ def _remove_abandoned(path: Path) -> None:
     try:
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0))
     except OSError as error:
-        # A link is not ours; it is removed, and its target stays as it is.
+        # A link is not ours: it is removed, and its target stays.
         if error.errno == errno.ELOOP:
             path.unlink(missing_ok=True)
         return
@@ -141,12 +136,10 @@ def _try_lock(handle: int) -> Literal["held", "taken", "unsupported"]:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold a lock between processes and threads; wait until it is free.
+    """Hold a lock against other processes and threads; wait until it is free.
 
-    The operating system frees the lock when its process ends, however it ends.
-
-    Args:
-        path: The lock's file. It is made where it is missing, and stays.
+    The operating system frees the lock when its process ends, however it ends. The lock's file is
+    created if it is missing, and stays.
 
     Raises:
         StorageError: If the file system has no locks.
@@ -166,15 +159,15 @@ def locked(path: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            # A process that was forked meanwhile has the file open, too: closing would not do.
+            # A process forked meanwhile has the file open, too: closing would not free the lock.
             unlock_descriptor(file.fileno())
 
 
 @contextmanager
 def try_locked(path: Path) -> Iterator[bool]:
-    """Hold a lock as `locked` does, or go on at once without it; yield whether it is held.
+    """Hold a lock as `locked` does, or continue at once without it; yield whether it is held.
 
-    Where the file system has no locks it counts as held.
+    Where the file system has no locks, it counts as held.
     """
     from filelock import unlock_descriptor
 
@@ -187,33 +180,8 @@ def try_locked(path: Path) -> Iterator[bool]:
                 unlock_descriptor(file.fileno())
 
 
-@contextmanager
-def open_exclusive(path: Path) -> Iterator[FileIO]:
-    """Open a new, empty shard for this process alone; it is removed unless it was renamed.
-
-    The lock is a file in ``.parts``, which stays. On a file system without locks nothing keeps two
-    processes from writing one file; one of them will find it altered or gone.
-
-    Raises:
-        ShardError: If another process has it.
-    """
-    lock = path.parent / PARTS / f"{path.name}.lock"
-    lock.parent.mkdir(parents=True, exist_ok=True)
-    with try_locked(lock) as is_ours:
-        if not is_ours:
-            raise ShardError(
-                f"{path}: another process is packing this shard. Give each process a part of its "
-                f"own (--part I/N), or wait for that one."
-            )
-        try:
-            with FileIO(path, "w+") as file:
-                yield file
-        finally:
-            path.unlink(missing_ok=True)
-
-
 def copy_with_crc32(chunks: Iterable[bytes], write: Callable[[bytes], object]) -> int:
-    """Pass each chunk of bytes on, and return the crc32 of all of them."""
+    """Write each chunk of bytes, and return the crc32 of all of them."""
     crc32 = 0
     for chunk in chunks:
         write(chunk)

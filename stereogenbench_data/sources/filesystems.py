@@ -1,6 +1,6 @@
 """Ranges through fsspec's file systems: the Hub's own for ``hf://``, s3fs for ``s3://``, others.
 
-Errors do not chain those of the file systems: their messages may hold signed URLs.
+Errors do not chain those of the file systems, whose messages may hold signed URLs.
 """
 
 import os
@@ -8,12 +8,13 @@ import re
 import sys
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from threading import Thread
 from typing import Any, Final, TypeVar
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources.location import shown
-from stereogenbench_data.sources.retry import Attempt, TooSlow, TransientError
+from stereogenbench_data.sources.retry import Attempt, TransientError
 
 _T = TypeVar("_T")
 
@@ -29,26 +30,26 @@ _NETWORK_ERRORS: Final = (
     ("httpx", "TransportError"),
     ("huggingface_hub.errors", "HfHubHTTPError"),
 )
-"""What file systems raise; a module that was not imported raised nothing."""
+"""What file systems raise where a server cannot be reached; only imported modules count."""
 
 _CHANGE_MARKS: Final = ("ETag", "etag", "LastModified", "last_modified", "mtime", "size")
-"""What file systems state of a file that changes with it."""
+"""What file systems report of a file that changes with its content."""
 
 _COMMIT: Final = re.compile(r"[0-9a-f]{40}")
 
 _SETUP_ERRORS: Final = (("botocore.exceptions", "BotoCoreError"),)
-"""What file systems raise where they are not set up: without a login, for example."""
+"""What file systems raise where they are not set up, for example without a login."""
 
 
 class MissingObject(StorageError):
-    """What a URL names is not there."""
+    """The object that a URL names does not exist."""
 
 
 class FilesystemTransport:
-    """One object of whatever fsspec opens. Logins are the file system's own business."""
+    """One object that fsspec opens. Its file system handles logins and time limits of silence."""
 
     def __init__(self, url: str) -> None:
-        """Name an object; how long silence may last, the file system decides."""
+        """Name an object; nothing is requested yet."""
         self._url = url
         self._where = shown(url)
         self._opened: tuple[int, Any, str] | None = None
@@ -56,71 +57,61 @@ class FilesystemTransport:
         self._seen: dict[str, dict[str, str]] = {}
 
     def size(self, attempt: Attempt) -> int:
-        """Return how many bytes the object has."""
-        with self._named_errors():
-            files, path = self._filesystem(attempt)
-            if _is_s3(files):
-                return int(self._conditional(attempt).size)
-            size = _within(attempt, lambda: files.size(path))
+        """Return the size of the object in bytes."""
+        size = self._call(
+            attempt,
+            lambda files, path: (
+                int(self._conditional(files, path).size) if _is_s3(files) else files.size(path)
+            ),
+        )
         if not isinstance(size, int):
             raise StorageError(f"{self._where}: has no size ({size!r}): is it a folder?")
         return size
 
     def entries(self, attempt: Attempt) -> dict[str, int | None]:
-        """Return what a folder holds: names, with the size of a file and None for a folder."""
-        with self._named_errors():
-            files, path = self._filesystem(attempt)
-            listed = _within(attempt, lambda: files.ls(path, detail=True))
-        names = [str(entry["name"]).rstrip("/").rpartition("/")[2] for entry in listed]
-        sizes = [
-            None if entry["type"] == "directory" else int(entry["size"] or 0) for entry in listed
-        ]
-        own = path.rstrip("/").rpartition("/")[2]
-        return {
-            name: size
-            for name, size, entry in zip(names, sizes, listed, strict=True)
-            if name and (name != own or str(entry["name"]).strip("/") != path.strip("/"))
-        }
+        """List a folder: name to size in bytes, None for a folder."""
+        folder, listed = self._call(
+            attempt, lambda files, path: (path.strip("/"), files.ls(path, detail=True))
+        )
+        found: dict[str, int | None] = {}
+        for entry in listed:
+            path = str(entry["name"]).strip("/")
+            if path != folder and path:
+                is_folder = entry["type"] == "directory"
+                found[path.rpartition("/")[2]] = None if is_folder else int(entry["size"] or 0)
+        return found
 
     def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
         """Yield the bytes from start to stop."""
         for first in range(start, stop, _CHUNK):
             last = min(first + _CHUNK, stop)
-            with self._named_errors():
-                data = self._read(first, last, attempt)
+            data, details = self._call(attempt, partial(self._read, first, last))
+            self._require_same(details)
             yield data
             if len(data) != last - first:
                 return
 
-    def _read(self, first: int, last: int, attempt: Attempt) -> bytes:
-        files, path = self._filesystem(attempt)
+    def _read(self, first: int, last: int, files: Any, path: str) -> tuple[bytes, Any]:
+        """Return the bytes from first to last, and what the file system reports of the file."""
         if _is_s3(files):
-            file = self._conditional(attempt)
-            return bytes(_within(attempt, lambda: file._fetch_range(first, last)))
+            return bytes(self._conditional(files, path)._fetch_range(first, last)), None
         if files.async_impl:
-            return bytes(_within(attempt, lambda: files.cat_file(path, start=first, end=last)))
+            return bytes(files.cat_file(path, start=first, end=last)), None
+        # Without a cache, or fsspec would read megabytes ahead.
+        with files.open(path, "rb", cache_type="none") as file:
+            file.seek(first)
+            return file.read(last - first), getattr(file, "details", None)
 
-        def read() -> tuple[bytes, Any]:
-            # Without a cache, or fsspec would read megabytes ahead.
-            with files.open(path, "rb", cache_type="none") as file:
-                file.seek(first)
-                return file.read(last - first), getattr(file, "details", None)
-
-        data, details = _within(attempt, read)
-        self._require_same(details)
-        return data
-
-    def _conditional(self, attempt: Attempt) -> Any:
-        """Return an object of S3, opened once: it is read only while its ETag is the same."""
-        files, path = self._filesystem(attempt)
+    def _conditional(self, files: Any, path: str) -> Any:
+        """Return an object of S3, opened once: it is read only while its ETag stays the same."""
         if self._file is None:
             # What was listed before may be of an older object.
             files.invalidate_cache(path)
-            self._file = _within(attempt, lambda: files.open(path, "rb", cache_type="none"))
+            self._file = files.open(path, "rb", cache_type="none")
         return self._file
 
     def _require_same(self, details: Any) -> None:
-        """Refuse a file that is not the one that was read from before, as far as it tells."""
+        """Refuse a file that was replaced since the first read, if its file system reports it."""
         if not isinstance(details, Mapping):
             return
         now = {name: str(details[name]) for name in _CHANGE_MARKS if name in details}
@@ -137,24 +128,26 @@ class FilesystemTransport:
             f"the new one."
         )
 
-    def _filesystem(self, attempt: Attempt) -> tuple[Any, str]:
-        """Return this process's file system, and the object's path in it."""
-        if self._opened is None or self._opened[0] != os.getpid():
-            import fsspec.core
-
-            files, path = fsspec.core.url_to_fs(self._url)
-            if self._url.partition("://")[0] == "hf":
-                path = _within(attempt, lambda: _pinned(files, path))
-            self._opened, self._file = (os.getpid(), files, path), None
-        return self._opened[1:]
-
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy in another process needs; it opens its own file system."""
+        """Return the state for a copy in another process, which opens its own file system."""
         return self.__dict__ | {"_opened": None, "_file": None}
+
+    def _call(self, attempt: Attempt, operation: Callable[[Any, str], _T]) -> _T:
+        """Return an operation's result, given this process's file system and the object's path."""
+        with self._named_errors():
+            if self._opened is None or self._opened[0] != os.getpid():
+                import fsspec.core
+
+                files, path = fsspec.core.url_to_fs(self._url)
+                if self._url.partition("://")[0] == "hf":
+                    path = _within(attempt, lambda: _pinned(files, path))
+                self._opened, self._file = (os.getpid(), files, path), None
+            _, opened, place = self._opened
+            return _within(attempt, lambda: operation(opened, place))
 
     @contextmanager
     def _named_errors(self) -> Iterator[None]:
-        """Turn what file systems raise into a `TransientError`, or an error that says the cure."""
+        """Raise errors of file systems as a `TransientError`, or an error that names the cure."""
         try:
             yield
         except StorageError:
@@ -169,35 +162,27 @@ class FilesystemTransport:
                 f"for access."
             ) from None
         except ImportError as error:
-            raise StorageError(self._uninstalled(error)) from None
+            extra = _EXTRAS.get(self._url.partition("://")[0])
+            cure = f"pip install 'stereogenbench-data[{extra}]'" if extra else "install it"
+            raise StorageError(
+                f"{self._where}: needs a package that is not installed ({error}): {cure}."
+            ) from None
         except ValueError:
             raise StorageError(
-                f"{self._where}: is no URL that fsspec can open. Correct it, or fetch the data and "
+                f"{self._where}: not a URL that fsspec can open. Correct it, or fetch the data and "
                 f"pass the folder."
             ) from None
         except network_errors() as error:
-            raise self._failure(error) from None
+            if type(error).__name__ == "FileExpired":  # s3fs: the ETag has changed
+                raise self._replaced(f"{error.args[-1]!s:.120}") from None
+            if _status(error) in _REFUSED:
+                raise StorageError(f"{self._where}: {_reason(error)}. {_MISSING}") from None
+            raise TransientError(_reason(error)) from None
         except _loaded(_SETUP_ERRORS) as error:
             raise StorageError(
                 f"{self._where}: may not be read ({_reason(error)}). Log in to its store, or set "
                 f"up its file system."
             ) from None
-
-    def _failure(self, error: BaseException) -> TransientError | StorageError:
-        """Return what is raised where a store was reached, or a network was not."""
-        if isinstance(error, TooSlow):
-            return TransientError(str(error))
-        if type(error).__name__ == "FileExpired":  # s3fs: the ETag is another
-            return self._replaced(f"{error.args[-1]!s:.120}")
-        if _status(error) in _REFUSED:
-            return StorageError(f"{self._where}: {_reason(error)}. {_MISSING}")
-        return TransientError(_reason(error))
-
-    def _uninstalled(self, error: ImportError) -> str:
-        scheme = self._url.partition("://")[0]
-        extra = _EXTRAS.get(scheme)
-        cure = f"pip install 'stereogenbench-data[{extra}]'" if extra else "install it"
-        return f"{self._where}: needs a package that is not installed ({error}): {cure}."
 
 
 def _is_s3(files: Any) -> bool:
@@ -205,22 +190,21 @@ def _is_s3(files: Any) -> bool:
     return type(files).__module__.partition(".")[0] == "s3fs"
 
 
+_commits: Final[dict[tuple[int, str, str, str, str], str | None]] = {}
+"""Commits of the Hub's branches, as this process has resolved them."""
+
+
 def _pinned(files: Any, path: str) -> str:
     """Return a path of the Hub at the commit that its branch is at now.
 
-    So what one process reads of a file is of one commit, whatever is pushed meanwhile.
+    So everything that one process reads is of one commit, whatever is pushed meanwhile.
     """
     found = files.resolve_path(path)
     revision = getattr(found, "revision", None)
     if revision is None or _COMMIT.fullmatch(revision):
         return path
-    key = (
-        os.getpid(),
-        str(getattr(files, "endpoint", "")),
-        found.repo_type,
-        found.repo_id,
-        revision,
-    )
+    endpoint = str(getattr(files, "endpoint", ""))
+    key = (os.getpid(), endpoint, found.repo_type, found.repo_id, revision)
     if key not in _commits:
         info = files._api.repo_info(found.repo_id, repo_type=found.repo_type, revision=revision)
         _commits[key] = info.sha
@@ -228,18 +212,14 @@ def _pinned(files: Any, path: str) -> str:
     return f"{pinned}/{found.path_in_repo}".rstrip("/") if _commits[key] else path
 
 
-_commits: Final[dict[tuple[int, str, str, str, str], str | None]] = {}
-"""Commits of the Hub's branches, as this process has resolved them."""
-
-
 def _within(attempt: Attempt, call: Callable[[], _T]) -> _T:
-    """Return what a call returns, in the time that a read has left.
+    """Return what a call returns, within the time that a read has left.
 
-    File systems bound single waits at best. A call that takes longer is left to itself, in a thread
-    that no process waits for when it ends.
+    File systems limit single waits at best. A call that takes longer is abandoned, in a thread
+    that does not keep the process alive.
 
     Raises:
-        TooSlow: If it takes longer.
+        TransientError: If it takes longer.
     """
     returned: list[_T] = []
     raised: list[BaseException] = []
@@ -258,12 +238,12 @@ def _within(attempt: Attempt, call: Callable[[], _T]) -> _T:
     if raised:
         raise raised[0]
     if not returned:
-        raise attempt.too_slow()
+        raise TransientError(str(attempt.too_slow()))
     return returned[0]
 
 
 def _status(error: BaseException) -> int | None:
-    """Return the server's answer, where the error is one."""
+    """Return the status of the server's response, if the error holds one."""
     return getattr(getattr(error, "response", None), "status_code", None)
 
 
@@ -276,7 +256,7 @@ def _reason(error: BaseException) -> str:
 
 
 def network_errors() -> tuple[type[BaseException], ...]:
-    """Return what file systems and the Hub's client raise where a server cannot be reached."""
+    """Return the errors of file systems and the Hub's client for an unreachable server."""
     return _loaded(_NETWORK_ERRORS)
 
 

@@ -1,6 +1,6 @@
 """Ranges over http and https, with urllib3; every response is checked to be the part requested.
 
-Errors do not chain urllib3's own: their messages hold the whole URL, with what is secret in it.
+Errors do not chain urllib3's own, whose messages hold the whole URL with its secrets.
 """
 
 import atexit
@@ -10,6 +10,7 @@ import os
 import re
 import socket
 from collections.abc import Generator, Mapping
+from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -29,14 +30,15 @@ from stereogenbench_data.sources.retry import Attempt, TooSlow, TransientError
 _REDIRECTS: Final = frozenset({301, 302, 303, 307, 308})
 _MOST_REDIRECTS: Final = 5
 _PASSING: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
-"""Answers that may be others in a while."""
+"""Status codes of failures that may pass."""
 
 _FETCH: Final = "or fetch the data and pass the folder"
+_MISSING: Final = "Check the URL, and that the index and its shards lie in one folder."
 _CURES: Final = {
     401: f"It asks for a login: use hf:// or s3://, which know yours, {_FETCH}.",
     403: f"It may not be read with what the URL says: check access, {_FETCH}.",
-    404: "Check the URL, and that the index and its shards lie in one folder.",
-    410: "Check the URL, and that the index and its shards lie in one folder.",
+    404: _MISSING,
+    410: _MISSING,
 }
 _NUMBER: Final = re.compile(r"[0-9]{1,18}")
 _PART: Final = re.compile(r"bytes (?:([0-9]{1,18})-([0-9]{1,18})|\*)/([0-9]{1,18}|\*)")
@@ -45,8 +47,8 @@ _DATE: Final = re.compile(r"[A-Za-z0-9,: +-]{1,64}")
 _CHUNK: Final = 64 * 1024
 
 _pools: Final[dict[tuple[int, str], urllib3.PoolManager]] = {}
-"""Connections by process and proxy. Those that came over a fork are left alone: their sockets
-belong to the parent."""
+"""Connections by process and proxy. Those inherited over a fork are not used: their sockets belong
+to the parent."""
 
 _current_attempt: Final[ContextVar[Attempt | None]] = ContextVar("_current_attempt", default=None)
 """The attempt that this thread's request belongs to."""
@@ -54,14 +56,14 @@ _current_attempt: Final[ContextVar[Attempt | None]] = ContextVar("_current_attem
 
 @dataclass(frozen=True, slots=True)
 class _Version:
-    """What a server states of an object that changes with it; "" where it states nothing."""
+    """What a server states of an object that changes with its content; "" where it is silent."""
 
     etag: str
     modified: str
     size: str
 
     def changes(self, now: "_Version") -> str:
-        """Return what another answer tells otherwise, "" if the object is the same."""
+        """Return how another response differs, "" if the object is the same."""
         compared = [("ETag", self.etag.removeprefix("W/"), now.etag.removeprefix("W/"))]
         if not (self.etag and now.etag):
             compared.append(("Last-Modified", self.modified, now.modified))
@@ -77,10 +79,10 @@ class WebTransport:
     """One object of a web server."""
 
     def __init__(self, url: str) -> None:
-        """Name an object; a user and password in its URL are sent as a login, never shown.
+        """Name an object; user and password of its URL are sent as a login, and never shown.
 
         Raises:
-            StorageError: If it is no URL.
+            StorageError: If it is not a URL.
         """
         parts = split_url(url)
         login, _, host = parts.netloc.rpartition("@")
@@ -98,8 +100,8 @@ class WebTransport:
         stated = self._stated_size(response)
         if not _NUMBER.fullmatch(stated):
             raise StorageError(
-                f"{self._where}: its server does not tell how large it is ({stated[:80]!r}): fetch "
-                f"the data and pass the folder."
+                f"{self._where}: its server does not state its size ({stated[:80]!r}): fetch the "
+                f"data and pass the folder."
             )
         return int(stated)
 
@@ -114,7 +116,7 @@ class WebTransport:
         except HTTPError as error:
             raise TransientError(_reason(error)) from None
         finally:
-            # What was read to its end has gone back to the pool already, and is not closed.
+            # A response that was read to its end is back in the pool, and is not closed.
             response.close()
 
     def _get(self, start: int, stop: int, attempt: Attempt) -> urllib3.BaseHTTPResponse:
@@ -142,7 +144,7 @@ class WebTransport:
     def _ask(
         self, url: str, headers: Mapping[str, str], attempt: Attempt
     ) -> urllib3.BaseHTTPResponse:
-        """Return a server's answer, or the first of several."""
+        """Return a server's response, which may be a redirect."""
         token = _current_attempt.set(attempt)
         try:
             allowed_s = attempt.next_wait_s()
@@ -159,38 +161,33 @@ class WebTransport:
             raise TransientError(str(error)) from None
         except (LocationValueError, UnicodeError):
             sent = "" if url == self._url else f"is redirected to {shown(url)[:200]}, which "
-            raise StorageError(f"{self._where}: {sent}is no URL: correct it.") from None
+            raise StorageError(f"{self._where}: {sent}is not a URL: correct it.") from None
         except HTTPError as error:
             raise TransientError(_reason(error)) from None
         finally:
             _current_attempt.reset(token)
 
     def _redirected(self, url: str, response: urllib3.BaseHTTPResponse) -> str:
-        """Return where an answer sends its reader, if that is a place to go to."""
+        """Return where a response redirects to, if that may be followed."""
         stated = response.headers.get("Location", "").strip()
         length = response.headers.get("Content-Length", "")
         if _NUMBER.fullmatch(length) and int(length) <= _CHUNK:
             response.drain_conn()  # so that the connection can be used again
         response.close()
-        try:
+        there, parts, reason = stated, split_url(""), ""
+        with suppress(ValueError, StorageError):
             there = urljoin(url, stated)
-        except ValueError:
-            there = stated
-        try:
             parts = split_url(there)
-        except StorageError:
-            parts = split_url("")
-        reason = ""
         if not stated:
-            reason = "names no place to go to"
+            reason = "redirects without a location"
         elif parts.scheme not in WEB_SCHEMES or not parts.hostname:
-            reason = f"sends on to {shown(there)[:200]!r}, which is no URL of a web server"
+            reason = f"redirects to {shown(there)[:200]!r}, which is not a URL of a web server"
         elif (split_url(url).scheme, parts.scheme) == ("https", "http"):
-            reason = f"sends on from https to {shown(there)[:200]}, which nothing protects"
+            reason = f"redirects from https to {shown(there)[:200]}, which is not encrypted"
         elif parts.hostname != split_url(url).hostname and (
             is_inside(parts.hostname) and not is_inside(split_url(url).hostname or "")
         ):
-            reason = f"sends on to {shown(there)[:200]}, inside this machine's own network"
+            reason = f"redirects to {shown(there)[:200]}, inside this machine's own network"
         if reason:
             raise StorageError(
                 f"{self._where}: the server answers {response.status} and {reason}. Check the URL "
@@ -200,7 +197,7 @@ class WebTransport:
         return urlunsplit(parts._replace(netloc=host, fragment=""))
 
     def _condition(self) -> dict[str, str]:
-        """Return the header that asks for a part only while the object is what it was."""
+        """Return the header that asks for a part only if the object is unchanged."""
         seen = self._seen.get("first")
         if seen is not None and _STRONG_TAG.fullmatch(seen.etag):
             return {"If-Range": seen.etag}
@@ -209,7 +206,7 @@ class WebTransport:
         return {}
 
     def _require_same(self, response: urllib3.BaseHTTPResponse) -> None:
-        """Refuse an answer from another object than the one that was read from before."""
+        """Refuse a response of an object that was replaced since the first read."""
         size = self._stated_size(response)
         now = _Version(
             etag=response.headers.get("ETag", "").strip(),
@@ -235,7 +232,7 @@ class WebTransport:
         raise StorageError(f"{self._where}: the server answers {answer}. {cure}")
 
     def _require_part(self, response: urllib3.BaseHTTPResponse, start: int, stop: int) -> None:
-        """Refuse a response that is not the requested part, or its beginning."""
+        """Refuse a response that is neither the requested part nor its beginning."""
         if response.status == 200:
             size = response.headers.get("Content-Length", "")[:20]
             if start == 0 and size == str(stop):
@@ -258,19 +255,19 @@ class WebTransport:
             )
 
     def _stated_size(self, response: urllib3.BaseHTTPResponse) -> str:
-        """Return the whole object's size as a response states it, a number or not."""
+        """Return the whole object's size as a response states it, which may not be a number."""
         if response.status == 200:
             return response.headers.get("Content-Length", "")
         return self._content_range(response)[2]
 
     def _content_range(self, response: urllib3.BaseHTTPResponse) -> tuple[str, str, str]:
-        """Return first and last byte (empty where there are none) and size, as stated."""
+        """Return the stated first and last byte, "" where there are none, and size."""
         stated = response.headers.get("Content-Range", "")
         found = _PART.fullmatch(stated)
         if found is None:
             response.close()
             raise StorageError(
-                f"{self._where}: the server answers {response.status} and does not tell which "
+                f"{self._where}: the server answers {response.status} and does not state which "
                 f"part it sends (Content-Range: {stated[:80]!r}): use another, {_FETCH}."
             )
         first, last, size = found.groups(default="")
@@ -278,7 +275,7 @@ class WebTransport:
 
 
 class _TimedStream(io.RawIOBase):
-    """The bytes of a connection; no wait for them exceeds the limits of the attempt."""
+    """The bytes of a connection; waits for them stay within the limits of the attempt."""
 
     def __init__(self, stream: io.RawIOBase, connection: socket.socket, attempt: Attempt) -> None:
         super().__init__()
@@ -308,7 +305,7 @@ class _TimedStream(io.RawIOBase):
 
 
 class _TimedResponse(http.client.HTTPResponse):
-    """A response whose head and body are read within the limits of the attempt."""
+    """A response whose head and body arrive within the limits of the attempt."""
 
     def __init__(self, sock: socket.socket, *args: Any, **how: Any) -> None:
         super().__init__(sock, *args, **how)
@@ -347,13 +344,13 @@ def _pool(url: str) -> urllib3.PoolManager:
 
 @atexit.register
 def close_connections() -> None:
-    """Close the connections that this process keeps open; reading opens new ones."""
+    """Close the connections of this process; reading opens new ones."""
     for key in [key for key in _pools if key[0] == os.getpid()]:
         _pools.pop(key).clear()
 
 
 def _reason(error: BaseException) -> str:
-    """Return what happened without the URL, which urllib3 puts into its messages."""
+    """Return what happened, without the URL that urllib3's messages hold."""
     reason = getattr(error, "reason", None)
     inner = reason if isinstance(reason, BaseException) else error
     cause = inner.__cause__ or inner.__context__
@@ -365,7 +362,7 @@ def _reason(error: BaseException) -> str:
 
 
 def _retry_after_s(header: str) -> float:
-    """Return how many seconds a Retry-After header asks to wait, 0 where it does not."""
+    """Return how many seconds a Retry-After header asks to wait, 0 if it is not valid."""
     if re.fullmatch("[0-9]+", header):
         return float(header)
     try:

@@ -1,7 +1,7 @@
-"""Where data are, a path or a URL: how it is joined and shown, and whose word it takes to open it.
+"""Locations of data, paths or URLs: how they are joined and shown, and which ones may be opened.
 
-What a user names is opened, whatever it is. What a file names may be another's choice: see
-`why_not_from_a_file`.
+A location that the user names is always opened. One that a file names may be a stranger's choice:
+see `why_not_from_a_file`.
 """
 
 import ipaddress
@@ -15,21 +15,21 @@ from stereogenbench_data.errors import StorageError, url_without_secrets
 
 WEB_SCHEMES: Final = ("http", "https")
 FILE_SCHEMES: Final = ("https", "http", "hf", "s3")
-"""What a file may name as the place of data: stores that hold bytes, and nothing else.
+"""What a file may name as the place of data: stores of bytes only.
 
 Other file systems of fsspec reach into this machine (``local``, ``reference``, ``ssh`` ...), or
-open what yet another part of the URL names.
+open what another part of the URL names.
 """
 
 _ODD: Final = re.compile(r"[\x00-\x20\x7f\\]")
 _IPV6_HOST: Final = re.compile(r"(?<=://)\[[0-9A-Fa-f:.]*\]")
 _EMBEDDED: Final = ipaddress.ip_network("64:ff9b::/96")
-"""IPv6 addresses that stand for IPv4 addresses, the last 32 bits."""
+"""IPv6 addresses that hold an IPv4 address in their last 32 bits."""
 
 
 def is_remote(location: str | Path) -> bool:
-    """Return whether a location is a URL of something that is not a file of this machine."""
-    return "://" in str(location) and not _is_file_url(str(location))
+    """Return whether a location is a URL, and not one of a file of this machine."""
+    return "://" in str(location) and not _is_file_url(location)
 
 
 def is_web(location: str) -> bool:
@@ -39,40 +39,39 @@ def is_web(location: str) -> bool:
 
 def local_path(location: str | Path) -> Path:
     """Return a local location as an absolute path, ``~`` expanded; a ``file://`` URL is one too."""
-    text = str(location)
-    if _is_file_url(text):
-        return Path(unquote(split_url(text).path))
+    if _is_file_url(location):
+        return Path(unquote(split_url(str(location)).path))
     return Path(location).expanduser().absolute()
 
 
-def _is_file_url(location: str) -> bool:
-    return location[:7].lower() == "file://"
+def _is_file_url(location: str | Path) -> bool:
+    return str(location)[:7].lower() == "file://"
 
 
 def split_url(url: str) -> SplitResult:
     """Return the parts of a URL.
 
     Raises:
-        StorageError: If it is none, as with half an IPv6 address or, of a web server, a port that
-            is no number.
+        StorageError: If it is not a URL, as with half an IPv6 address or, for a web server, a
+            port that is not a number.
     """
     try:
         parts = urlsplit(url)
         if is_web(url):
             _ = parts.port
     except ValueError:
-        raise StorageError(f"{shown(url)}: is no URL: correct it.") from None
+        raise StorageError(f"{shown(url)}: not a URL: correct it.") from None
     return parts
 
 
 def joined(root: str, path: str) -> str:
     """Return the URL of a path below a root.
 
-    What follows the root's path stays behind the whole: a query, as of a signed URL, or the
-    archive that a chain of file systems opens (``zip://folder::s3://bucket/all.zip``).
+    What follows the root's path stays at the end: the query of a signed URL, or the archive that a
+    chain of file systems opens (``zip://folder::s3://bucket/all.zip``).
 
     Raises:
-        StorageError: If the root is no URL, or the path would make it a chain of file systems.
+        StorageError: If the root is not a URL, or the path would make it a chain of file systems.
     """
     if "::" in path:
         raise StorageError(
@@ -87,10 +86,10 @@ def joined(root: str, path: str) -> str:
 
 
 def split_name(url: str) -> tuple[str, str]:
-    """Return the URL of the folder that holds a URL's last part, and this part.
+    """Return the URL of the folder that holds a URL's last part, and that part.
 
     Raises:
-        StorageError: If it is no URL.
+        StorageError: If it is not a URL.
     """
     parts = split_url(url)
     folder, _, name = parts.path.rpartition("/")
@@ -98,38 +97,35 @@ def split_name(url: str) -> tuple[str, str]:
 
 
 def shown(location: str | Path) -> str:
-    """Return a location as messages and files may show it: a URL without login, query, fragment.
-
-    So is every URL of a chain. Other logins than those in URLs are never part of a location.
-    """
+    """Return a location as messages and files may show it: URLs without login, query, fragment."""
     text = str(location)
     return url_without_secrets(text) if is_remote(text) else text
 
 
 def why_not_from_a_file(url: str) -> str:
-    """Return why a URL that a file names is not opened without the user's word, "" if it is.
+    """Return why a URL that a file names is not opened unless the user names it; "" if it is.
 
-    It must be of `FILE_SCHEMES`, without a chain of file systems, a login or a query, and on a web
-    server that is neither this machine nor one of its own network.
+    It must be of `FILE_SCHEMES`, without a chain of file systems, a login or a query. A web server
+    must be outside this machine and its own network.
     """
     scheme = url.partition("://")[0].lower()
     try:
         host = split_url(url).hostname or "" if is_web(url) else ""
     except StorageError:
-        return "it is no URL"
+        return "it is not a URL"
     if "::" in (_IPV6_HOST.sub("", url) if is_web(url) else url):
         return "it is a chain of file systems"
     if scheme not in FILE_SCHEMES:
         return f"it is none of {', '.join(f'{each}://' for each in FILE_SCHEMES)}"
     if shown(url) != url or _ODD.search(url):
-        return "it holds a login, a query, or signs that no address has"
+        return "it holds a login, a query, or characters that no address has"
     return "it is on this machine or in its own network" if is_web(url) and is_inside(host) else ""
 
 
 def is_inside(host: str) -> bool:
-    """Return whether a host is this machine or one of a network that the world cannot reach.
+    """Return whether a host is this machine, or in a network that the internet cannot reach.
 
-    Names are looked up; one that is unknown is of neither.
+    Names are looked up; an unknown one is neither.
     """
     name = unquote(host).rstrip(".").lower()
     if name in ("", "localhost") or name.endswith(".localhost"):

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from stereogenbench_data.errors import ShardError, StorageError, describe_os_error
+from stereogenbench_data.errors import ShardError, StorageError, explain_os_errors
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.sources.cache import ShardCache
@@ -23,54 +23,15 @@ from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
 
 UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
-"""What no member's path may hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
-
-_UNSAFE_PATH: Final = re.compile(UNSAFE_PATH)
-
-
-def size_of(location: str | Path) -> int:
-    """Return how many bytes a file has, local or by URL.
-
-    Raises:
-        StorageError: If it is not there or cannot be read.
-    """
-    if is_remote(location):
-        return RemoteObject(str(location)).size()
-    path = local_path(location)
-    try:
-        return path.stat().st_size
-    except OSError as error:
-        raise StorageError(
-            describe_os_error(f"{path}: cannot be read", error, "Fetch it again.")
-        ) from error
-
-
-def read_range(location: str | Path, start: int, stop: int) -> bytes:
-    """Return the bytes from start to stop of a file, local or by URL.
-
-    Raises:
-        StorageError: If they cannot be had.
-    """
-    if is_remote(location):
-        return RemoteObject(str(location)).read(start, stop)
-    path = local_path(location)
-    try:
-        with FileSlice(path, Member(path.name, start, stop - start)) as file:
-            return file.read()
-    except StorageError:
-        raise
-    except OSError as error:
-        raise StorageError(
-            describe_os_error(f"{path}: cannot be read", error, "Fetch it again.")
-        ) from error
+"""What a member's path may not hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
 
 
 class MemberSource:
     """Opens the files of an index's scenes, wherever they lie.
 
-    A file of a released folder is given by its path. A member of a local shard is an open file
-    over its part of the shard. What lies behind a URL is fetched by ranges as it is read or,
-    with a cache, as a whole once.
+    A file of a released folder is returned as its path, a member of a local shard as an open file
+    over its part of the shard. A member behind a URL is fetched in ranges as it is read; with a
+    cache it is fetched whole, once.
     """
 
     def __init__(
@@ -88,12 +49,12 @@ class MemberSource:
         Args:
             root: The folder or URL that members' paths are relative to.
             shards: What the index knows of each shard, by path.
-            revision: The index's digest, by which a cache tells data apart.
+            revision: The index's digest, by which a cache distinguishes data.
             cache: Where to keep members that come from a URL, or None.
             check: What is compared with its checksum. "opened": each member of a shard or of the
-                cache when this process first opens it, and one from a URL when its last byte
-                comes. "metadata": metadata files alone.
-            retry: How often to try a server, and how slow it may be; None for the defaults.
+                cache when this process first opens it, and each member from a URL when its last
+                byte arrives. "metadata": metadata files only.
+            retry: How reading from a server is retried; None for the defaults.
         """
         self._root = str(root)
         self._shards = shards
@@ -128,7 +89,7 @@ class MemberSource:
         )
 
     def _checked(self, file: FileSlice, scene: Scene, name: str) -> FileSlice:
-        """Return an open file whose bytes were compared with their checksum once, if asked for."""
+        """Return an open file after its first checksum comparison, where `check` asks for one."""
         member = scene.members[name]
         place = (member.path, member.offset)
         if self._check == "opened" and member.crc32 is not None and place not in self._sound:
@@ -141,7 +102,7 @@ class MemberSource:
         return file
 
     def read(self, scene: Scene, name: str) -> bytes:
-        """Return one of a scene's metadata files, whole and as its checksum says.
+        """Return the bytes of one of a scene's metadata files, compared with its checksum.
 
         Raises:
             StorageError: If it is missing, unreadable or not the one that was indexed.
@@ -158,7 +119,7 @@ class MemberSource:
         return text
 
     def label(self, scene: Scene, name: str) -> str:
-        """Return what messages call one of a scene's files: where it lies, and its name."""
+        """Return the place and the name of one of a scene's files, for messages."""
         name = scene.held_name(name)
         place = self._shown(scene.members[name].path)
         return place if place.endswith(name) else f"{place}: {name}"
@@ -169,10 +130,9 @@ class MemberSource:
         return self._shown(place if place in self._shards else scene.id.key)
 
     def drop_damaged(self, scene: Scene, names: Iterable[str]) -> bool:
-        """Drop files of a scene from the cache that are not as they were stored.
+        """Drop a scene's damaged files from the cache; return whether there were any.
 
-        Returns:
-            Whether there were any, so that reading again may help.
+        If so, reading again may help.
         """
         if self._cache is None or not is_remote(self._root):
             return False
@@ -190,7 +150,7 @@ class MemberSource:
         return str(local_path(self._root) / path)
 
     def _object(self, member: Member) -> RemoteObject:
-        """Return what holds a member; it is kept, so that its size is checked once."""
+        """Return the file that holds a member; it is kept, so its size is checked once."""
         if member.path not in self._objects:
             shard = self._shards.get(member.path)
             self._objects[member.path] = RemoteObject(
@@ -201,7 +161,7 @@ class MemberSource:
         return self._objects[member.path]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what a copy in another process needs; it checks sizes for itself."""
+        """Return the state for a copy in another process, which checks sizes for itself."""
         return self.__dict__ | {"_objects": {}}
 
 
@@ -223,10 +183,8 @@ def open_local(
     _require_safe(member)
     path = local_path(root) / member.path
     again = "Fetch the shard again, or use the index that was made with it."
-    try:
+    with explain_os_errors(f"{path}: cannot be read", again, kind=ShardError):
         file = FileSlice(path, member)
-    except OSError as error:
-        raise ShardError(describe_os_error(f"{path}: cannot be read", error, again)) from error
     found, end = file.status().st_size, member.offset + member.size
     if found < end or (shard is not None and found != shard.size):
         file.close()
@@ -247,40 +205,39 @@ def member_path(root: str | Path, member: Member) -> Path:
     """
     _require_safe(member)
     path = local_path(root) / member.path
-    try:
+    cure = "fetch it again, or run `stereogenbench index` again."
+    expected = f"By the index it has {member.size} bytes: {cure}"
+    with explain_os_errors(f"{path}: cannot be read", expected):
         size_bytes = path.stat().st_size
-    except OSError as error:
-        cure = (
-            f"By the index it has {member.size} bytes: fetch it again, or run `stereogenbench "
-            f"index` again."
-        )
-        raise StorageError(describe_os_error(f"{path}: cannot be read", error, cure)) from error
     if size_bytes != member.offset + member.size:
         raise StorageError(
             f"{path}: has {size_bytes} bytes, and the index says "
-            f"{member.offset + member.size}. The file was cut short or changed after its index: "
-            f"fetch it again, or run `stereogenbench index` again."
+            f"{member.offset + member.size}. It was cut short or changed after its index: {cure}"
         )
     return path
 
 
 def require_own_files(root: str | Path, paths: Iterable[str]) -> None:
-    """Refuse files of a folder that are to be passed on and that links lead out of it to.
+    """Refuse to pass on files of a folder if a link leads out of it.
 
-    Such a link in a stranger's folder would carry any file of this machine into what is published.
-    Links to other files of the folder are as good as copies; so are those of the Hub's cache, which
-    keeps the files of a snapshot in ``blobs`` beside it. Reading for oneself follows all links.
+    Such a link in a stranger's folder could publish any file of this machine. Links to other files
+    of the folder are allowed; so are those of the Hub's cache, which keeps the files of a snapshot
+    in ``blobs`` beside it. Reading alone follows all links.
 
     Args:
         root: The folder, on this machine.
-        paths: Of the files, below it.
+        paths: The paths of the files below it.
 
     Raises:
-        StorageError: Naming the first such file, where it leads and what to do.
+        StorageError: It names the first such file, where it leads and what to do.
     """
     root = local_path(root)
     real = os.path.realpath(root)
-    own = [real, *_hub_blobs(Path(real))]
+    own = [real] + [
+        str(each.parent.parent / "blobs")  # the Hub's cache, if the folder is one of its snapshots
+        for each in (Path(real), *Path(real).parents)
+        if each.parent.name == "snapshots" and each.parent.parent.name.startswith("datasets--")
+    ]
     folders: dict[str, str] = {}
     for path in paths:
         folder, _, name = path.rpartition("/")
@@ -296,17 +253,8 @@ def require_own_files(root: str | Path, paths: Iterable[str]) -> None:
             )
 
 
-def _hub_blobs(real: Path) -> list[str]:
-    """Return where the Hub's cache keeps the files of the snapshot that a folder lies in."""
-    return [
-        str(each.parent.parent / "blobs")
-        for each in (real, *real.parents)
-        if each.parent.name == "snapshots" and each.parent.parent.name.startswith("datasets--")
-    ]
-
-
 def _require_safe(member: Member) -> None:
-    if _UNSAFE_PATH.search(member.path):
+    if re.search(UNSAFE_PATH, member.path):
         raise StorageError(
             f"{member.path!r}: a member's path is relative to the data's root and stays inside "
             f"it. The index was not made by this package: run `stereogenbench index` again."
@@ -314,19 +262,15 @@ def _require_safe(member: Member) -> None:
 
 
 def read_text_file(path: Path, *, where: str) -> bytes:
-    """Return the bytes of a metadata file, of which the size is checked before it is read.
+    """Return the bytes of a metadata file; its size is checked before it is read.
 
     Raises:
         StorageError: If the file is missing or unreadable.
         SchemaError: If it is too large for a metadata file.
     """
-    try:
+    with explain_os_errors(f"{where}: cannot be read", "Fetch it again."):
         status = path.stat()
         if stat.S_ISREG(status.st_mode):
             require_text_size(status.st_size, where=where)
             return path.read_bytes()
-    except OSError as error:
-        raise StorageError(
-            describe_os_error(f"{where}: cannot be read", error, "Fetch it again.")
-        ) from error
-    raise StorageError(f"{where}: is no file. Put the release's own file in its place.")
+    raise StorageError(f"{where}: not a file. Put the release's own file in its place.")

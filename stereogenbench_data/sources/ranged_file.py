@@ -1,4 +1,4 @@
-"""A member's bytes as a file of their own: seekable, read-only, blind to what lies around it."""
+"""A member's bytes as a seekable, read-only file of their own."""
 
 import errno
 import io
@@ -14,20 +14,20 @@ from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.schema.records import Member
 
 FIRST_BLOCK: Final = 64 * 1024
-"""Bytes fetched where reading starts anew."""
+"""Bytes of the first block where reading starts."""
 
 LARGEST_BLOCK: Final = 1024 * 1024
-"""Bytes to which a block grows while reading goes on where the one before it ended."""
+"""Bytes to which blocks grow while reading continues where the previous one ended."""
 
 KEPT_BYTES: Final = 2 * LARGEST_BLOCK
-"""Bytes of a member that are kept to be read again: a file's header, the frames nearby."""
+"""Bytes of a member that are kept for reading again: a file's header, nearby frames."""
 
 
 class MemberFile(io.RawIOBase):
-    """A file that holds just the bytes of one member; what reads them is up to the subclass."""
+    """A file of the bytes of one member; subclasses read them."""
 
     def __init__(self, size: int) -> None:
-        """Stand at the start of so many bytes."""
+        """Begin at the start of so many bytes."""
         super().__init__()
         self.size = size
         self._position = 0
@@ -37,25 +37,24 @@ class MemberFile(io.RawIOBase):
         return True
 
     def seekable(self) -> bool:
-        """Return that it can be sought in."""
+        """Return that positions can be set."""
         return True
 
     def tell(self) -> int:
-        """Return where the next byte is read."""
+        """Return the position of the next byte."""
         return self._position
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Go to a place, counted from the start, from here or from the end; return it."""
+        """Set the position, relative to the start, to itself or to the end; return it."""
         start = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self.size}[whence]
         if start + offset < 0:
-            raise ValueError(f"there is no place {start + offset} in a file")
+            raise ValueError(f"a file has no position {start + offset}: seek to 0 or later.")
         self._position = start + offset
         return self._position
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Return the next so many bytes, fewer only at the end; with -1 all that are left."""
-        wanted = self.size if size is None or size < 0 else self._position + size
-        stop = min(wanted, self.size)
+        """Return the next bytes, fewer than asked for only at the end; all the rest for -1."""
+        stop = self.size if size is None or size < 0 else min(self._position + size, self.size)
         if stop <= self._position:
             return b""
         data = self._bytes(self._position, stop)
@@ -63,7 +62,7 @@ class MemberFile(io.RawIOBase):
         return data
 
     def readinto(self, buffer: Any, /) -> int:
-        """Fill whatever has a buffer's interface as far as there are bytes; return how many."""
+        """Read into a buffer as far as there are bytes; return how many."""
         room = memoryview(buffer).cast("B")
         data = self.read(len(room))
         room[: len(data)] = data
@@ -75,18 +74,22 @@ class MemberFile(io.RawIOBase):
 
 
 class FileSlice(MemberFile):
-    """A member of a local shard, or of the cache: it stays readable while the file is replaced."""
+    """A member of a local shard or of the cache; it stays readable if the file is replaced."""
 
     def __init__(self, path: Path, member: Member) -> None:
         """Open the file that holds the member's bytes.
 
         Raises:
-            OSError: If it cannot be opened, or is no file.
+            OSError: If it cannot be opened, or is not a file.
         """
         super().__init__(member.size)
         self._path = path
         self._offset = member.offset
-        self._file = io.FileIO(_regular_file(path), "rb")
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):  # opening a pipe would wait for its writer
+            code = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
+            raise OSError(code, "not a regular file")
+        self._file = io.FileIO(path, "rb")
 
     def status(self) -> os.stat_result:
         """Return what the operating system knows of the whole file that holds the member."""
@@ -102,7 +105,7 @@ class FileSlice(MemberFile):
 
     def close(self) -> None:
         """Close the file."""
-        # An object whose making failed is closed too.
+        # This is also called when __init__ has failed.
         if not self.closed and hasattr(self, "_file"):
             self._file.close()
         super().close()
@@ -122,22 +125,15 @@ class FileSlice(MemberFile):
         return data
 
 
-def _regular_file(path: Path) -> Path:
-    """Return a path that is a file; a pipe would be waited for when it is opened."""
-    mode = path.stat().st_mode
-    if not stat.S_ISREG(mode):
-        code = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL
-        raise OSError(code, "it is no regular file")
-    return path
-
-
 class RangedFile(MemberFile):
-    """A member of which bytes are fetched in blocks as they are asked for, ahead of the reader.
+    """A member whose bytes are fetched in blocks as they are read, ahead of the reader.
 
-    Blocks start small and double while reading goes on where one ended, so that a first frame
-    costs little and a whole pass few requests. No byte is fetched twice in a pass forwards, and
-    none beyond the member. When the last of all its bytes comes, they are compared with their
-    checksum.
+    Blocks start small and double while reading continues where one ended, so a first frame costs
+    little and a whole pass needs few requests. A forward pass fetches no byte twice, and none
+    beyond the member. Once all bytes have arrived, they are compared with their checksum.
+
+    Attributes:
+        failure: The error of the first fetch that failed; further fetches raise it again.
     """
 
     def __init__(
@@ -148,13 +144,13 @@ class RangedFile(MemberFile):
         name: str = "",
         crc32: int | None = None,
     ) -> None:
-        """Read through ``fetch(start, stop)``, which returns these bytes of the member.
+        """Prepare to read; nothing is fetched yet.
 
         Args:
-            fetch: What returns bytes of the member.
-            size: How many it has.
+            fetch: Returns the bytes of the member from a start to a stop.
+            size: The size of the member in bytes.
             name: What messages call it.
-            crc32: Their checksum; None compares nothing.
+            crc32: Its checksum; None compares nothing.
         """
         super().__init__(size)
         self._fetch = fetch
@@ -163,7 +159,7 @@ class RangedFile(MemberFile):
         self.failure: StorageError | None = None
 
     def close(self) -> None:
-        """Forget what was fetched."""
+        """Free what was fetched."""
         self._blocks.clear()
         super().close()
 
@@ -192,7 +188,7 @@ class RangedFile(MemberFile):
             if self._checksum is not None:
                 self._checksum.add(*block)
         except StorageError as error:
-            # Whoever reads may take an error for the end of the file and try again: tell it anew.
+            # FFmpeg may take an error for the end of the file and try again: it is raised again.
             self.failure = error
             raise
         self._blocks.append(block)
@@ -202,9 +198,9 @@ class RangedFile(MemberFile):
 
 
 class _Checksum:
-    """The crc32 of a member whose parts come in nearly ascending order.
+    """The crc32 of a member whose parts arrive in nearly ascending order.
 
-    A part that lies ahead, such as an MP4 file's table at its end, waits for those before it. Where
+    A part that lies ahead, such as an MP4 file's table at its end, waits for those before it. If
     too much would have to wait, as when single frames are read, nothing is compared.
     """
 
@@ -217,10 +213,10 @@ class _Checksum:
         self._ahead: dict[int, bytes] = {}
 
     def add(self, start: int, data: bytes) -> None:
-        """Take note of a part; with the last one all are compared.
+        """Add a part; the last one completes the comparison.
 
         Raises:
-            ShardError: If they are not what was expected.
+            ShardError: If the checksum is another than the one expected.
         """
         if self._end >= min(self._size, start + len(data)):
             return
@@ -238,7 +234,7 @@ class _Checksum:
 
 
 def require_crc32(found: int, *, expected: int | None, name: str) -> None:
-    """Refuse a member whose bytes are not those that were indexed.
+    """Refuse a member whose bytes have changed since it was indexed.
 
     Raises:
         ShardError: If the checksum is another than the one expected; None expects any.

@@ -1,10 +1,11 @@
 """Files behind URLs: any range of their bytes, resumed where a connection broke off.
 
-A transport makes the requests: `http` for http and https, `filesystems` for everything else.
+A transport makes the requests: `http` for http and https, `filesystems` for everything else. Its
+methods raise `TransientError` where another attempt may help, else `StorageError`.
 """
 
-from collections.abc import Callable, Generator, Iterator
-from typing import Protocol, TypeVar
+from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources.filesystems import FilesystemTransport
@@ -13,21 +14,6 @@ from stereogenbench_data.sources.location import is_web, shown
 from stereogenbench_data.sources.retry import Attempt, RetryPolicy, RetryState, TransientError
 
 _T = TypeVar("_T")
-
-
-class Transport(Protocol):
-    """One way to reach one remote file.
-
-    Both methods raise `TransientError` where another attempt may help, else `StorageError`.
-    """
-
-    def size(self, attempt: Attempt) -> int:
-        """Return the size of the file in bytes."""
-        ...
-
-    def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
-        """Yield the bytes from start to stop, or the first of them."""
-        ...
 
 
 class RemoteObject:
@@ -54,7 +40,7 @@ class RemoteObject:
         self._expected_size = expected_size
         self._is_checked = expected_size is None
         self._policy = retry or RetryPolicy()
-        self._transport: Transport = (WebTransport if is_web(url) else FilesystemTransport)(url)
+        self._transport = WebTransport(url) if is_web(url) else FilesystemTransport(url)
 
     def __repr__(self) -> str:
         """Return the URL, without login and query."""
@@ -113,10 +99,10 @@ class RemoteObject:
                 self._wait(state, error, received=start - begin, doing=doing)
 
     def entries(self) -> dict[str, int | None]:
-        """List the file as a folder: name to size in bytes, None for a folder.
+        """List a folder: name to size in bytes, None for a folder.
 
         Raises:
-            StorageError: If it cannot be listed; plain web servers have no lists.
+            StorageError: If it cannot be listed; plain web servers have no listings.
         """
         if not isinstance(self._transport, FilesystemTransport):
             raise StorageError(
@@ -147,10 +133,13 @@ class RemoteObject:
                 self._wait(state, error, received=0, doing="asked for its size")
 
     def _wait(self, state: RetryState, error: TransientError, *, received: int, doing: str) -> None:
+        policy = self._policy
         if not state.wait(error, received=received):
             raise StorageError(
                 f"{self.where}: cannot be read, {doing} ({state.describe(error)}). Check the "
                 f"network and the server, then try again; or fetch the data and pass the folder; "
                 f"or allow a slower server: SceneIndex.open(..., retry=RetryPolicy(...)), which "
-                f"has {self._policy.limits} now."
+                f"has least_rate_bytes_s={policy.least_rate_bytes_s:.10g} over "
+                f"window_s={policy.window_s:g}, timeout_s={policy.timeout_s:g}, "
+                f"longest_read_s={policy.longest_read_s:g} now."
             ) from error

@@ -13,19 +13,17 @@ from stereogenbench_data.errors import StorageError
 _BYTES_PER_TIME_LIMIT: Final = 8 * 2**20
 """The time limit of a read starts anew after this many bytes."""
 
-_JITTER: Final = random.SystemRandom()
-"""Jitter must not draw from the program's own random numbers."""
-
 
 def _random() -> float:
-    return _JITTER.random()
+    """Draw from 0 to 1, without changing the program's own random numbers."""
+    return random.SystemRandom().random()
 
 
 class TransientError(Exception):
-    """A failure that may not occur again; ``wait_s`` is the wait that the server asked for."""
+    """A failure that may pass; ``wait_s`` is the wait that the server asked for, in seconds."""
 
     def __init__(self, reason: str, *, wait_s: float = 0.0) -> None:
-        """Say what happened."""
+        """Take what happened, for messages."""
         super().__init__(reason)
         self.wait_s = wait_s
 
@@ -45,16 +43,16 @@ class RetryPolicy:
         longest_wait_s: The longest wait in seconds, unless the server asks for more.
         longest_asked_s: The longest wait in seconds that a server may ask for; beyond it reading
             gives up.
-        timeout_s: Seconds that connecting may take, and seconds until a response begins, with all
-            redirects.
+        timeout_s: Seconds until a connection is made, and seconds until a response begins,
+            redirects included.
         least_rate_bytes_s: Bytes per second that a response must deliver once it has begun. Fewer
             over ``window_s`` end the attempt.
         window_s: Seconds over which the rate is measured.
         longest_read_s: Seconds that one read may take with all attempts and waits; of a long read,
-            each 8 MiB. Time in which nothing is asked of the server does not count.
-        sleep: What waits.
-        chance: What draws a random number from 0 to 1.
-        clock: What tells the time in seconds.
+            each 8 MiB. Time without a request to the server does not count.
+        sleep: Waits so many seconds.
+        chance: Draws a random number from 0 to 1.
+        clock: Returns the time in seconds.
     """
 
     attempts: int = 6
@@ -70,10 +68,10 @@ class RetryPolicy:
     clock: Callable[[], float] = field(default=time.monotonic, repr=False)
 
     def __post_init__(self) -> None:
-        """Refuse limits that limit nothing.
+        """Refuse limits without an effect.
 
         Raises:
-            StorageError: If there is to be no attempt, or a limit is negative or not a number.
+            StorageError: If there is no attempt, or a limit is negative or not a number.
         """
         above_zero = ("attempts", "timeout_s", "window_s", "longest_read_s")
         for name in (*above_zero, "least_rate_bytes_s", "first_wait_s", "longest_wait_s"):
@@ -98,52 +96,43 @@ class RetryPolicy:
         self.sleep(wait_s)
         return True
 
-    @property
-    def limits(self) -> str:
-        """The limits on a server's speed, for messages."""
-        return (
-            f"least_rate_bytes_s={self.least_rate_bytes_s:.10g} over window_s={self.window_s:g}, "
-            f"timeout_s={self.timeout_s:g}, longest_read_s={self.longest_read_s:g}"
-        )
-
 
 class Attempt:
-    """The time limits of one attempt: it counts each wait for bytes and limits the next one."""
+    """The time limits of one attempt: it counts each wait for bytes and limits the next one.
+
+    Attributes:
+        clock: Returns the time in seconds.
+        left_s: Seconds that the read has left.
+    """
 
     def __init__(self, policy: RetryPolicy, *, left_s: float) -> None:
-        """Begin with the head of a response, in a read that has so many seconds left."""
+        """Begin with the head of a response, in a read that has ``left_s`` left."""
         self.clock = policy.clock
-        self.timeout_s = policy.timeout_s
+        self.left_s = left_s
         self._policy = policy
-        self._left_s = left_s
         self._in_body = False
         self._waited_s = 0.0
         self._received = 0
 
-    @property
-    def left_s(self) -> float:
-        """Seconds that the read has left."""
-        return self._left_s
-
     def begin_body(self) -> None:
-        """Go on to the body of a response, where the rate is measured."""
+        """Begin the body of a response, whose rate is measured."""
         self._in_body, self._waited_s, self._received = True, 0.0, 0
 
     def next_wait_s(self) -> float:
         """Return how many seconds the next wait may last, above 0.
 
         Raises:
-            TooSlow: If none is left.
+            TooSlow: If no time is left.
         """
         limit_s = self._policy.window_s if self._in_body else self._policy.timeout_s
-        wait_s = min(limit_s - self._waited_s, self._left_s)
+        wait_s = min(limit_s - self._waited_s, self.left_s)
         if wait_s <= 0:
             raise self.too_slow()
         return wait_s
 
     def add(self, waited_s: float, received: int) -> None:
-        """Count a wait, and the bytes that it brought."""
-        self._left_s -= waited_s
+        """Count a wait, and the bytes received in it."""
+        self.left_s -= waited_s
         self._waited_s += waited_s
         self._received += received
         enough = self._policy.least_rate_bytes_s * self._policy.window_s
@@ -152,7 +141,7 @@ class Attempt:
 
     def too_slow(self) -> TooSlow:
         """Return the error that names the exceeded limit."""
-        if self._left_s <= 0:
+        if self.left_s <= 0:
             return TooSlow(f"a read may take {self._policy.longest_read_s:g} s")
         if self._in_body:
             return TooSlow(
@@ -190,13 +179,13 @@ class RetryState:
             self._attempt_s += spent_s
 
     def add(self, received: int) -> None:
-        """Count bytes that came."""
+        """Count received bytes."""
         before, self._received = self._received, self._received + received
         if before // _BYTES_PER_TIME_LIMIT != self._received // _BYTES_PER_TIME_LIMIT:
             self._spent_s = 0.0
 
     def wait(self, error: TransientError, *, received: int) -> bool:
-        """Wait before the next attempt, after one that brought so many bytes; False gives up."""
+        """Wait before the next attempt; ``received`` is of the last one. False gives up."""
         policy = self._policy
         is_fast = received > 0 and received >= policy.least_rate_bytes_s * self._attempt_s
         self.failures = 1 if is_fast else self.failures + 1

@@ -5,17 +5,17 @@ same bytes on any number of processors.
 """
 
 from collections.abc import Callable
-from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, cast
+from typing import Final, cast
 
 import av
 import numpy as np
 from av.video.stream import VideoStream
-from jaxtyping import Float64, Shaped, UInt8, UInt16
+from jaxtyping import Float64, UInt16
 
+from stereogenbench_data.media.depth_packing import grey_frame
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_name
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.ray_casting import View
@@ -29,8 +29,10 @@ from stereogenbench_data.synthesis.request import ExportContract
 
 _LARGEST: Final = {"gray16le": 65535, "gray12le": 4095, "gray10le": 1023}
 _RATE_HZ: Final = int(FRAME_RATE_HZ)
-_X264_OPTIONS: Final = {"crf": "18", "x264-params": "cpu-independent=1"}
-_FFV1_OPTIONS: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
+_OPTIONS: Final = {
+    "libx264": {"crf": "18", "x264-params": "cpu-independent=1"},
+    "ffv1": {"level": "3", "slices": "4", "slicecrc": "1"},
+}
 
 
 def write_camera(
@@ -40,25 +42,36 @@ def write_camera(
 
     ``after_frame`` is called after each frame; an exception from it ends the work.
     """
-    contract = plan.request.contract
+    contract, size_px = plan.request.contract, plan.request.picture_px
+    tag = contract.depth_tag
     light = static_light(plan.scene)
-    first = plan.view(camera=camera, frame=0)
-    with ExitStack() as files:
-        rgb = files.enter_context(open_rgb(folder, camera=camera, view=first))
-        depth = files.enter_context(
-            open_depth(folder, camera=camera, view=first, contract=contract)
-        )
+
+    def moment(frame: int) -> tuple[SceneState, View]:
+        state = SceneState(plan.scene, moment_s=plan.moment_s(frame), static_light=light)
+        return state, plan.view(camera=camera, frame=frame)
+
+    with (
+        VideoWriter(
+            folder / rgb_name(camera), size_px=size_px, codec="libx264", pixel_format="yuv420p"
+        ) as rgb,
+        VideoWriter(
+            folder / depth_name(camera),
+            size_px=size_px,
+            codec="ffv1",
+            pixel_format=contract.depth_format,
+            tags=None if tag is None else {tag: repr(contract.depth_unit_m)},
+        ) as depth,
+    ):
         for frame in range(plan.request.frames):
-            view = plan.view(camera=camera, frame=frame)
-            state = SceneState(plan.scene, moment_s=plan.moment_s(frame), static_light=light)
+            state, view = moment(frame)
             picture, depth_m = render_frame(state, view=view)
-            rgb.write(rgb_frame(picture))
+            shown = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            rgb.write(shown.reformat(format="yuv420p", threads=1))
             if contract.frame_lag:
-                measured = frame - contract.frame_lag
-                view = plan.view(camera=camera, frame=measured)
-                state = SceneState(plan.scene, moment_s=plan.moment_s(measured), static_light=light)
+                state, view = moment(frame - contract.frame_lag)
                 depth_m = render_depth(state, view=view)
-            depth.write(depth_frame(depth_m, view=view, contract=contract))
+            units = depth_units(depth_m, view=view, contract=contract)
+            depth.write(grey_frame(units, pixel_format=contract.depth_format))
             after_frame()
 
 
@@ -72,13 +85,12 @@ class VideoWriter:
         size_px: tuple[int, int],
         codec: str,
         pixel_format: str,
-        tags: dict[str, str],
+        tags: dict[str, str] | None = None,
     ) -> None:
         self._container = av.open(path, "w", container_options={"fflags": "+bitexact"})
-        self._container.metadata.update(tags)
-        options = _X264_OPTIONS if codec == "libx264" else _FFV1_OPTIONS
+        self._container.metadata.update(tags or {})
         self._stream = cast(
-            VideoStream, self._container.add_stream(codec, rate=_RATE_HZ, options=options)
+            VideoStream, self._container.add_stream(codec, rate=_RATE_HZ, options=_OPTIONS[codec])
         )
         self._stream.width, self._stream.height = size_px
         self._stream.pix_fmt = pixel_format
@@ -107,44 +119,6 @@ class VideoWriter:
             self._container.close()
 
 
-def open_rgb(folder: Path, *, camera: int, view: View) -> VideoWriter:
-    """Open the video of a camera's pictures: yuv420p, x264's defaults, constant rate factor 18."""
-    return VideoWriter(
-        folder / rgb_name(camera),
-        size_px=view.size_px,
-        codec="libx264",
-        pixel_format="yuv420p",
-        tags={},
-    )
-
-
-def open_depth(folder: Path, *, camera: int, view: View, contract: ExportContract) -> VideoWriter:
-    """Open the video of a camera's depth, with the depth tag of the contract, if any."""
-    tag = contract.depth_tag
-    return VideoWriter(
-        folder / depth_name(camera),
-        size_px=view.size_px,
-        codec="ffv1",
-        pixel_format=contract.depth_format,
-        tags={} if tag is None else {tag: repr(contract.depth_unit_m)},
-    )
-
-
-def rgb_frame(picture: UInt8[np.ndarray, "h w 3"]) -> av.VideoFrame:
-    """Return a picture as a frame for the encoder."""
-    return av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(format="yuv420p", threads=1)
-
-
-def depth_frame(
-    depth_m: Float64[np.ndarray, "h w"], *, view: View, contract: ExportContract
-) -> av.VideoFrame:
-    """Return depth as a frame in the contract's pixel format."""
-    units = depth_units(depth_m, view=view, contract=contract)
-    frame = av.VideoFrame(*view.size_px, contract.depth_format)
-    _fill_plane(frame.planes[0], units)
-    return frame
-
-
 def depth_units(
     depth_m: Float64[np.ndarray, "h w"], *, view: View, contract: ExportContract
 ) -> UInt16[np.ndarray, "h w"]:
@@ -156,10 +130,3 @@ def depth_units(
         depth_m = depth_m * np.sqrt(1 + right**2 + below**2)
     largest = _LARGEST[contract.depth_format]
     return np.minimum(np.rint(depth_m / contract.depth_unit_m), largest).astype(np.uint16)
-
-
-def _fill_plane(plane: Any, rows: Shaped[np.ndarray, "h w"]) -> None:
-    """Copy an array into a plane, whose rows may be longer than the array's."""
-    padded = np.zeros((rows.shape[0], plane.line_size // rows.itemsize), rows.dtype)
-    padded[:, : rows.shape[1]] = rows
-    plane.update(padded)

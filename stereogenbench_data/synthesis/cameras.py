@@ -16,35 +16,33 @@ from stereogenbench_data.errors import SynthesisError
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import CAMERA_COUNT, CAMERA_PAIRS
 
-IPD_MEAN_CM: Final = 6.38
-IPD_SD_CM: Final = 0.5
-IPD_RANGE_CM: Final = (4.5, 8.5)
-UNIFORM_RANGE_CM: Final = (1.0, 150.0)
-PAIRWISE_RANGE_CM: Final = (5.0, 200.0)
+OFFSET_RANGE_CM: Final = 1e6
 FOCAL_RANGE_MM: Final = (18.0, 85.0)
 
-_GAPS: Final = CAMERA_COUNT - 1
-_SPAN_SCALE_CM: Final = 77.0
+_IPD_CM: Final = {"loc": 6.38, "scale": 0.5}
+_IPD_RANGE_CM: Final = (4.5, 8.5)
+_UNIFORM_RANGE_CM: Final = (1.0, 150.0)
+_UNIFORM_SPAN_CM: Final = 77.0
+_PAIRWISE_RANGE_CM: Final = (5.0, 200.0)
 _PAIRWISE_SPAN_CM: Final = (180.0, 200.0)
 _PAIRWISE_CANDIDATES: Final = 48
+_GAPS: Final = CAMERA_COUNT - 1
+_LOOK_HEIGHT_M: Final = 0.95
 
 Gaps = Float64[np.ndarray, "5"]
-OFFSET_RANGE_CM: Final = 1e6
-LOOK_HEIGHT_M: Final = 0.95
-
 Vector = Float64[np.ndarray, "3"]
 
 
 def random_gaps_cm(family: str, *, rng: np.random.Generator) -> Gaps:
-    """Return five random gaps between neighbouring cameras in cm, from left to right.
+    """Return five random gaps between neighbouring cameras, from left to right, in cm.
 
     - ``IPD_Gaussian``: each from a normal (6.38, 0.5) truncated to [4.5, 8.5] cm.
     - ``Uniform``: each from U[1, 150] cm; the rig is then kept with probability
       exp(-span / 77 cm), else sampled again. The rejection stands for the release's checks of
       collision, visibility and framing, which wide rigs fail more often. Median, mean and standard
       deviation are 44, 53 and 39 cm; in the release's train split they are 43, 53 and 39.
-    - ``Pairwise_Uniform``: the one of 48 rigs whose 15 distances are spread most evenly over
-      [5, 200] cm.
+    - ``Pairwise_Uniform``: of 48 rigs the one whose 15 sorted distances are closest to evenly
+      spaced ones in [5, 200] cm.
 
     Raises:
         SynthesisError: If the family is not one of these three.
@@ -52,11 +50,25 @@ def random_gaps_cm(family: str, *, rng: np.random.Generator) -> Gaps:
     Source: the StereoGenBench paper, section 3 and its appendix on realised baselines.
     """
     if family == "IPD_Gaussian":
-        return _truncated_normal(rng)
+        low, high = _IPD_RANGE_CM
+        kept = np.empty(0)
+        while len(kept) < _GAPS:
+            sampled = rng.normal(**_IPD_CM, size=_GAPS)
+            kept = np.concatenate([kept, sampled[(sampled >= low) & (sampled <= high)]])
+        return kept[:_GAPS]
     if family == "Uniform":
-        return _uniform_with_rejection(rng)
+        while True:
+            gaps = rng.uniform(*_UNIFORM_RANGE_CM, _GAPS)
+            if rng.random() < np.exp(-gaps.sum() / _UNIFORM_SPAN_CM):
+                return gaps
     if family == "Pairwise_Uniform":
-        return _even_distances(rng)
+        low, high = _PAIRWISE_RANGE_CM
+        even = low + (high - low) * (np.arange(len(CAMERA_PAIRS)) + 0.5) / len(CAMERA_PAIRS)
+        rigs = []
+        for _ in range(_PAIRWISE_CANDIDATES):
+            span = rng.uniform(*_PAIRWISE_SPAN_CM)
+            rigs.append(low + rng.dirichlet(np.ones(_GAPS)) * (span - _GAPS * low))
+        return min(rigs, key=lambda gaps: np.abs(np.sort(pair_distances_cm(gaps)) - even).max())
     raise SynthesisError(
         f"family {family!r} is unknown: choose IPD_Gaussian, Uniform or Pairwise_Uniform."
     )
@@ -73,37 +85,6 @@ def pair_distances_cm(gaps_cm: Gaps) -> Float64[np.ndarray, "15"]:
 def lateral_places_cm(gaps_cm: Gaps) -> Float64[np.ndarray, "6"]:
     """Return the distance in cm of each camera to the right of camera 0."""
     return np.concatenate([[0.0], np.cumsum(gaps_cm)])
-
-
-def _truncated_normal(rng: np.random.Generator) -> Gaps:
-    low, high = IPD_RANGE_CM
-    kept = np.empty(0)
-    while len(kept) < _GAPS:
-        drawn = rng.normal(IPD_MEAN_CM, IPD_SD_CM, _GAPS)
-        kept = np.concatenate([kept, drawn[(drawn >= low) & (drawn <= high)]])
-    return kept[:_GAPS]
-
-
-def _uniform_with_rejection(rng: np.random.Generator) -> Gaps:
-    while True:
-        gaps = rng.uniform(*UNIFORM_RANGE_CM, _GAPS)
-        if rng.random() < np.exp(-gaps.sum() / _SPAN_SCALE_CM):
-            return gaps
-
-
-def _even_distances(rng: np.random.Generator) -> Gaps:
-    """Return the candidate whose sorted distances are closest to evenly spaced ones."""
-    low, high = PAIRWISE_RANGE_CM
-    even = low + (high - low) * (np.arange(len(CAMERA_PAIRS)) + 0.5) / len(CAMERA_PAIRS)
-    best, least = np.empty(0), np.inf
-    for _ in range(_PAIRWISE_CANDIDATES):
-        span = rng.uniform(*_PAIRWISE_SPAN_CM)
-        free = rng.dirichlet(np.ones(_GAPS)) * (span - _GAPS * low)
-        gaps = low + free
-        deviation = float(np.abs(np.sort(pair_distances_cm(gaps)) - even).max())
-        if deviation < least:
-            best, least = gaps, deviation
-    return best
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,7 +111,7 @@ class CameraPath:
     def rotator_deg(self, moment_s: float) -> Vector:
         """Return pitch, yaw and roll in scene axes."""
         _, _, _, roll_deg, aside_m, up_m = self._oscillations(moment_s)
-        target = np.array([0.0, aside_m + self.follow_m_s * moment_s, LOOK_HEIGHT_M + up_m])
+        target = np.array([0.0, aside_m + self.follow_m_s * moment_s, _LOOK_HEIGHT_M + up_m])
         x, y, z = target - self.centre_m(moment_s)
         return np.array([*np.degrees([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)]), roll_deg])
 
@@ -138,13 +119,8 @@ class CameraPath:
         """Return the middle of the rig in scene axes."""
         azimuth_deg, stretch, up_m, *_ = self._oscillations(moment_s)
         azimuth, distance_m = np.radians(azimuth_deg), self.distance_m * (1 + stretch)
-        return np.array(
-            [
-                -distance_m * np.cos(azimuth),
-                distance_m * np.sin(azimuth),
-                self.height_m + up_m,
-            ]
-        )
+        x_m, y_m = -distance_m * np.cos(azimuth), distance_m * np.sin(azimuth)
+        return np.array([x_m, y_m, self.height_m + up_m])
 
     def _oscillations(self, moment_s: float) -> Float64[np.ndarray, "6"]:
         angles = 2 * np.pi * moment_s / self.periods_s + self.phases
@@ -160,7 +136,7 @@ def random_path(rng: np.random.Generator, *, distance_m: float, follow_m_s: floa
         amplitudes=largest * rng.uniform(0.6, 1.0, 6),
         periods_s=rng.uniform(4.0, 9.0, 6),
         phases=rng.uniform(0, 2 * np.pi, 6),
-        height_m=LOOK_HEIGHT_M + distance_m * rng.uniform(0.08, 0.15),
+        height_m=_LOOK_HEIGHT_M + distance_m * rng.uniform(0.08, 0.15),
         follow_m_s=follow_m_s,
     )
 
@@ -169,14 +145,9 @@ def quaternion_from_rotator(rotator_deg: Vector) -> Float64[np.ndarray, "4"]:
     """Return the unit quaternion x, y, z, w of a rotator."""
     half = np.radians(rotator_deg) / 2
     (sp, sy, sr), (cp, cy, cr) = np.sin(half), np.cos(half)
-    return np.array(
-        [
-            cr * sp * sy - sr * cp * cy,
-            -cr * sp * cy - sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ]
-    )
+    x, y = cr * sp * sy - sr * cp * cy, -cr * sp * cy - sr * cp * sy
+    z, w = cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy
+    return np.array([x, y, z, w])
 
 
 def rig_locations_cm(

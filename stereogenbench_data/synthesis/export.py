@@ -21,9 +21,7 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     TRAJECTORY_JSON,
 )
-from stereogenbench_data.synthesis.cameras import (
-    quaternion_from_rotator,
-)
+from stereogenbench_data.synthesis.cameras import quaternion_from_rotator
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.request import ExportContract
 
@@ -38,12 +36,8 @@ _REPRESENTATIONS: Final = {
 def completion_text(plan: ScenePlan) -> str:
     """Return the completion marker. It records the request, so that a later run can compare it."""
     request = plan.request
-    map_name = request.map_name
-    marker = {
-        "scene_label": plan.label,
-        "scene_index": plan.label_number,
-        "map_name": map_name,
-        "map_path": f"/Game/{map_name}/Maps/{map_name}",
+    marker = _labels(plan) | {
+        "map_path": f"/Game/{request.map_name}/Maps/{request.map_name}",
         "synthesis": {
             "seed": request.seed,
             "frames": request.frames,
@@ -69,6 +63,14 @@ def metadata_texts(plan: ScenePlan) -> dict[str, str]:
 
 def _json(value: dict[str, Any]) -> str:
     return json.dumps(value, indent=2)
+
+
+def _labels(plan: ScenePlan) -> dict[str, Any]:
+    return {
+        "scene_label": plan.label,
+        "scene_index": plan.label_number,
+        "map_name": plan.request.map_name,
+    }
 
 
 def _camera_name(plan: ScenePlan, *, camera: int) -> str:
@@ -97,10 +99,7 @@ def _baseline(plan: ScenePlan) -> dict[str, Any]:
     if contract.principal_point_px is not None:
         x_px, y_px = contract.principal_point_px
         intrinsics["principal_point_px"] = {"x": x_px, "y": y_px}
-    return {
-        "scene_label": plan.label,
-        "scene_index": plan.label_number,
-        "map_name": plan.request.map_name,
+    return _labels(plan) | {
         "unit": "cm",
         "camera_count": CAMERA_COUNT,
         "image_width": width_px,
@@ -123,10 +122,7 @@ def _pair(plan: ScenePlan, *, left: int, right: int) -> dict[str, Any]:
 
 
 def _trajectory(plan: ScenePlan) -> dict[str, Any]:
-    return {
-        "scene_label": plan.label,
-        "scene_index": plan.label_number,
-        "map_name": plan.request.map_name,
+    return _labels(plan) | {
         "character_id": plan.character,
         "unit": "cm",
         "rotation_representation": _REPRESENTATIONS[plan.request.contract.rotation],

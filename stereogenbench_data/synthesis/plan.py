@@ -105,13 +105,21 @@ class ScenePlan:
 
 
 def plan_scene(request: SynthRequest, *, index: int) -> ScenePlan:
-    """Return the plan of a scene: random, from the request's seed and folder and the number."""
+    """Return the random plan of a scene, which follows from seed, folder and the scene's number."""
     seed = np.random.SeedSequence((request.seed, index, zlib.crc32(request.folder.encode())))
     rig_rng, path_rng, scene_rng = (np.random.default_rng(child) for child in seed.spawn(3))
     places_cm = lateral_places_cm(random_gaps_cm(request.family, rng=rig_rng))
     drawn_mm = float(rig_rng.uniform(*FOCAL_RANGE_MM))
     focal_mm = drawn_mm if request.focal_mm is None else request.focal_mm
-    framing = _framing(request, focal_mm=focal_mm, span_m=places_cm[-1] / 100)
+    width_mm, height_mm = request.contract.sensor_mm
+    span_m = places_cm[-1] / 100
+    # The subject fills part of the picture, but the cameras keep away from it.
+    framing = Framing(
+        distance_m=max(_SUBJECT_M / _SUBJECT_PART * focal_mm / height_mm, span_m, 1.5),
+        width_per_m=width_mm / focal_mm,
+        span_m=span_m,
+        pixel_per_m=width_mm / focal_mm / request.size_px,
+    )
     walk_m_s = float(path_rng.choice([-1.0, 1.0]) * path_rng.uniform(0.5, 0.8))
     offset_cm = path_rng.uniform(-1, 1, 3) * request.world_offset_cm
     heading_deg = float(path_rng.uniform(-180, 180))
@@ -125,16 +133,4 @@ def plan_scene(request: SynthRequest, *, index: int) -> ScenePlan:
         heading_deg=heading_deg,
         offset_cm=offset_cm,
         character=f"SK_Synth{int(path_rng.integers(1, 20)):02d}",
-    )
-
-
-def _framing(request: SynthRequest, *, focal_mm: float, span_m: float) -> Framing:
-    """Choose a distance at which the subject fills part of the picture, but not too close."""
-    width_mm, height_mm = request.contract.sensor_mm
-    distance_m = _SUBJECT_M / _SUBJECT_PART * focal_mm / height_mm
-    return Framing(
-        distance_m=max(distance_m, span_m, 1.5),
-        width_per_m=width_mm / focal_mm,
-        span_m=span_m,
-        pixel_per_m=width_mm / focal_mm / request.size_px,
     )

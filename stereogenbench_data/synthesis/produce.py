@@ -1,29 +1,41 @@
 """Synthetic scenes on disk, for `stereogenbench synth`.
 
 A scene is rendered into a hidden folder beside the splits and moved to its place when it is
-complete; its completion marker is written last. An interrupted run leaves no incomplete scenes, and
-the next run of the same request renders only the missing ones.
+complete. An interrupted run leaves no incomplete scenes, and the next run of the same request
+renders only the missing ones.
 """
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.engine import LOCAL, Engine
-from stereogenbench_data.errors import SynthesisError, cure_of
+import torch
+
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
+from stereogenbench_data.errors import StorageError, SynthesisError, cure_of
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
+from stereogenbench_data.synthesis.camera_writer import write_camera
 from stereogenbench_data.synthesis.export import completion_text, metadata_texts
 from stereogenbench_data.synthesis.plan import ScenePlan, plan_scene
 from stereogenbench_data.synthesis.request import SynthRequest
-from stereogenbench_data.synthesis.workers import CameraJob, run_jobs
-
-Progress = Callable[[int, int], None]
 
 _UNFINISHED: Final = ".unfinished"
 _CURE: Final = "Check that the disk has free space and may be written to."
+_AGAIN: Final = "Then run the same request again: complete scenes are kept."
+
+
+@dataclass(frozen=True, slots=True)
+class _CameraTask:
+    """One camera of one scene, and the folder for its videos."""
+
+    request: SynthRequest
+    index: int
+    camera: int
+    folder: Path
 
 
 def synthesise(
@@ -52,30 +64,28 @@ def synthesise(
         SynthesisError: If ``workers`` is below 1, a scene's folder has other content, a file
             cannot be written, or a worker process dies.
     """
-    if workers is not None and workers < 1:
-        raise SynthesisError(f"workers must be at least 1, got {workers}.")
     root = Path(out)
     missing = [index for index in range(request.scenes) if _is_missing(root, request, index=index)]
     per_scene = CAMERA_COUNT * request.frames
-    drawn = (request.scenes - len(missing)) * per_scene
-
-    def after_frames(count: int) -> None:
-        nonlocal drawn
-        drawn += count
-        if progress is not None:
-            progress(drawn, request.scenes * per_scene)
-
+    total = request.scenes * per_scene
+    advance = advance_of(progress, done=total - len(missing) * per_scene, total=total)
     left = dict.fromkeys(missing, CAMERA_COUNT)
-    jobs = list(_jobs(root, request, missing=missing))
-    after_frames(0)
+    advance(0)
     try:
-        with closing(
-            run_jobs(jobs, workers=workers, engine=engine, after_frames=after_frames)
-        ) as done:
-            for job in done:
-                left[job.index] -= 1
-                if not left[job.index]:
-                    _finish(root, plan_scene(request, index=job.index), drawn_in=job.folder)
+        written = engine.map(
+            _write_camera,
+            list(_camera_tasks(root, request, missing=missing)),
+            name=lambda task: f"{task.request.key(task.index)}, camera {task.camera}",
+            workers=workers,
+            advance=advance,
+        )
+        with closing(written):
+            for task in written:
+                left[task.index] -= 1
+                if not left[task.index]:
+                    _finish(root, plan_scene(request, index=task.index), rendered_in=task.folder)
+    except StorageError as error:
+        raise SynthesisError(str(error)) from error
     finally:
         _clear(root, request, missing=missing)
     warn_if_stale(root)
@@ -102,7 +112,8 @@ def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
     return False
 
 
-def _jobs(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[CameraJob]:
+def _camera_tasks(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[_CameraTask]:
+    """Yield the cameras of all missing scenes, whose folders are made empty."""
     for index in missing:
         folder = out / _UNFINISHED / request.key(index)
         try:
@@ -114,21 +125,40 @@ def _jobs(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[C
                 + cure_of(error, "Choose an output that you may write to.")
             ) from error
         for camera in range(CAMERA_COUNT):
-            yield CameraJob(request=request, index=index, camera=camera, folder=folder)
+            yield _CameraTask(request, index, camera, folder)
 
 
-def _finish(out: Path, plan: ScenePlan, *, drawn_in: Path) -> None:
+def _write_camera(task: _CameraTask, after_frames: Advance) -> _CameraTask:
+    """Write a camera's videos; a worker process calls this."""
+    plan = plan_scene(task.request, index=task.index)
+    # Torch renders with one thread, because its rounding depends on the number of threads.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        write_camera(
+            plan, camera=task.camera, folder=task.folder, after_frame=lambda: after_frames(1)
+        )
+    except OSError as error:
+        raise SynthesisError(
+            f"{plan.key}: camera {task.camera} cannot be written to {task.folder}: {error}. "
+            f"{cure_of(error, _CURE)} {_AGAIN}"
+        ) from error
+    finally:
+        torch.set_num_threads(threads)
+    return task
+
+
+def _finish(out: Path, plan: ScenePlan, *, rendered_in: Path) -> None:
     """Write the metadata, with the completion marker last, and move the scene to its place."""
     folder = out / plan.key
     try:
         for name, text in metadata_texts(plan).items():
-            (drawn_in / name).write_text(text)
+            (rendered_in / name).write_text(text)
         folder.parent.mkdir(parents=True, exist_ok=True)
-        drawn_in.rename(folder)
+        rendered_in.rename(folder)
     except OSError as error:
         raise SynthesisError(
-            f"{plan.key}: cannot be completed in {out}: {error}. {cure_of(error, _CURE)} Then "
-            f"run the same request again: complete scenes are kept."
+            f"{plan.key}: cannot be completed in {out}: {error}. {cure_of(error, _CURE)} {_AGAIN}"
         ) from error
 
 

@@ -58,7 +58,7 @@ class View:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rays:
-    """Rays by their place in the plane at depth 1: right of and below the optical axis.
+    """Rays by their place in the plane at depth 1, to the right of and below the optical axis.
 
     They are either a grid, with ``right`` (1, w) and ``below`` (h, 1), or a list, with both (n,).
     """
@@ -106,7 +106,10 @@ def first_hits(
     The ground is the plane z = slope . (x, y). A solid is `SKY` (at infinite depth), `GROUND`,
     or `FIRST_SHAPE` plus the index of a shape in ``shapes``.
     """
-    depth_m = _ground_depth(rays, view=view, slope=slope)
+    normal = np.array([-slope[0], -slope[1], 1.0])
+    (descent,) = rays.directions(-(normal @ view.axes)[None])
+    with np.errstate(divide="ignore"):
+        depth_m = np.where(descent > 0, (normal @ view.eye) / descent, np.inf)
     solid = np.where(np.isfinite(depth_m), GROUND, SKY)
     for number, shape in enumerate(shapes, FIRST_SHAPE):
         index, inside = rays.within(_bounds(shape, view=view))
@@ -118,13 +121,6 @@ def first_hits(
         depth_m[index] = np.where(nearer, t, depth_m[index])
         solid[index] = np.where(nearer, number, solid[index])
     return depth_m, solid
-
-
-def _ground_depth(rays: Rays, *, view: View, slope: Float64[np.ndarray, "2"]) -> Array:
-    normal = np.array([-slope[0], -slope[1], 1.0])
-    (descent,) = rays.directions(-(normal @ view.axes)[None])
-    with np.errstate(divide="ignore"):
-        return np.where(descent > 0, (normal @ view.eye) / descent, np.inf)
 
 
 def _bounds(shape: Shape, *, view: View) -> tuple[float, float, float, float]:

@@ -1,7 +1,7 @@
 """Pictures and depth of a scene: matte textured surfaces, lit by one sun.
 
 Colours depend on the place on the surface and on the size of a pixel there, but not on the viewing
-direction. So a view that is warped into another by its depth agrees with it.
+direction. So a view that is warped into another view by its depth agrees with that view.
 """
 
 from typing import Any, Final
@@ -51,17 +51,9 @@ class SceneState:
         self.light = static_light.copy()
         for shape in walker:
             cast_shadow(self.light, shape=shape, scene=scene)
-        self.materials = np.array(
-            [
-                (texture_row(material.texture), 1 / material.tile_m, *material.tint)
-                for material in (
-                    _SKY_MATERIAL,
-                    scene.ground,
-                    *(shape.material for shape in self.shapes),
-                )
-            ],
-            np.float32,
-        ).T.copy()
+        materials = (_SKY_MATERIAL, scene.ground, *(shape.material for shape in self.shapes))
+        rows = [(texture_row(each.texture), 1 / each.tile_m, *each.tint) for each in materials]
+        self.materials = np.array(rows, np.float32).T.copy()
 
     def first_hits(self, rays: Rays, *, view: View) -> tuple[Array, Array]:
         """Return the depth in metres of each ray's first hit, and the number of the solid."""
@@ -91,13 +83,9 @@ def render_frame(
     depth_m = np.empty((height, width))
     solid = np.empty((height, width), np.int64)
     for rows, rays in pixel_rays(view):
-        depth_m[rows], solid[rows] = state.first_hits(rays, view=view)
+        near_m, met = depth_m[rows], solid[rows] = state.first_hits(rays, view=view)
         strip, lit = _shaded(
-            state,
-            view=view,
-            rays=rays.listed(),
-            depth_m=depth_m[rows].ravel(),
-            solid=solid[rows].ravel(),
+            state, view=view, rays=rays.listed(), depth_m=near_m.ravel(), solid=met.ravel()
         )
         colour[rows] = strip.T.reshape(-1, width, 3)
         light[rows] = lit.reshape(-1, width)
@@ -110,10 +98,7 @@ def _edges(
 ) -> Bool[np.ndarray, "h w"]:
     """Mark pixels beside another solid or another face of the same box."""
     edges = np.zeros(solid.shape, bool)
-    for first, second in (
-        (np.s_[:, :-1], np.s_[:, 1:]),
-        (np.s_[:-1], np.s_[1:]),
-    ):
+    for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         differ = solid[first] != solid[second]
         differ |= np.abs(light[first] - light[second]) > _FACE_LIGHT
         edges[first] |= differ
@@ -150,20 +135,16 @@ def _shaded(
     for number in np.flatnonzero(np.bincount(solid)):
         index = np.flatnonzero(solid == number)
         part = Rays(rays.right[index], rays.below[index])
+        reach = 1.0 if number == SKY else depth_m[index]
         if number == SKY:
-            u_m, v_m, facing, lit = _on_sky(part, view=view)
-            reach = 1.0
+            met = _on_sky(part, view=view)
+        elif number == GROUND:
+            met = _on_ground(part, view=view, state=state, depth_m=reach)
         else:
-            reach = depth_m[index]
-            if number == GROUND:
-                u_m, v_m, facing, lit = _on_ground(part, view=view, state=state, depth_m=reach)
-            else:
-                shape = state.shapes[number - FIRST_SHAPE]
-                u_m, v_m, facing, lit = _on_shape(
-                    part, view=view, shape=shape, depth_m=reach, sun=state.scene.sun
-                )
-        place_m[0, index], place_m[1, index], light[index] = u_m, v_m, lit
-        footprint_m[index], slant[index] = reach, facing
+            shape = state.shapes[number - FIRST_SHAPE]
+            met = _on_shape(part, view=view, shape=shape, depth_m=reach, sun=state.scene.sun)
+        place_m[0, index], place_m[1, index], slant[index], light[index] = met
+        footprint_m[index] = reach
     footprint_m *= np.maximum(slant, _LEAST_SLANT) ** np.float32(-_SLANT_POWER)
     footprint_m *= _BLUR_PX / max(view.focal_px)
     return _painted(
@@ -178,7 +159,7 @@ def _painted(
     footprint_m: Float32[np.ndarray, " n"],
     light: Float32[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "3 n"]:
-    """Multiply a texture by its tint, the light and, except for the sky, a fine grain."""
+    """Return textures times their tint, the light and, except for the sky, a fine grain."""
     row, tiles_per_m, *tint = materials
     grain = sample_atlas(
         tiles=place_m / np.float32(_GRAIN_TILE_M),
@@ -199,7 +180,7 @@ def _lit(*, sunward: Array, upward: Array, sunlight: Array) -> Array:
 
 
 def _on_sky(rays: Rays, *, view: View) -> tuple[Array, Array, Array, Array]:
-    """Return place, facing and light on a layer of clouds that curves down to the horizon."""
+    """Return u, v, facing and light on a layer of clouds that curves down to the horizon."""
     x, y, z = rays.directions(view.axes)
     length = np.sqrt(x * x + y * y + z * z)
     height = np.abs(z) / length + 0.15

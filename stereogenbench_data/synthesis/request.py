@@ -66,8 +66,7 @@ class ExportContract:
         _require_choice("depth_kind", self.depth_kind, choices=get_args(DepthKind))
         _require_choice("depth_format", self.depth_format, choices=get_args(DepthFormat))
         _require_positive("depth_unit_m", self.depth_unit_m)
-        for side_mm in self.sensor_mm:
-            _require_positive("sensor_mm", side_mm)
+        _require_positive("sensor_mm", *self.sensor_mm)
         if not 0 <= self.primary_pair[0] < self.primary_pair[1] < CAMERA_COUNT:
             raise SynthesisError(
                 f"primary_pair must be two different cameras of 0..{CAMERA_COUNT - 1}, the left "
@@ -165,6 +164,7 @@ def _require_choice(name: str, value: object, *, choices: tuple[object, ...]) ->
         )
 
 
-def _require_positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0):
-        raise SynthesisError(f"{name} must be a positive number, got {value!r}.")
+def _require_positive(name: str, *values: float) -> None:
+    for value in values:
+        if not (math.isfinite(value) and value > 0):
+            raise SynthesisError(f"{name} must be a positive number, got {value!r}.")

@@ -10,8 +10,8 @@ axis, t is the depth along that axis.
 
 import colorsys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -86,32 +86,22 @@ def entry_depth(shape: Shape, *, origin: Sequence[Array], direction: Sequence[Ar
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         if shape.kind == "box":
-            return _box_entry(origin, direction)
-        return _ellipsoid_entry(origin, direction)
+            near, far = -np.inf, np.inf
+            for o, d in zip(origin, direction, strict=True):
+                inverse = 1 / np.where(d == 0, _PARALLEL, d)
+                middle, reach = -o * inverse, np.abs(inverse)
+                near = np.maximum(near, middle - reach)
+                far = np.minimum(far, middle + reach)
+            return np.where((near < far) & (near > 0), near, np.inf)
+        squared = sum(d * d for d in direction)
+        half_linear = sum(o * d for o, d in zip(origin, direction, strict=True))
+        constant = sum(o * o for o in origin) - 1
+        root = np.sqrt(half_linear * half_linear - squared * constant)
+        t = (-half_linear - root) / squared
+        return np.where(t > 0, t, np.inf)
 
 
-def _box_entry(origin: Sequence[Array], direction: Sequence[Array]) -> Array:
-    near, far = -np.inf, np.inf
-    for o, d in zip(origin, direction, strict=True):
-        inverse = 1 / np.where(d == 0, _PARALLEL, d)
-        middle = -o * inverse
-        reach = np.abs(inverse)
-        near = np.maximum(near, middle - reach)
-        far = np.minimum(far, middle + reach)
-    return np.where((near < far) & (near > 0), near, np.inf)
-
-
-def _ellipsoid_entry(origin: Sequence[Array], direction: Sequence[Array]) -> Array:
-    squared = sum(d * d for d in direction)
-    half_linear = sum(o * d for o, d in zip(origin, direction, strict=True))
-    constant = sum(o * o for o in origin) - 1
-    root = np.sqrt(half_linear * half_linear - squared * constant)
-    t = (-half_linear - root) / squared
-    return np.where(t > 0, t, np.inf)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Surface:
+class Surface(NamedTuple):
     """The surface of a shape where rays hit it, with one number per ray in each attribute.
 
     Attributes:
@@ -230,7 +220,11 @@ def random_scene(rng: np.random.Generator, *, framing: Framing, walk_m_s: float)
     return SceneModel(
         slope=slope,
         ground=_material(rng, textures=_GROUNDS, tile_m=(2.0, 4.0)),
-        static_shapes=tuple(_on_slope(shape, slope=slope) for shape in static_shapes),
+        # The shapes stand on a level ground; here they are raised to the slanted one.
+        static_shapes=tuple(
+            replace(shape, centre=shape.centre + _UP * (slope @ shape.centre[:2]))
+            for shape in static_shapes
+        ),
         clothes=(
             Material("plaster", 0.5, (1.5, 1.05, 0.8)),
             _material(rng, textures=_CLOTHES, tile_m=(0.3, 0.8)),
@@ -249,12 +243,6 @@ def _material(
     red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
     texture = textures[int(rng.integers(len(textures)))]
     return Material(texture, float(rng.uniform(*tile_m)), (red, green, blue))
-
-
-def _on_slope(shape: Shape, *, slope: Float64[np.ndarray, "2"]) -> Shape:
-    """Raise a shape from a level ground at height 0 to the slanted ground."""
-    lifted = shape.centre + _UP * (slope @ shape.centre[:2])
-    return Shape(shape.kind, lifted, shape.axes, shape.half_m, shape.material)
 
 
 def _rotated_axes(*, yaw: float, tilt: float = 0.0) -> Array:

@@ -25,8 +25,6 @@ _ROW_TEXELS: Final = SIDE_TEXELS + _BORDER
 Tile = Any
 """(side, side, 3) or (side, side, 1), float64."""
 
-Draw = Callable[[np.random.Generator], Tile]
-
 
 def sample_atlas(
     *,
@@ -181,11 +179,8 @@ def _bricks(rng: np.random.Generator) -> Tile:
 def _boards(rng: np.random.Generator) -> Tile:
     tone, inside = _blocks(rng, rows=8, columns=2, joint=0.03)
     streaks = np.repeat(_noise(rng, slope=1.0)[:, ::8].repeat(8, axis=1), 3, axis=2)
-    return (
-        0.25
-        + inside * (0.28 + 0.12 * tone + 0.05 * streaks)
-        + _colour_noise(rng, slope=1.0, spread=0.04)
-    )
+    boards = inside * (0.28 + 0.12 * tone + 0.05 * streaks)
+    return 0.25 + boards + _colour_noise(rng, slope=1.0, spread=0.04)
 
 
 def _weave(rng: np.random.Generator) -> Tile:
@@ -199,7 +194,7 @@ def _weave(rng: np.random.Generator) -> Tile:
     )
 
 
-TEXTURES: Final[dict[str, Draw]] = {
+TEXTURES: Final[dict[str, Callable[[np.random.Generator], Tile]]] = {
     "clouds": _clouds,
     "grain": _grain,
     "plaster": _plaster,

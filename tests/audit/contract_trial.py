@@ -21,7 +21,6 @@ from tests.audit.corruption import (
     as_inverse,
     as_ray,
     exchange,
-    lagged,
     late,
     place_cameras,
     read_depth,
@@ -139,7 +138,7 @@ def _contract_cases(rng: np.random.Generator, *, frames: int) -> Iterator[Case]:
     )  # fmt: skip
     lag = int(rng.choice([lag for lag in (-2, -1, 1, 2, 5) if abs(lag) < frames - 1]))
     yield Case(
-        "depth of all lagged", lambda f: rewrite_depth(f, lagged(lag)),
+        "depth of all lagged", lambda f: rewrite_depth(f, late(lag)),
         named=rf"(^| ){lag}( |$)" if abs(lag) < 4 else "or beyond",
         paste=f"DepthEncoding(frame_lag={lag})",
         false=frozenset({LAG}), blamed=frozenset({LAG}), details=f"{lag}",
@@ -173,7 +172,7 @@ def _camera_cases(rng: np.random.Generator, *, frames: int) -> Iterator[Case]:
         ("depth of one camera halved", scaled(0.5), r"0\.5\d* x"),
         ("depth of one camera scaled by 3 to 5 %", scaled(float(rng.choice([0.95, 1.03, 1.05]))),
          r"is \d\.\d+ x"),
-        ("depth of one camera lagged", lagged(int(rng.choice([-3, -1, 1, 2]))), "lag|explains"),
+        ("depth of one camera lagged", late(int(rng.choice([-3, -1, 1, 2]))), "lag|explains"),
         ("depth of one camera flipped", lambda u: np.flip(u, 1 + int(rng.integers(2))), "flip"),
         ("depth of one camera one pixel aside", lambda u: np.roll(u, 1, axis=2), "depth of"),
     ):  # fmt: skip

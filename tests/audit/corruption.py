@@ -149,15 +149,6 @@ def as_inverse(folder: Path):
     return change
 
 
-def lagged(lag: int):
-    """Return the change after which depth frame t + lag belongs to RGB frame t."""
-
-    def change(units):
-        return units[np.clip(np.arange(len(units)) - lag, 0, len(units) - 1)]
-
-    return change
-
-
 def scaled(factor: float):
     """Return the change to depth so many times as large."""
 
@@ -169,10 +160,10 @@ def scaled(factor: float):
 
 
 def late(frames: int):
-    """Return the change after which a picture shows what was so many frames before."""
+    """Return the change after which frame t holds what frame t - ``frames`` held."""
 
-    def change(pictures):
-        return pictures[np.clip(np.arange(len(pictures)) - frames, 0, len(pictures) - 1)]
+    def change(video):
+        return video[np.clip(np.arange(len(video)) - frames, 0, len(video) - 1)]
 
     return change
 

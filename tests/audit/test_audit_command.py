@@ -86,7 +86,7 @@ def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(
     def stop_at_the_second(task, after_bytes):
         if audited:
             raise KeyboardInterrupt
-        audited.append(task.scene.id.key)
+        audited.append(task.access.key)
         return plain(task, after_bytes)
 
     monkeypatch.setattr(geometry_audit, "audit_scene", stop_at_the_second)
@@ -96,7 +96,7 @@ def test_a_stopped_audit_keeps_its_journal_and_the_next_run_uses_it(
     monkeypatch.setattr(
         geometry_audit,
         "audit_scene",
-        lambda task, told: audited.append(task.scene.id.key) or plain(task, told),
+        lambda task, told: audited.append(task.access.key) or plain(task, told),
     )
     again = run(small_shards, "--workers", "1", "--frames", "1", *place)
 

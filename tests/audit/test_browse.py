@@ -2,17 +2,13 @@
 
 import dataclasses
 import shutil
-import threading
 import time
 
 import numpy as np
 import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
-from stereogenbench_data.audit.browser.catalogue import Catalogue
-from stereogenbench_data.audit.browser.server import PageServer
-from stereogenbench_data.audit.browser.service import Service
-from stereogenbench_data.audit.scene_reader import SceneReader
+from tests.audit.browsing import run, serving
 from tests.servers.tools import require_module, require_tool
 
 # The index names a scene that was left out, each time that it is opened.
@@ -55,13 +51,8 @@ def data(small_release, tmp_path_factory):
 def address(data):
     with pytest.warns(UserWarning, match="scene_000999"):
         index = SceneIndex.open(data)
-    service = Service(Catalogue(index, shown_data=str(data)), SceneReader(index))
-    with PageServer(service) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
+    with serving(index, data) as server:
         yield server.url
-        server.shutdown()
-        thread.join()
 
 
 @pytest.fixture(scope="module")
@@ -141,12 +132,6 @@ def page(browser, address):
     page = Page(browser, address)
     page.open()
     return page
-
-
-def run(line):
-    names = {}
-    exec(line, names)  # what a user copies is to run as it stands
-    return names
 
 
 def keys_listed(page):

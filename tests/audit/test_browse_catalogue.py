@@ -8,6 +8,7 @@ import pytest
 from stereogenbench_data import DepthEncoding, SceneIndex, SelectionError, StereoPairs
 from stereogenbench_data.audit.browser.catalogue import Catalogue, Choice, parse_choice
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
+from tests.audit.browsing import run
 
 SCENE = "train/Uniform/SynthStage/scene_000001"
 
@@ -20,12 +21,6 @@ def index(small_release):
 @pytest.fixture(scope="module")
 def catalogue(index, small_release):
     return Catalogue(index, shown_data=str(small_release))
-
-
-def run(line):
-    names = {}
-    exec(line, names)  # the line under test, which is to run as it stands
-    return names
 
 
 QUERIES = [
@@ -149,8 +144,8 @@ def test_a_scene_outside_the_choice_has_no_place_in_the_list(catalogue):
 @pytest.mark.parametrize(
     ("query", "reason"),
     [
-        ({"bin": ["[1,2)"]}, r"no '\[1,2\)' to choose"),
-        ({"pairs": ["sweep"]}, "no 'sweep' to choose"),
+        ({"bin": ["[1,2)"]}, r"no choice '\[1,2\)'"),
+        ({"pairs": ["sweep"]}, "no choice 'sweep'"),
         ({"focal_low": ["wide"]}, "focal must be of numbers, got 'wide'"),
         ({"baseline_high": ["inf"]}, "baseline must be of finite numbers, got 'inf'"),
     ],

@@ -34,7 +34,6 @@ from tests.audit.corruption import (
     copied,
     edit_baseline,
     exchange,
-    lagged,
     late,
     place_cameras,
     rewrite_depth,
@@ -245,7 +244,7 @@ def test_a_scene_of_one_frame_does_not_tell_the_lag(tmp_path):
 
     assert not verdict.is_wrong
     assert answer(verdict, "frame lag").status == "cannot tell"
-    assert answer(verdict, "frame lag").note.startswith("not tested, for want of frames: -3, -2")
+    assert answer(verdict, "frame lag").note.startswith("not tested, for lack of frames: -3, -2")
     assert answer(verdict, "depth along").status == "confirmed"
 
 
@@ -440,7 +439,7 @@ def test_inverse_depth_is_found_with_its_unit(verdict_on):
 
 @pytest.mark.parametrize("lag", [-2, 2])
 def test_a_lag_is_found(verdict_on, lag):
-    verdict = verdict_on(lambda folder: rewrite_depth(folder, lagged(lag)), frames=5)
+    verdict = verdict_on(lambda folder: rewrite_depth(folder, late(lag)), frames=5)
 
     assert wrong_topics(verdict) == {"frame lag"}
     assert f"{lag}" in answer(verdict, "frame lag").found.split(" or ")
@@ -483,7 +482,7 @@ def test_files_numbered_one_too_high_are_seen_and_nothing_is_pasted(verdict_on):
     [
         (5, scaled(0.5), r"is 0\.[45]\d* x that of the others"),
         (1, scaled(1.05), r"is 1\.0[45]\d* x that of the others"),
-        (3, lagged(2), r"fits better with a lag of \+2 frames"),
+        (3, late(2), r"fits better with a lag of \+2 frames"),
         (0, lambda units: np.flip(units, 1), r"fits better flipped \(vertical\)"),
     ],
     ids=["halved", "5 % more", "lagged", "flipped"],
@@ -537,7 +536,7 @@ def test_a_camera_that_is_recorded_elsewhere_is_named(verdict_on):
     verdict = verdict_on(lambda folder: place_cameras(folder, {3: 1.2}))
 
     (fault,) = verdict.faults
-    assert "camera 3 is not where it is said to be" in fault
+    assert "camera 3 is not at its recorded position" in fault
     assert verdict.choices == ()
 
 

@@ -1,5 +1,6 @@
 """The audit of whole scenes: exact ones, the same ones in shards, and ones made wrong."""
 
+import dataclasses
 import json
 import shutil
 import warnings
@@ -9,7 +10,13 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.audit import geometry_audit as audit_module
-from stereogenbench_data.audit.audit_records import AuditLimits, ToleranceAudit
+from stereogenbench_data.audit.audit_records import (
+    AuditLimits,
+    SceneAudit,
+    ToleranceAudit,
+    plain,
+    revived,
+)
 from stereogenbench_data.audit.audit_table import audit_markdown, pooled_px
 from stereogenbench_data.audit.geometry_audit import (
     AuditRequest,
@@ -254,9 +261,9 @@ def contradicting(folder):
          "from frame 0 to the next audited one the camera moves and depth stays the same"),
         (changed_depth(5, hidden), "cam_05_depth.mkv", "occluder", "31% of the picture, from the"),
         (higher_pictures, "cam_02_rgb.mp4", "pictures fit", "pictures of camera 2 are "),
-        (late_pictures, "cam_01_rgb.mp4", "picture time", "frame after are taken"),
+        (late_pictures, "cam_01_rgb.mp4", "picture time", "if those of the frame after are taken"),
         (reversed_pictures, "cam_04_rgb.mp4", "picture content",
-         "pictures of camera 4, taken to "),
+         "pictures of camera 4, warped by depth to "),
         (changed_depth(0, lambda units: np.roll(units, 1, 2)), "cam_00_depth.mkv", "depth fit",
          "depth of camera 0 is +"),
         (changed_depth(4, scaled(1.02)), "cam_04_depth.mkv", "depth fit",
@@ -268,7 +275,7 @@ def contradicting(folder):
         (longer_baseline, "", "pose/baseline", "differ by 0.05 cm (limit 0.001)"),
         (focal_in_pixels, "", "intrinsics", "recorded intrinsics deviate"),
         (turned, "", "rig rotation", "turned against camera 0 by 1 deg"),
-        (contradicting, "cam_05_depth.mkv", "unreadable", "its tags do not tell one positive"),
+        (contradicting, "cam_05_depth.mkv", "unreadable", "its tags do not state one positive"),
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )  # fmt: skip
@@ -495,6 +502,32 @@ def test_a_damaged_journal_is_passed_over(exact, small_release, tmp_path):
 
     (expected,) = [scene for scene in exact.to_json()["scenes"] if scene["key"] == SCENE]
     assert report.to_json()["scenes"] == [expected]
+
+
+def test_the_record_of_a_scene_survives_json(exact):
+    for scene in exact.scenes:
+        stored = json.loads(json.dumps(plain(dataclasses.asdict(scene))))
+
+        assert repr(revived(SceneAudit, stored)) == repr(scene)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda record: record.pop("frames"),
+        lambda record: record.update(odd=1),
+        lambda record: record.update(frames="7"),
+        lambda record: record["cameras"].pop(),
+        lambda record: record["alignment"]["lags"].append([0, 1]),
+    ],
+    ids=["a field less", "a field more", "another type", "five cameras", "a short row"],
+)
+def test_the_record_of_a_scene_is_refused_if_it_has_another_form(exact, change):
+    stored = json.loads(json.dumps(plain(dataclasses.asdict(exact.scenes[0]))))
+    change(stored)
+
+    with pytest.raises((TypeError, ValueError), match=r"fields|stored as|5 cameras|shorter"):
+        revived(SceneAudit, stored)
 
 
 def test_progress_counts_frames(small_release):

@@ -26,12 +26,12 @@ def results(material, tmp_path_factory):
     found = Results(tmp_path_factory.mktemp("out") / "results.json")
     found.put("data", facts(material))
     found.put("machine", {"cores": 2, "cpu": "a processor", "versions": {"av": "18.1"}})
-    found.put("accuracy", accuracy.measure_accuracy(material, rounds=1, cases=6, say=str))
+    found.put("accuracy", accuracy.measure_accuracy(material, rounds=1, cases=6, report=str))
     plan = race.Plan(rounds=1)
-    found.put("tried", tried.measure_tried(material, rounds=1, say=str))
+    found.put("tried", tried.measure_tried(material, rounds=1, report=str))
     found.put("evaluation", evaluation.measure(frames=1, size_px=64, workers=1))
     workloads = [TINY["all-frames"], TINY["all-frames-crf26"]]
-    race.run_races(workloads, material, found, plan=plan, say=str)
+    race.run_races(workloads, material, found, plan=plan, report=str)
     return found
 
 
@@ -46,12 +46,12 @@ def test_a_round_holds_every_entrant_that_can_race(results):
 
 def test_rounds_that_are_there_are_not_run_again_when_resumed(results, material):
     before = results.race("all-frames")["rounds"]
-    told = []
+    reported = []
 
     plan = race.Plan(rounds=1, resume=True)
-    race.run_races([TINY["all-frames"]], material, results, plan=plan, say=told.append)
+    race.run_races([TINY["all-frames"]], material, results, plan=plan, report=reported.append)
 
-    assert told == []
+    assert reported == []
     assert results.race("all-frames")["rounds"] == before
 
 
@@ -107,7 +107,7 @@ def test_the_functions_that_the_profile_times_are_there():
 def test_the_parts_of_a_profile_add_up_to_the_whole(material):
     job = Job(TINY["all-frames"], material)
 
-    found = clock.in_a_fork(lambda: profile._profiled(job, job.tree))
+    found = clock.in_a_fork(lambda: profile.profiled(job, job.tree))
 
     assert found["ms"]["decoding depth"] > 0
     assert found["ms"]["decoding colour"] > 0
@@ -115,8 +115,8 @@ def test_the_parts_of_a_profile_add_up_to_the_whole(material):
 
 
 def test_starting_and_memory_are_measured(material):
-    index = start._open_and_select(material)
-    watched = clock.in_a_fork(lambda: start._watch(material, batches=2, say=str))
+    index = start.open_and_select(material)
+    watched = clock.in_a_fork(lambda: start.watch_memory(material, batches=2, report=str))
 
     assert index["pairs"] == 15 * round(774 * material.scale)
     assert watched["batches"] == 2
@@ -199,10 +199,14 @@ def test_a_step_that_fails_is_told_and_the_others_are_measured(material, tmp_pat
 
     monkeypatch.setattr(__main__, "measure_memory", fail)
     monkeypatch.setattr(__main__, "measure_profile", lambda *_, **__: {"all": 1})
-    results, told = Results(tmp_path / "results.json"), []
+    results, reported = Results(tmp_path / "results.json"), []
 
-    failed = __main__._measure_others(
-        ["memory", "profile"], material, results, options=parse(["--rounds", "1"]), say=told.append
+    failed = __main__.measure_others(
+        ["memory", "profile"],
+        material,
+        results,
+        options=parse(["--rounds", "1"]),
+        report=reported.append,
     )
 
     assert failed == ["memory: ValueError: no such thing"]
@@ -224,10 +228,10 @@ def test_options_choose_workloads_and_workers():
     assert others == ["memory"]
 
 
-def test_the_command_is_said_to_need_a_checkout(tmp_path):
+def test_the_command_names_the_checkout_that_it_needs(tmp_path):
     code = (
         "import sys, pathlib, stereogenbench_data.cli.bench as bench; "
-        "bench.__file__ = '/nowhere/at/all/bench.py'; bench._checkout()"
+        "bench.__file__ = '/nowhere/at/all/bench.py'; bench.bench()"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False

@@ -1,7 +1,7 @@
-"""Load every record set of a descriptor as mlcroissant does, and print what came, as JSON.
+"""Load every record set of a descriptor with mlcroissant, and print the records as JSON.
 
-A process of its own, because mlcroissant takes the place of its cache when it is imported, and
-keeps what it unpacked by URL alone.
+It runs in its own process, because mlcroissant reads the place of its cache when it is imported,
+and names what it unpacked by URL alone.
 """
 
 import json
@@ -23,7 +23,7 @@ def main(path: str, mapping: dict[str, str]) -> None:
     backwards = mlc.Dataset(jsonld=path, mapping=local)
     found = {name: list(forwards.records(name)) for name in names}
     again = {name: len(list(backwards.records(name))) for name in reversed(names)}
-    told = {
+    report = {
         "counts": {name: len(records) for name, records in found.items()},
         "backwards": again,
         "contents": {
@@ -38,8 +38,8 @@ def main(path: str, mapping: dict[str, str]) -> None:
     }
     if all("://" in each.get("contentUrl", "://") for each in document["distribution"]):
         strict = mlc.Dataset(jsonld=document, mapping=local)
-        told["first_of_each"] = [bool(next(iter(strict.records(name)))) for name in names]
-    print(json.dumps(told))  # noqa: T201 - the process tells its parent
+        report["first_of_each"] = [bool(next(iter(strict.records(name)))) for name in names]
+    print(json.dumps(report))  # noqa: T201 - the parent process reads it
 
 
 def _crc(row: dict, name: str) -> int:

@@ -1,4 +1,4 @@
-"""The dataset card: read by people, obeyed by `datasets`."""
+"""The dataset card: for people, and for `datasets`."""
 
 import json
 import os
@@ -72,13 +72,13 @@ def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_pa
     require_module("datasets")
     folder = shutil.copytree(SAMPLE, tmp_path / "hub")
     write_card_over(folder)
-    asked = [["Uniform", "train"], ["IPD_Gaussian", "eval_unseen_map"]]
+    wanted = [["Uniform", "train"], ["IPD_Gaussian", "eval_unseen_map"]]
     code = LOAD if torchcodec == "present" else WITHOUT_TORCHCODEC + LOAD
 
     with serving(folder, handler=HubHandler) as server:
         settings = {"HF_ENDPOINT": server.url, "HF_HOME": str(tmp_path / "home")}
         done = subprocess.run(
-            [sys.executable, "-c", code, REPOSITORY, json.dumps(asked)],
+            [sys.executable, "-c", code, REPOSITORY, json.dumps(wanted)],
             capture_output=True, text=True, check=False, timeout=120, env=os.environ | settings,
         )  # fmt: skip
 

@@ -25,17 +25,17 @@ DAY = Publication(published=date(2026, 11, 21))
 
 
 def validated(*paths):
-    """The exit codes of `mlcroissant validate`, and what it says beyond news."""
+    """Return the exit status of `mlcroissant validate` and its lines that are not information."""
     program = Path(sys.executable).with_name("mlcroissant")
-    said = []
+    found = []
     for path in paths:
         done = subprocess.run(
             [str(program), "validate", "--jsonld", str(path)],
             capture_output=True, text=True, check=False, timeout=120,
         )  # fmt: skip
         lines = [line for line in done.stderr.splitlines() if line and not line.startswith("I")]
-        said.append((done.returncode, lines))
-    return said
+        found.append((done.returncode, lines))
+    return found
 
 
 def loaded(path, cache, mapping=None):
@@ -49,7 +49,7 @@ def loaded(path, cache, mapping=None):
 
 
 def stored(index, *names):
-    """(scene, camera or None, crc32) of members, as the index has them."""
+    """Return [scene, camera or None, crc32] of members, as the index has them."""
     found = []
     for row in range(len(index)):
         scene = index.scene(row)
@@ -73,22 +73,22 @@ def test_the_shipped_descriptors_are_valid_without_a_warning():
 def test_the_shipped_descriptor_of_the_sample_loads_every_record_in_both_orders(tmp_path):
     sample = SceneIndex.open(HOME / "shards")
 
-    told = loaded(SHIPPED / "sample.json", tmp_path)
+    records = loaded(SHIPPED / "sample.json", tmp_path)
 
-    assert told["counts"] == {
+    assert records["counts"] == {
         "splits": 2, "eval_subsets": 2, "families": 3, "maps": 2, "scenes": 8,
         "scene_categories": 8, "pairs": 120, "shards": 7, "descriptions": 8, "media_files": 96,
         "rgb_videos": 48, "depth_videos": 48, "baseline_json": 8, "trajectory_json": 8,
         "scene_complete_json": 8,
     }  # fmt: skip
-    assert told["backwards"] == told["counts"]
+    assert records["backwards"] == records["counts"]
     cameras = range(6)
     rgb = stored(sample, *((camera, f"cam_{camera:02d}_rgb.mp4") for camera in cameras))
-    assert told["contents"]["rgb_videos"] == rgb
+    assert records["contents"]["rgb_videos"] == rgb
     depth = stored(sample, *((camera, f"cam_{camera:02d}_depth.mkv") for camera in cameras))
-    assert told["contents"]["depth_videos"] == depth
-    assert told["contents"]["baseline_json"] == stored(sample, (None, "baseline.json"))
-    assert told["baselines"] == sample.column("baselines_cm").reshape(-1).tolist()
+    assert records["contents"]["depth_videos"] == depth
+    assert records["contents"]["baseline_json"] == stored(sample, (None, "baseline.json"))
+    assert records["baselines"] == sample.column("baselines_cm").reshape(-1).tolist()
 
 
 def test_the_shipped_descriptors_are_those_that_the_sample_gives(tmp_path):
@@ -120,12 +120,12 @@ def test_absolute_addresses_pass_the_steps_of_the_conference_checker(web, index,
     )  # fmt: skip
     write_descriptor(index, place, publication=publication)
 
-    told = loaded(place, tmp_path / "cache")
+    records = loaded(place, tmp_path / "cache")
 
-    assert told["counts"]["scenes"] == len(index)
-    assert told["counts"]["pairs"] == 15 * len(index)
-    assert told["backwards"] == told["counts"]
-    assert told["first_of_each"] == [True] * len(told["counts"])
+    assert records["counts"]["scenes"] == len(index)
+    assert records["counts"]["pairs"] == 15 * len(index)
+    assert records["backwards"] == records["counts"]
+    assert records["first_of_each"] == [True] * len(records["counts"])
 
 
 def test_a_released_tree_is_read_from_its_own_files(small_release, tmp_path):
@@ -133,17 +133,17 @@ def test_a_released_tree_is_read_from_its_own_files(small_release, tmp_path):
     path = tmp_path / "hub.json"
     write_descriptor(tree, path, publication=DAY)
 
-    told = loaded(path, tmp_path / "cache", {"repository": str(small_release)})
+    records = loaded(path, tmp_path / "cache", {"repository": str(small_release)})
 
     assert validated(path) == [(0, [])]
-    assert told["counts"]["scenes"] == len(tree)
-    assert told["counts"]["pairs"] == 15 * len(tree)
-    assert told["counts"]["rgb_videos"] == told["counts"]["depth_videos"] == 6 * len(tree)
-    assert told["backwards"] == told["counts"]
-    assert {row["scenes/scene_id"]: row["scenes/focal_mm"] for row in told["scenes"]} == dict(
+    assert records["counts"]["scenes"] == len(tree)
+    assert records["counts"]["pairs"] == 15 * len(tree)
+    assert records["counts"]["rgb_videos"] == records["counts"]["depth_videos"] == 6 * len(tree)
+    assert records["backwards"] == records["counts"]
+    assert {row["scenes/scene_id"]: row["scenes/focal_mm"] for row in records["scenes"]} == dict(
         zip(tree.column("key"), tree.column("focal_mm"), strict=True)
     )
-    assert sorted(told["baselines"]) == sorted(tree.column("baselines_cm").reshape(-1).tolist())
+    assert sorted(records["baselines"]) == sorted(tree.column("baselines_cm").reshape(-1).tolist())
 
 
 def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_path):
@@ -153,13 +153,13 @@ def test_shards_of_packed_depth_are_described_by_its_suffix(small_release, tmp_p
     path = tmp_path / "data.json"
     write_descriptor(packed, path, publication=DAY)
 
-    told = loaded(path, tmp_path / "cache")
+    records = loaded(path, tmp_path / "cache")
 
     assert validated(path) == [(0, [])]
     cameras = range(6)
     depth = stored(packed, *((camera, f"cam_{camera:02d}_depth.b2frame") for camera in cameras))
-    assert told["contents"]["depth_videos"] == depth
-    assert told["counts"]["media_files"] == 12 * len(packed)
+    assert records["contents"]["depth_videos"] == depth
+    assert records["counts"]["media_files"] == 12 * len(packed)
     assert check_descriptor(path) == []
 
 

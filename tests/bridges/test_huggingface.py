@@ -187,9 +187,9 @@ def test_without_datasets_the_extra_is_named():
         "except ExtraError as error:\n    print(error)\n"
     )
 
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
-    assert "pip install 'stereogenbench-data[huggingface]'" in said.stdout
+    assert "pip install 'stereogenbench-data[huggingface]'" in done.stdout
 
 
 DERIVED = {

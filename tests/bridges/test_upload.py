@@ -3,14 +3,13 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 
 import pytest
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import MARK
 from stereogenbench_data.bridges.croissant.check import check_descriptor
+from tests.cli.command import run
 from tests.servers.fault import serving
 from tests.servers.hub import REPOSITORY
 from tests.servers.hub_upload import TOKEN, UploadHubHandler
@@ -32,16 +31,12 @@ def upload_hub(tmp_path):
 
 
 def uploaded(folder, hub, home, *, token=TOKEN, **more):
-    """Run the command in a process of its own: the client reads its settings when imported."""
+    """Run the command in its own process: the client reads its settings when it is imported."""
     settings = {
         "HF_ENDPOINT": hub.url, "HF_HOME": str(home), "HF_HUB_DISABLE_XET": "1",
         "HF_HUB_DISABLE_TELEMETRY": "1", **({"HF_TOKEN": token} if token else {}), **more,
     }  # fmt: skip
-    command = [sys.executable, "-m", "stereogenbench_data.cli.main", "upload", str(folder)]
-    return subprocess.run(
-        [*command, REPOSITORY, "--json"], capture_output=True, text=True, check=False,
-        timeout=120, env=os.environ | settings,
-    )  # fmt: skip
+    return run("upload", folder, REPOSITORY, "--json", env=os.environ | settings)
 
 
 def test_shards_index_card_and_descriptor_arrive_whole(folder, upload_hub, tmp_path):
@@ -69,17 +64,16 @@ def test_shards_index_card_and_descriptor_arrive_whole(folder, upload_hub, tmp_p
 
 def test_a_second_upload_sends_no_shard_again(folder, upload_hub, tmp_path):
     uploaded(folder, upload_hub, tmp_path / "home")
-    objects = {
-        path.name: path.stat().st_mtime_ns for path in (upload_hub.folder / ".objects").iterdir()
-    }
 
+    def objects():
+        folder = upload_hub.folder / ".objects"
+        return {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+
+    before = objects()
     done = uploaded(folder, upload_hub, tmp_path / "home")
 
     assert done.returncode == 0, done.stderr
-    again = {
-        path.name: path.stat().st_mtime_ns for path in (upload_hub.folder / ".objects").iterdir()
-    }
-    assert again == objects
+    assert objects() == before
 
 
 def test_a_token_is_neither_printed_nor_written(folder, upload_hub, tmp_path):

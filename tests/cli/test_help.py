@@ -8,18 +8,17 @@ from typing import get_args
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.cli.synth import RotationForm
 from stereogenbench_data.schema.release import FAMILIES
+from tests.cli.command import invoke, one_line, run
 
 COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]  # a group has commands
 
 
 def shown(*arguments):
-    result = CliRunner().invoke(app, [*arguments], env={"COLUMNS": "200", "TERMINAL_WIDTH": "200"})
-    return " ".join(result.output.split())
+    return one_line(invoke(*arguments, env={"COLUMNS": "200", "TERMINAL_WIDTH": "200"}).output)
 
 
 def test_help_groups_the_commands_in_the_order_of_use():
@@ -60,20 +59,15 @@ def test_the_forms_of_rotations_are_those_that_can_be_written():
     assert get_args(RotationForm) == get_args(request.RotationForm)
 
 
-def completed(line, **options):
+def completed(line):
     words = shlex.split(line)
     last = "" if line.endswith(" ") else words.pop()
-    ended = subprocess.run(
-        [sys.executable, "-m", "stereogenbench_data"], capture_output=True, text=True,
-        check=False, timeout=120,
-        env=os.environ | {
-            "_STEREOGENBENCH_COMPLETE": "complete_bash",
-            "COMP_WORDS": " ".join([*words, last]),
-            "COMP_CWORD": str(len(words)),
-        },
-        **options,
-    )  # fmt: skip
-    return ended.stdout.split()
+    variables = {
+        "_STEREOGENBENCH_COMPLETE": "complete_bash",
+        "COMP_WORDS": " ".join([*words, last]),
+        "COMP_CWORD": str(len(words)),
+    }
+    return run(env=os.environ | variables).stdout.split()
 
 
 def test_completion_knows_commands():
@@ -103,22 +97,13 @@ def test_completion_knows_the_scenes_that_an_option_may_name(small_shards):
 def test_completion_knows_limits_and_what_depth_may_have_lost():
     assert completed("stereogenbench audit x --limit base") == ["baseline_cm="]
     assert set(completed("stereogenbench audit x --accept ")) == {
-        "8-bit",
-        "9-bit",
-        "10-bit",
-        "12-bit",
-        "14-bit",
-        "chroma",
-        "lossy",
-    }
+        "8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "chroma", "lossy",
+    }  # fmt: skip
 
 
 def test_a_completion_script_can_be_had():
-    ended = subprocess.run(
-        [sys.executable, "-m", "stereogenbench_data", "--show-completion", "bash"],
-        capture_output=True, text=True, check=False, timeout=120,
-        env=os.environ | {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"},
-    )  # fmt: skip
+    environment = os.environ | {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    ended = run("--show-completion", "bash", env=environment)
 
     assert "_STEREOGENBENCH_COMPLETE=complete_bash" in ended.stdout
 
@@ -128,7 +113,7 @@ def test_help_imports_neither_torch_nor_numpy():
         "import sys; from stereogenbench_data.cli.commands import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: pass\n"
-        "heavy = {'torch', 'numpy', 'pyarrow', 'av', 'PIL'} & sys.modules.keys()\n"
+        "heavy = {'torch', 'numpy', 'pyarrow', 'av', 'PIL', 'ray'} & sys.modules.keys()\n"
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)

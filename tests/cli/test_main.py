@@ -1,16 +1,8 @@
 """The command as a whole, run as a user runs it."""
 
-import subprocess
-import sys
-
 import pytest
 
-
-def run(*arguments, **options):
-    return subprocess.run(
-        [sys.executable, "-m", "stereogenbench_data", *map(str, arguments)],
-        capture_output=True, text=True, check=False, timeout=120, **options,
-    )  # fmt: skip
+from tests.cli.command import run
 
 
 def test_help_tells_a_newcomer_what_to_do_first():
@@ -24,7 +16,9 @@ def test_help_tells_a_newcomer_what_to_do_first():
 
 
 def test_no_arguments_show_the_help():
-    assert "Usage" in run().stdout + run().stderr
+    shown = run()
+
+    assert "Usage" in shown.stdout + shown.stderr
 
 
 def test_the_version_is_the_packages():
@@ -33,7 +27,7 @@ def test_the_version_is_the_packages():
     assert run("--version").stdout.strip() == f"stereogenbench-data {__version__}"
 
 
-def test_an_error_is_said_without_a_traceback_and_ends_with_exit_code_2(tmp_path):
+def test_an_error_is_reported_without_a_traceback_and_ends_with_exit_status_2(tmp_path):
     shown = run("index", tmp_path / "nowhere")
 
     assert shown.returncode == 2
@@ -42,15 +36,16 @@ def test_an_error_is_said_without_a_traceback_and_ends_with_exit_code_2(tmp_path
     assert len(shown.stderr.strip().splitlines()) <= 2
 
 
-def test_debug_shows_the_traceback(tmp_path):
-    shown = run("--debug", "index", tmp_path / "nowhere")
+@pytest.mark.parametrize("words", ["--debug index nowhere", "index nowhere --debug"])
+def test_debug_shows_the_traceback_wherever_it_stands(tmp_path, words):
+    shown = run(*words.split(), cwd=tmp_path)
 
     assert shown.returncode != 0
     assert "Traceback" in shown.stderr
 
 
 @pytest.mark.parametrize("arguments", [["idnex"], ["index"], ["synth", "out", "--scenes", "some"]])
-def test_a_call_that_is_off_is_a_usage_error(arguments, tmp_path):
+def test_a_wrong_call_is_a_usage_error(arguments, tmp_path):
     shown = run(*arguments, cwd=tmp_path)
 
     assert shown.returncode == 2

@@ -7,9 +7,9 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from stereogenbench_data.cli.commands import app
 from stereogenbench_data.cli.options import grouped
 from stereogenbench_data.samples.size import SwappedSizeWarning
+from tests.cli.command import invoke, one_line
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,17 +34,17 @@ def command_of(place):
 
 
 @pytest.mark.parametrize(
-    ("place", "words", "said"),
+    ("place", "words", "printed"),
     [
         (Place, ["house", "cat"], "cat in house on 0 Place False"),
         (Place, ["house", "cat", "--floor", "3", "--loud"], "cat in house on 3 Place True"),
         (Attic, ["house", "cat"], "cat in house on 9 Attic False"),
     ],
 )
-def test_a_group_of_options_is_one_parameter_of_the_command(place, words, said):
+def test_a_group_of_options_is_one_parameter_of_the_command(place, words, printed):
     shown = CliRunner().invoke(command_of(place), words)
 
-    assert (shown.exit_code, shown.stdout.strip()) == (0, said)
+    assert (shown.exit_code, shown.stdout.strip()) == (0, printed)
 
 
 def test_what_a_group_requires_is_required_of_the_command():
@@ -55,10 +55,10 @@ def test_what_a_group_requires_is_required_of_the_command():
 
 
 def refused(*words):
-    """Return what is said of a call that ends with exit status 2, as one line."""
-    shown = CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "300"})
+    """Return the message of a call that ends with exit status 2, as one line."""
+    shown = invoke(*words, env={"COLUMNS": "300"})
     assert shown.exit_code == 2, shown.output
-    return " ".join(shown.stderr.replace("│", " ").split())
+    return one_line(shown.stderr)
 
 
 @pytest.mark.parametrize(
@@ -77,21 +77,19 @@ def refused(*words):
         (["pack", "d", "o"], "--part", "first", "I/N"),
     ],
 )
-def test_an_option_that_cannot_be_is_named_with_its_value_and_what_it_may_be(
-    words, option, value, cure
-):
-    said = refused(*words, option, value)
+def test_a_refused_option_is_named_with_its_value_and_what_it_may_be(words, option, value, cure):
+    message = refused(*words, option, value)
 
-    assert all(word in said for word in (option, value, cure)), said
+    assert all(word in message for word in (option, value, cure)), message
 
 
 def test_synth_takes_one_number_for_width_and_height_and_names_the_option_of_another():
     assert "'--size'" in refused("synth", "out", "--size", "64x48")
 
 
-def test_a_size_that_looks_exchanged_is_warned_of_by_name(small_shards, tmp_path):
+def test_a_size_that_looks_swapped_gives_a_warning_that_names_the_option(small_shards, tmp_path):
     words = ["export-inputs", small_shards, tmp_path / "in", "--tier", "G2", "--frames", "first"]
     with pytest.warns(SwappedSizeWarning, match="--size 52x30"):
-        shown = CliRunner().invoke(app, [*map(str, words), "--size", "30x52", "--workers", "1"])
+        shown = invoke(*words, "--size", "30x52", "--workers", "1")
 
     assert shown.exit_code == 0, shown.output

@@ -1,10 +1,12 @@
-"""Signals that come while the command is still being imported."""
+"""Signals while the command imports what it needs, and signals of a process that calls it."""
 
 import signal
 import subprocess
 import sys
 
 import pytest
+
+from tests.cli.command import invoke
 
 pytestmark = pytest.mark.usefixtures("usual_signals")
 
@@ -45,18 +47,7 @@ def test_ctrl_c_that_is_ignored_stays_ignored():
 
 
 def test_calling_commands_in_a_process_leaves_its_signals_alone(small_shards):
-    from typer.testing import CliRunner
-
-    from stereogenbench_data.cli.commands import app
-
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    assert CliRunner().invoke(app, ["stats", str(small_shards)]).exit_code == 0
+    assert invoke("stats", small_shards).exit_code == 0
 
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-
-
-def test_the_module_of_the_command_has_no_other_names():
-    from stereogenbench_data.cli import main
-
-    with pytest.raises(AttributeError, match="no attribute 'apps'"):
-        main.apps  # noqa: B018

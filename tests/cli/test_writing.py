@@ -7,24 +7,15 @@ import resource
 import signal
 import stat
 import subprocess
-import sys
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-from rich.console import Console
-from typer.testing import CliRunner
 
-from stereogenbench_data.cli import progress
-from stereogenbench_data.cli.commands import app
+from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import write_report, writing
+from tests.cli.command import COMMAND, invoke, one_line, run
 from tests.servers.tools import small_disk
-
-COMMAND = (sys.executable, "-m", "stereogenbench_data")
-
-
-def invoke(*arguments):
-    return CliRunner().invoke(app, [str(each) for each in arguments])
 
 
 @contextmanager
@@ -75,7 +66,7 @@ def test_a_file_that_cannot_be_written_is_named_and_not_left_half(
     last = shown.stderr.splitlines()[-1]
     assert shown.exit_code == 2
     assert last.startswith(f"OSError: {words[-1]}"), last
-    assert "File too large. Choose a place that takes files of this size." in last
+    assert "(File too large). Choose a place that takes files of this size." in last
     left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
     assert [name for name in left if not name.endswith(".journal")] == []
 
@@ -92,7 +83,7 @@ def test_a_full_disk_leaves_no_empty_picture_and_keeps_the_one_before(small_shar
         assert {path.name for path in tmp_path.iterdir()} == {"before.png", "full"}
         assert before.read_bytes() == b"a picture"
     assert [new.exit_code, again.exit_code] == [2, 2]
-    assert "No space left on device. Make room, or choose another place." in new.stderr
+    assert "(No space left on device). Make room, or choose another place." in new.stderr
 
 
 def test_a_report_that_cannot_be_written_leaves_the_one_before(tmp_path):
@@ -127,24 +118,22 @@ def test_an_index_does_not_replace_a_device_or_a_pipe(small_release, tmp_path):
     shown = invoke("index", small_release, "-o", pipe)
 
     assert shown.exit_code == 2
-    assert "is not a regular file" in " ".join(shown.stderr.replace("│", " ").split())
+    assert "is not a regular file" in one_line(shown.stderr)
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
 def test_what_the_terminal_lacks_is_printed_as_a_question_mark(small_shards, tmp_path):
-    ended = subprocess.run(
-        [*COMMAND, "show", str(small_shards), "-o", "\u0105.png"], cwd=tmp_path, check=False,
-        capture_output=True, env=os.environ | {"PYTHONIOENCODING": "latin-1"},
-    )  # fmt: skip
+    environment = os.environ | {"PYTHONIOENCODING": "latin-1"}
+    ended = run("show", small_shards, "-o", "\u0105.png", cwd=tmp_path, env=environment)
 
-    assert (ended.returncode, ended.stderr) == (0, b"")
-    assert ended.stdout.startswith(b"?.png: ")
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith("?.png: ")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no /dev/full")
-def test_the_exit_status_is_right_where_nothing_can_be_said():
+def test_the_exit_status_is_right_where_no_message_can_be_printed():
     with Path("/dev/full").open("w") as full:
-        ended = subprocess.run([*COMMAND, "stats", "nowhere"], stderr=full, check=False)
+        ended = run("stats", "nowhere", stderr=full)
 
     assert ended.returncode == 2
 
@@ -156,7 +145,7 @@ def test_a_command_whose_stdout_was_closed_does_its_work(small_shards):
     assert (ended.returncode, ended.stderr) == (0, "")
 
 
-def test_a_descriptor_is_told_as_json(small_shards, tmp_path):
+def test_a_descriptor_is_reported_as_json(small_shards, tmp_path):
     shown = invoke("croissant", small_shards, "-o", tmp_path / "c.json", "--json")
 
     assert shown.exit_code == 0
@@ -167,26 +156,36 @@ def test_a_descriptor_is_told_as_json(small_shards, tmp_path):
     }
 
 
-def shown_progress(monkeypatch, *, width, every_s):
-    """Return what is printed of three megabytes where stderr is no terminal."""
-    console = Console(width=width, force_terminal=False, color_system=None)
-    monkeypatch.setattr(progress, "Console", lambda **_: console)
-    monkeypatch.setattr(progress, "_LOGGED_EVERY_S", every_s)
-    with console.capture() as captured, progress.progress_bar("packing", unit="MB") as report:
-        for done in (1, 2, 3):
-            report(done * 1_000_000, 3_000_000)
-    return captured.get().splitlines()
+@pytest.fixture
+def printed_progress(monkeypatch, capsys):
+    """Return the lines about three megabytes where stderr is not a terminal."""
+
+    def lines(*, width, every_s, done_mb=(1, 2, 3)):
+        monkeypatch.setenv("COLUMNS", str(width))
+        with progress_bar("packing", unit="MB", log_every_s=every_s) as report:
+            for done in done_mb:
+                report(done * 1_000_000, 3_000_000)
+        return capsys.readouterr().err.splitlines()
+
+    return lines
 
 
-def test_a_log_gets_progress_line_by_line_as_time_passes(monkeypatch):
-    often = shown_progress(monkeypatch, width=80, every_s=0)
-    seldom = shown_progress(monkeypatch, width=80, every_s=60)
+def test_a_log_gets_progress_line_by_line_as_time_passes(printed_progress):
+    often = printed_progress(width=80, every_s=0)
+    seldom = printed_progress(width=80, every_s=60)
 
     assert [line.split("MB")[0].split()[-1] for line in often] == ["1/3", "2/3", "3/3", "3/3"]
     assert len(seldom) == 1
 
 
-def test_a_narrow_terminal_has_no_room_for_a_bar(monkeypatch):
-    (narrow,) = shown_progress(monkeypatch, width=40, every_s=60)
+def test_a_narrow_terminal_has_no_room_for_a_bar(printed_progress):
+    (narrow,) = printed_progress(width=40, every_s=60)
 
     assert narrow.startswith("packing 3/3 MB")
+
+
+def test_before_the_first_report_there_is_neither_a_count_nor_a_rate(printed_progress):
+    (line,) = printed_progress(width=80, every_s=60, done_mb=())
+
+    assert line.startswith("packing")
+    assert "MB" not in line

@@ -25,7 +25,7 @@ from stereogenbench_data.datasets.open_videos import (
     videos_per_scene,
 )
 from stereogenbench_data.samples import streams
-from stereogenbench_data.samples.fields import PAIR_FIELDS, streams_of
+from stereogenbench_data.samples.request import parse_request
 from stereogenbench_data.selection.order import OrderRule
 from tests.datasets.conftest import flat, in_turn, keys_of
 
@@ -484,7 +484,9 @@ def test_videos_are_closed_after_their_scenes_last_sample(small_index):
 def test_a_scene_needs_the_videos_that_its_fields_are_made_from(small_index):
     def videos(fields, **selection):
         pairs = StereoPairs(small_index, fields=fields, **selection)
-        return videos_per_scene(pairs.plan, streams_of(fields, known=PAIR_FIELDS))
+        options = {"size": None, "depth": None, "transform": None}
+        request = parse_request("pairs", "single", fields=fields, **options)
+        return videos_per_scene(pairs.plan, request.streams)
 
     assert videos(("left", "right", "disparity")) == 3
     assert videos(("left", "right", "disparity"), pairs="all") == 11

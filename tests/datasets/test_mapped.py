@@ -265,7 +265,11 @@ def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():
         ({"size": (5.5, 5)}, FieldError, "size must be"),
         ({"size": 5}, FieldError, "size must be"),
         ({"seed": -1}, SelectionError, "seed must be"),
-        ({"split": "test"}, SelectionError, "split there is 'eval', 'train'"),
+        (
+            {"split": "test"},
+            SelectionError,
+            "split='test' matches none of 4 scenes; found 'eval', 'train'",
+        ),
         ({"pairs": [(0, 7)]}, SelectionError, "no pair"),
         ({"frames": 7}, SelectionError, "scene with 7 frames"),
         ({"transform": 42}, FieldError, "a transform is called with"),

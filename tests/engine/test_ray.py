@@ -13,14 +13,17 @@ from typing import Any
 
 import pytest
 
+from stereogenbench_data.audit.contract.doctor import diagnose
 from stereogenbench_data.audit.geometry_audit import AuditRequest, audit
 from stereogenbench_data.engine import Engine, RayCluster
 from stereogenbench_data.errors import ExtraError, ShardError, StorageError
 from stereogenbench_data.evaluation.evaluate import evaluate
+from stereogenbench_data.evaluation.inputs import export_inputs
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards.pack import pack
+from stereogenbench_data.shards.unpack import unpack
 from stereogenbench_data.shards.verify import verify
 from stereogenbench_data.synthesis import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -98,7 +101,7 @@ class LosesAWorker:
         return self.engine.map(DiesOnce(task, self.mark), items, **how)
 
 
-# The six commands.
+# The batch commands.
 
 
 @dataclass(frozen=True)
@@ -142,6 +145,22 @@ def synth_(data, **how):
     return bytes_of(data.out)
 
 
+def unpack_(data, **how):
+    unpack(data.shards, data.out, **how)
+    return bytes_of(data.out)
+
+
+def doctor_(data, **how):
+    return repr(diagnose(data.release, scenes=2, frames=2, **how))
+
+
+def export_inputs_(data, **how):
+    export_inputs(
+        data.release, data.out, tier="G0", size=(48, 64), pairs=[(0, 1)], frames=[0], **how
+    )
+    return bytes_of(data.out)
+
+
 @pytest.fixture(scope="module")
 def material(small_release, tmp_path_factory):
     place = tmp_path_factory.mktemp("material")
@@ -153,7 +172,8 @@ def material(small_release, tmp_path_factory):
 
 @pytest.mark.usefixtures("ray")
 @pytest.mark.parametrize(
-    "command", [index_, pack_, verify_, audit_, evaluate_, synth_],
+    "command",
+    [index_, pack_, verify_, audit_, evaluate_, synth_, unpack_, doctor_, export_inputs_],
     ids=lambda command: command.__name__.rstrip("_"),
 )  # fmt: skip
 def test_a_cluster_that_loses_a_worker_gives_what_this_process_gives(command, material, tmp_path):

@@ -1,18 +1,16 @@
 """Small scenes to be scored, and right views of them on disk."""
 
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from stereogenbench_data.evaluation.predictions import frame_name, item_name
+from stereogenbench_data import evaluate
+from stereogenbench_data.evaluation.aggregate import Scores
+from stereogenbench_data.evaluation.predictions import frame_name, item_name, open_frames
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.request import Request
-from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.synthesis import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
@@ -45,10 +43,8 @@ def protocol() -> EvaluationProtocol:
 def rendered(index: SceneIndex, scene: str, camera: int, frame: int, *, size=SIZE) -> np.ndarray:
     """Return a view as it is scored, uint8 (3, h, w)."""
     row = list(index.column("key")).index(scene)
-    request = Request(kind="pairs", fields=("right",), layout="single", size=size)
-    with closing(SampleLoader(index, request)) as loader:
-        address = Address(row, 0 if camera else 1, (camera,), (frame,))
-        return loader.load(address, clip="frame", generator=np.random.default_rng(0))["right"]
+    with open_frames(index, ("right",), size=size) as load:
+        return load(row, (0 if camera else 1, camera), frame)["right"]
 
 
 def write_pngs(folder: Path, index: SceneIndex, *, camera=1, size=SIZE, frames=range(FRAMES)):
@@ -60,6 +56,26 @@ def write_pngs(folder: Path, index: SceneIndex, *, camera=1, size=SIZE, frames=r
             view = rendered(index, scene, camera, frame, size=size)
             Image.fromarray(view.transpose(1, 2, 0)).save(target / frame_name(frame))
     return folder
+
+
+def scored(index, predictions, protocol, **options) -> Scores:
+    """Return the scores of predictions, of tier G1 and in this process unless told otherwise."""
+    options = {"tier": "G1", "workers": 1} | options
+    return evaluate(index, predictions, protocol=protocol, **options)
+
+
+def numbers(scores):
+    """Return all that was scored as text that is equal only for equal last digits."""
+    return [
+        (pair.scene, pair.pair, pair.fault, repr(sorted(pair.tallies.items())))
+        for pair in scores.pairs
+    ]
+
+
+def photograph(path: Path) -> np.ndarray:
+    """Return a picture of a file, uint8 (3, h, w)."""
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB")).transpose(2, 0, 1)
 
 
 @pytest.fixture(scope="session")

@@ -1,6 +1,5 @@
 """Calibration controls: what each shows, and the relations that must hold between them."""
 
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,12 +12,9 @@ from stereogenbench_data import EvaluationError, EvaluationProtocol, score_contr
 from stereogenbench_data.evaluation.aggregate import cell
 from stereogenbench_data.evaluation.controls import CONTROLS, derangement, relations, wrong_camera
 from stereogenbench_data.evaluation.models.opencv import Sgbm
-from stereogenbench_data.samples.load import SampleLoader
-from stereogenbench_data.samples.request import Request
+from stereogenbench_data.evaluation.predictions import open_frames
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from stereogenbench_data.selection.plan import Address
-from tests.evaluation.conftest import SIZE
-from tests.evaluation.test_evaluate import numbers, scored
+from tests.evaluation.conftest import SIZE, numbers, scored
 
 SHARDS = Path(__file__).resolve().parents[2] / "shards"
 
@@ -48,7 +44,7 @@ def test_derangements_of_other_seeds_differ():
 
 
 def test_one_scene_has_no_derangement():
-    with pytest.raises(EvaluationError, match="takes its views from another scene, and 1 is sel"):
+    with pytest.raises(EvaluationError, match=r"'random right'.* 1 is selected: select two"):
         derangement(["alone"], seed=0)
 
 
@@ -78,14 +74,10 @@ def test_the_targets_scores_are_those_of_identity(on_the_sample):
 
 def test_both_fits_of_a_frame_are_of_the_one_disparity_that_the_matcher_found(on_the_sample):
     target = on_the_sample[0]
-    request = Request(
-        kind="pairs", fields=("left", "right", "disparity", "visible"), layout="single",
-        size=(240, 416),
-    )  # fmt: skip
+    fields = ("left", "right", "disparity", "visible")
     for pair in target.pairs:
-        with closing(SampleLoader(target.index, request)) as loader:
-            address = Address(pair.row, pair.pair[0], (pair.pair[1],), (0,))
-            sample = loader.load(address, clip="frame", generator=np.random.default_rng(0))
+        with open_frames(target.index, fields, size=(240, 416)) as load:
+            sample = load(pair.row, pair.pair, 0)
         found, true = Sgbm()(sample["left"], sample["right"]), sample["disparity"][0]
         used = sample["visible"][0] & np.isfinite(found) & np.isfinite(true)
         slope, offset = np.polyfit(found[used].astype(float), true[used].astype(float), 1)

@@ -14,26 +14,13 @@ import torch
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from stereogenbench_data import EvaluationError, EvaluationProtocol, evaluate
+from stereogenbench_data import EvaluationError, EvaluationProtocol
 from stereogenbench_data.evaluation.predictions import PredictionFault, frame_name, item_name
 from stereogenbench_data.schema.release import rgb_name
 from stereogenbench_data.shards.pack import pack
-from tests.evaluation.conftest import FRAMES, SIZE, rendered, write_pngs
+from tests.evaluation.conftest import FRAMES, SIZE, numbers, rendered, scored, write_pngs
 from tests.servers.fault import serving
 from tests.servers.tools import require_module
-
-
-def scored(index, predictions, protocol, **options):
-    options = {"tier": "G1", "workers": 1} | options
-    return evaluate(index, predictions, protocol=protocol, **options)
-
-
-def numbers(scores):
-    """Return all that was scored as text that is equal only for equal last digits."""
-    return [
-        (pair.scene, pair.pair, pair.fault, repr(sorted(pair.tallies.items())))
-        for pair in scores.pairs
-    ]
 
 
 def keys(index):
@@ -391,9 +378,7 @@ def test_frames_that_are_not_single_and_fixed_are_refused(
 
 @pytest.mark.parametrize("options", [{"pairs": "sweep"}, {"direction": "right_to_left"}])
 def test_pairs_that_are_no_left_and_right_are_refused(scored_index, right_views, protocol, options):
-    with pytest.raises(
-        EvaluationError, match="a right view is generated from the view to its left"
-    ):
+    with pytest.raises(EvaluationError, match=r"right view .* choose pairs='primary', 'adjacent'"):
         scored(scored_index, right_views, protocol, **options)
 
 
@@ -430,21 +415,21 @@ def test_each_view_is_decoded_once_for_all_pairs(scored_index, protocol, monkeyp
 def test_what_metrics_are_computed_with_is_loaded_once_for_all_scenes(
     scored_index, right_views, monkeypatch
 ):
-    from stereogenbench_data.evaluation import protocol
+    from stereogenbench_data.evaluation import frame_metrics
 
     loaded = []
-    load = protocol.load_model
+    load = frame_metrics.load_model
 
     def counted(*arguments):
         loaded.append(arguments)
         return load(*arguments)
 
-    monkeypatch.setattr(protocol, "load_model", counted)
+    monkeypatch.setattr(frame_metrics, "load_model", counted)
     matches = EvaluationProtocol(metrics=("e_match",), size=SIZE)
     scored(scored_index, right_views, matches, frames=[0])
 
     assert len(loaded) == 1
-    assert protocol.models_of.cache_info().currsize == 0
+    assert frame_metrics.models_of.cache_info().currsize == 0
 
 
 def test_progress_counts_frames_of_pairs_up_to_all(scored_index, right_views, protocol):

@@ -43,11 +43,9 @@ def test_an_unknown_name_is_answered_with_the_known_ones(kind):
         load_model(kind, "raft")
 
 
-@pytest.mark.parametrize(
-    "entry", [entry for models in MODELS.values() for entry in models.values()], ids=str
-)
-def test_every_model_of_the_registry_can_be_imported(entry):
-    module, _, name = entry.path.partition(":")
+@pytest.mark.parametrize("path", [path for models in MODELS.values() for path in models.values()])
+def test_every_model_of_the_registry_can_be_imported(path):
+    module, _, name = path.partition(":")
 
     assert getattr(import_module(f"stereogenbench_data.evaluation.models.{module}"), name).__doc__
 
@@ -158,36 +156,38 @@ __version__ = "0.test"
 '''
 
 
-def test_dedode_is_given_its_weights_and_the_picture_as_kornia_wants_it(monkeypatch, tmp_path):
+@pytest.fixture
+def kornia(monkeypatch, tmp_path):
+    """A folder with a module that stands for kornia, which can be imported from there."""
     (tmp_path / "kornia.py").write_text(KORNIA)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "kornia", raising=False)
+    yield tmp_path
+    sys.modules.pop("kornia", None)
+
+
+def test_dedode_is_given_its_weights_and_the_picture_as_kornia_wants_it(kornia):
     layer = torch.nn.Linear(1, 1)
     torch.nn.init.constant_(layer.bias, 0.25)
     for weights in (DETECTOR, DESCRIPTOR):
-        torch.save(layer.state_dict(), tmp_path / weights.file)
+        torch.save(layer.state_dict(), kornia / weights.file)
     picture = np.zeros((3, 6, 8), dtype=np.uint8)
     picture[:, 2, 5] = 255
 
-    matcher = load_model("keypoint matcher", "dedode", ModelOptions(weights=tmp_path))
+    matcher = load_model("keypoint matcher", "dedode", ModelOptions(weights=kornia))
     found = matcher.detect(picture)
 
     assert matcher.name == "DeDoDe (kornia 0.test)"
     assert matcher.settings["detector"] == "L-upright"
     np.testing.assert_array_equal(found.xy_px, [(5.5, 2.5)])
     np.testing.assert_array_equal(found.descriptors, np.full((1, 4), 0.25 * 2048))
-    monkeypatch.delitem(sys.modules, "kornia")
 
 
-def test_dedode_without_its_second_file_says_which(monkeypatch, tmp_path):
-    (tmp_path / "kornia.py").write_text(KORNIA)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "kornia", raising=False)
-    torch.save(torch.nn.Linear(1, 1).state_dict(), tmp_path / DETECTOR.file)
+def test_dedode_without_its_second_file_says_which(kornia):
+    torch.save(torch.nn.Linear(1, 1).state_dict(), kornia / DETECTOR.file)
 
     with pytest.raises(ExtraError, match=r"descriptor B-upright are not at .*_descriptor_B.pth"):
-        load_model("keypoint matcher", "dedode", ModelOptions(weights=tmp_path))
-    monkeypatch.delitem(sys.modules, "kornia")
+        load_model("keypoint matcher", "dedode", ModelOptions(weights=kornia))
 
 
 FOUNDATION_STEREO = '''

@@ -106,11 +106,9 @@ def test_features_of_a_picture_do_not_depend_on_its_batch(lpips):
 
 def test_each_says_what_it_is(inception, i3d, lpips):
     assert isinstance(inception, ImageFeatures)
-    assert (inception.distance, inception.dim) == ("FID", 2048)
     assert isinstance(i3d, VideoFeatures)
-    assert (i3d.distance, i3d.dim, i3d.min_frames) == ("FVD", 400, 10)
+    assert i3d.min_frames == 10
     assert isinstance(lpips, PairMetric)
-    assert not lpips.higher_is_better
     assert lpips.settings["network"] == "AlexNet"
 
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
-from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from stereogenbench_data.errors import EvaluationError, ExtraError
@@ -17,6 +16,7 @@ from stereogenbench_data.evaluation.metrics.pixels import (
     psnr_db,
     ssim,
 )
+from tests.evaluation.conftest import photograph
 
 pictures = arrays(np.uint8, (3, 13, 17))
 
@@ -41,19 +41,18 @@ def noisy(picture: np.ndarray, *, sigma: float) -> np.ndarray:
 @pytest.fixture(
     scope="module", params=["cones/left.png", "cloth3/view1.png", "motorcycle/motorcycle_left.png"]
 )
-def photograph(request, ground_truth):
-    with Image.open(ground_truth / request.param) as picture:
-        return np.asarray(picture.convert("RGB")).transpose(2, 0, 1)
+def photographed(request, ground_truth):
+    return photograph(ground_truth / request.param)
 
 
 @pytest.mark.parametrize("sigma", [0.3, 5, 80])
-def test_photographs_score_as_in_scikit_image(photograph, sigma):
-    other = noisy(photograph, sigma=sigma)
+def test_photographs_score_as_in_scikit_image(photographed, sigma):
+    other = noisy(photographed, sigma=sigma)
 
-    assert psnr_db(other, photograph) == pytest.approx(
-        peak_signal_noise_ratio(photograph, other, data_range=255), abs=1e-9
+    assert psnr_db(other, photographed) == pytest.approx(
+        peak_signal_noise_ratio(photographed, other, data_range=255), abs=1e-9
     )
-    assert ssim(other, photograph) == pytest.approx(true_ssim(photograph, other), abs=1e-9)
+    assert ssim(other, photographed) == pytest.approx(true_ssim(photographed, other), abs=1e-9)
 
 
 @pytest.mark.parametrize("size", [(11, 11), (11, 200), (74, 75), (138, 31), (480, 832)])

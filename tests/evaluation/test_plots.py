@@ -11,8 +11,7 @@ from stereogenbench_data import EvaluationError, EvaluationProtocol, score_contr
 from stereogenbench_data.evaluation import plots
 from stereogenbench_data.evaluation.aggregate import tally
 from stereogenbench_data.evaluation.plots import write_plots
-from tests.evaluation.conftest import SIZE
-from tests.evaluation.test_evaluate import scored
+from tests.evaluation.conftest import SIZE, scored
 
 
 @pytest.fixture(scope="module")
@@ -56,16 +55,14 @@ def test_the_papers_sd_is_drawn_beside_the_filtered_fit_alone(results, tmp_path,
         )
         for one in results
     ]
-    drawn = []
-    monkeypatch.setattr(
-        plots, "_draw_reference", lambda axes, results, metric: drawn.append(metric) or []
-    )
+    asked = []
+    monkeypatch.setattr(plots, "reference_rows", lambda table, tier: asked.append(table) or [])
     files = write_plots(tmp_path, with_sd)
 
     assert [path.name for path in files] == [
         "sd_filtered_by_baseline.png", "sd_least_squares_by_baseline.png",
     ]  # fmt: skip
-    assert drawn == ["sd"]
+    assert asked == ["bins"]
 
 
 def test_methods_of_two_tiers_are_not_drawn_together(scored_index, tmp_path, protocol):

@@ -43,12 +43,13 @@ def write_video(path, levels, *, size=(8, 16)):
     return path
 
 
-def levels(path, wanted=WANTED):
-    frames = open_prediction(path, wanted)
-    try:
-        return [int(frames.read(frame).mean()) for frame in wanted.frames]
-    finally:
-        frames.close()
+def read(path, frame=0):
+    with open_prediction(path, WANTED) as read_frame:
+        return read_frame(frame)
+
+
+def levels(path):
+    return [int(read(path, frame).mean()) for frame in WANTED.frames]
 
 
 @pytest.fixture
@@ -94,7 +95,7 @@ def test_pictures_of_the_stored_size_are_read_as_they_are_and_scaled_by_area(ite
     pixels[:, 16:] = 200
     for frame in (0, 2):
         write_png(item, frame, pixels)
-    stored = open_prediction(item, WANTED).read(0)
+    stored = read(item)
     view = scaled_rgb(stored, size=WANTED.size, scaler=VideoReformatter())
 
     assert stored.shape == (3, 32, 32)
@@ -124,7 +125,7 @@ def test_a_missing_frame_is_named(item):
     write_png(item, 0, picture(1))
 
     with pytest.raises(PredictionFault, match=r"lacks 1 of 2 frames, the first is 002\.png"):
-        open_prediction(item, WANTED)
+        read(item)
 
 
 def test_a_frame_beyond_the_scene_is_named(item):
@@ -132,7 +133,7 @@ def test_a_frame_beyond_the_scene_is_named(item):
         write_png(item, frame, picture(1))
 
     with pytest.raises(PredictionFault, match=r"holds 003\.png, and the scene has 3 frames"):
-        open_prediction(item, WANTED)
+        read(item)
 
 
 def test_a_picture_of_another_size_is_named_with_those_that_would_do(item):
@@ -142,7 +143,7 @@ def test_a_picture_of_another_size_is_named_with_those_that_would_do(item):
     with pytest.raises(
         PredictionFault, match=r"000\.png is 16x9; expected 16x8, or the scene's own 32x32"
     ):
-        open_prediction(item, WANTED).read(0)
+        read(item)
 
 
 @pytest.mark.parametrize(("mode", "shape"), [("L", (8, 16)), ("RGBA", (8, 16, 4))])
@@ -151,7 +152,7 @@ def test_pictures_without_three_channels_are_refused(item, mode, shape):
         write_png(item, frame, np.zeros(shape, dtype=np.uint8))
 
     with pytest.raises(PredictionFault, match=rf"pixels of mode {mode} of 8 bits: write 8-bit RGB"):
-        open_prediction(item, WANTED).read(0)
+        read(item)
 
 
 def test_pictures_of_16_bits_are_refused_not_halved(item):
@@ -160,7 +161,7 @@ def test_pictures_of_16_bits_are_refused_not_halved(item):
         cv2.imwrite(str(item / frame_name(frame)), np.full((8, 16, 3), 300, dtype=np.uint16))
 
     with pytest.raises(PredictionFault, match=r"000\.png has pixels of mode RGB of 16 bits"):
-        open_prediction(item, WANTED).read(0)
+        read(item)
 
 
 def test_a_link_to_nowhere_is_a_picture_that_cannot_be_read(item):
@@ -169,7 +170,7 @@ def test_a_link_to_nowhere_is_a_picture_that_cannot_be_read(item):
 
     assert stamp_prediction(item)
     with pytest.raises(PredictionFault, match=r"002\.png cannot be read as a picture"):
-        open_prediction(item, WANTED).read(2)
+        read(item, 2)
 
 
 @pytest.mark.parametrize("damage", ["cut", "text", "payload"])
@@ -187,7 +188,7 @@ def test_a_damaged_picture_is_named(item, damage):
     path.write_bytes(changed[damage])
 
     with pytest.raises(PredictionFault, match=r"00-01: .*002\.png cannot be read as a picture"):
-        open_prediction(item, WANTED).read(2)
+        read(item, 2)
 
 
 def test_a_video_of_another_number_of_frames_is_named_with_those_that_would_do(item):
@@ -196,14 +197,14 @@ def test_a_video_of_another_number_of_frames_is_named_with_those_that_would_do(i
     with pytest.raises(
         PredictionFault, match=r"holds 4 frames; expected 3 \(the scene's\) or 2 \(those evaluated"
     ):
-        open_prediction(path, WANTED)
+        read(path)
 
 
 def test_a_video_of_another_size_is_named(item):
     path = write_video(item.with_name(f"{item.name}.mkv"), [1, 2], size=(16, 16))
 
     with pytest.raises(PredictionFault, match=r"is 16x16; expected 16x8"):
-        open_prediction(path, WANTED)
+        read(path)
 
 
 def test_a_cut_video_is_named(item):

@@ -37,14 +37,14 @@ def test_a_cell_is_as_printed(table, where, column, printed):
 
 
 def test_every_table_has_all_its_rows_and_names_its_source():
-    counts = {name: len(reference_table(name).rows) for name in SOURCES}
+    counts = {name: len(reference_table(name)) for name in SOURCES}
 
     assert counts == {"main": 22, "unseen": 22, "bins": 55, "controls": 4}
     assert all(source.startswith("tab:") for source in SOURCES.values())
 
 
 def test_the_bins_of_every_method_cover_the_281_scenes():
-    for method in {row["method"] for row in reference_table("bins").rows}:
+    for method in {row["method"] for row in reference_table("bins")}:
         rows = reference_rows("bins", method=method)
 
         assert [int(row["n_scenes"]) for row in rows] == [52, 65, 70, 55, 39]
@@ -53,7 +53,7 @@ def test_the_bins_of_every_method_cover_the_281_scenes():
 
 def test_every_number_is_one():
     for name in SOURCES:
-        for row in reference_table(name).rows:
+        for row in reference_table(name):
             numbers = [
                 value for key, value in row.items() if key in ("psnr", "ssim", "sd") and value
             ]
@@ -93,7 +93,7 @@ def test_every_number_stands_in_the_paper():
         there = re.findall(r"\d+\.\d+", body)
         ours = [
             value
-            for row in reference_table(name).rows
+            for row in reference_table(name)
             for value in row.values()
             if re.fullmatch(r"\d+\.\d+", value)
         ]

@@ -1,7 +1,6 @@
 """SD: hand-worked lines, and SGBM on photographs with measured disparity."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +10,13 @@ from PIL import Image
 from scipy.stats import linregress
 
 from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.evaluation.frame_metrics import MetricModels, TargetFrame
 from stereogenbench_data.evaluation.metrics.scale import fit_scale, scale_settings
 from stereogenbench_data.evaluation.models.interfaces import StereoMatcher
 from stereogenbench_data.evaluation.models.opencv import Sgbm
-from stereogenbench_data.evaluation.protocol import EvaluationProtocol, MetricModels
-from stereogenbench_data.evaluation.scene_scores import PairScorer, TargetFrame
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+from stereogenbench_data.evaluation.scene_scores import PairScorer
+from tests.evaluation.conftest import photograph
 
 METHODS = ("filtered", "least_squares", "theil_sen")
 SIZE = (20, 30)
@@ -215,9 +216,8 @@ def test_a_frames_record_has_sd_by_every_fit_of_one_estimate(
     sample = {
         "left": picture, "right": picture, "disparity": truth[None], "visible": EVERYWHERE[None],
     }  # fmt: skip
-    frame = TargetFrame(sample, None, stored_right=lambda: picture)
-    reader = SimpleNamespace(read=lambda wanted, samples: [picture])
-    scorer = PairScorer(models, reader, wanted=None)
+    frame = TargetFrame(sample, None, load_stored=lambda: sample)
+    scorer = PairScorer(models, lambda wanted, samples: [picture], wanted=None)
 
     scorer.add([frame])
     columns = scorer.scores().columns
@@ -233,13 +233,10 @@ def test_a_frames_record_has_sd_by_every_fit_of_one_estimate(
 
 @pytest.fixture(scope="module")
 def cloth(ground_truth):
-    def read(name):
-        with Image.open(ground_truth / "cloth3" / name) as picture:
-            return np.asarray(picture)
-
-    left, right = (read(f"view{number}.png").transpose(2, 0, 1) for number in (1, 5))
-    disparity = read("disp1.png").astype(np.float32) / 2
-    return left, right, disparity
+    folder = ground_truth / "cloth3"
+    left, right = (photograph(folder / f"view{number}.png") for number in (1, 5))
+    with Image.open(folder / "disp1.png") as picture:
+        return left, right, np.asarray(picture).astype(np.float32) / 2
 
 
 @pytest.fixture(scope="module")

@@ -71,7 +71,7 @@ def test_patches_of_a_random_view_match_worst_and_need_not_match_best_in_the_tar
 
 
 def test_match_errors_are_ordered_and_the_copied_left_has_what_the_formula_says(scores):
-    errors = {name: score["match"].error for name, score in scores.items()}
+    errors = {name: score["match"].e_match for name, score in scores.items()}
     target = scores["target"]["match"]
 
     assert errors["target"] == 0 < errors["wrong baseline"] < errors["random"]
@@ -107,7 +107,7 @@ def measured(left, right, *, threads):
             psnr_db(noisy, right),
             ssim(noisy, right),
             patch_psnr(left, noisy).mean_db,
-            match_error(noisy, against=against, matcher=Sift()).error,
+            match_error(noisy, against=against, matcher=Sift()).e_match,
             fit.slope,
             fit.residual_std_px,
             *ColourStatistics()(noisy[None])[0],

@@ -99,9 +99,10 @@ def test_methods_of_one_tier_share_a_table_and_those_of_two_do_not(scores):
     assert [row.method for row in both.rows if not row.is_papers] == ["one", "two"] * 2
     with pytest.raises(EvaluationError, match=r"their tier differs \(G0 and G2\)"):
         tables_of([scores("one"), scores("two", tier="G2")])
-    other = EvaluationProtocol(size=(240, 416))
-    with pytest.raises(EvaluationError, match="their protocol differs"):
-        tables_of([scores("one"), scores("two", protocol=other)])
+    for change in ({"size": (240, 416)}, {"fit": "least_squares"}):
+        other = EvaluationProtocol(**change)
+        with pytest.raises(EvaluationError, match="their protocol differs"):
+            tables_of([scores("one"), scores("two", protocol=other)])
 
 
 def test_what_is_not_comparable_with_the_paper_is_said(scores):
@@ -164,13 +165,6 @@ def test_theil_sens_sd_is_a_third_column_where_it_is_asked_for(scores):
     assert [name for name in plain.columns if name.startswith("sd")] == [
         "sd_filtered", "sd_least_squares",
     ]  # fmt: skip
-
-
-def test_methods_of_two_fits_do_not_share_a_table(scores):
-    other = EvaluationProtocol(fit="least_squares")
-
-    with pytest.raises(EvaluationError, match="their protocol differs"):
-        tables_of([scores("one"), scores("two", protocol=other)])
 
 
 def test_every_form_of_a_report_has_sd_by_both_fits_and_says_why(scores, tmp_path):

@@ -3,7 +3,7 @@
 import pytest
 
 from stereogenbench_data import EvaluationError
-from stereogenbench_data.evaluation.tiers import TIERS, require_tier
+from stereogenbench_data.evaluation.protocol import TIERS, require_tier
 from stereogenbench_data.samples.fields import PAIR_FIELDS
 
 

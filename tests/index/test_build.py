@@ -8,7 +8,7 @@ import pytest
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import build as walk_module
-from stereogenbench_data.index.build import SceneJournal, walk
+from stereogenbench_data.index.build import scene_journal, walk
 
 KEY = "train/Uniform/Car_Dealer/scene_{:06d}"
 
@@ -89,7 +89,7 @@ def stopped_walk(root, journal_path, *, after):
             raise KeyboardInterrupt
 
     with (
-        SceneJournal(journal_path, walk="w") as journal,
+        scene_journal(journal_path, walk="w") as journal,
         pytest.raises(KeyboardInterrupt, match=r"^$"),
     ):
         walk(root, journal=journal, progress=stop)
@@ -98,7 +98,7 @@ def stopped_walk(root, journal_path, *, after):
 def resumed_walk(root, journal_path, *, name="w"):
     """The number of scenes that were known at the start, and the report."""
     told = []
-    with SceneJournal(journal_path, walk=name) as journal:
+    with scene_journal(journal_path, walk=name) as journal:
         report = walk(root, journal=journal, progress=lambda done, total: told.append(done))
     return told[0], report
 
@@ -158,7 +158,7 @@ def test_a_journal_that_cannot_be_written_is_named(linked_scenes, root, tmp_path
     (tmp_path / "file").write_text("")
 
     with (
-        SceneJournal(tmp_path / "file" / "journal", walk="w") as journal,
+        scene_journal(tmp_path / "file" / "journal", walk="w") as journal,
         pytest.raises(StorageError, match="file/journal: the journal cannot be written"),
     ):
         walk(root, journal=journal)
@@ -166,7 +166,7 @@ def test_a_journal_that_cannot_be_written_is_named(linked_scenes, root, tmp_path
 
 def test_a_journal_that_cannot_be_read_is_named(tmp_path):
     with pytest.raises(StorageError, match="the journal of an earlier run cannot be read"):
-        SceneJournal(tmp_path, walk="w")
+        scene_journal(tmp_path, walk="w")
 
 
 @pytest.mark.parametrize(

@@ -119,7 +119,7 @@ def test_a_contradiction_that_is_not_fatal_is_told(make_scene, root, run):
     result = run(root)
 
     assert result.exit_code == 0
-    assert "1 to know:" in result.stderr
+    assert "1 note:" in result.stderr
     assert "its files call the map 'Car_Dealer'" in result.stderr
 
 

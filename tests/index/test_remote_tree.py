@@ -1,6 +1,5 @@
 """A tree in the released layout behind a URL: found, indexed and read like one on this machine."""
 
-import fsspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -10,9 +9,7 @@ from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index import open as index_module
 from stereogenbench_data.index.tree import find_remote_scenes
-from tests.servers.fault import serving
-from tests.servers.hub import REPOSITORY, HubHandler
-from tests.servers.tools import require_module
+from tests.servers.hub import REPOSITORY, hub_serving
 
 HUB = f"hf://datasets/{REPOSITORY}@main"
 
@@ -20,10 +17,7 @@ HUB = f"hf://datasets/{REPOSITORY}@main"
 @pytest.fixture
 def hub_tree(small_release, monkeypatch):
     """A Hub whose data set is `small_release`."""
-    require_module("huggingface_hub")
-    with serving(small_release, handler=HubHandler) as server:
-        conf = {"endpoint": server.url, "token": False}
-        monkeypatch.setitem(fsspec.config.conf, "hf", conf)
+    with hub_serving(small_release, monkeypatch) as server:
         yield server
 
 
@@ -77,9 +71,7 @@ def test_a_part_is_indexed_under_a_name_of_its_own(small_release):
 def test_too_many_scenes_are_not_described_each_time(monkeypatch):
     monkeypatch.setattr(index_module, "MOST_REMOTE_SCENES", 3)
 
-    with pytest.raises(
-        StorageError, match=r"of 4 scenes are too many .*`stereogenbench index hf://"
-    ):
+    with pytest.raises(StorageError, match=r"4 scenes are too many .*`stereogenbench index hf://"):
         SceneIndex.open(HUB)
 
 

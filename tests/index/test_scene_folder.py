@@ -8,8 +8,8 @@ import pytest
 from stereogenbench_data.errors import MediaError, SchemaError, StorageError
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
+    SceneFolder,
     describe_scene,
-    open_scene_folder,
     stamp_of,
 )
 from stereogenbench_data.schema.records import Member
@@ -224,11 +224,11 @@ def test_a_folder_that_is_gone_is_named(root):
 
 def test_the_stamp_changes_with_a_files_size_and_time(make_scene, root):
     path = make_scene() / "trajectory.json"
-    first = stamp_of(open_scene_folder(root, KEY).stamps())
+    first = stamp_of(SceneFolder(root, KEY).stamps())
 
     os.utime(path, (1, 1))
-    second = stamp_of(open_scene_folder(root, KEY).stamps())
+    second = stamp_of(SceneFolder(root, KEY).stamps())
     path.unlink()
-    third = stamp_of(open_scene_folder(root, KEY).stamps())
+    third = stamp_of(SceneFolder(root, KEY).stamps())
 
     assert len({first, second, third}) == 3

@@ -232,7 +232,7 @@ def test_pack_into_a_tree_of_scenes_says_that_its_index_hides_them(tree, small_r
 
 
 def test_pack_into_a_tree_with_an_index_is_refused(tree, small_release):
-    with pytest.raises(ShardError, match=r"index\.parquet: is there, and was not packed here"):
+    with pytest.raises(ShardError, match=r"index\.parquet: already exists and was not packed"):
         pack(small_release / "train" / "..", tree, workers=1)
 
 

@@ -170,7 +170,7 @@ def test_an_index_goes_to_another_process_whole(scenes, tmp_path):
 
 
 def test_two_scenes_of_one_key_are_refused(scenes, tmp_path):
-    with pytest.raises(StorageError, match="scene_000001' is there twice"):
+    with pytest.raises(StorageError, match="scene_000001' is listed twice"):
         SceneIndex.from_scenes([*scenes, scenes[1]], tmp_path)
 
 
@@ -178,7 +178,7 @@ def test_two_scenes_of_one_key_are_refused(scenes, tmp_path):
 def test_a_path_that_could_leave_the_root_is_refused(scenes, tmp_path, path):
     bad = dataclasses.replace(scenes[0], members={"a": Member(path, 0, 1)})
 
-    with pytest.raises(StorageError, match="is no path inside the data's root"):
+    with pytest.raises(StorageError, match="is not a path inside the data's root"):
         SceneIndex.from_scenes([bad], tmp_path)
 
 
@@ -186,7 +186,7 @@ def test_a_path_that_could_leave_the_root_is_refused(scenes, tmp_path, path):
 def test_a_file_name_that_could_leave_its_scene_is_refused(scenes, tmp_path, name):
     bad = dataclasses.replace(scenes[0], members={name: Member("train/a.tar", 0, 1)})
 
-    with pytest.raises(StorageError, match="is no path inside the data's root"):
+    with pytest.raises(StorageError, match="is not a path inside the data's root"):
         SceneIndex.from_scenes([bad], tmp_path)
 
 
@@ -217,6 +217,7 @@ def with_path(path):
     [
         (lambda table, head: head.update(format=2), "of format 2, and this version .* reads fo"),
         (lambda table, head: head.update(broken=3), "description of itself was altered"),
+        (lambda table, head: head.update(incomplete={"a": 3}), "description of itself was altered"),
         (lambda table, head: head.update(root=3), "description of itself was altered"),
         (lambda table, head: head["shards"].update(x=3), "description of itself was altered"),
         (
@@ -234,10 +235,10 @@ def with_path(path):
             lambda table, head: table.set_column(0, "key", pa.array([1, 2, 3, 4, 5])),
             r"not those of an index \(see key",
         ),
-        (lambda table, head: table.take([1, 0, 2, 3, 4]), "is there twice or out of order"),
-        (with_path("train/other"), "its rows are not those that were written"),
-        (with_path("../../etc/passwd"), "'../../etc/passwd' is no path inside the data's root"),
-        (with_path("/etc/passwd"), "'/etc/passwd' is no path inside the data's root"),
+        (lambda table, head: table.take([1, 0, 2, 3, 4]), "is listed twice or out of order"),
+        (with_path("train/other"), "its rows were changed"),
+        (with_path("../../etc/passwd"), "'../../etc/passwd' is not a path inside the data's root"),
+        (with_path("/etc/passwd"), "'/etc/passwd' is not a path inside the data's root"),
     ],
 )
 def test_an_altered_index_is_refused(scenes, tmp_path, edit, match):
@@ -251,7 +252,7 @@ def test_an_altered_index_is_refused(scenes, tmp_path, edit, match):
 def test_a_foreign_parquet_file_is_refused(tmp_path):
     pq.write_table(pa.table({"a": [1]}), tmp_path / "other.parquet")
 
-    with pytest.raises(StorageError, match="is a Parquet file, but no index of this package"):
+    with pytest.raises(StorageError, match="a Parquet file, but not an index"):
         SceneIndex.open(tmp_path / "other.parquet")
 
 
@@ -261,7 +262,7 @@ def test_a_truncated_index_is_refused(scenes, tmp_path, keep):
     content = path.read_bytes()
     path.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
 
-    with pytest.raises(StorageError, match=r"no Parquet file that can be read .* cut short"):
+    with pytest.raises(StorageError, match=r"not a readable Parquet file .* cut short"):
         SceneIndex.open(path)
 
 
@@ -301,7 +302,7 @@ def test_a_url_without_an_index_is_named(web):
 def test_a_damaged_index_behind_a_url_is_named(web):
     (web.folder / "index.parquet").write_bytes(b"PAR1 and no more")
 
-    with pytest.raises(StorageError, match=r"/index.parquet: is no Parquet file that can be read"):
+    with pytest.raises(StorageError, match=r"/index.parquet: not a readable Parquet file"):
         SceneIndex.open(f"{web.url}?key=secret")
 
 
@@ -363,9 +364,8 @@ def test_an_index_elsewhere_opens_once_the_user_says_where_its_data_are(scenes, 
 
     with pytest.raises(
         StorageError,
-        match=rf"{kept}: its data are not beside it, and it records their root as {tmp_path}/data. "
-        r"A file may not choose such a place \(it is outside the index's own folder\). If you "
-        rf"trust it, name the root yourself: SceneIndex.open\('{kept}', root=...\), or --root",
+        match=rf"{kept}: .*root as {tmp_path}/data.*\(it is outside the index's own folder\).* "
+        rf"SceneIndex.open\('{kept}', root=...\), or --root",
     ):
         SceneIndex.open(kept)
     for root in (tmp_path / "data", str(tmp_path / "data"), (tmp_path / "data").as_uri()):
@@ -379,7 +379,7 @@ def test_a_root_that_is_no_folder_is_refused(scenes, tmp_path):
     (tmp_path / "tree").mkdir()
 
     for root in (tmp_path / "gone", path, ""):
-        with pytest.raises(StorageError, match=r"is no folder, and was named as the root"):
+        with pytest.raises(StorageError, match=r"not a folder, and was named as the root"):
             SceneIndex.open(path, root=root)
     with pytest.raises(StorageError, match=r"tree: has no index.parquet, and a root was named"):
         SceneIndex.open(tmp_path / "tree", root=tmp_path)
@@ -415,7 +415,7 @@ def recording(scenes, path, root):
         ("https://example.org/x?key=word", "it holds a login, a query, or"),
         ("https://example.org\\@127.0.0.1/x", "it holds a login, a query, or"),
         ("https://example.org/\x1b[31m", "it holds a login, a query, or"),
-        ("http://[::1", "it is no URL"),
+        ("http://[::1", "it is not a URL"),
         ("http://127.0.0.1/x", "it is on this machine or in its own network"),
         ("HTTPS://127.0.0.1/x", "it is on this machine or in its own network"),
         ("http://localhost:8000/x", "it is on this machine or in its own network"),
@@ -511,11 +511,11 @@ def with_row(**values):
         (with_row(depth_unit_m=[0.0] * 6), "depth_unit_m is 0.0, not"),
         (with_row(depth_unit_source=["guess"] * 6), "depth_unit_source is 'guess', none of tag"),
         (with_row(primary_left=6), "primary_left is 6, not 0 to 5"),
-        (with_row(primary_left=1, primary_right=1), "a primary pair has one camera twice"),
+        (with_row(primary_left=1, primary_right=1), "a primary pair has a camera twice"),
         (with_row(split="test"), "split is 'test', none of train, eval"),
         (with_row(subset="some"), "subset is 'some', none of seen_map, unseen_map, None"),
-        (with_row(family="a/b"), "family is 'a/b', no name of a folder"),
-        (with_row(map_name="\x1b[31m"), r"map_name is .*, no name of a folder"),
+        (with_row(family="a/b"), "family is 'a/b', not a folder's name"),
+        (with_row(map_name="\x1b[31m"), r"map_name is .*, not a folder's name"),
         (
             with_row(principal_x_px=3.0, principal_y_px=None),
             "a principal point has one number",
@@ -542,20 +542,14 @@ def test_a_value_that_no_scene_has_is_refused_though_the_digest_is_right(
         SceneIndex.open(path)
 
 
-def test_reasons_that_are_no_texts_are_refused(scenes, tmp_path):
-    path = written(scenes, tmp_path)
-    altered(path, lambda table, head: head.update(incomplete={"a": 3}))
-
-    with pytest.raises(StorageError, match="its description of itself was altered"):
-        SceneIndex.open(path)
-
-
 def test_an_index_whose_root_is_gone_says_where_it_was(scenes, tmp_path):
     (tmp_path / "data").mkdir()
     SceneIndex.from_scenes(scenes, tmp_path / "data").write(tmp_path / "index.parquet")
     (tmp_path / "data").rmdir()
 
-    with pytest.raises(StorageError, match=f"its data were at {tmp_path}/data, which is no folder"):
+    with pytest.raises(
+        StorageError, match=f"its data were at {tmp_path}/data, which is not a folder"
+    ):
         SceneIndex.open(tmp_path / "index.parquet")
 
 

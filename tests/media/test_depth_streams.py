@@ -114,7 +114,7 @@ def test_a_stream_that_may_have_lost_depth_is_refused_by_name(clips, case):
 
     assert str(refusal.value) == (
         f"a/cam_01_depth.mkv: depth is stored by codec {stored} ({', '.join(risks)}), which does "
-        f"not keep depth whole. Store it as gray16le with FFV1; if it is meant so, pass "
+        f"not keep depth whole. Store it as gray16le with FFV1; if this is intended, pass "
         f"DepthEncoding(accept=frozenset({{{accept}}})), with unit_m=... if the file does not tell "
         f"its unit."
     )

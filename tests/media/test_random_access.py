@@ -9,6 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.decoder import Decoder, UnexpectedPicture
 from stereogenbench_data.media.video import VideoReader, read_rgb
 
 X264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p")
@@ -45,10 +46,15 @@ def test_every_frame_in_random_order_is_ffmpegs_own(clips, structure):
     "structure", ["deep pyramid", "groups of 12", "mpeg4 with b-frames", "hevc"]
 )
 def test_no_frame_of_a_sound_file_is_reached_the_long_way(clips, structure, suffix, monkeypatch):
-    def long_way(reader, index):
-        pytest.fail(f"frame {index} was decoded from the start")
+    reach = Decoder.reach
 
-    monkeypatch.setattr(VideoReader, "_reach_from_start", long_way)
+    def reach_at_once(decoder, index):
+        try:
+            return reach(decoder, index)
+        except (UnexpectedPicture, av.FFmpegError) as error:
+            pytest.fail(f"frame {index} has to be decoded from the start: {error}")
+
+    monkeypatch.setattr(Decoder, "reach", reach_at_once)
     path = clips.rgb(f"{structure}.{suffix}", *STRUCTURES[structure])
 
     with VideoReader(path, name="clip", frames=clips.frames) as reader:

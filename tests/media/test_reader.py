@@ -86,10 +86,10 @@ def test_facts_can_be_asked_for_between_two_frames_of_an_open_file(clips, clip):
     assert (first, pixel_format, second) == (20, "yuv420p", 21)
 
 
-def test_slices_can_be_decoded_at_once(clips):
+def test_a_picture_of_several_slices_is_read(clips):
     path = clips.rgb("slices.mkv", "-c:v", "ffv1", "-pix_fmt", "yuv420p", "-slices", "4")
 
-    with VideoReader(path, name="clip", frames=clips.frames, threads=2) as reader:
+    with VideoReader(path, name="clip", frames=clips.frames) as reader:
         assert [clips.number(read_rgb(reader, index)) for index in (3, 30, 29)] == [3, 30, 29]
 
 
@@ -121,10 +121,9 @@ def test_a_reader_says_why_it_cannot_be_pickled(clips, clip):
         pickle.dumps(reader)
 
 
-@pytest.mark.parametrize(("frames", "threads"), [(0, 1), (48, 0)])
-def test_no_frames_and_no_threads_are_refused(clip, frames, threads):
-    with pytest.raises(MediaError, match=r"clip: (frames|threads) must be at least 1, got 0"):
-        VideoReader(clip, name="clip", frames=frames, threads=threads)
+def test_no_frames_are_refused(clip):
+    with pytest.raises(MediaError, match="clip: frames must be at least 1, got 0"):
+        VideoReader(clip, name="clip", frames=0)
 
 
 def test_a_missing_file_is_named_with_its_path(tmp_path):

@@ -422,9 +422,9 @@ def test_jitter_of_nothing_changes_nothing():
 
 
 def test_a_third_of_a_turn_of_hue_takes_red_to_green():
-    from stereogenbench_data.samples.transforms import _hue_rotation
+    from stereogenbench_data.samples.transforms import hue_rotation
 
-    np.testing.assert_allclose(_hue_rotation(1 / 3) @ [1, 0, 0], [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(hue_rotation(1 / 3) @ [1, 0, 0], [0, 1, 0], atol=1e-6)
 
 
 def test_the_eraser_paints_on_the_second_view_alone():
@@ -442,13 +442,13 @@ def test_the_eraser_paints_on_the_second_view_alone():
     [
         (lambda: Compose([Eraser(), HorizontalFlip()]), "put Eraser last"),
         (lambda: Compose([Compose([Eraser()]), HorizontalFlip()]), "put Eraser last"),
-        (lambda: Resize(0, 5), "sizes are whole numbers and start at 1"),
-        (lambda: Letterbox(5, 0), "sizes are whole numbers and start at 1"),
-        (lambda: Crop(0, 0, 0, 5), "sizes are whole numbers and start at 1"),
-        (lambda: RandomCrop(-1, 5), "sizes are whole numbers and start at 1"),
+        (lambda: Resize(0, 5), "whole numbers of pixels from 1, got"),
+        (lambda: Letterbox(5, 0), "whole numbers of pixels from 1, got"),
+        (lambda: Crop(0, 0, 0, 5), "whole numbers of pixels from 1, got"),
+        (lambda: RandomCrop(-1, 5), "whole numbers of pixels from 1, got"),
         (lambda: Crop(30, 0, 20, 5)(made_views(), None), "reaches beyond a picture of 60 x 40"),
-        (lambda: Crop(-1, 0, 20, 5), "sizes are whole numbers and start at 1"),
-        (lambda: Resize(1.5, 5), "sizes are whole numbers"),
+        (lambda: Crop(-1, 0, 20, 5), "whole numbers of pixels from 1, got"),
+        (lambda: Resize(1.5, 5), "whole numbers of pixels from 1, got 5 x 1.5"),
         (lambda: HorizontalFlip(1.5), "probability of HorizontalFlip must be 0 to 1, got 1.5"),
         (lambda: HorizontalFlip("x"), "must be 0 to 1, got 'x'"),
         (lambda: RandomScale(2, 1), "low, high of RandomScale must ascend"),

@@ -42,17 +42,13 @@ def test_a_filter_keeps_the_scenes_that_match(index, filters, expected):
 
 
 def test_the_filter_that_empties_a_selection_is_named_with_what_there_is(index):
-    with pytest.raises(SelectionError) as caught:
+    what, place, found = "map='Town'", "4 scenes .*split='train', family='IPD_Gaussian'", "'Egypt'"
+    with pytest.raises(SelectionError, match=f"{what} .*{place}.* found {found}"):
         keys(index, split="train", family="IPD_Gaussian", map="Town")
-
-    assert str(caught.value) == (
-        "map='Town' matches none of 4 scenes of those left by split='train', "
-        "family='IPD_Gaussian'; map there is 'Egypt'."
-    )
 
 
 def test_a_misspelt_value_is_answered_with_the_nearest_one(index):
-    with pytest.raises(SelectionError, match="family there is 'Uniform', 'IPD_Gaussian'"):
+    with pytest.raises(SelectionError, match="found 'Uniform', 'IPD_Gaussian'"):
         keys(index, family="Unifrom")
 
 
@@ -73,7 +69,7 @@ def test_a_misspelt_filter_is_answered_with_the_nearest_one(index):
 
 
 def test_a_range_that_nothing_meets_says_what_the_numbers_span(index):
-    with pytest.raises(SelectionError, match="focal_mm there is 20 to 35"):
+    with pytest.raises(SelectionError, match=r"focal_mm=.* found 20 to 35"):
         keys(index, focal_mm=(80, 90))
 
 
@@ -95,5 +91,5 @@ def test_a_search_for_no_words_is_refused(index, caption):
 
 
 def test_words_that_no_caption_holds_say_how_many_captions_there_are(index):
-    with pytest.raises(SelectionError, match="written for 7 scenes"):
+    with pytest.raises(SelectionError, match="captions of 7 scenes"):
         keys(index, caption="submarine")

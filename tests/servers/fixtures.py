@@ -12,7 +12,7 @@ import pytest
 
 from stereogenbench_data.shards.pack import pack
 from tests.servers.fault import FaultServer, serving
-from tests.servers.hub import HubHandler
+from tests.servers.hub import hub_serving
 from tests.servers.nginx import Nginx, nginx_serving
 from tests.servers.tools import require_module, require_tool
 
@@ -87,11 +87,8 @@ def nginx(tmp_path: Path, small_shards: Path) -> Iterator[Nginx]:
 
 @pytest.fixture
 def hub(small_shards: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultServer]:
-    """A Hub whose data set is `small_shards`, to which the file system of ``hf://`` is pointed."""
-    require_module("huggingface_hub")
-    with serving(small_shards, handler=HubHandler) as server:
-        conf = {"endpoint": server.url, "token": False}
-        monkeypatch.setitem(fsspec.config.conf, "hf", conf)
+    """A Hub whose data set is `small_shards`."""
+    with hub_serving(small_shards, monkeypatch) as server:
         yield server
 
 

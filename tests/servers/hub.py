@@ -8,11 +8,17 @@ path, as the Hub sends large ones to its content network. What is asked for with
 import json
 import re
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 from urllib.parse import unquote, urlsplit
 
-from tests.servers.fault import FileHandler
+import fsspec
+import pytest
+
+from tests.servers.fault import FaultServer, FileHandler, serving
+from tests.servers.tools import require_module
 
 REPOSITORY: Final = "some-group/some-data"
 COMMIT: Final = "0123456789abcdef0123456789abcdef01234567"
@@ -56,7 +62,10 @@ class HubHandler(FileHandler):
         elif found := re.fullmatch(rf"/api/datasets/{REPOSITORY}(?:/revision/(.+))?", path):
             self._known(found[1], lambda: {"id": REPOSITORY, "sha": COMMIT, "siblings": []})
         elif found := re.fullmatch(rf"/api/datasets/{REPOSITORY}/tree/([^/]+)/?(.*)", path):
-            self._known(found[1], lambda: self._tree(found[2]))
+            if (self.server.folder / found[2]).is_dir():
+                self._known(found[1], lambda: self._tree(found[2]))
+            else:
+                self._refuse(404, "EntryNotFound")
         elif found := re.fullmatch(rf"/datasets/{REPOSITORY}/resolve/([^/]+)/(.+)", path):
             self._redirect(found[2])
         else:
@@ -103,3 +112,13 @@ class HubHandler(FileHandler):
         self.send_header("Content-Length", str(len(text)))
         self.end_headers()
         self.wfile.write(text)
+
+
+@contextmanager
+def hub_serving(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultServer]:
+    """Serve a folder as the data set of a Hub, to which the file system of ``hf://`` is pointed."""
+    require_module("huggingface_hub")
+    with serving(folder, handler=HubHandler) as server:
+        conf = {"endpoint": server.url, "token": False}
+        monkeypatch.setitem(fsspec.config.conf, "hf", conf)
+        yield server

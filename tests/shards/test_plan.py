@@ -118,7 +118,7 @@ def test_another_release_or_target_is_another_plan(index_of, sizes, target):
 def test_families_that_differ_in_case_alone_are_refused(index_of):
     index = index_of({key(0): 1, key(0, "UNIFORM"): 1})
 
-    with pytest.raises(ShardError, match="would be one file where case does not count"):
+    with pytest.raises(ShardError, match=r"UNIFORM-000000\.tar .* ignores case\. Rename"):
         plan_shards(index)
 
 
@@ -141,7 +141,7 @@ def test_a_key_too_long_for_ustar_is_refused(index_of):
 
 
 def test_data_behind_a_url_are_not_packed(index_of):
-    with pytest.raises(ShardError, match="is far away"):
+    with pytest.raises(ShardError, match=r"example\.org/data: is remote\. Download"):
         plan_shards(index_of({key(0): 1}, root="https://example.org/data"))
 
 
@@ -161,5 +161,5 @@ def test_a_size_is_read_as_it_is_written(text, size):
 
 @pytest.mark.parametrize("text", ["", "GB", "-2GB", "2 parsecs", "0", "0.1", "1e9", "2GBB"])
 def test_what_is_no_size_is_refused(text):
-    with pytest.raises(ShardError, match="is no size of a shard: write one such as 500MB"):
+    with pytest.raises(ShardError, match=f"{text!r} is not a size: write one such as 500MB"):
         parse_size(text)

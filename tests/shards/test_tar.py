@@ -16,22 +16,13 @@ from stereogenbench_data.shards.tar import (
     LARGEST_MEMBER_BYTES,
     TarMember,
     member_header,
-    padded,
     read_checksums,
     read_members,
 )
 from tests.servers.tools import require_tool
+from tests.shards.shard_files import tar_of
 
 LONG = f"train/{'f' * 60}/{'m' * 60}/scene_000041.cam_00_rgb.mp4"
-
-
-def tar_of(members):
-    """A tar by our own headers."""
-    blocks = [
-        member_header(name, len(content)) + content + bytes(padded(len(content)) - len(content))
-        for name, content in members
-    ]
-    return b"".join(blocks) + END_OF_ARCHIVE
 
 
 def members_of(content):
@@ -147,7 +138,7 @@ def test_gnu_tar_lists_the_same_files(tmp_path):
     ]
 
 
-def test_members_are_told_with_where_their_bytes_begin():
+def test_members_are_reported_with_where_their_bytes_begin():
     assert members_of(tar_of(TWO)) == [
         TarMember("a/one.json", 512, 600),
         TarMember("a/one.cam_00_rgb.mp4", 512 + 1024 + 512, 2048),
@@ -163,19 +154,19 @@ def test_padding_to_whole_records_as_tar_writes_it_is_read():
 @pytest.mark.parametrize(
     ("name", "match"),
     [
-        ("/etc/passwd", "no relative path"),
-        ("../x.json", "no relative path"),
-        ("a/../x.json", "no relative path"),
-        ("a//x.json", "no relative path"),
-        ("a\\x.json", "no relative path"),
-        ("C:x.json", "no relative path"),
-        ("a/ä.json", "no relative path of plain ascii"),
-        ("a/x\n.json", "no relative path"),
-        ("", "no relative path"),
+        ("/etc/passwd", "not a relative path"),
+        ("../x.json", "not a relative path"),
+        ("a/../x.json", "not a relative path"),
+        ("a//x.json", "not a relative path"),
+        ("a\\x.json", "not a relative path"),
+        ("C:x.json", "not a relative path"),
+        ("a/ä.json", "not a relative path in ASCII"),
+        ("a/x\n.json", "not a relative path"),
+        ("", "not a relative path"),
         ("a/x.pkl", r"code that runs when it is loaded \(\.pkl\)"),
         ("a/x.PyD", r"\(\.pyd\)"),
         ("a/x.pth.gz", r"\(\.pth\)"),
-        (f"a/{'x' * 101}", "has 103 letters, and ustar holds 100"),
+        (f"a/{'x' * 101}", "has 103 characters, and ustar holds 100"),
         (f"{'f' * 80}/{'g' * 120}/x", "Shorten its folders' names"),
     ],
 )
@@ -196,12 +187,12 @@ def test_a_size_that_ustar_cannot_hold_is_not_written(size):
         (0, ("byte 0, after its start,", "nothing of a header")),
         (100, ("byte 0, after its start,", "only 100 of the 512 bytes of a header")),
         (512 + 300, ("byte 0,", "'a/one.json' claims 600 bytes", "the shard has 812")),
-        (512 + 800, ("byte 0,", "'a/one.json' claims 600 bytes, which with padding end")),
+        (512 + 800, ("byte 0,", "'a/one.json' claims 600 bytes. With padding they end")),
         (1536, ("byte 1536, after 'a/one.json',", "nothing of a header or of the end")),
         (1536 + 511, ("byte 1536, after 'a/one.json',", "only 511 of the 512 bytes")),
         (2048 + 2047, ("'a/one.cam_00_rgb.mp4' claims 2048 bytes",)),
         (4096, ("byte 4096, after 'a/one.cam_00_rgb.mp4',", "nothing of a header or of the end")),
-        (4096 + 512, ("byte 4096,", "only 512 of the 1024 zeros are there that end the archive")),
+        (4096 + 512, ("byte 4096,", "only 512 of the 1024 zeros that end the archive")),
         (4096 + 700, ("byte 4096,", "only 700 of the 1024 zeros")),
     ],
     ids=[
@@ -235,7 +226,7 @@ def test_no_damaged_byte_of_a_header_or_of_the_end_goes_unseen(place, change):
         assert "x.tar: at byte" in str(error)  # noqa: PT017
 
 
-def test_a_damaged_header_is_told_with_its_checksum():
+def test_a_damaged_header_is_reported_with_its_checksum():
     content = bytearray(tar_of(TWO))
     content[1536 + 3] ^= 1
 
@@ -246,7 +237,7 @@ def test_a_wiped_out_header_does_not_end_the_tar_early():
     content = tar_of([*TWO, ("b.json", b"")])
     wiped = content[:4096] + bytes(1024) + content[4096:]
 
-    refused(wiped, "byte 4096,", "zeros end the archive and other bytes follow")
+    refused(wiped, "byte 4096,", "zeros end the archive, but other bytes follow")
 
 
 @pytest.mark.parametrize(
@@ -275,7 +266,7 @@ def test_a_pax_header_is_refused():
 
     content = python_tar((info, b"film"), form=tarfile.PAX_FORMAT)
 
-    refused(content, "is a PAX header, and a shard holds regular files only")
+    refused(content, "is a PAX header, but a shard holds regular files only")
 
 
 def test_a_gnu_long_name_is_refused():
@@ -287,14 +278,14 @@ def test_a_gnu_long_name_is_refused():
 def test_gnu_headers_are_not_posix_ustar():
     content = python_tar((tarfile.TarInfo("a.mp4"), b"film"), form=tarfile.GNU_FORMAT)
 
-    refused(content, "'a.mp4'", "not that of POSIX ustar")
+    refused(content, "'a.mp4'", "which is not that of POSIX ustar")
 
 
 @pytest.mark.parametrize(
     ("name", "what"),
     [
-        ("/etc/passwd.json", "no relative path"),
-        ("a/../../x.json", "no relative path"),
+        ("/etc/passwd.json", "not a relative path"),
+        ("a/../../x.json", "not a relative path"),
         ("a/x.pkl", "may hold code that runs when it is loaded (.pkl)"),
         ("a/x.pyd", "(.pyd)"),
         ("a/x.pth", "(.pth)"),
@@ -308,14 +299,14 @@ def test_a_member_with_a_dangerous_name_is_refused(name, what):
 
 
 def test_a_second_member_of_one_name_is_refused():
-    refused(tar_of([TWO[0], TWO[0]]), "'a/one.json' is there a second time")
+    refused(tar_of([TWO[0], TWO[0]]), "'a/one.json' occurs a second time")
 
 
 def test_ten_gigabytes_are_not_believed_in_octal():
     """Twelve octal digits, without the byte that ends them."""
     header = with_field(member_header("a.mp4", 1), 124, b"%012o" % 10_000_000_000)
 
-    refused(header + END_OF_ARCHIVE, "'a.mp4' claims 10000000000 bytes", "the size is false")
+    refused(header + END_OF_ARCHIVE, "'a.mp4' claims 10000000000 bytes", "the size is wrong")
 
 
 def test_ten_gigabytes_are_not_believed_in_binary():
@@ -323,7 +314,7 @@ def test_ten_gigabytes_are_not_believed_in_binary():
         member_header("a.mp4", 1), 124, b"\x80" + (10_000_000_000).to_bytes(11, "big")
     )
 
-    refused(header + END_OF_ARCHIVE, "'a.mp4'", "no octal number")
+    refused(header + END_OF_ARCHIVE, "'a.mp4'", "not an octal number")
 
 
 def test_checksums_are_of_the_whole_and_of_the_parts_asked_for():

@@ -1,7 +1,9 @@
-"""Verifying shards: each kind of damage is found, named, and told with its cure."""
+"""Verifying shards: each kind of damage is found, named, and reported with its cure."""
 
 import io
 import json
+import os
+import re
 import shutil
 import subprocess
 import sys
@@ -20,9 +22,10 @@ from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Member, ShardFacts
 from stereogenbench_data.shards.companion_files import write_companion_files
 from stereogenbench_data.shards.pack import pack
-from stereogenbench_data.shards.tar import END_OF_ARCHIVE, member_header, padded, read_members
+from stereogenbench_data.shards.tar import END_OF_ARCHIVE, read_members
 from stereogenbench_data.shards.verify import Problem, verify
 from tests.servers.scene_fixtures import write_video
+from tests.shards.shard_files import flip_byte, scenes_of, tar_of
 
 PAIR = "train-Uniform-000000.tar"
 SINGLE = "train-IPD_Gaussian-000000.tar"
@@ -37,22 +40,9 @@ def shards(small_shards, tmp_path):
 
 
 @pytest.fixture
-def edit(shards):
-    """Change the bytes of a shard."""
-
-    def change(name, how):
-        path = shards / name
-        content = bytearray(path.read_bytes())
-        path.write_bytes(how(content) or content)
-
-    return change
-
-
-@pytest.fixture
 def place(shards):
     """Where a file of the index lies."""
-    index = SceneIndex.open(shards)
-    scenes = {scene.id.key: scene for scene in map(index.scene, range(len(index)))}
+    scenes = scenes_of(shards)
     return lambda scene, name: scenes[scene].members[name]
 
 
@@ -61,11 +51,11 @@ def lines(shards, **how):
     return [str(problem) for problem in report.problems]
 
 
-def flipped(at):
-    def flip(content):
-        content[at] ^= 1
-
-    return flip
+def assert_lines(found, *expected):
+    """Each line begins with the first text of a tuple, and holds the others in their order."""
+    assert len(found) == len(expected), found
+    for line, texts in zip(found, expected, strict=True):
+        assert re.match(".*".join(map(re.escape, texts)), line), line
 
 
 def test_sound_shards_have_no_problem(small_shards):
@@ -95,13 +85,13 @@ def test_decoding_counts_every_video_and_progress_ends_at_the_end(small_shards):
     ("where", "found"),
     [
         ("in a header", "only 100 of the 512 bytes of a header or of the end of the archive"),
-        ("at a header", "nothing of a header or of the end of the archive is there"),
+        ("at a header", "nothing of a header or of the end of the archive"),
         ("in a payload", "'{member}' claims "),
-        ("before the end", "nothing of a header or of the end of the archive is there"),
-        ("in the end", "only 512 of the 1024 zeros are there that end the archive"),
+        ("before the end", "nothing of a header or of the end of the archive"),
+        ("in the end", "only 512 of the 1024 zeros that end the archive"),
     ],
 )
-def test_a_cut_shard_is_told_with_the_place_and_what_is_lost(shards, edit, place, where, found):
+def test_a_cut_shard_is_reported_with_the_place_and_what_is_lost(shards, place, where, found):
     member = place(SCENES[1], "cam_02_rgb.mp4")
     size = (shards / PAIR).stat().st_size
     cut = {
@@ -111,34 +101,34 @@ def test_a_cut_shard_is_told_with_the_place_and_what_is_lost(shards, edit, place
         "before the end": size - 1024,
         "in the end": size - 512,
     }[where]
-    edit(PAIR, lambda content: content[:cut])
+    os.truncate(shards / PAIR, cut)
 
-    told = lines(shards)
+    reported = lines(shards)
 
-    assert told[0].startswith(f"{PAIR}: at byte ")
-    assert found.format(member=f"{SCENES[1]}.cam_02_rgb.mp4") in told[0]
-    assert "cut short" in told[0]
-    assert told[0].endswith(f". {FETCH}")
+    assert reported[0].startswith(f"{PAIR}: at byte ")
+    assert found.format(member=f"{SCENES[1]}.cam_02_rgb.mp4") in reported[0]
+    assert "cut short" in reported[0]
+    assert reported[0].endswith(f". {FETCH}")
     lost = [] if "end" in where else [
         f"{PAIR}: {SCENES[1]}: 8 of its files are cut off (cam_02_depth.mkv, cam_02_rgb.mp4, "
         f"cam_03_depth.mkv, ...). {FETCH}"
     ]  # fmt: skip
-    assert told[1:] == lost
+    assert reported[1:] == lost
 
 
-def test_a_flipped_payload_byte_is_told_with_its_member(shards, edit, place):
+def test_a_flipped_payload_byte_is_reported_with_its_member(shards, place):
     member = place(SCENES[1], "cam_03_depth.mkv")
-    edit(PAIR, flipped(member.offset + 1000))
+    flip_byte(shards / PAIR, member.offset + 1000)
 
-    (told,) = lines(shards)
+    (reported,) = lines(shards)
 
-    assert told.startswith(f"{PAIR}: {SCENES[1]}: cam_03_depth.mkv: its bytes have crc32 ")
-    assert told.endswith(f", and by the index {member.crc32:08x} is right. {FETCH}")
+    assert reported.startswith(f"{PAIR}: {SCENES[1]}: cam_03_depth.mkv: its bytes have crc32 ")
+    assert reported.endswith(f", and the index says {member.crc32:08x}. {FETCH}")
 
 
-def test_a_flipped_header_byte_is_told_and_what_follows_is_still_looked_at(shards, edit, place):
-    edit(PAIR, flipped(place(SCENES[0], "cam_00_rgb.mp4").offset - 512 + 5))
-    edit(PAIR, flipped(place(SCENES[1], "baseline.json").offset))
+def test_a_flipped_header_byte_is_reported_and_what_follows_is_still_looked_at(shards, place):
+    flip_byte(shards / PAIR, place(SCENES[0], "cam_00_rgb.mp4").offset - 512 + 5)
+    flip_byte(shards / PAIR, place(SCENES[1], "baseline.json").offset)
 
     header, payload = lines(shards)
 
@@ -147,32 +137,23 @@ def test_a_flipped_header_byte_is_told_and_what_follows_is_still_looked_at(shard
     assert payload.startswith(f"{PAIR}: {SCENES[1]}: baseline.json: its bytes have crc32")
 
 
-def test_a_byte_between_members_is_told_by_the_shard_alone(shards, edit, place):
+def test_a_byte_between_members_is_reported_by_the_shard_alone(shards, place):
     member = place(SCENES[0], "_scene_complete.json")
     assert member.size % 512
-    edit(PAIR, flipped(member.offset + member.size))
+    flip_byte(shards / PAIR, member.offset + member.size)
 
-    (told,) = lines(shards)
+    (reported,) = lines(shards)
 
-    assert told.startswith(f"{PAIR}: all members are whole, and yet the file has ")
-
-
-def test_bytes_after_the_end_are_told(shards, edit):
-    edit(PAIR, lambda content: content + bytes(512))
-
-    (told,) = lines(shards)
-
-    assert "all members are whole, and yet the file has" in told
+    assert reported.startswith(f"{PAIR}: all members are sound, but the file has ")
 
 
-def tar_of(files):
-    return (
-        b"".join(
-            member_header(name, len(content)) + content + bytes(padded(len(content)) - len(content))
-            for name, content in files
-        )
-        + END_OF_ARCHIVE
-    )
+def test_bytes_after_the_end_are_reported(shards):
+    with (shards / PAIR).open("ab") as file:
+        file.write(bytes(512))
+
+    (reported,) = lines(shards)
+
+    assert "all members are sound, but the file has" in reported
 
 
 KEY = "train/Uniform/Town/scene_000001"
@@ -211,142 +192,115 @@ def toy(small_shards, tmp_path):
     return verified
 
 
-def test_exchanged_payloads_are_both_told(toy):
+def test_exchanged_payloads_are_both_reported(toy):
     exchanged = [FILES[0], (FILES[1][0], FILES[2][1]), (FILES[2][0], FILES[1][1])]
 
-    told = toy(tar_of(exchanged))
+    reported = toy(tar_of(exchanged))
 
-    assert [line.split(": ")[2] for line in told] == ["cam_00_rgb.mp4", "cam_01_rgb.mp4"]
-    assert all("its bytes have crc32" in line for line in told)
+    assert [line.split(": ")[2] for line in reported] == ["cam_00_rgb.mp4", "cam_01_rgb.mp4"]
+    assert all("its bytes have crc32" in line for line in reported)
 
 
-def test_exchanged_names_are_both_told(toy):
+def test_exchanged_names_are_both_reported(toy):
     exchanged = [FILES[0], (FILES[2][0], FILES[1][1]), (FILES[1][0], FILES[2][1])]
 
-    told = toy(tar_of(exchanged))
+    reported = toy(tar_of(exchanged))
 
-    assert told == [
-        f"x.tar: {KEY}: cam_00_rgb.mp4: has 512 bytes from byte 2560 on, and by the index 512 "
-        f"from 1536 on. {FETCH}",
-        f"x.tar: {KEY}: cam_01_rgb.mp4: has 512 bytes from byte 1536 on, and by the index 512 "
-        f"from 2560 on. {FETCH}",
-    ]
-
-
-def test_a_missing_member_is_told_and_so_is_what_moved(toy):
-    told = toy(tar_of([FILES[0], FILES[2]]))
-
-    assert told[0] == f"x.tar: {KEY}: cam_00_rgb.mp4: is missing. {FETCH}"
-    assert "cam_01_rgb.mp4: has 512 bytes from byte 1536 on" in told[1]
-    assert len(told) == 2
+    assert_lines(
+        reported,
+        (f"x.tar: {KEY}: cam_00_rgb.mp4: ", "512 bytes", "2560", "512", "1536", FETCH),
+        (f"x.tar: {KEY}: cam_01_rgb.mp4: ", "512 bytes", "1536", "512", "2560", FETCH),
+    )
 
 
-def test_a_member_too_many_is_told(toy):
-    told = toy(tar_of([*FILES, (f"{KEY}.cam_09_rgb.mp4", b"more")]))
+def test_a_missing_member_is_reported_and_so_is_what_moved(toy):
+    reported = toy(tar_of([FILES[0], FILES[2]]))
 
-    assert told == [
-        f"x.tar: {KEY}: cam_09_rgb.mp4: is there, and the index does not know it. {FETCH}"
-    ]
+    assert_lines(
+        reported,
+        (f"x.tar: {KEY}: cam_00_rgb.mp4: is missing", FETCH),
+        (f"x.tar: {KEY}: cam_01_rgb.mp4: ", "512 bytes", "1536", FETCH),
+    )
+
+
+def test_a_member_too_many_is_reported(toy):
+    reported = toy(tar_of([*FILES, (f"{KEY}.cam_09_rgb.mp4", b"more")]))
+
+    assert_lines(reported, (f"x.tar: {KEY}: cam_09_rgb.mp4: ", "not in the index", FETCH))
 
 
 def test_a_renamed_scene_is_of_another_pack(toy):
-    told = toy(tar_of([(name.replace("0001", "0002"), content) for name, content in FILES]))
+    reported = toy(tar_of([(name.replace("0001", "0002"), content) for name, content in FILES]))
 
-    assert told == [
-        f"x.tar: holds other scenes than the index says: 1 unknown, 1 not there ({KEY}, "
-        f"{KEY[:-1]}2); shard and index are of different packs. Put the index beside the shards "
-        f"that it was packed with."
-    ]
+    names = f"({KEY}, {KEY[:-1]}2)"
+    assert_lines(reported, ("x.tar: ", "1 unknown, 1 missing", names, "Put the index beside"))
 
 
 @pytest.mark.parametrize(
     ("name", "kind", "found"),
     [
         ("a/x.pkl", tarfile.REGTYPE, "'a/x.pkl': may hold code that runs when it is loaded"),
-        ("a/x.pyd", tarfile.REGTYPE, "may hold code that runs when it is loaded (.pyd)"),
-        ("a/x.pth", tarfile.REGTYPE, "may hold code that runs when it is loaded (.pth)"),
-        ("../x.json", tarfile.REGTYPE, "'../x.json': its name is no relative path"),
-        ("/x.json", tarfile.REGTYPE, "'/x.json': its name is no relative path"),
+        ("../x.json", tarfile.REGTYPE, "'../x.json': its name is not a relative path"),
         ("a/x.mp4", tarfile.SYMTYPE, "'a/x.mp4' is a symbolic link"),
-        ("a/x.mp4", tarfile.LNKTYPE, "'a/x.mp4' is a hard link"),
-        ("a/x.mp4", tarfile.CHRTYPE, "'a/x.mp4' is a character device"),
-        ("a/x", tarfile.DIRTYPE, "'a/x/' is a directory"),
-        ("a/x.mp4", tarfile.GNUTYPE_SPARSE, "'a/x.mp4' is a GNU sparse file"),
-        ("a/x.mp4", tarfile.XHDTYPE, "'a/x.mp4' is a PAX header"),
-        ("././@LongLink", tarfile.GNUTYPE_LONGNAME, "is a GNU long name"),
-        (FILES[0][0], tarfile.REGTYPE, "_000001.cam_00_depth.mkv' is there a second time"),
+        (FILES[0][0], tarfile.REGTYPE, "_000001.cam_00_depth.mkv' occurs a second time"),
     ],
-)  # fmt: skip
+)
 def test_a_member_that_no_shard_may_hold_is_refused_by_name(toy, name, kind, found):
+    """All kinds and names are in the tests of the tar."""
     info = tarfile.TarInfo(name)
     info.type = kind
     whole = tar_of(FILES)[: -len(END_OF_ARCHIVE)]
 
-    (told,) = toy(whole + info.tobuf(tarfile.USTAR_FORMAT) + END_OF_ARCHIVE)
+    (reported,) = toy(whole + info.tobuf(tarfile.USTAR_FORMAT) + END_OF_ARCHIVE)
 
-    assert told.startswith("x.tar: at byte 3072, after ")
-    assert found in told
-
-
-def test_ten_gigabytes_that_are_not_there_are_refused_at_once(toy):
-    header = bytearray(member_header("a/x.mp4", 1))
-    header[124:136] = b"%012o" % 10_000_000_000
-    header[148:156] = b" " * 8
-    header[148:156] = b"%06o\0 " % sum(header)
-
-    (told,) = toy(tar_of(FILES)[: -len(END_OF_ARCHIVE)] + header + END_OF_ARCHIVE)
-
-    assert "'a/x.mp4' claims 10000000000 bytes" in told
+    assert reported.startswith("x.tar: at byte 3072, after ")
+    assert found in reported
 
 
-def test_a_missing_shard_is_told_with_what_it_held(shards):
+def test_a_missing_shard_is_reported_with_what_it_held(shards):
     (shards / PAIR).unlink()
 
-    assert lines(shards, mode="decode") == [f"{PAIR}: is missing, with 2 scenes. {FETCH}"]
+    assert_lines(lines(shards, mode="decode"), (f"{PAIR}: is missing", "2 scenes", FETCH))
 
 
-def test_shards_that_the_index_does_not_know_are_told(shards):
+def test_shards_that_the_index_does_not_know_are_reported(shards):
     shutil.copy(shards / PAIR, shards / "train-Uniform-000001.tar")
     (shards / "train-Uniform-000002.tar.tmp").write_bytes(b"half")
 
-    assert lines(shards) == [
-        "train-Uniform-000001.tar: is there, and the index does not know it. Put the index "
-        "beside the shards that it was packed with.",
-        "train-Uniform-000002.tar.tmp: is an unfinished shard. Run `stereogenbench pack` again, "
-        "or remove it.",
-    ]
+    assert_lines(
+        lines(shards),
+        ("train-Uniform-000001.tar: is not in the index", "Put the index beside the shards"),
+        ("train-Uniform-000002.tar.tmp: is an unfinished shard", "`stereogenbench pack`"),
+    )
 
 
-def test_an_index_of_another_pack_is_told_for_every_shard_that_differs(
+def test_an_index_of_another_pack_is_reported_for_every_shard_that_differs(
     shards, small_release, tmp_path
 ):
     pack(small_release, tmp_path / "other", target_bytes=250_000, workers=1)
     shutil.copy(tmp_path / "other" / "index.parquet", shards / "index.parquet")
 
-    told = lines(shards, mode="decode")
+    reported = lines(shards, mode="decode")
 
-    assert [line.partition(":")[0] for line in told] == [
+    assert [line.partition(":")[0] for line in reported] == [
         "dali/train-Uniform-000000.idx", "dali/train-Uniform-000001.idx", "shards.json", PAIR,
         "train-Uniform-000001.tar",
     ]  # fmt: skip
-    assert told[3].startswith(
-        f"{PAIR}: holds 17 members that the index does not place in it ({SCENES[1]}._scene"
+    assert_lines(
+        reported[3:],
+        (f"{PAIR}: ", "17 members", f"({SCENES[1]}._scene", "Fetch the shard and its index again"),
+        ("train-Uniform-000001.tar: is missing", "1 scene"),
     )
-    assert told[3].endswith(
-        ": something was appended, or the index is of another pack. Fetch the shard and its index "
-        "again, or pack them again."
-    )
-    assert told[4].startswith("train-Uniform-000001.tar: is missing, with 1 scene.")
 
 
-def test_all_problems_are_listed_whatever_the_workers(shards, edit, place):
+def test_all_problems_are_listed_whatever_the_workers(shards, place):
     (shards / SINGLE).unlink()
     for scene in SCENES:
-        edit(PAIR, flipped(place(scene, "trajectory.json").offset))
+        flip_byte(shards / PAIR, place(scene, "trajectory.json").offset)
 
-    told = verify(shards, workers=2).problems
+    reported = verify(shards, workers=2).problems
 
-    assert [(each.shard, each.scene, each.member) for each in told] == [
+    assert [(each.shard, each.scene, each.member) for each in reported] == [
         (SINGLE, "", ""),
         (PAIR, SCENES[0], "trajectory.json"),
         (PAIR, SCENES[1], "trajectory.json"),
@@ -374,42 +328,42 @@ def repacked(small_release, tmp_path):
     return make
 
 
-def test_a_video_with_fewer_frames_is_told_by_decoding(repacked, tmp_path):
+def test_a_video_with_fewer_frames_is_reported_by_decoding(repacked, tmp_path):
     short = write_video(tmp_path / "short.mp4", frames=6, size=(64, 64), tags={})
 
-    assert repacked("cam_01_rgb.mp4", short.read_bytes()) == [
-        f"{PAIR}: {SCENES[0]}: cam_01_rgb.mp4: has 6 frames of 64x64 pixels, and by the index 7 "
-        f"of 64x64. Pack the scene again from a video that is whole."
-    ]
+    assert_lines(
+        repacked("cam_01_rgb.mp4", short.read_bytes()),
+        (f"{PAIR}: {SCENES[0]}: cam_01_rgb.mp4: ", "6 frames of 64x64", "7 of 64x64", "Pack the"),
+    )
 
 
-def test_a_damaged_video_is_told_by_decoding(repacked, small_release):
+def test_a_damaged_video_is_reported_by_decoding(repacked, small_release):
     content = bytearray((small_release / SCENES[0] / "cam_02_depth.mkv").read_bytes())
     content[len(content) // 2] ^= 0x55
 
-    (told,) = repacked("cam_02_depth.mkv", bytes(content))
+    (reported,) = repacked("cam_02_depth.mkv", bytes(content))
 
-    assert told.startswith(f"{PAIR}: {SCENES[0]}: cam_02_depth.mkv: ")
-    assert "frame" in told
+    assert reported.startswith(f"{PAIR}: {SCENES[0]}: cam_02_depth.mkv: ")
+    assert "frame" in reported
 
 
-def test_depth_of_another_unit_than_the_index_says_is_told_by_decoding(repacked, tmp_path):
+def test_depth_of_another_unit_than_the_index_says_is_reported_by_decoding(repacked, tmp_path):
     other = write_video(
         tmp_path / "o_depth.mkv", frames=7, size=(64, 64), tags={"DEPTH_SCALE": "0.5"}
     )
 
-    (told,) = repacked("cam_05_depth.mkv", other.read_bytes())
+    (reported,) = repacked("cam_05_depth.mkv", other.read_bytes())
 
     assert (
-        "cam_05_depth.mkv: is stored as ('ffv1', 'gray16le', 0.5), and by the index as "
+        "cam_05_depth.mkv: is stored as ('ffv1', 'gray16le', 0.5), and the index says "
         "('ffv1', 'gray16le', 0.001)"
-    ) in told
+    ) in reported
 
 
-def test_what_is_no_video_is_told_by_decoding(repacked):
-    (told,) = repacked("cam_00_rgb.mp4", b"no film")
+def test_what_is_no_video_is_reported_by_decoding(repacked):
+    (reported,) = repacked("cam_00_rgb.mp4", b"no film")
 
-    assert "cam_00_rgb.mp4: cannot be opened as MP4 or Matroska" in told
+    assert "cam_00_rgb.mp4: cannot be opened as MP4 or Matroska" in reported
 
 
 def test_a_folder_that_was_not_finished_is_refused(shards):
@@ -420,7 +374,7 @@ def test_a_folder_that_was_not_finished_is_refused(shards):
 
 
 def test_a_folder_without_index_is_refused(tmp_path):
-    with pytest.raises(ShardError, match=r"holds no index\.parquet\. Point at a folder that"):
+    with pytest.raises(ShardError, match=r"holds no index\.parquet\. Pass a folder that"):
         verify(tmp_path)
 
 
@@ -431,8 +385,8 @@ def test_a_released_folder_is_not_shards(small_release, tmp_path):
         verify(tmp_path, root=small_release)
 
 
-def test_far_shards_are_to_be_fetched(tmp_path):
-    with pytest.raises(ShardError, match=r"is far away\. Fetch the shards"):
+def test_remote_shards_must_be_downloaded_first(tmp_path):
+    with pytest.raises(ShardError, match=r"shards: is remote\. Download the shards"):
         verify("https://example.org/shards")
 
 
@@ -458,7 +412,7 @@ def test_far_shards_are_to_be_fetched(tmp_path):
          "its path tells family 'Uniform', and by the index it is 'IPD_Gaussian'"),
     ],
 )  # fmt: skip
-def test_an_index_that_contradicts_a_shards_metadata_is_told(shards, member, change, found):
+def test_an_index_that_contradicts_a_shards_metadata_is_reported(shards, member, change, found):
     index = SceneIndex.open(shards)
     scenes = [index.scene(row) for row in range(len(index))]
     row = [scene.id.key for scene in scenes].index(SCENES[1])
@@ -466,16 +420,15 @@ def test_an_index_that_contradicts_a_shards_metadata_is_told(shards, member, cha
     altered = SceneIndex.from_scenes(scenes, shards, shards=index.shards)
     altered.write(shards / "index.parquet")
 
-    (told,) = lines(shards)
+    (reported,) = lines(shards)
 
-    assert told.startswith(": ".join(part for part in (PAIR, SCENES[1], member) if part) + ": ")
-    assert found in told
-    assert told.endswith(". Fetch the shard and its index again, or pack them again.")
+    assert reported.startswith(": ".join(part for part in (PAIR, SCENES[1], member) if part) + ": ")
+    assert found in reported
+    assert reported.endswith(". Fetch the shard and its index again, or pack them again.")
 
 
 @pytest.mark.parametrize("name", ["shards.json", f"dali/{PAIR[:-4]}.idx"])
-def test_files_for_other_readers_that_are_missing_or_altered_are_told(shards, name):
-    write = "Fetch it again, or write it anew: run `stereogenbench pack` again."
+def test_files_for_other_readers_that_are_missing_or_altered_are_reported(shards, name):
     content = (shards / name).read_bytes()
     (shards / name).write_bytes(content.replace(b"1", b"2", 1))
     altered = lines(shards)
@@ -483,19 +436,19 @@ def test_files_for_other_readers_that_are_missing_or_altered_are_told(shards, na
 
     missing = lines(shards)
 
-    assert altered == [f"{name}: contradicts the index. {write}"]
-    assert missing == [f"{name}: is missing, and pack wrote it. {write}"]
+    cure = "run `stereogenbench pack` again"
+    assert_lines(altered, (f"{name}: contradicts the index", cure))
+    assert_lines(missing, (f"{name}: is missing", cure))
 
 
-def test_a_file_that_was_appended_to_a_shard_is_told_as_such(shards, edit):
+def test_a_file_that_was_appended_to_a_shard_is_reported_as_such(shards):
     added = tar_of([("train/Uniform/SynthStage/scene_000009.notes.txt", b"mine")])
-    edit(PAIR, lambda content: content[: -len(END_OF_ARCHIVE)] + added)
+    content = (shards / PAIR).read_bytes()
+    (shards / PAIR).write_bytes(content[: -len(END_OF_ARCHIVE)] + added)
 
-    assert lines(shards) == [
-        f"{PAIR}: holds 1 member that the index does not place in it (train/Uniform/SynthStage/"
-        f"scene_000009.notes.txt): something was appended, or the index is of another pack. Fetch "
-        f"the shard and its index again, or pack them again."
-    ]
+    name = "(train/Uniform/SynthStage/scene_000009.notes.txt)"
+    cure = "Fetch the shard and its index again"
+    assert_lines(lines(shards), (f"{PAIR}: holds 1 member ", name, "appended", cure))
 
 
 def test_a_damaged_index_of_shards_is_to_be_fetched_or_packed_again(shards):
@@ -512,7 +465,7 @@ def test_an_index_that_contradicts_itself_is_refused(shards):
     index.shards.pop(PAIR)
     index.write(shards / "index.parquet")
 
-    with pytest.raises(ShardError, match=f"in {PAIR} and knows no such shard"):
+    with pytest.raises(ShardError, match=f"in {PAIR}, but does not list this shard"):
         verify(shards)
 
 
@@ -549,7 +502,7 @@ def test_the_command_ends_with_1_and_a_line_for_each_problem(shards):
     assert result.stdout.splitlines()[-1].endswith("; 2 problems")
 
 
-def test_one_problem_is_told_in_the_singular(shards):
+def test_one_problem_is_reported_in_the_singular(shards):
     (shards / "shards.json").unlink()
 
     assert command(shards).stdout.endswith("; 1 problem\n")
@@ -560,10 +513,10 @@ def test_the_command_reports_as_json(shards):
 
     result = command(shards, "--json")
 
-    told = json.loads(result.stdout)
+    reported = json.loads(result.stdout)
     assert result.exit_code == 1
-    assert (told["shards"], told["scenes"]) == (3, 4)
-    assert told["problems"] == [
+    assert (reported["shards"], reported["scenes"]) == (3, 4)
+    assert reported["problems"] == [
         {
             "shard": PAIR,
             "scene": "",
@@ -591,4 +544,4 @@ def test_a_link_to_nowhere_is_no_shard(shards):
 
     [line] = lines(shards)
 
-    assert line.startswith(f"{shard.name}: is no file, with ")
+    assert line.startswith(f"{shard.name}: is not a file, with ")

@@ -14,11 +14,29 @@ import pytest
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.records import Member
 from stereogenbench_data.schema.release import BASELINE_JSON, TRAJECTORY_JSON
-from stereogenbench_data.sources.location import joined, shown
-from stereogenbench_data.sources.members import MemberSource, read_range, size_of
+from stereogenbench_data.sources.location import is_remote, joined, local_path, shown
+from stereogenbench_data.sources.members import MemberSource
+from stereogenbench_data.sources.ranged_file import FileSlice
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import RetryPolicy
 
 VIDEO = "cam_00_rgb.mp4"
+
+
+def read_range(place, start, stop):
+    """Return the bytes from start to stop of a file, local or by URL; retries do not wait."""
+    if is_remote(place):
+        retry = RetryPolicy(sleep=lambda wait_s: None)
+        return RemoteObject(str(place), retry=retry).read(start, stop)
+    with FileSlice(local_path(place), Member("", start, stop - start)) as file:
+        return file.read()
+
+
+def size_of(place):
+    """Return the size in bytes of a file, local or by URL."""
+    return RemoteObject(place).size() if is_remote(place) else local_path(place).stat().st_size
 
 
 def bytes_of(opened):
@@ -30,7 +48,7 @@ def bytes_of(opened):
 
 
 class SourceTests:
-    """The contract of `MemberSource`, `read_range` and `size_of` for one kind of place."""
+    """The contract of `MemberSource` and what it reads through, for one kind of place."""
 
     @pytest.fixture
     def root(self):

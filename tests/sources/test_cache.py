@@ -24,8 +24,8 @@ from tests.servers.tools import small_disk
 DATA = bytes(number * 7 % 256 for number in range(100_000))
 
 
-class Shelf(RemoteObject):
-    """A shard that is here; it notes what is fetched, and hands out other bytes as it is told."""
+class Shard(RemoteObject):
+    """A local shard that records what is fetched, and returns the bytes in `wrong` first."""
 
     def __init__(self, data=DATA, *, where="https://h/x.tar"):
         super().__init__(where)
@@ -45,8 +45,8 @@ def member(offset, size, **how):
     return Member(how.get("path", "x.tar"), offset, size, crc32)
 
 
-def read(cache, wanted, shelf, *, revision="1"):
-    with cache.open(wanted, remote=shelf, revision=revision) as file:
+def read(cache, wanted, shard, *, revision="1"):
+    with cache.open(wanted, remote=shard, revision=revision) as file:
         return file.read()
 
 
@@ -55,8 +55,8 @@ def items(folder):
 
 
 @pytest.fixture
-def shelf():
-    return Shelf()
+def shard():
+    return Shard()
 
 
 @pytest.fixture
@@ -64,11 +64,11 @@ def cache(tmp_path):
     return ShardCache(tmp_path, limit_bytes=10_000)
 
 
-def test_a_member_is_fetched_once(cache, shelf):
+def test_a_member_is_fetched_once(cache, shard):
     for _ in range(3):
-        assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
+        assert read(cache, member(1000, 2000), shard) == DATA[1000:3000]
 
-    assert shelf.fetched == [(1000, 3000)]
+    assert shard.fetched == [(1000, 3000)]
     assert cache.used_bytes() == 2000
 
 
@@ -76,12 +76,12 @@ def test_a_cache_shows_its_folder_and_limit(cache, tmp_path):
     assert repr(cache) == f"ShardCache({str(tmp_path)!r}, limit_bytes=10000)"
 
 
-def test_another_cache_in_the_folder_finds_it(cache, shelf, tmp_path):
-    read(cache, member(1000, 2000), shelf)
-    read(ShardCache(tmp_path, limit_bytes=5000), member(1000, 2000), shelf)
-    read(pickle.loads(pickle.dumps(cache)), member(1000, 2000), shelf)
+def test_another_cache_in_the_folder_finds_it(cache, shard, tmp_path):
+    read(cache, member(1000, 2000), shard)
+    read(ShardCache(tmp_path, limit_bytes=5000), member(1000, 2000), shard)
+    read(pickle.loads(pickle.dumps(cache)), member(1000, 2000), shard)
 
-    assert len(shelf.fetched) == 1
+    assert len(shard.fetched) == 1
 
 
 @pytest.mark.parametrize(
@@ -95,15 +95,15 @@ def test_another_cache_in_the_folder_finds_it(cache, shelf, tmp_path):
     ],
     ids=["revision", "shard", "checksum", "offset", "size"],
 )
-def test_what_differs_in_anything_is_another_item(cache, shelf, other, revision):
-    read(cache, member(1000, 2000), shelf)
+def test_what_differs_in_anything_is_another_item(cache, shard, other, revision):
+    read(cache, member(1000, 2000), shard)
 
-    assert read(cache, other, shelf, revision=revision) == DATA[other.offset :][: other.size]
-    assert len(shelf.fetched) == 2
+    assert read(cache, other, shard, revision=revision) == DATA[other.offset :][: other.size]
+    assert len(shard.fetched) == 2
 
 
 def test_members_with_a_checksum_are_shared_by_all_addresses_others_are_not(cache):
-    one, other = Shelf(where="https://a/x.tar"), Shelf(where="https://b/x.tar")
+    one, other = Shard(where="https://a/x.tar"), Shard(where="https://b/x.tar")
     for crc32 in (zlib.crc32(DATA[:50]), None):
         read(cache, member(0, 50, crc32=crc32), one)
         read(cache, member(0, 50, crc32=crc32), other)
@@ -111,74 +111,73 @@ def test_members_with_a_checksum_are_shared_by_all_addresses_others_are_not(cach
     assert (len(one.fetched), len(other.fetched)) == (2, 1)
 
 
-def test_wrong_bytes_are_fetched_again_once(cache, shelf):
-    shelf.wrong = [bytes(2000)]
+def test_wrong_bytes_are_fetched_again_once(cache, shard):
+    shard.wrong = [bytes(2000)]
 
-    assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
-    assert len(shelf.fetched) == 2
+    assert read(cache, member(1000, 2000), shard) == DATA[1000:3000]
+    assert len(shard.fetched) == 2
 
 
-def test_bytes_that_stay_wrong_are_an_error_and_are_not_kept(cache, shelf, tmp_path):
-    shelf.wrong = [bytes(2000), bytes(2000)]
+def test_bytes_that_stay_wrong_are_an_error_and_are_not_kept(cache, shard, tmp_path):
+    shard.wrong = [bytes(2000), bytes(2000)]
 
     with pytest.raises(
         ShardError,
-        match=r"https://h/x.tar: the 2000 bytes from 1000 on have crc32 [0-9a-f]{8}, and the index "
-        r"says [0-9a-f]{8}, twice. The shard was damaged or replaced",
+        match=r"https://h/x.tar: the 2000 bytes from 1000 on .* [0-9a-f]{8}, twice.*use the",
     ):
-        cache.open(member(1000, 2000), remote=shelf, revision="1")
+        cache.open(member(1000, 2000), remote=shard, revision="1")
     assert items(tmp_path) == []
     assert cache.used_bytes() == 0
 
 
-def test_an_item_of_another_size_is_fetched_again(cache, shelf, tmp_path):
-    read(cache, member(1000, 2000), shelf)
+def test_an_item_of_another_size_is_fetched_again(cache, shard, tmp_path):
+    read(cache, member(1000, 2000), shard)
     for cut in (1999, 0):
         os.truncate(items(tmp_path)[0], cut)
-        assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
+        assert read(cache, member(1000, 2000), shard) == DATA[1000:3000]
 
-    assert len(shelf.fetched) == 3
+    assert len(shard.fetched) == 3
 
 
-def test_an_item_that_was_written_into_is_fetched_again(cache, shelf, tmp_path):
-    read(cache, member(1000, 2000), shelf)
+def test_an_item_that_was_written_into_is_fetched_again(cache, shard, tmp_path):
+    read(cache, member(1000, 2000), shard)
     items(tmp_path)[0].write_bytes(bytes(2000))
 
-    assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
-    assert len(shelf.fetched) == 2
+    assert read(cache, member(1000, 2000), shard) == DATA[1000:3000]
+    assert len(shard.fetched) == 2
 
 
 @pytest.mark.parametrize(("crc32", "fetched"), [(zlib.crc32(DATA[1000:3000]), 1), (None, 2)])
 def test_an_item_of_another_time_is_kept_if_its_checksum_is_right(
-    cache, shelf, tmp_path, crc32, fetched
+    cache, shard, tmp_path, crc32, fetched
 ):
     wanted = member(1000, 2000, crc32=crc32)
-    read(cache, wanted, shelf)
+    read(cache, wanted, shard)
     os.utime(items(tmp_path)[0])
-    read(cache, wanted, shelf)
+    read(cache, wanted, shard)
 
-    assert len(shelf.fetched) == fetched
-    assert read(cache, wanted, shelf) == DATA[1000:3000]
-    assert len(shelf.fetched) == fetched
+    assert len(shard.fetched) == fetched
+    assert read(cache, wanted, shard) == DATA[1000:3000]
+    assert len(shard.fetched) == fetched
 
 
-def test_a_folder_in_an_items_place_makes_way_for_it_and_is_kept(cache, shelf, tmp_path):
-    read(cache, member(1000, 2000), shelf)
+def test_a_folder_in_an_items_place_makes_way_for_it_and_is_kept(cache, shard, tmp_path):
+    read(cache, member(1000, 2000), shard)
     item = items(tmp_path)[0]
     item.unlink()
     item.mkdir()
     (item / "mine.txt").touch()
 
-    assert read(cache, member(1000, 2000), shelf) == DATA[1000:3000]
+    assert read(cache, member(1000, 2000), shard) == DATA[1000:3000]
     assert item.is_file()
     assert len(list(tmp_path.rglob("mine.txt"))) == 1
 
 
-def test_a_damaged_item_is_found_and_dropped_when_it_is_looked_for(cache, shelf, tmp_path):
+def test_a_damaged_item_is_found_and_dropped_when_it_is_looked_for(cache, shard, tmp_path):
     wanted = member(1000, 2000)
-    how = {"where": shelf.where, "revision": "1"}
+    how = {"where": shard.where, "revision": "1"}
     assert not cache.drop_damaged(wanted, **how)
-    read(cache, wanted, shelf)
+    read(cache, wanted, shard)
     assert not cache.drop_damaged(wanted, **how)
     item = items(tmp_path)[0]
     times = item.stat()
@@ -186,50 +185,50 @@ def test_a_damaged_item_is_found_and_dropped_when_it_is_looked_for(cache, shelf,
     os.utime(item, ns=(times.st_atime_ns, times.st_mtime_ns))
 
     assert cache.drop_damaged(wanted, **how)
-    assert read(cache, wanted, shelf) == DATA[1000:3000]
+    assert read(cache, wanted, shard) == DATA[1000:3000]
 
 
-def test_what_was_not_used_for_longest_goes_first(cache, shelf, tmp_path):
+def test_what_was_not_used_for_longest_goes_first(cache, shard, tmp_path):
     first, second, third = (member(3000 * each, 3000) for each in range(3))
     for age, wanted in enumerate((first, second, third)):
         known = set(items(tmp_path))
-        read(cache, wanted, shelf)
+        read(cache, wanted, shard)
         newest = (set(items(tmp_path)) - known).pop()
         os.utime(newest, (1000 + age, newest.stat().st_mtime))
-    read(cache, first, shelf)
-    shelf.fetched.clear()
+    read(cache, first, shard)
+    shard.fetched.clear()
 
-    read(cache, member(9000, 2000), shelf)
+    read(cache, member(9000, 2000), shard)
     assert cache.used_bytes() == 8000
-    read(cache, third, shelf)
-    read(cache, first, shelf)
-    assert shelf.fetched == [(9000, 11_000)]
-    read(cache, second, shelf)
-    assert len(shelf.fetched) == 2
+    read(cache, third, shard)
+    read(cache, first, shard)
+    assert shard.fetched == [(9000, 11_000)]
+    read(cache, second, shard)
+    assert len(shard.fetched) == 2
 
 
-def test_a_reader_keeps_what_was_evicted_under_it(cache, shelf):
-    with cache.open(member(0, 6000), remote=shelf, revision="1") as file:
-        read(cache, member(6000, 6000), shelf)
+def test_a_reader_keeps_what_was_evicted_under_it(cache, shard):
+    with cache.open(member(0, 6000), remote=shard, revision="1") as file:
+        read(cache, member(6000, 6000), shard)
 
         assert cache.used_bytes() == 6000
         assert file.read() == DATA[:6000]
 
 
-def test_an_item_above_the_limit_is_refused_with_both_sizes(cache, shelf):
+def test_an_item_above_the_limit_is_refused_with_both_sizes(cache, shard):
     with pytest.raises(
         StorageError, match=r"limit of 10000 bytes is below the 10001 bytes of a member of https"
     ):
-        cache.open(member(0, 10_001), remote=shelf, revision="1")
-    assert shelf.fetched == []
-    assert len(read(cache, member(0, 10_000), shelf)) == 10_000
+        cache.open(member(0, 10_001), remote=shard, revision="1")
+    assert shard.fetched == []
+    assert len(read(cache, member(0, 10_000), shard)) == 10_000
 
 
-def test_files_of_others_are_neither_counted_nor_deleted(cache, shelf, tmp_path):
+def test_files_of_others_are_neither_counted_nor_deleted(cache, shard, tmp_path):
     (tmp_path / "mine.txt").write_bytes(bytes(50_000))
     (tmp_path / FOLDER_NAME / "items" / "mine.tar").write_bytes(bytes(50_000))
     for each in range(8):
-        read(cache, member(4000 * each, 4000), shelf)
+        read(cache, member(4000 * each, 4000), shard)
 
     assert cache.used_bytes() == 8000
     assert (tmp_path / "mine.txt").stat().st_size == 50_000
@@ -239,7 +238,7 @@ def test_files_of_others_are_neither_counted_nor_deleted(cache, shelf, tmp_path)
 def test_a_folder_of_that_name_that_is_no_cache_is_refused(tmp_path):
     (tmp_path / FOLDER_NAME).mkdir()
     (tmp_path / FOLDER_NAME / "thesis.tex").touch()
-    with pytest.raises(StorageError, match=r"members: holds thesis.tex and is no cache of this"):
+    with pytest.raises(StorageError, match=r"members: holds thesis.tex and is not a cache of this"):
         ShardCache(tmp_path, limit_bytes=1)
 
     (tmp_path / FOLDER_NAME / "CACHEDIR.TAG").write_text("something else")
@@ -258,12 +257,11 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path):
 
 @pytest.mark.parametrize("limit", [0, -1, "1GB", None, 1.5, True], ids=repr)
 def test_a_limit_that_is_no_number_of_bytes_is_refused(tmp_path, limit):
-    with pytest.raises(
-        StorageError, match=rf"limit in whole bytes above 0, got {limit!r}: give a number, such as"
-    ):
+    refused = pytest.raises(StorageError, match=rf"{tmp_path}: .*, got {limit!r}: give a number")
+    with refused:
         require_limit(limit, folder=tmp_path)
     if type(limit) is int:
-        with pytest.raises(StorageError, match="above 0"):
+        with refused:
             ShardCache(tmp_path, limit_bytes=limit)
 
 
@@ -280,32 +278,32 @@ def test_a_folder_of_shards_is_refused_and_left_as_it_is(tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_full_disk_is_told_and_leaves_nothing(cache, shelf, tmp_path, monkeypatch):
+def test_a_full_disk_is_told_and_leaves_nothing(cache, shard, tmp_path, monkeypatch):
     def full(descriptor):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(cache_module.os, "fsync", full)
     with pytest.raises(StorageError, match=r"\(No space left on device\)\. .*smaller limit"):
-        cache.open(member(0, 2000), remote=shelf, revision="1")
+        cache.open(member(0, 2000), remote=shard, revision="1")
     assert items(tmp_path) == []
 
 
-def test_a_count_that_was_lost_is_made_again(cache, shelf, tmp_path):
+def test_a_count_that_was_lost_is_made_again(cache, shard, tmp_path):
     ledger = tmp_path / FOLDER_NAME / "locks" / "size"
-    read(cache, member(0, 6000), shelf)
+    read(cache, member(0, 6000), shard)
     for damage in (b"", b"\xff nonsense"):
         ledger.write_bytes(damage)
-        read(cache, member(6000, 3000), shelf)
-        read(cache, member(10_000, 3000), shelf)
+        read(cache, member(6000, 3000), shard)
+        read(cache, member(10_000, 3000), shard)
 
         assert cache.used_bytes() <= 10_000
 
 
-def test_the_rest_of_a_fill_that_was_killed_is_cleared_when_room_is_needed(cache, shelf, tmp_path):
+def test_the_rest_of_a_fill_that_was_killed_is_cleared_when_room_is_needed(cache, shard, tmp_path):
     (tmp_path / FOLDER_NAME / "items" / ("0" * 64 + ".part")).write_bytes(bytes(7000))
     assert cache.used_bytes() == 7000
 
-    read(cache, member(0, 6000), shelf)
+    read(cache, member(0, 6000), shard)
     assert cache.used_bytes() == 6000
 
 
@@ -316,11 +314,11 @@ def test_the_rest_of_a_fill_that_was_killed_is_cleared_when_room_is_needed(cache
 @settings(deadline=None, max_examples=25)
 def test_it_never_holds_more_than_its_limit_and_never_lies(tmp_path_factory, opened, limit):
     cache = ShardCache(tmp_path_factory.mktemp("cache"), limit_bytes=limit)
-    shelf = Shelf()
+    shard = Shard()
     for each in opened:
         wanted = member(1000 * each, 500 * each)
 
-        assert read(cache, wanted, shelf) == DATA[1000 * each :][: 500 * each]
+        assert read(cache, wanted, shard) == DATA[1000 * each :][: 500 * each]
         assert cache.used_bytes() <= limit
 
 
@@ -428,23 +426,23 @@ def disk(tmp_path):
         yield place
 
 
-def test_a_cache_that_may_only_be_read_serves_what_it_holds(disk, shelf):
+def test_a_cache_that_may_only_be_read_serves_what_it_holds(disk, shard):
     wanted = member(1000, 2000)
-    read(ShardCache(disk, limit_bytes=10_000), wanted, shelf)
+    read(ShardCache(disk, limit_bytes=10_000), wanted, shard)
     subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
 
     cache = ShardCache(disk, limit_bytes=10_000)
 
-    assert read(cache, wanted, shelf) == DATA[1000:3000]
+    assert read(cache, wanted, shard) == DATA[1000:3000]
     assert not cache.drop_damaged(wanted, where="https://h/x.tar", revision="1")
-    assert shelf.fetched == [(1000, 3000)]
+    assert shard.fetched == [(1000, 3000)]
     with pytest.raises(StorageError, match=r"Read-only file system\). Choose a place that can be"):
-        read(cache, member(0, 1000), shelf)
+        read(cache, member(0, 1000), shard)
 
 
-def test_a_cache_that_another_process_is_making_is_used(tmp_path, shelf):
+def test_a_cache_that_another_process_is_making_is_used(tmp_path, shard):
     (tmp_path / FOLDER_NAME).mkdir()
     (tmp_path / FOLDER_NAME / ".CACHEDIR.TAG.unfinished").write_bytes(b"Signat")
 
-    assert read(ShardCache(tmp_path, limit_bytes=10_000), member(0, 10), shelf) == DATA[:10]
+    assert read(ShardCache(tmp_path, limit_bytes=10_000), member(0, 10), shard) == DATA[:10]
     assert not (tmp_path / FOLDER_NAME / ".CACHEDIR.TAG.unfinished").exists()

@@ -97,23 +97,13 @@ def test_a_name_that_begins_or_ends_with_dots_is_let_through(root):
     assert member_path(root, Member("a/..b.", 0, 1)) == root / "a" / "..b."
 
 
-def test_a_file_of_another_size_is_named_with_both_sizes(root):
-    with pytest.raises(StorageError, match=r"b.json: has 5 bytes, and the index says 6. The file"):
-        open_local(root, Member("a/b.json", 0, 6))
-
-
-def test_a_file_that_is_gone_is_named(root):
-    with pytest.raises(StorageError, match=r"c.json: cannot be read \(No such file.*index` again"):
-        open_local(root, Member("a/c.json", 0, 5))
-
-
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
 def test_what_is_no_file_in_a_shards_place_is_named_and_not_waited_for(root, in_shard, make):
     scene, shards = in_shard
     (root / "x.tar").unlink()
     make(root / "x.tar")
 
-    with pytest.raises(ShardError, match=r"x.tar: cannot be read \(it is no regular file\). Fetch"):
+    with pytest.raises(ShardError, match=r"x.tar: cannot be read \(not a regular file\). Fetch"):
         MemberSource(root, shards=shards).open(scene, "b.json")
 
 
@@ -137,14 +127,14 @@ def test_a_pipe_in_a_files_place_is_named_and_not_waited_for(root, scene):
     os.mkfifo(root / "pipe")
     scene = with_file(scene, Member("pipe", 0, 0))
 
-    with pytest.raises(StorageError, match=r"pipe: b.json: is no file. Put the release's own"):
+    with pytest.raises(StorageError, match=r"pipe: b.json: not a file. Put the release's own"):
         MemberSource(root, shards={}).read(scene, "b.json")
 
 
 def test_a_folder_in_a_files_place_is_named(root, scene):
     scene = with_file(scene, Member("a", 0, (root / "a").stat().st_size))
 
-    with pytest.raises(StorageError, match=r"a: b.json: is no file. Put the release"):
+    with pytest.raises(StorageError, match=r"a: b.json: not a file. Put the release"):
         MemberSource(root, shards={}).read(scene, "b.json")
 
 
@@ -256,7 +246,7 @@ def test_every_error_is_made_of_one_text_that_shows_no_login():
      "http://u:PW@h..h/x"],
 )  # fmt: skip
 def test_a_url_that_is_none_is_named_without_its_login(url):
-    with pytest.raises(StorageError, match=r"is no URL: correct it") as caught:
+    with pytest.raises(StorageError, match=r"not a URL: correct it") as caught:
         SceneIndex.open(url)
     assert "PW" not in str(caught.value)
 

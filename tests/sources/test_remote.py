@@ -7,11 +7,11 @@ import urllib3
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.sources import http as web_transport
-from stereogenbench_data.sources.members import read_range, size_of
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy, TransientError
 from tests.servers.fault import Answer, serving
 from tests.servers.raw import raw_serving
+from tests.sources.source_kit import read_range, size_of
 
 DATA = bytes(range(256)) * 1000
 
@@ -52,20 +52,6 @@ def test_the_size_costs_one_byte(served):
     assert served.sent == 1
 
 
-def test_a_local_file_is_read_by_range_too(tmp_path):
-    (tmp_path / "x y.tar").write_bytes(DATA)
-
-    for place in (tmp_path / "x y.tar", (tmp_path / "x y.tar").as_uri()):
-        assert read_range(place, 1000, 3000) == DATA[1000:3000]
-        assert size_of(place) == len(DATA)
-    with pytest.raises(StorageError, match=r"gone.tar: cannot be read \(No such file"):
-        size_of(tmp_path / "gone.tar")
-    with pytest.raises(StorageError, match=r"gone.tar: cannot be read \(No such file"):
-        read_range(tmp_path / "gone.tar", 0, 1)
-    with pytest.raises(StorageError, match=r"x y.tar: ends at byte 256000"):
-        read_range(tmp_path / "x y.tar", 0, len(DATA) + 1)
-
-
 def test_an_answer_cut_short_is_gone_on_with_where_it_ended(served, clock):
     served.answers = [Answer(stop_after=30_000), Answer(stop_after=100_000)]
     remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
@@ -82,8 +68,7 @@ def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, clock):
 
     with pytest.raises(
         StorageError,
-        match=r"x.tar: cannot be read, at byte 0 of 9 \(the server answers 503 Service Unavailable;"
-        r" 6 tries\). Check the network and the server",
+        match=r"x.tar: .* byte 0 of 9 \(the server answers 503 .*; 6 tries\). Check the network",
     ):
         remote.read(0, 9)
     assert clock.waits_s == [0.5, 1.0, 2.0, 3.0, 3.0]
@@ -159,8 +144,7 @@ def test_a_server_that_ignores_ranges_is_refused_before_it_has_sent_all(served):
 
     with pytest.raises(
         StorageError,
-        match=r"sends the whole file \(256000 bytes\) when asked for bytes 5 to 9. Members are "
-        r"read in parts: use a server that honours ranges, as nginx does",
+        match=r"x.tar: .*whole file \(256000 bytes\) .* bytes 5 to 9.* use a server that honours",
     ):
         read_range(f"{served.url}/x.tar", 5, 9)
 
@@ -177,7 +161,7 @@ def test_the_whole_may_be_sent_where_the_whole_is_asked_for(served):
     [
         ("bytes 6-8/256000", r"sends bytes 6 to 8 when asked for 5 to 8. It does not honour"),
         ("bytes 5-9/256000", r"sends bytes 5 to 9 when asked for 5 to 8. It does not honour"),
-        ("pages 5-8/256000", r"does not tell which part it sends \(Content-Range: 'pages 5-8/256"),
+        ("pages 5-8/256000", r"does not state which part it sends \(Content-Range: 'pages 5-8/256"),
     ],
 )
 def test_another_part_than_the_one_asked_for_is_refused(served, told, message):
@@ -195,7 +179,7 @@ def test_a_file_that_ends_before_the_range_is_told(served):
 def test_a_size_that_is_not_told_is_an_error(served):
     served.always["x.tar"] = Answer(content_range="bytes 0-0/*")
 
-    with pytest.raises(StorageError, match="its server does not tell how large it is"):
+    with pytest.raises(StorageError, match="its server does not state its size"):
         size_of(f"{served.url}/x.tar")
 
 
@@ -204,8 +188,7 @@ def test_a_file_of_another_size_than_the_index_says_is_told_before_it_is_read(se
 
     with pytest.raises(
         ShardError,
-        match=r"x.tar: has 256000 bytes, and the index says 255999. The index is of another pack, "
-        r"or the file was replaced or cut short",
+        match=r"x.tar: has 256000 bytes, and the index says 255999. .*use the index that was made",
     ):
         remote.read(0, 9)
     assert served.sent == 1
@@ -256,7 +239,7 @@ def test_a_query_is_neither_shown_nor_chained(clock):
 
 
 def test_a_url_that_is_none_is_told(clock):
-    with pytest.raises(StorageError, match="is no URL: correct it"):
+    with pytest.raises(StorageError, match="not a URL: correct it"):
         RemoteObject("http://a:b:c/x", retry=clock.policy()).read(0, 9)
 
 
@@ -435,9 +418,8 @@ def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, 
         raw_serving(answering) as url,
         pytest.raises(
             StorageError,
-            match=rf"x.tar: cannot be read, at byte \d+ of 65536 \({reason}; 2 tries\)[^(]*"
-            r".*RetryPolicy\(...\)\), which has least_rate_bytes_s=1000000 over window_s=0.2, "
-            r"timeout_s=0.4, longest_read_s=600 now",
+            match=rf"x.tar: .* byte \d+ of 65536 \({reason}; 2 tries\).*RetryPolicy\(...\)\).* "
+            r"least_rate_bytes_s=1000000 over window_s=0.2, timeout_s=0.4, longest_read_s=600",
         ),
     ):
         RemoteObject(f"{url}/x.tar", retry=retry).read(0, 65536)
@@ -514,9 +496,7 @@ def test_a_length_that_is_no_number_is_named(told):
 
     with (
         raw_serving(whole) as url,
-        pytest.raises(
-            StorageError, match=rf"its server does not tell how large it is \('{told[:80]}'\)"
-        ),
+        pytest.raises(StorageError, match=rf"its server does not state its size \('{told[:80]}'\)"),
     ):
         RemoteObject(f"{url}/x.tar").size()
 
@@ -534,7 +514,7 @@ def test_a_content_range_that_is_none_is_named(told, status):
     with (
         raw_serving(odd) as url,
         pytest.raises(
-            StorageError, match=rf"answers {status} and does not tell which part it sends"
+            StorageError, match=rf"answers {status} and does not state which part it sends"
         ) as caught,
     ):
         RemoteObject(f"{url}/x.tar").read(0, 9)
@@ -544,12 +524,12 @@ def test_a_content_range_that_is_none_is_named(told, status):
 @pytest.mark.parametrize(
     ("location", "message"),
     [
-        (None, "the server answers 302 and names no place to go to"),
-        ("http://[::1", r"sends on to 'http://\[::1', which is no URL of a web server"),
-        ("file:///etc/passwd", "sends on to 'file:///etc/passwd', which is no URL of a web server"),
-        ("ftp://me:word@h/x", "sends on to 'ftp://h/x', which is no URL of a web server"),
-        ("http://h:99999/", "sends on to 'http://h:99999/', which is no URL of a web server"),
-        ("http://a..b/", "is redirected to http://a..b/, which is no URL"),
+        (None, "the server answers 302 and redirects without a location"),
+        ("http://[::1", r"redirects to 'http://\[::1', which is not a URL of a web server"),
+        ("file:///etc/passwd", "redirects to 'file:///etc/passwd', which is not a URL"),
+        ("ftp://me:word@h/x", "redirects to 'ftp://h/x', which is not a URL of a web server"),
+        ("http://h:99999/", "redirects to 'http://h:99999/', which is not a URL of a web server"),
+        ("http://a..b/", "is redirected to http://a..b/, which is not a URL"),
     ],
 )
 def test_a_redirect_to_no_place_is_named(served, location, message):
@@ -563,7 +543,7 @@ def test_a_redirect_to_no_place_is_named(served, location, message):
 @pytest.mark.parametrize(
     ("url", "there", "message"),
     [
-        ("https://8.8.8.8/x", "http://8.8.8.8/x", "sends on from https to http://8.8.8.8/x, which"),
+        ("https://8.8.8.8/x", "http://8.8.8.8/x", "redirects from https to http://8.8.8.8/x,"),
         ("https://8.8.8.8/x", "https://127.0.0.1/y", "inside this machine's own network"),
         ("http://8.8.8.8/x", "http://[::ffff:10.0.0.1]/y", "inside this machine's own network"),
         ("http://8.8.8.8/x", "http://169.254.169.254/", "inside this machine's own network"),
@@ -573,10 +553,10 @@ def test_a_redirect_to_no_place_is_named(served, location, message):
 def test_a_redirect_into_the_own_network_or_without_tls_is_refused(
     monkeypatch, url, there, message
 ):
-    def moved(*_):
+    def moved(*_, **how):
         return urllib3.HTTPResponse(status=302, headers={"Location": there})
 
-    monkeypatch.setattr(web_transport.WebTransport, "_ask", moved)
+    monkeypatch.setattr(urllib3.PoolManager, "request", moved)
 
     with pytest.raises(StorageError, match=message):
         read_range(url, 0, 9)

@@ -12,14 +12,13 @@ import pytest
 
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.sources import filesystems
-from stereogenbench_data.sources.members import read_range, size_of
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
 from tests.servers.fault import Answer
 from tests.servers.fixtures import BUCKET
 from tests.servers.hub import COMMIT, REPOSITORY, HubHandler
 from tests.servers.tools import require_module
+from tests.sources.source_kit import read_range, size_of
 
 
 def shard_of(folder: Path) -> Path:
@@ -167,7 +166,6 @@ def test_what_is_read_of_a_branch_of_the_hub_is_of_one_commit(hub, small_shards)
             return parsed
 
     hub.RequestHandlerClass = Listening
-    filesystems._commits.clear()
     remote.read(0, 9)
 
     asked = [path for path in paths if "/resolve/" in path]
@@ -232,7 +230,7 @@ def test_a_file_system_that_fails_is_asked_again(monkeypatch):
 
 
 def test_a_url_that_no_file_system_opens_is_told():
-    with pytest.raises(StorageError, match=r"nope://a/b: is no URL that fsspec can open. Correct"):
+    with pytest.raises(StorageError, match=r"nope://a/b: not a URL that fsspec can open. Correct"):
         read_range("nope://a/b", 0, 9)
 
 

@@ -5,10 +5,9 @@ import pytest
 
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.cache import ShardCache
-from stereogenbench_data.sources.members import read_range
 from tests.servers.fault import Answer, serving
 from tests.servers.hub import COMMIT, REPOSITORY
-from tests.sources.source_kit import BASELINE_JSON, SourceTests
+from tests.sources.source_kit import BASELINE_JSON, SourceTests, read_range
 
 
 class TestReleasedFolder(SourceTests):

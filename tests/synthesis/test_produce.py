@@ -60,15 +60,15 @@ def test_another_seed_or_folder_gives_another_scene(tmp_path, other):
 
 
 def test_progress_counts_camera_frames_up_to_all(tmp_path):
-    told = []
+    seen = []
 
     synthesise(
-        tmp_path, SynthRequest(scenes=2, **SMALL), progress=lambda *counts: told.append(counts)
+        tmp_path, SynthRequest(scenes=2, **SMALL), progress=lambda *counts: seen.append(counts)
     )
 
-    assert told[0] == (0, 24)
-    assert told[-1] == (24, 24)
-    assert told == sorted(told)
+    assert seen[0] == (0, 24)
+    assert seen[-1] == (24, 24)
+    assert seen == sorted(seen)
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -1,13 +1,13 @@
-"""What the page lists: which scenes and pairs a choice leaves, with counts, and its Python line."""
+"""What the page lists: the scenes and pairs that a choice leaves, counts, and a Python line."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
-from jaxtyping import Bool, Int64
+from jaxtyping import Int64
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
@@ -15,28 +15,24 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
 from stereogenbench_data.selection.filters import filter_scenes
-from stereogenbench_data.selection.pairs import PairList, baselines_cm, choose_pairs
+from stereogenbench_data.selection.pairs import PairList, baselines_cm, choose_pairs, in_bin
 
 MOST_ROWS: Final = 200
-"""How many scenes one answer lists at most."""
+"""The largest number of scenes in one response."""
 
 _KEPT_CHOICES: Final = 32
 
 FACETS: Final = {"split": "split", "subset": "subset", "family": "family", "map": "map_name"}
-"""The filters of which the page lists every value, and the columns that have them."""
+"""The filters whose values the page lists, and the index columns of these."""
 PairKind = Literal["primary", "adjacent", "all"]
-PAIR_KINDS: Final[dict[str, PairKind]] = {
-    "primary": "primary", "adjacent": "adjacent", "all": "all"
-}  # fmt: skip
-"""The pairs that can be chosen, by their names in a query."""
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What is chosen on the page.
+    """The filters that are set on the page.
 
     Attributes:
-        texts: Of each of `FACETS`, the values of which one must match; empty lets all pass.
+        texts: (name, values) of `FACETS`; one of the values must match.
         focal_mm: A closed range in mm, or None.
         baseline_cm: A closed range in cm, names of bins, or None.
         caption: Words that must all be in the caption.
@@ -50,7 +46,7 @@ class Choice:
     pairs: PairKind = "all"
 
     def filters(self) -> dict[str, Any]:
-        """Return the filters of scenes that are set, by their names in `SceneFilters`."""
+        """Return the filters that are set, by their names in `SceneFilters`."""
         found: dict[str, Any] = {
             name: values[0] if len(values) == 1 else list(values) for name, values in self.texts
         }
@@ -62,33 +58,33 @@ class Choice:
 
 
 def parse_choice(query: Mapping[str, list[str]]) -> Choice:
-    """Return the choice that a query states.
+    """Return the choice in a query.
 
     Args:
-        query: Names to values: those of `FACETS` any number of times, ``bin`` likewise;
+        query: Maps names to values: names of `FACETS` and ``bin`` with any number of values;
             ``focal_low``, ``focal_high``, ``baseline_low``, ``baseline_high``, ``caption`` and
-            ``pairs`` once.
+            ``pairs`` with one.
 
     Raises:
-        SelectionError: If a number is none, or a value is none of those there are.
+        SelectionError: If a number is not a number, or there is no such value.
     """
     texts = tuple((name, tuple(sorted(set(query[name])))) for name in FACETS if query.get(name))
     bins = tuple(sorted(set(query.get("bin", ()))))
     unknown = [name for name in bins if name not in BASELINE_BINS]
-    pairs = query.get("pairs", ["all"])[0]
-    if unknown or pairs not in PAIR_KINDS:
-        raise SelectionError(f"there is no {(unknown or [pairs])[0]!r} to choose.")
+    pairs: Any = query.get("pairs", ["all"])[0]
+    if unknown or pairs not in get_args(PairKind):
+        raise SelectionError(f"there is no choice {(unknown or [pairs])[0]!r}.")
     return Choice(
         texts=texts,
         focal_mm=_range(query, "focal"),
         baseline_cm=bins or _range(query, "baseline"),
         caption=query.get("caption", [""])[0],
-        pairs=PAIR_KINDS[pairs],
+        pairs=pairs,
     )
 
 
 def _range(query: Mapping[str, list[str]], name: str) -> tuple[float, float] | None:
-    """Return the closed range that two numbers mean; an end that is left out is open."""
+    """Return the closed range of two numbers; an end that is left out is open."""
     ends: list[float] = []
     for end, default in (("low", 0.0), ("high", 1e6)):
         text = query.get(f"{name}_{end}", [""])[0].strip()
@@ -105,12 +101,12 @@ def _range(query: Mapping[str, list[str]], name: str) -> tuple[float, float] | N
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChosenPairs:
-    """What a choice leaves.
+    """The scenes and pairs that a choice leaves.
 
     Attributes:
-        rows: Rows of scenes of which a pair is left, ascending.
+        rows: Rows of scenes with a pair left, ascending.
         pairs: These pairs.
-        reason: Why there is none, empty where there is one.
+        reason: Why there is no pair; empty if there is one.
     """
 
     rows: Int64[np.ndarray, " n"]
@@ -119,7 +115,7 @@ class ChosenPairs:
 
 
 class Catalogue:
-    """The scenes of an index as the page asks for them; from any thread."""
+    """The scenes of an index as the page asks for them; may be used by any thread."""
 
     def __init__(
         self, index: SceneIndex, *, shown_data: str, depth: DepthEncoding | None = None
@@ -127,15 +123,15 @@ class Catalogue:
         """Take an index.
 
         Args:
-            index: Of the data.
-            shown_data: What `StereoPairs` is given for these data.
-            depth: The depth contract instead of the files' own, or None.
+            index: The index of the data.
+            shown_data: The argument of `StereoPairs` for these data.
+            depth: A depth contract in place of the files' own, or None.
         """
         self.index = index
         self._data = shown_data
         self._depth = depth
         self._row_of = {str(key): row for row, key in enumerate(index.column("key"))}
-        self._chosen = lru_cache(maxsize=_KEPT_CHOICES)(self._choose)
+        self.choose = lru_cache(maxsize=_KEPT_CHOICES)(self._choose)
 
     def row(self, key: str) -> int:
         """Return the row of a key.
@@ -144,33 +140,29 @@ class Catalogue:
             SelectionError: If there is no such scene.
         """
         if key not in self._row_of:
-            raise SelectionError(f"{key!r} is no key of {len(self.index)} scenes.")
+            raise SelectionError(f"{key!r} is not the key of any of {len(self.index)} scenes.")
         return self._row_of[key]
 
     def about(self) -> dict[str, Any]:
-        """Return what the page says of the data as a whole."""
+        """Return what the page shows of the data as a whole."""
         focal_mm = self.index.column("focal_mm")
-        found = baselines_cm(self.index, self._all_pairs())
+        rows = np.arange(len(self.index), dtype=np.int64)
+        depth = "" if self._depth is None else f"depth unit {self._depth.unit_m:g} m, as asked"
+        found = baselines_cm(self.index, choose_pairs(self.index, rows, pairs="all"))
         return {
             "data": self._data,
             "scenes": len(self.index),
             "focal_mm": [float(focal_mm.min()), float(focal_mm.max())],
             "baseline_cm": [float(found.min()), float(found.max())],
-            "depth": ""
-            if self._depth is None
-            else f"depth unit {self._depth.unit_m:g} m, as asked",
+            "depth": depth,
             "left_out": {**self.index.broken, **self.index.incomplete},
         }
 
-    def choose(self, choice: Choice) -> ChosenPairs:
-        """Return what a choice leaves."""
-        return self._chosen(choice)
-
     def summary(self, choice: Choice) -> dict[str, Any]:
-        """Return how many scenes and pairs a choice leaves, why none, and the counts of filters.
+        """Return how many scenes and pairs a choice leaves, why none, and the filters' counts.
 
-        The count of a filter's value is of the scenes that all other filters leave; that of a
-        baseline bin is of the pairs.
+        A filter's value counts the scenes that all other filters leave; a baseline bin counts
+        pairs.
         """
         chosen = self.choose(choice)
         return {
@@ -207,7 +199,7 @@ class Catalogue:
         }
 
     def place(self, choice: Choice, key: str) -> int:
-        """Return the number of a scene among the chosen ones, -1 where it is not one of them."""
+        """Return the position of a scene among the chosen ones, -1 if it is not one of them."""
         rows, row = self.choose(choice).rows, self.row(key)
         place = int(np.searchsorted(rows, row))
         return place if place < len(rows) and rows[place] == row else -1
@@ -217,12 +209,9 @@ class Catalogue:
         row = self.row(key)
         scene, pairs = self.index.scene(row), self.choose(choice).pairs
         mine = pairs.row == row
-        selected = {
-            (int(left), int(right))
-            for left, right in zip(
-                pairs.source[mine].tolist(), pairs.targets[mine, 0].tolist(), strict=True
-            )
-        }
+        selected = set(
+            zip(pairs.source[mine].tolist(), pairs.targets[mine, 0].tolist(), strict=True)
+        )
         return _facts(scene, depth=self._depth) | {
             "place": self.place(choice, key),
             "pairs": [
@@ -240,7 +229,7 @@ class Catalogue:
         }
 
     def selection_line(self, choice: Choice) -> str:
-        """Return the Python that selects what is chosen, all frames; it runs as it stands."""
+        """Return Python that selects the chosen pairs with all frames; it runs as it is."""
         options = choice.filters() | {"pairs": choice.pairs}
         if choice.baseline_cm is not None:
             wanted = choice.baseline_cm
@@ -249,16 +238,15 @@ class Catalogue:
         return self._line("pairs", options | {"frames": "all"})
 
     def sample_line(self, key: str, *, pair: tuple[int, int], frame: int) -> str:
-        """Return the Python that gives the one sample that is shown; it runs as it stands."""
+        """Return Python that gives the sample shown; it runs as it is."""
         self.row(key)
         return self._line("sample", {"scenes": key, "pairs": [pair], "frames": frame}) + "[0]"
 
     def _line(self, name: str, options: Mapping[str, Any]) -> str:
         imports = "StereoPairs"
-        if self._depth is not None:
-            imports = "DepthEncoding, StereoPairs"
         given = "".join(f", {option}={value!r}" for option, value in options.items())
         if self._depth is not None:
+            imports = "DepthEncoding, StereoPairs"
             given += f", depth=DepthEncoding(unit_m={self._depth.unit_m!r})"
         return (
             f"from stereogenbench_data import {imports}\n"
@@ -266,32 +254,22 @@ class Catalogue:
         )
 
     def _choose(self, choice: Choice) -> ChosenPairs:
+        """Return what a choice leaves; the last results are kept."""
         filters: Any = choice.filters()
-        empty = choose_pairs(self.index, np.zeros(0, dtype=np.int64), pairs="all")
         try:
-            rows = filter_scenes(self.index, filters)
             pairs = choose_pairs(
-                self.index,
-                rows,
-                pairs=choice.pairs,
+                self.index, filter_scenes(self.index, filters), pairs=choice.pairs,
                 baseline_cm=choice.baseline_cm,
-            )
+            )  # fmt: skip
         except SelectionError as error:
+            empty = choose_pairs(self.index, np.zeros(0, dtype=np.int64), pairs="all")
             return ChosenPairs(empty.row, empty, str(error))
         return ChosenPairs(np.unique(pairs.row), pairs)
 
-    def _all_pairs(self) -> PairList:
-        return choose_pairs(self.index, np.arange(len(self.index), dtype=np.int64), pairs="all")
-
     def _counts(self, choice: Choice, facet: str) -> dict[str, int]:
         """Return, for each value of a filter, how many scenes the other filters leave."""
-        others = Choice(
-            texts=tuple((name, values) for name, values in choice.texts if name != facet),
-            focal_mm=choice.focal_mm,
-            baseline_cm=choice.baseline_cm,
-            caption=choice.caption,
-            pairs=choice.pairs,
-        )
+        texts = tuple((name, values) for name, values in choice.texts if name != facet)
+        others = replace(choice, texts=texts)
         column = self.index.column(FACETS[facet])
         known = sorted({str(value) for value in column if value is not None})
         found, counts = np.unique(column[self.choose(others).rows].astype(str), return_counts=True)
@@ -299,22 +277,9 @@ class Catalogue:
         return {value: left.get(value, 0) for value in known}
 
     def _bin_counts(self, choice: Choice) -> dict[str, int]:
-        others = Choice(choice.texts, choice.focal_mm, None, choice.caption, choice.pairs)
-        found = baselines_cm(self.index, self.choose(others).pairs)[:, 0]
-        return {
-            name: int(np.count_nonzero(_in_bin(found, name)))
-            for name in BASELINE_BINS
-        }  # fmt: skip
-
-
-def _in_bin(found: Any, name: str) -> Bool[np.ndarray, " n"]:
-    low, high = BASELINE_BINS[name]
-    inside: Bool[np.ndarray, " n"] = (found >= low) & (found < high)
-    if high == BASELINE_BINS["[100,150]"][1]:
-        inside |= found == high
-    elif low == BASELINE_BINS["[100,150]"][1]:
-        inside &= found != low
-    return inside
+        pairs = self.choose(replace(choice, baseline_cm=None)).pairs
+        found = baselines_cm(self.index, pairs)[:, 0]
+        return {name: int(in_bin(found, name).sum()) for name in BASELINE_BINS}
 
 
 def _facts(scene: Scene, *, depth: DepthEncoding | None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A web server for one reader: on this machine alone, read-only, for its own page alone."""
+"""A read-only web server for one reader on this machine, for its own page only."""
 
 import json
 import socket
@@ -28,17 +28,16 @@ _HEADERS: Final = {
 }
 _MOST_CONNECTIONS: Final = 64
 _SILENT_S: Final = 20
-"""How long a connection may stay silent, or leave an answer unread."""
+"""How long a connection may send nothing, or leave a response unread."""
 _LEAST_WAIT_S: Final = 0.25
-"""How long a connection may take for its question before others may have its place."""
+"""How long a connection may take to send its request before another may take its place."""
 
 
 class PageServer(ThreadingHTTPServer):
     """Serves the page of one `Service` on the loopback interface.
 
-    It answers GET and HEAD of its own paths, to a browser that was sent to it by its own name:
-    another Host (a name that was made to point here), or a request that another site's page
-    makes, is refused.
+    It answers GET and HEAD requests for its own paths. It refuses another Host (a name made to
+    point here) and requests from another site's page.
     """
 
     daemon_threads = True
@@ -65,7 +64,7 @@ class PageServer(ThreadingHTTPServer):
         return f"http://{LOOPBACK}:{self.server_address[1]}/"
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Response in a thread of its own; where too many are open, the longest silent one goes."""
+        """Answer in a thread; if too many connections are open, end the longest silent one."""
         while not self._places.acquire(blocking=False):
             if not self._end_longest_silent():
                 self.shutdown_request(request)
@@ -76,20 +75,20 @@ class PageServer(ThreadingHTTPServer):
         super().process_request(request, client_address)
 
     def begin_waiting(self, request: socket.socket) -> None:
-        """Note that a connection has nothing to be answered from now on."""
+        """Note that a connection has no request to answer from now on."""
         with self._lock:
             self._waiting[request] = time.monotonic()
 
     def end_waiting(self, request: socket.socket) -> None:
-        """Note that a connection has sent a request, or ends: nobody may take its place."""
+        """Note that a connection has sent a request, or ends: its place may not be taken."""
         with self._lock:
             self._waiting.pop(request, None)
 
     def _end_longest_silent(self) -> bool:
-        """End the connection that has been silent for longest, after a moment's patience.
+        """End the connection that has been silent for longest, after a short wait.
 
         Returns:
-            Whether there was one; if not, all of them are being answered.
+            Whether there was one; if not, all connections are being answered.
         """
         with self._lock:
             if not self._waiting:
@@ -100,12 +99,12 @@ class PageServer(ThreadingHTTPServer):
             if self._waiting.get(request) != since:
                 return True
             del self._waiting[request]
-            with suppress(OSError):  # its thread meets the end, and frees its place
+            with suppress(OSError):  # its thread sees the end, and frees its place
                 request.shutdown(socket.SHUT_RDWR)
         return True
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """Response one connection, and make room for another."""
+        """Answer one connection, and make room for another."""
         try:
             super().process_request_thread(request, client_address)
         finally:
@@ -113,7 +112,7 @@ class PageServer(ThreadingHTTPServer):
             self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Log nothing: a browser that went away is no error, and errors are sent to the page."""
+        """Log nothing: a browser that left is not an error, and errors are sent to the page."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -124,23 +123,15 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = _SILENT_S
 
     def do_GET(self) -> None:
-        """Response a question."""
-        self._answer_alone(body="send")
+        """Answer a request."""
+        self._answer(body="send")
 
     def do_HEAD(self) -> None:
-        """Response a question without its content."""
-        self._answer_alone(body="leave out")
-
-    def _answer_alone(self, *, body: str) -> None:
-        """Response, and keep the connection from being ended meanwhile."""
-        self.server.end_waiting(self.connection)
-        try:
-            self._answer(body=body)
-        finally:
-            self.server.begin_waiting(self.connection)
+        """Answer a request without the content."""
+        self._answer(body="leave out")
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Say what is wrong, as JSON: also where the library finds a request malformed."""
+        """Send an error as JSON, also for a request that the library finds malformed."""
         status = HTTPStatus(code)
         if status == HTTPStatus.NOT_IMPLEMENTED:
             status = HTTPStatus.METHOD_NOT_ALLOWED
@@ -151,37 +142,41 @@ class _Handler(BaseHTTPRequestHandler):
         """Keep quiet."""
 
     def _answer(self, *, body: str) -> None:
+        """Send a response; the connection's place is not taken meanwhile."""
+        self.server.end_waiting(self.connection)
+        try:
+            self._send(*self._response(), body=body)
+        finally:
+            self.server.begin_waiting(self.connection)
+
+    def _response(self) -> tuple[HTTPStatus, Response]:
         refusal = self._refusal()
         if refusal:
             self.close_connection = True
-            self._send(HTTPStatus.FORBIDDEN, _error(refusal), body=body)
-            return
+            return HTTPStatus.FORBIDDEN, _error(refusal)
         parts = urlsplit(self.path)
         try:
             query = parse_qs(parts.query, max_num_fields=200, errors="strict")
-            answer = self.server.service.answer(parts.path, query)
+            response = self.server.service.answer(parts.path, query)
         except SelectionError as error:
-            self._send(HTTPStatus.BAD_REQUEST, _error(str(error)), body=body)
+            return HTTPStatus.BAD_REQUEST, _error(str(error))
         except StereoGenBenchError as error:
-            response = _error(f"{type(error).__name__}: {error}")
-            self._send(HTTPStatus.UNPROCESSABLE_ENTITY, response, body=body)
+            return HTTPStatus.UNPROCESSABLE_ENTITY, _error(f"{type(error).__name__}: {error}")
         except ValueError:
-            self._send(HTTPStatus.BAD_REQUEST, _error("the question is malformed"), body=body)
-        else:
-            if answer is None:
-                self._send(HTTPStatus.NOT_FOUND, _error("there is nothing here"), body=body)
-            else:
-                self._send(HTTPStatus.OK, answer, body=body)
+            return HTTPStatus.BAD_REQUEST, _error("the request is malformed")
+        if response is None:
+            return HTTPStatus.NOT_FOUND, _error("there is nothing here")
+        return HTTPStatus.OK, response
 
     def _refusal(self) -> str:
-        """Return why a request is refused, nothing where it is one of this page's own."""
+        """Return why a request is refused, "" if it comes from this page."""
         hosts = self.headers.get_all("Host") or []
         if len(hosts) != 1 or hosts[0].lower() not in self.server.hosts:
-            return f"this is {self.server.url}, and was asked for as another host"
+            return f"this is {self.server.url}, but the request names another host"
         site = self.headers.get("Sec-Fetch-Site", "none")
         is_page = self.path == "/" and self.headers.get("Sec-Fetch-Mode") == "navigate"
         if site not in ("none", "same-origin") and not is_page:
-            return "another site's page asked for this"
+            return "the request comes from another site's page"
         return ""
 
     def _send(self, status: HTTPStatus, answer: Response, *, body: str) -> None:

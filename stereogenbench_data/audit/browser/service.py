@@ -1,4 +1,4 @@
-"""What the page asks for, as bytes: lists as JSON, pictures as JPEG, maps as plain numbers."""
+"""The page's requests answered in bytes: lists as JSON, pictures as JPEG, maps as numbers."""
 
 import io
 import json
@@ -27,7 +27,7 @@ STATIC: Final = {
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
 } | {f"/{name}.js": (f"{name}.js", "text/javascript; charset=utf-8") for name in _SCRIPTS}
-"""The files of the page, by their paths: no other file on disk is served."""
+"""The files of the page by their paths; no other file on disk is served."""
 
 _JPEG_QUALITY: Final = 95
 _MAP_FIELDS: Final = ("disparity", "valid", "depth")
@@ -35,7 +35,7 @@ _MAP_FIELDS: Final = ("disparity", "valid", "depth")
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What is sent back: bytes, what they are, and whether the browser may keep them."""
+    """What is sent back: bytes, their media type, and whether the browser may keep them."""
 
     content: bytes
     kind: str
@@ -43,18 +43,24 @@ class Response:
 
 
 class Service:
-    """Answers the page's questions; from any thread."""
+    """Answers the page's requests; may be used by any thread."""
 
     def __init__(self, catalogue: Catalogue, reader: SceneReader) -> None:
-        """Take what lists the scenes, and what reads them."""
+        """Take the catalogue of scenes and their reader."""
         self._catalogue = catalogue
         self._reader = reader
         self._started = secrets.token_hex(4)
         self._routes: dict[str, Callable[[Query], Response]] = {
             "/api/about": self._about,
-            "/api/choice": self._choice,
-            "/api/scenes": self._scenes,
-            "/api/scene": self._scene,
+            "/api/choice": lambda query: _json(catalogue.summary(parse_choice(query))),
+            "/api/scenes": lambda query: _json(
+                catalogue.listed(
+                    parse_choice(query), first=_whole(query, "first"), count=_whole(query, "count")
+                )
+            ),
+            "/api/scene": lambda query: _json(
+                catalogue.scene(_text(query, "key"), parse_choice(query))
+            ),
             "/api/line": self._line,
             "/left.jpg": lambda query: self._picture(query, "left"),
             "/right.jpg": lambda query: self._picture(query, "right"),
@@ -64,10 +70,10 @@ class Service:
         }
 
     def answer(self, path: str, query: Query) -> Response | None:
-        """Return the answer to a path, None where there is none.
+        """Return the response for a path, None if there is no such path.
 
         Raises:
-            SelectionError: If the question names what is not there.
+            SelectionError: If the query names something that does not exist.
             StorageError: If a file is missing or is not the one that was indexed.
             MediaError: If a video does not decode to what the index says.
         """
@@ -85,16 +91,6 @@ class Service:
             "hidden": list(HIDDEN),
         }
         return _json(self._catalogue.about() | {"colours": colours, "started": self._started})
-
-    def _choice(self, query: Query) -> Response:
-        return _json(self._catalogue.summary(parse_choice(query)))
-
-    def _scenes(self, query: Query) -> Response:
-        first, count = _whole(query, "first"), _whole(query, "count")
-        return _json(self._catalogue.listed(parse_choice(query), first=first, count=count))
-
-    def _scene(self, query: Query) -> Response:
-        return _json(self._catalogue.scene(_text(query, "key"), parse_choice(query)))
 
     def _line(self, query: Query) -> Response:
         key, _, pair, frame = self._moment(query)
@@ -116,7 +112,7 @@ class Service:
         return Response(numbers.tobytes(), "application/octet-stream", keep=True)
 
     def _visible(self, query: Query) -> Response:
-        """Return one byte a pixel, 1 where the right camera sees it too."""
+        """Return one byte for each pixel, 1 where the right camera sees it too."""
         _, row, pair, frame = self._moment(query)
         sample = self._reader.pair(row, pair=pair, frame=frame, fields=("visible",))
         numbers = sample["visible"].astype(np.uint8).tobytes()
@@ -134,7 +130,7 @@ def _json(value: Any) -> Response:
 
 def _text(query: Query, name: str) -> str:
     if name not in query:
-        raise SelectionError(f"the question has no {name!r}.")
+        raise SelectionError(f"the request has no {name!r}.")
     return query[name][0]
 
 

@@ -1,12 +1,11 @@
-"""Each camera held against the others: one file may be wrong where all together look right.
+"""Each camera compared with the others, to find single files that are wrong.
 
-A match of two pictures is judged twice, by the depth of either camera. Where nothing is wrong both
-explain as many matches, whatever the pictures are like; where one camera's depth is wrong, it
-alone explains fewer, or differs in scale from the other. What is wrong with a picture (its rows do
-not align, it is of another moment) shows in all pairs of its camera, by either depth.
+A match of two pictures is judged twice, by the depth of either camera. In correct data both explain
+as many matches; wrong depth of one camera explains fewer, or differs in scale from the other. A
+fault of a picture (its rows do not align, it shows another moment) appears in all pairs of its
+camera, by either depth.
 
-Cameras that agree with one another are the ones that others are held against: the largest group of
-them, if it is more than half.
+The reference is the largest group of cameras that agree with one another, if it is the majority.
 """
 
 import math
@@ -15,27 +14,28 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from stereogenbench_data.audit.contract.fitting import voted_scale
 from stereogenbench_data.audit.contract.hypotheses import Hypothesis, Question
-from stereogenbench_data.audit.contract.matching import FrameMatch, Luma, SceneFrames, match_rows
+from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames, match_rows
 from stereogenbench_data.audit.contract.scoring import Pair, ScoredContract, sample_along_rows
+from stereogenbench_data.audit.picture_check import Luma
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 LEAST_SHARE: Final = 0.5
-"""Of a camera's matches with its neighbours as many at least must be explained by its depth."""
+"""Least share of a camera's matches with its neighbours that its depth must explain."""
 MOST_LOG_SCALE: Final = 0.005
 MOST_ROWS_PX: Final = 0.25
 MOST_COLUMNS_PX: Final = 0.4
-"""Beyond these a camera differs from the others: scale of its depth, rows, columns."""
+"""Limits beyond which a camera differs from the others: scale of its depth, rows, columns."""
 _LEAST_DEFICIT: Final = 0.12
-"""A share of matches by which pairs of a camera stay behind pairs as wide of others."""
+"""Least share of matches that a camera's pairs lack, compared with other pairs as wide."""
 _LEAST_ASYMMETRY: Final = 0.03
 _LEAST_GAIN: Final = 0.01
 _LEAST_LATER: Final = 0.03
 _LEAST_AWAY: Final = 0.25
-"""Two depths of one point agree if their disparities differ by less, in pixels."""
+"""Two depths of a point agree if their disparities differ by fewer pixels."""
 _GAIN_ERRORS: Final = 3.0
 _FEWEST_MATCHES: Final = 100
 _NARROWEST: Final = 2
@@ -46,15 +46,15 @@ _MAJORITY: Final = CAMERA_COUNT // 2 + 1
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """One camera beside the others.
+    """One camera compared with the others.
 
     Attributes:
-        camera: Its number, as its files have it.
+        camera: The number in its files' names.
         matches: Pixels found both in its pictures and in those of its two nearest neighbours.
-        agreement: Share of them that its own depth explains to a pixel; nan where untested.
-        depth_scale: Its depth over that of the cameras that agree, the same points; nan if unknown.
-        row_px: How far down its pictures lie, beside those of the cameras that agree.
-        column_px: How far to the right, beside what depth predicts.
+        agreement: Share of them that its own depth explains to a pixel; nan if untested.
+        depth_scale: Its depth over that of the reference cameras at the same points.
+        row_px: How far its pictures are shifted down, against the reference cameras.
+        column_px: How far they are shifted to the right, against what depth predicts.
     """
 
     camera: int
@@ -66,17 +66,17 @@ class CameraFigures:
 
     @property
     def is_tested(self) -> bool:
-        """Whether enough was found to judge it by."""
+        """Whether there were enough matches to judge it."""
         return self.matches >= _FEWEST_MATCHES and math.isfinite(self.agreement)
 
 
 @dataclass(frozen=True, slots=True)
 class CameraCheck:
-    """What a contract leaves to explain, camera by camera.
+    """How well each camera fits a contract.
 
     Attributes:
-        cameras: Figures of all six.
-        faults: In words, what is wrong with single cameras; each names its camera.
+        cameras: Figures of all six cameras; empty if no pair has enough matches.
+        faults: What is wrong with single cameras, in words; each names its camera.
     """
 
     cameras: tuple[CameraFigures, ...] = ()
@@ -84,7 +84,7 @@ class CameraCheck:
 
     @property
     def agreement(self) -> float:
-        """Share of the matches of neighbouring cameras that is explained; nan where untested."""
+        """Share of the matches of neighbouring cameras that is explained; nan if untested."""
         tested = [figures for figures in self.cameras if figures.is_tested]
         count = sum(figures.matches for figures in tested)
         explained = sum(figures.matches * figures.agreement for figures in tested)
@@ -92,7 +92,7 @@ class CameraCheck:
 
     @property
     def untested(self) -> tuple[int, ...]:
-        """Cameras of which too little was found in other pictures."""
+        """Cameras with too few matches in other pictures."""
         tested = {figures.camera for figures in self.cameras if figures.is_tested}
         return tuple(camera for camera in range(CAMERA_COUNT) if camera not in tested)
 
@@ -108,7 +108,7 @@ class CameraCheck:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Beside:
-    """Two cameras, all their matches of all frames, and what either depth says of them."""
+    """Two cameras: their matches of all frames, and what either camera's depth predicts."""
 
     pair: Pair
     width_m: float
@@ -123,12 +123,12 @@ class _Beside:
 
     @property
     def share(self) -> float:
-        """The share of matches that the better of both depths explains."""
+        """The share of matches that the better of the two depths explains."""
         return max(self.near.values())
 
 
 class CameraComparison:
-    """A scene's cameras at one contract."""
+    """Compares a scene's cameras under one contract."""
 
     def __init__(
         self,
@@ -138,16 +138,19 @@ class CameraComparison:
         *,
         depth_step: float,
     ) -> None:
-        """Take frame matches from both sides by turns, and a contract with its scale fitted."""
+        """Take frame matches, by turns from either side, and a contract with its scale fitted."""
         self._views = views
         self._matches = matches
         self._contract = contract
         self._depth_step = depth_step
         self._most_log_scale = max(MOST_LOG_SCALE, depth_step / 4)
         self._partner: dict[int, FrameMatch] = {}
+        by_pair: dict[Pair, list[tuple[FrameMatch, FrameMatch]]] = {}
         for here, there in zip(matches[::2], matches[1::2], strict=True):
             self._partner |= {id(here): there, id(there): here}
-        self._pairs = {beside.pair: beside for beside in self._besides()}
+            by_pair.setdefault(here.pair, []).append((here, there))
+        found = {pair: self._beside(pair, both) for pair, both in by_pair.items()}
+        self._pairs = {pair: beside for pair, beside in found.items() if beside is not None}
 
     def check(self) -> CameraCheck:
         """Return every camera's figures and faults."""
@@ -163,33 +166,18 @@ class CameraComparison:
             ("to the right", "to the left"),
         )
         figures = []
-        for camera in range(CAMERA_COUNT):
+        for camera, shifts in enumerate(zip(scales, rows_px, columns_px, strict=True)):
             nearest = self._of(camera)[:_NARROWEST]
             count = sum(beside.count for beside in nearest)
             explained = sum(beside.count * beside.near[camera] for beside in nearest)
-            figures.append(
-                CameraFigures(
-                    camera, count, explained / count if count else math.nan,
-                    scales[camera], rows_px[camera], columns_px[camera],
-                )
-            )  # fmt: skip
+            share = explained / count if count else math.nan
+            figures.append(CameraFigures(camera, count, share, *shifts))
         faults = dict(column_faults)
         for camera in sorted({*row_faults, *self._behind()}):
             faults[camera] = self._picture_fault(camera, rows_px[camera], row_faults.get(camera))
         faults |= self._depth_faults(scales, scale_faults, beside=set(faults))
-        found = [faults[camera] for camera in sorted(faults)]
-        if not found:
-            found = self._width_faults()
+        found = [faults[camera] for camera in sorted(faults)] or self._width_faults()
         return CameraCheck(tuple(figures), tuple(found))
-
-    def _besides(self) -> Iterator[_Beside]:
-        by_pair: dict[Pair, list[tuple[FrameMatch, FrameMatch]]] = {}
-        for here, there in zip(self._matches[::2], self._matches[1::2], strict=True):
-            by_pair.setdefault(here.pair, []).append((here, there))
-        for pair, both in by_pair.items():
-            found = self._beside(pair, both)
-            if found is not None:
-                yield found
 
     def _beside(self, pair: Pair, both: Sequence[tuple[FrameMatch, FrameMatch]]) -> _Beside | None:
         parts = []
@@ -201,7 +189,7 @@ class CameraComparison:
                 continue
             known = mine[1] & theirs[1]
             shift_px = here.shift_px(self._contract.offsets_px)
-            rows = row_terms(self._views, here)
+            rows = _row_terms(self._views, here)
             parts.append([
                 part[known]
                 for part in (scale * mine[0] + shift_px, shift_px - scale * theirs[0],
@@ -243,10 +231,8 @@ class CameraComparison:
         return sorted(own, key=lambda beside: beside.width_m)
 
     def _scales(self) -> tuple[list[float], dict[int, str]]:
-        """Return each camera's depth over that of those that agree, and which differ.
-
-        Disparity goes with the inverse of depth, so that the sign is turned.
-        """
+        """Return each camera's depth over that of the reference, and the cameras that differ."""
+        # Disparity is inverse to depth: hence the sign.
         values = {pair: -beside.log_ratio for pair, beside in self._pairs.items()}
         limits = {
             pair: max(self._most_log_scale, 4 * beside.ratio_error)
@@ -264,7 +250,7 @@ class CameraComparison:
     def _shifts(
         self, values: dict[Pair, float], most_px: float, directions: tuple[str, str]
     ) -> tuple[list[float], dict[int, str]]:
-        """Return how far each camera's picture is shifted, and those shifted too far."""
+        """Return how far each camera's pictures are shifted, and the cameras shifted too far."""
         levels, group = _levels(values, dict.fromkeys(values, most_px))
         words = {
             camera: f"pictures of camera {camera} are {abs(value):.1f} px {directions[value < 0]}"
@@ -274,7 +260,7 @@ class CameraComparison:
         return levels, _or_all(words, group, f"pictures ({directions[0]} or {directions[1]})")
 
     def _behind(self) -> Iterator[int]:
-        """Yield cameras all of whose pairs explain fewer matches than pairs as wide of others."""
+        """Yield cameras all of whose pairs explain fewer matches than other pairs as wide."""
         for camera in range(CAMERA_COUNT):
             deficits = []
             for beside in self._of(camera):
@@ -289,7 +275,7 @@ class CameraComparison:
                 yield camera
 
     def _picture_fault(self, camera: int, row_px: float, row_fault: str | None) -> str:
-        """Return what is wrong with a camera's pictures: which other reading of them fits best."""
+        """Return what is wrong with a camera's pictures, by the reading that fits best."""
         behind = set(self._behind()) - {camera}
         own = self._of(camera)
         neighbour = next((beside for beside in own if not set(beside.pair) & behind), own[0])
@@ -297,27 +283,23 @@ class CameraComparison:
         matches = [match for match in self._matches if (match.left, match.right) == (other, camera)]
         middle = matches[len(matches) // 2]
         frames = self._views.scene.frames
-        now = self._share([(middle, self._band(middle.frame, camera))])
+        as_it_is = self._views.band(middle.frame, camera)
+        now = self._share([(middle, as_it_is)])
         readings = [
-            (self._share([(middle, turned(self._band(middle.frame, camera)))]), words)
-            for words, turned in _TURNED.items()
+            (self._share([(middle, turned(as_it_is))]), words) for words, turned in _TURNED.items()
         ]
         if row_fault is not None:
             rows = int(np.rint(row_px)) or int(np.sign(row_px))
-            band = np.roll(self._band(middle.frame, camera), -rows, axis=0)
-            readings.append((self._share([(middle, band)]), ""))
+            readings.append((self._share([(middle, np.roll(as_it_is, -rows, axis=0))]), ""))
         for lag in range(-_FARTHEST_FRAMES, _FARTHEST_FRAMES + 1):
             usable = [match for match in matches if 0 <= match.frame + lag < frames]
             if lag and usable:
                 match = min(usable, key=lambda each: abs(each.frame - middle.frame))
-                share = self._share([(match, self._band(match.frame + lag, camera))])
-                many = "s" if abs(lag) > 1 else ""
-                word = "late" if lag > 0 else "early"
-                readings.append((share, f"{abs(lag)} frame{many} {word}"))
-        everywhere = [each for each in self._matches if (each.left, each.right) == (other, camera)]
+                share = self._share([(match, self._views.band(match.frame + lag, camera))])
+                readings.append((share, _lateness(lag)))
         share, words = max(readings, default=(0.0, ""))
-        elsewhere = self._share_elsewhere(everywhere)
-        # Where disparities are small another place explains what is wrong with rows as well.
+        elsewhere = self._share_elsewhere(matches)
+        # With small disparities another place also explains a fault of rows.
         if elsewhere > share + _LEAST_DEFICIT:
             share, words = elsewhere, _ELSEWHERE
         wanted = max(
@@ -335,7 +317,7 @@ class CameraComparison:
         return f"pictures of camera {camera} are {words}" if words else row_fault or ""
 
     def _share_elsewhere(self, matches: Sequence[FrameMatch]) -> float:
-        """Return the share of matches that depth explains if the two stand otherwise apart."""
+        """Return the share of matches that depth explains if the cameras stand elsewhere."""
         found, predicted = [], []
         for match in matches:
             prediction = self._views.predicted(match, self._contract.hypothesis)
@@ -345,18 +327,15 @@ class CameraComparison:
         if not sum(map(len, found)):
             return 0.0
         found_px, predicted_px = np.concatenate(found), np.concatenate(predicted)
-        # The two may even stand the other way round.
+        # The two may even stand in the other order.
         aways = [
             voted_scale(found_px, sign * predicted_px) * sign * predicted_px - found_px
             for sign in (1, -1)
         ]
         return max(float((np.abs(away) < matches[0].grain_px).mean()) for away in aways)
 
-    def _band(self, frame: int, camera: int) -> Luma:
-        return self._views.band(frame, camera)
-
     def _share(self, matches: Sequence[tuple[FrameMatch, Luma]]) -> float:
-        """Return the share of matches with other right pictures that depth explains."""
+        """Return the share of matches with given right pictures that depth explains."""
         near, count = 0, 0
         hypothesis = self._contract.hypothesis
         for match, right in matches:
@@ -376,15 +355,20 @@ class CameraComparison:
     def _depth_faults(
         self, scales: Sequence[float], scale_faults: dict[int, str], *, beside: set[int]
     ) -> dict[int, str]:
-        """Return cameras whose depth explains less than it should, and what would explain more."""
+        """Return cameras whose depth explains too little, and what would explain more."""
         faults = {}
-        for camera in sorted(set(range(CAMERA_COUNT)) - beside - self._aside()):
-            own = [
-                each for each in self._of(camera)
-                if not (set(each.pair) - {camera}) & (beside | set(scale_faults))
-            ] or self._of(camera)  # fmt: skip
-            if not own:
+        offsets_px = self._contract.offsets_px
+        for camera in sorted(set(range(CAMERA_COUNT)) - beside):
+            pairs = self._of(camera)
+            is_shifted = bool(offsets_px) and all(
+                abs(offsets_px.get(each.pair, math.inf)) >= MOST_COLUMNS_PX for each in pairs
+            )
+            if is_shifted or not pairs:
                 continue
+            own = [
+                each for each in pairs
+                if not (set(each.pair) - {camera}) & (beside | set(scale_faults))
+            ] or pairs  # fmt: skip
             behind = [
                 each.near[camera] - next(n for c, n in each.near.items() if c != camera)
                 for each in own
@@ -401,26 +385,13 @@ class CameraComparison:
                 )
         return faults
 
-    def _aside(self) -> set[int]:
-        """Return cameras all of whose pairs have an offset: their pictures left their depth."""
-        offsets_px = self._contract.offsets_px
-        return {
-            camera
-            for camera in range(CAMERA_COUNT)
-            if offsets_px
-            and all(
-                abs(offsets_px.get(beside.pair, math.inf)) >= MOST_COLUMNS_PX
-                for beside in self._of(camera)
-            )
-        }
-
     def _better_depth(self, camera: int, *, scale: float) -> str:
-        """Return another reading of one camera's depth that explains clearly more, in words."""
+        """Return, in words, another reading of a camera's depth that explains clearly more."""
         hypothesis = self._contract.hypothesis
         matches = [match for match in self._matches if match.left == camera]
         now = self._shares(matches, hypothesis)
         subject = f"depth of camera {camera}"
-        lagged: dict[str, Hypothesis] = {}
+        lagged: dict[str, int] = {}
         readings: list[tuple[str, Float64[np.ndarray, " matches"]]] = [
             (
                 f"{subject} is {scale:.4g} x that of the others",
@@ -433,7 +404,7 @@ class CameraComparison:
                 factor = self._own_factor(matches, other) if question == "form" else 1.0
                 words = f"{subject} fits better {words}"
                 if question == "frame_lag":
-                    lagged[words] = other
+                    lagged[words] = other.frame_lag
                 readings.append((words, self._shares(matches, other, factor=factor)))
         for file in range(CAMERA_COUNT):
             if file != hypothesis.depth_file(camera):
@@ -446,24 +417,21 @@ class CameraComparison:
         best, most = "", 0.0
         for words, shares in readings:
             gain, is_clear = _gain(shares, now)
-            # The first of them are the simplest.
+            # The first ones are the simplest.
             if is_clear and gain > most + _LEAST_GAIN * bool(best):
                 best, most = words, gain
-        if best in lagged and self._is_late(camera, lagged[best]):
-            return f"pictures of camera {camera} are {self._lateness(lagged[best])}"
+        if best in lagged:
+            lag = hypothesis.frame_lag - lagged[best]
+            if self._is_late(camera, lag):
+                return f"pictures of camera {camera} are {_lateness(lag)}"
         return best
 
-    def _lateness(self, lagged: Hypothesis) -> str:
-        lag = self._contract.hypothesis.frame_lag - lagged.frame_lag
-        return f"{abs(lag)} frame{'s' if abs(lag) > 1 else ''} {'late' if lag > 0 else 'early'}"
+    def _is_late(self, camera: int, lag: int) -> bool:
+        """Tell whether a camera's pictures lag rather than its depth.
 
-    def _is_late(self, camera: int, lagged: Hypothesis) -> bool:
-        """Tell whether it is a camera's pictures that lag rather than its depth.
-
-        Depth before its time fits pictures that are late. If they are, then a later picture fits
-        the depth of the neighbours better.
+        Late pictures fit earlier depth. If they are late, a later picture fits the depth of the
+        neighbours better.
         """
-        lag = self._contract.hypothesis.frame_lag - lagged.frame_lag
         (neighbour,) = set(self._of(camera)[0].pair) - {camera}
         matches = [
             match
@@ -472,7 +440,7 @@ class CameraComparison:
             and 0 <= match.frame + lag < self._views.scene.frames
         ]
         now, then = (
-            self._share([(match, self._band(match.frame + by, camera)) for match in matches])
+            self._share([(match, self._views.band(match.frame + by, camera)) for match in matches])
             for by in (0, lag)
         )
         return then > now + _LEAST_LATER
@@ -497,10 +465,10 @@ class CameraComparison:
         file: int | None = None,
         factor: float = 1.0,
     ) -> Float64[np.ndarray, " matches"]:
-        """Return the share of each frame match at which a reading agrees with the other's depth.
+        """Return for each frame match the share where a reading agrees with the other's depth.
 
-        Depth agrees more sharply with depth than with matches, some of which are wrong. ``factor``
-        is what depth is divided by, in that disparity is multiplied.
+        Depth agrees more sharply with depth than with matches, some of which are wrong. Disparity
+        is multiplied by ``factor``.
         """
         shares = np.full(len(matches), np.nan)
         for place, match in enumerate(matches):
@@ -515,10 +483,7 @@ class CameraComparison:
         return shares
 
     def _width_faults(self) -> list[str]:
-        """Return whether pairs disagree on how wide they are, and which camera is common to them.
-
-        The others' distances are taken for right.
-        """
+        """Return which pairs disagree with the others on their width, and their common camera."""
         wide = {
             pair: beside for pair, beside in self._pairs.items()
             if beside.rms_px > 2.0 and beside.share >= LEAST_SHARE
@@ -535,10 +500,7 @@ class CameraComparison:
             return []
         common = set.intersection(*map(set, off))
         words = ", ".join(f"{a}-{b} by {math.expm1(v):+.1%}" for (a, b), v in off.items())
-        whose = ""
-        if len(common) == 1:
-            (camera,) = common
-            whose = f": camera {camera} {_ELSEWHERE}"
+        whose = f": camera {common.pop()} {_ELSEWHERE}" if len(common) == 1 else ""
         return [f"distances between cameras disagree: {words}{whose}"]
 
 
@@ -547,17 +509,21 @@ _TURNED: Final[dict[str, Callable[[Luma], Luma]]] = {
     "upside down": lambda band: band[::-1],
     "turned by 180 degrees": lambda band: band[::-1, ::-1],
 }
-_ELSEWHERE: Final = "is not where it is said to be, or its pictures are aside"
+_ELSEWHERE: Final = "is not at its recorded position, or its pictures are shifted"
 _READINGS: Final[dict[Question, str]] = {
     "frame_lag": "with a lag of {:+d} frames", "flip": "flipped ({})", "form": "as {} depth",
     "kind": "along the {}",
 }  # fmt: skip
 
 
-def row_terms(
+def _lateness(lag: int) -> str:
+    return f"{abs(lag)} frame{'s' if abs(lag) > 1 else ''} {'late' if lag > 0 else 'early'}"
+
+
+def _row_terms(
     views: SceneFrames, match: FrameMatch
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Return how far lower the left picture lies at each match: numerator and denominator.
+    """Return how far down the left picture is shifted at each match: numerator and denominator.
 
     One step of Lucas and Kanade along the column, over five rows, at the disparity that was found.
     """
@@ -577,7 +543,7 @@ def row_terms(
 
 
 def _median(values: Float64[np.ndarray, " n"]) -> tuple[float, float]:
-    """Return the median and its standard error by the spread; nan and inf of nothing."""
+    """Return the median and its standard error by the spread; nan and inf for no values."""
     if not len(values):
         return math.nan, math.inf
     middle = float(np.median(values))
@@ -587,9 +553,10 @@ def _median(values: Float64[np.ndarray, " n"]) -> tuple[float, float]:
 def _levels(
     values: Mapping[Pair, float], limits: Mapping[Pair, float]
 ) -> tuple[list[float], set[int]]:
-    """Return each camera's level from differences (first less second), and those that agree.
+    """Return each camera's level from differences (first less second), and the reference group.
 
-    The largest group that agrees is at 0; the others are at their median difference from it.
+    The largest group of cameras that agree is at 0; the others are at their median difference
+    from it.
     """
     group = {camera: {camera} for camera in range(CAMERA_COUNT)}
     for pair, value in values.items():
@@ -612,7 +579,7 @@ def _levels(
 
 
 def _or_all(words: dict[int, str], group: set[int], what: str) -> dict[int, str]:
-    """Return the words, or that cameras disagree where no majority of them agrees."""
+    """Return the words, or that cameras disagree if no majority of them agrees."""
     if not words or len(group) >= _MAJORITY:
         return words
     return dict.fromkeys(words, f"cameras disagree in {what}, and no majority of them agrees")
@@ -621,9 +588,9 @@ def _or_all(words: dict[int, str], group: set[int], what: str) -> dict[int, str]
 def _gain(
     better: Float64[np.ndarray, " n"], worse: Float64[np.ndarray, " n"]
 ) -> tuple[float, bool]:
-    """Return by how much one set of shares is larger on average, and whether that is sure."""
-    both: Bool[np.ndarray, " n"] = np.isfinite(better) & np.isfinite(worse)
-    gains = (better - worse)[both]
+    """Return by how much one set of shares is larger on average, and whether that is certain."""
+    gains = better - worse
+    gains = gains[np.isfinite(gains)]
     if len(gains) < _NARROWEST + 1:
         return 0.0, False
     mean, error = float(gains.mean()), float(gains.std(ddof=1)) / math.sqrt(len(gains))

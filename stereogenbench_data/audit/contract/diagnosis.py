@@ -1,8 +1,7 @@
-"""One scene's diagnosis: the declared contract, changed as little as the pictures ask.
+"""One scene's diagnosis: the declared contract, changed as little as the pictures ask for.
 
-`Search` fits each hypothesis once and takes the contract with the fewest changes that no further
-change clearly improves. `diagnose_scene` reports what that contract explains and what it leaves
-open.
+`Search` fits each hypothesis once and returns the contract with the fewest changes that no further
+change clearly improves. `diagnose_scene` reports how well that contract fits.
 """
 
 import math
@@ -23,6 +22,7 @@ from stereogenbench_data.audit.contract.matching import (
     FrameMatch,
     SceneFrames,
     disparity_px,
+    relative_step,
     spread_px,
 )
 from stereogenbench_data.audit.contract.scoring import (
@@ -37,16 +37,16 @@ from stereogenbench_data.audit.contract.scoring import (
 from stereogenbench_data.schema.records import Rig, Scene
 
 LEAST_LOG_SCALE: Final = 0.01
-"""A unit that is off by less is not called wrong."""
+"""A smaller error of the unit is not called wrong."""
 BIAS_PX: Final = 0.1
-"""By how much disparity may be off however many pixels agree: interpolation on small pictures."""
+"""Systematic error of disparity, by interpolation on small pictures."""
 LEAST_OFFSET_PX: Final = 0.3
 _NOTHING: Final = Evidence(math.nan, math.inf)
 
 
 @dataclass(frozen=True, slots=True)
 class Rival:
-    """Another answer to one question, all else as in the best contract but for the scale.
+    """Another answer to one question, with a scale of its own.
 
     ``behind`` is by how much the best contract is better.
     """
@@ -58,37 +58,38 @@ class Rival:
 
 @dataclass(frozen=True, slots=True)
 class SceneDiagnosis:
-    """What one scene's pictures say about its depth contract.
+    """What one scene's pictures show about its depth contract.
 
     Attributes:
         key: The scene.
         views: How many views (a pair in a frame) were compared.
         pairs: The pairs.
         matches: Pixels that were found in both pictures of a view.
-        textured: Pixels that were looked for.
+        textured: Pixels that were searched for.
         unit_m: The declared unit of the primary pair's left depth, in metres.
         unit_source: Where it comes from: "tag", "default", "user" or "unreadable".
-        focal_ratios: In words, other readings of focal length and sensor, and what disparity
-            each gives over that of the width; those that give the same are left out.
-        recorded_pair: The primary pair as it is recorded, if its left camera stands to the right
-            of the other by the poses; None if it does not.
+        focal_ratios: Maps other readings of focal length and sensor, in words, to their disparity
+            over that by the sensor's width; readings with equal results are left out.
+        recorded_pair: The recorded primary pair if, by the poses, its left camera stands to the
+            right of the other; else None.
         declared: The declared answers.
         best: The answers of the best contract.
         changed: What else the best contract changes: the scale, the offset, or both.
         scale: Found over declared disparity, fitted with the best contract's answers.
         scale_error: Standard error of log(scale).
         other_kind_scale: Scale with the other kind of depth, all else as in the best contract.
-        offsets_px: Constant disparity of each pair at the best contract.
-        gain: By how much the best contract beats the declared one.
-        parallax: By how much it beats no disparity at all.
+        offsets_px: Constant disparity of each pair with the best contract.
+        gain: By how much the best contract is better than the declared one.
+        parallax: By how much it is better than no disparity at all.
         agreement: Share of the matches of neighbouring cameras that the best contract explains.
         rivals: The other answers.
-        equals: Contracts with as few changes that are not clearly worse, in words.
+        equals: (hypothesis, fitted lengths, scale) of contracts with as few changes that are not
+            clearly worse.
         disparity_px: Root mean square of the disparities found.
-        spread_px: Root mean square of the same, less the mean of each view.
-        depth_step: How far apart neighbouring stored depths lie, as a share.
-        check: What the best contract leaves to explain, camera by camera.
-        problem: Why the scene could not be judged; empty where it could.
+        spread_px: The same, less the mean of each view.
+        depth_step: The `relative_step` of stored depths.
+        check: How well each camera fits the best contract.
+        problem: Why the scene could not be judged; empty if it could.
     """
 
     key: str
@@ -118,12 +119,17 @@ class SceneDiagnosis:
     check: CameraCheck = field(default_factory=CameraCheck)
     problem: str = ""
 
+    @property
+    def fits_scale(self) -> bool:
+        """Whether the best contract has a scale of its own."""
+        return self.changed in ("scale", "both") or self.best.form != self.declared.form
+
 
 def allowed_log_scale(depth_step: float) -> float:
-    """Return by how much log(unit) may be off without being called wrong.
+    """Return the error of log(unit) that is not called wrong.
 
-    Coarse depth moves the mean of 1 / depth by the order of its step squared, where it was rounded;
-    a quarter of a step allows for some that was cut off.
+    Rounding to coarse steps moves the mean of 1 / depth by about the step squared; a quarter of a
+    step allows for truncation.
     """
     return max(LEAST_LOG_SCALE, depth_step / 4 + depth_step**2)
 
@@ -146,22 +152,22 @@ def focal_ratios(rig: Rig) -> dict[str, float]:
 
 
 def crossed_pair(scene: Scene) -> Pair | None:
-    """Return the recorded primary pair if its cameras stand in the other order by the poses."""
+    """Return the recorded primary pair if the poses put its cameras in the other order."""
     left, right = scene.rig.primary_pair
     return (left, right) if scene.lateral_m[left] > scene.lateral_m[right] else None
 
 
 _COARSEST_STEP: Final = 0.5
-"""A scene whose stored depths are further apart, as a share, is not judged."""
+"""A scene with larger relative steps of stored depth is not judged."""
 _LEAST_SCALE_DB: Final = 0.02
 _SCALE_ERRORS: Final = 1.5
-"""A scale has an error of its own to be judged by, so its score has to prove less."""
+"""A scale is also judged by its own standard error, so its score needs to prove less."""
 _MOST_CHANGES: Final = 4
 _PROMISING: Final = 4
-"""Of the exchanges of cameras so many are tried with a scale of their own."""
+"""How many exchanges of cameras are tried with a scale of their own."""
 FEWEST_MATCHES: Final = 200
 _LEAST_PARALLAX_PX: Final = 0.3
-"""Smaller disparities (root mean square) are those of noise."""
+"""Smaller disparities (root mean square) are noise."""
 
 _LENGTHS: Final[dict[Free, tuple[str, ...]]] = {
     "nothing": (), "scale": ("scale",), "offset": ("offset",), "both": ("scale", "offset"),
@@ -170,7 +176,7 @@ _LENGTHS: Final[dict[Free, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A contract in the search: how much of it is fitted, and its score."""
+    """A contract in the search: which lengths are fitted, and its score."""
 
     free: Free
     score: ScoredContract
@@ -181,7 +187,7 @@ class _Candidate:
 
 
 class Search:
-    """Contracts of one scene, each fitted once."""
+    """The search for the best contract of a scene; fits each contract once."""
 
     def __init__(
         self,
@@ -190,12 +196,12 @@ class Search:
         *,
         least_log_scale: float = LEAST_LOG_SCALE,
     ) -> None:
-        """Take what the contracts are judged by, and how far off a unit may be."""
+        """Take frame matches, and the error of log(unit) that is not called wrong."""
         self._views = views
         self._least_log_scale = least_log_scale
         self._every = matches
         near = views.neighbours(Hypothesis())
-        # Those next but one are for the comparison of cameras.
+        # The pairs next but one serve the comparison of cameras.
         self._matches = [match for match in matches if match.pair in near] or list(matches)
         self._bias = BIAS_PX / max(disparity_px(matches), 1e-6)
         self._bias_beside_offset = BIAS_PX / max(spread_px(matches), 1e-6)
@@ -210,20 +216,6 @@ class Search:
             score = fit_hypothesis(self._views, self._matches, hypothesis, free=free)
             self._fitted[hypothesis, free] = _Candidate(free, score)
         return self._fitted[hypothesis, free]
-
-    def _at(self, hypothesis: Hypothesis, other: _Candidate) -> _Candidate:
-        """Return a hypothesis with the scale and the offsets of another contract."""
-        score = other.score
-        return _Candidate(
-            other.free,
-            score_hypothesis(
-                self._views,
-                self._matches,
-                hypothesis,
-                scale=score.scale,
-                offsets_px=score.offsets_px,
-            ),
-        )
 
     def best(self) -> _Candidate:
         """Return the contract with the fewest changes that no further change clearly improves."""
@@ -240,21 +232,21 @@ class Search:
         return self._settled(self._pruned(current))
 
     def _settled(self, current: _Candidate) -> _Candidate:
-        """Take the other kind of depth where the shape of disparity asks for it.
+        """Change the kind of depth if the shape of disparity asks for it.
 
-        A scale makes up for most of the difference, so that the search may have taken one instead.
+        A scale explains most of the difference, so the search may have chosen a scale instead.
         """
         (other,) = current.hypothesis.alternatives("kind")
         free = _freed(current.free, "scale")
         mine, theirs = (self.candidate(each, free=free) for each in (current.hypothesis, other))
-        # What is further off than a ray is longer than its depth has another scale altogether.
+        # A ray is longer than its depth by a limited factor; more than that is another scale.
         most = math.log(float(self._views.ray_per_planar.max())) + self._least_log_scale
         if abs(math.log(mine.score.scale / current.score.scale)) > most:
             return current
         return self._pruned(theirs) if self.gain(theirs, mine).by_shape else current
 
     def _one_change(self, current: _Candidate) -> Iterator[_Candidate]:
-        """Yield contracts that change one answer, or let one length be fitted."""
+        """Yield contracts that change one answer, or fit one more length."""
         for question in QUESTIONS:
             others = current.hypothesis.alternatives(question)
             if question == "order" and current.free != "nothing":
@@ -272,17 +264,15 @@ class Search:
         free = _freed(current.free, "scale")
         if free != current.free:
             for question in QUESTIONS:
-                others = (
-                    self._promising(current.hypothesis)
-                    if question == "order"
-                    else current.hypothesis.alternatives(question)
-                )
+                others = current.hypothesis.alternatives(question)
+                if question == "order":
+                    others = self._promising(current.hypothesis)
                 for hypothesis in others:
                     yield self.candidate(hypothesis, free=free)
             yield self.candidate(current.hypothesis, free="both")
 
     def _promising(self, current: Hypothesis) -> tuple[Hypothesis, ...]:
-        """Return the orders that explain most matches, whatever the scale."""
+        """Return the orders that explain most matches, at any scale."""
         if current not in self._likely:
             orders = current.alternatives("order")
             few = [match for match in self._matches if match.frame == self._matches[0].frame]
@@ -292,48 +282,46 @@ class Search:
         return self._likely[current]
 
     def _most_better(self, current: _Candidate, others: Iterator[_Candidate]) -> _Candidate | None:
-        """Return the contract that is clearly better than the current one by most."""
+        """Return the contract that improves most on the current one, None if none clearly does."""
         better = [other for other in others if self._is_better(other, current)]
         shifted = [other for other in better if "offset" in _new(other, current)]
         scaled = [other for other in better if "scale" in _new(other, current)]
         for other in shifted:
-            # One number for all pairs goes before one for each.
+            # One number for all pairs is preferred to one for each.
             if any(not self.gain(other, plain).is_clear() for plain in scaled):
                 better.remove(other)
         return max(better, key=lambda other: self.gain(other, current).mean_db, default=None)
 
     def _pruned(self, current: _Candidate) -> _Candidate:
-        """Take back changes that another one has made needless."""
+        """Undo changes that another change has made unnecessary."""
         for simpler in list(self._simpler(current)):
             if not self._is_better(current, simpler):
                 return self._pruned(simpler)
         return current
 
     def _simpler(self, current: _Candidate) -> Iterator[_Candidate]:
+        """Yield contracts with one change fewer."""
         declared = self.declared.hypothesis
-        fixed: dict[Free, tuple[Free, ...]] = {
-            "scale": ("nothing",), "offset": ("nothing",), "both": ("scale", "offset"),
-            "nothing": (),
-        }  # fmt: skip
         for question in current.hypothesis.changes_from(declared):
             back = current.hypothesis.changed(question, getattr(declared, question))
             yield self.candidate(back, free=current.free)
-        for free in fixed[current.free]:
+        fewer: dict[Free, tuple[Free, ...]] = {"nothing": (), "both": ("scale", "offset")}
+        for free in fewer.get(current.free, ("nothing",)):
             if current.hypothesis.form == declared.form or free in ("scale", "both"):
                 yield self.candidate(current.hypothesis, free=free)
 
     def simplest(self) -> _Candidate:
-        """Return the declared contract, with another scale only if that is clearly better."""
+        """Return the declared contract, with another scale if that is clearly better."""
         scaled = self.candidate(self.declared.hypothesis, free="scale")
         return scaled if self._is_better(scaled, self.declared) else self.declared
 
     def cameras(self, contract: _Candidate, *, depth_step: float) -> CameraCheck:
-        """Return what a contract leaves to explain, its scale fitted."""
+        """Return how well each camera fits a contract, its scale fitted."""
         fitted_too = self.candidate(contract.hypothesis, free=_freed(contract.free, "scale"))
         hypothesis = contract.hypothesis
         matches = self._every
         if hypothesis.order != self.declared.hypothesis.order:
-            # Other files stand beside each other.
+            # Other files are neighbours.
             frames = len({match.frame for match in matches})
             matches = self._views.frame_matches(frames=frames, hypothesis=hypothesis)
         return CameraComparison(
@@ -348,8 +336,12 @@ class Search:
         for question in QUESTIONS:
             for hypothesis in best.hypothesis.alternatives(question):
                 if question == "order" and hypothesis not in likely:
-                    # Two cameras exchanged leave the others, and with them the scale, as they are.
-                    other = self._at(hypothesis, best)
+                    # An exchange of two cameras leaves the others, and so the scale, as they are.
+                    score = score_hypothesis(
+                        self._views, self._matches, hypothesis,
+                        scale=best.score.scale, offsets_px=best.score.offsets_px,
+                    )  # fmt: skip
+                    other = _Candidate(best.free, score)
                 else:
                     other = self.candidate(hypothesis, free=free)
                 answer = getattr(hypothesis, question)
@@ -371,7 +363,7 @@ class Search:
     def gain_where_they_differ(self, best: _Candidate) -> Evidence:
         """Return by how much a contract is better than the declared one, where the two differ.
 
-        An offset of one camera leaves the pairs of the others as they are.
+        The offset of one camera leaves the pairs of the others as they are.
         """
         if best.hypothesis != self.declared.hypothesis or best.free != "offset":
             return self.gain(best, self.declared)
@@ -387,7 +379,7 @@ class Search:
         return evidence([self._matches[place] for place in moved], ours, theirs)
 
     def without_parallax(self, best: _Candidate) -> Evidence:
-        """Return by how much a contract is better than if all were infinitely far."""
+        """Return by how much a contract is better than infinite depth everywhere."""
         flat = score_hypothesis(self._views, self._matches, best.hypothesis, scale=1e-12)
         return evidence(self._matches, best.score, flat)
 
@@ -406,7 +398,7 @@ class Search:
         return found
 
     def _power(self, candidate: _Candidate) -> RayPower:
-        """Return the power of the ray's length at a contract, whichever its kind and scale."""
+        """Return the power of the ray's length for a contract of any kind and scale."""
         planar = candidate.hypothesis.changed("kind", "planar")
         free = _freed(candidate.free, "scale")
         if (planar, free) not in self._powers:
@@ -415,7 +407,7 @@ class Search:
         return self._powers[planar, free]
 
     def _is_better(self, other: _Candidate, current: _Candidate) -> bool:
-        """Tell whether a contract is clearly better, and what it fits worth mentioning."""
+        """Tell whether a contract is clearly better, and its fitted lengths are significant."""
         gain = self.gain(other, current)
         freed = (current.free, other.free)
         if other.hypothesis == current.hypothesis and freed in (
@@ -424,7 +416,7 @@ class Search:
             off = abs(math.log(other.score.scale))
             least = max(self._least_log_scale, self._bias)
             if current.free == "offset":
-                # Two things wrong at once take more to be believed.
+                # Two errors at once need more evidence.
                 least = max(2 * self._least_log_scale, self._bias_beside_offset)
             sure = off > least + LEAST_ERRORS * min(other.score.scale_error, 1e3)
             return sure and gain.is_clear(least_db=_LEAST_SCALE_DB, errors=_SCALE_ERRORS)
@@ -435,7 +427,7 @@ class Search:
 
 
 def _new(other: _Candidate, current: _Candidate) -> set[str]:
-    """Return which of "scale" and "offset" alone a contract fits beside another."""
+    """Return which of "scale" and "offset" a contract fits beyond another one."""
     if other.hypothesis != current.hypothesis:
         return set()
     return set(_LENGTHS[other.free]) - set(_LENGTHS[current.free])
@@ -450,10 +442,10 @@ def _freed(free: Free, length: str) -> Free:
 def _checked(
     search: Search, best: _Candidate, *, depth_step: float
 ) -> tuple[_Candidate, CameraCheck]:
-    """Return the contract to go by, and what it leaves to explain, camera by camera.
+    """Return the contract to report, and how well each camera fits it.
 
-    Where single files are wrong a contract for all may have been bent to them: then it is the
-    declared one, with a scale where it asks for one, that is checked.
+    Single wrong files may have bent the best contract to them. Then the declared contract, with
+    another scale if that is clearly better, is checked instead.
     """
     check = search.cameras(best, depth_step=depth_step)
     plain = search.simplest()
@@ -466,7 +458,7 @@ def _checked(
 
 
 def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
-    """Return what a scene's pictures say about its declared contract.
+    """Return what a scene's pictures show about its declared contract.
 
     Raises:
         MediaError: If a video does not decode, or has another size than the scene's metadata say.
@@ -487,27 +479,22 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
         "declared": declared,
     }
     if basics["matches"] < FEWEST_MATCHES:
-        return SceneDiagnosis(
-            **basics, best=declared,
-            problem=f"no texture: {basics['textured']:,} pixels have any, and "
-            f"{basics['matches']:,} were found in both pictures",
-        )  # fmt: skip
-    basics["depth_step"] = views.depth_step(matches[0].frame)
-    if basics["depth_step"] > _COARSEST_STEP:
-        return SceneDiagnosis(
-            **basics, best=declared,
-            problem=f"stored depth is too coarse: its steps are {basics['depth_step']:.0%} of it",
-        )  # fmt: skip
-    basics["spread_px"] = spread_px(matches)
-    least_log_scale = allowed_log_scale(basics["depth_step"])
-    basics["disparity_px"] = disparity_px(matches)
+        problem = (
+            f"no texture: {basics['textured']:,} pixels have any, and "
+            f"{basics['matches']:,} were found in both pictures"
+        )
+        return SceneDiagnosis(**basics, best=declared, problem=problem)
+    units, known = views.depth(matches[0].frame, file)
+    step = basics["depth_step"] = relative_step(units[known])
+    if step > _COARSEST_STEP:
+        problem = f"stored depth is too coarse: its steps are {step:.0%} of it"
+        return SceneDiagnosis(**basics, best=declared, problem=problem)
+    basics |= {"disparity_px": disparity_px(matches), "spread_px": spread_px(matches)}
     if basics["disparity_px"] < _LEAST_PARALLAX_PX:
-        return SceneDiagnosis(
-            **basics, best=declared,
-            problem=f"too little parallax: disparities are of {basics['disparity_px']:.2f} px",
-        )  # fmt: skip
-    search = Search(views, matches, least_log_scale=least_log_scale)
-    best, check = _checked(search, search.best(), depth_step=basics["depth_step"])
+        problem = f"too little parallax: disparities are of {basics['disparity_px']:.2f} px"
+        return SceneDiagnosis(**basics, best=declared, problem=problem)
+    search = Search(views, matches, least_log_scale=allowed_log_scale(step))
+    best, check = _checked(search, search.best(), depth_step=step)
     share_told = agreement(views, matches, best.score)
     parallax = search.without_parallax(best)
     if math.isnan(share_told) or not parallax.is_clear():

@@ -1,16 +1,16 @@
-"""The depth contract, measured: which of many explains what the pictures themselves show.
+"""The doctor: find out which depth contract explains the pictures of a data set.
 
-Pixels that are found again along the rows of the other picture give disparity without any depth.
-Every hypothesis on the contract predicts another disparity for them; the pictures are compared
-at that disparity, on the same pixels for all. The declared contract is changed as little as the
-pictures ask for. Where two contracts fit alike, the report names both.
+Matching along the rows of two pictures gives disparity without any depth. Each hypothesis on the
+contract predicts another disparity for the same pixels, at which the pictures are compared. The
+declared contract is changed as little as the pictures ask for. The report names all contracts that
+fit equally well.
 
-What cannot be seen: unit, focal length and baselines enter disparity as one quotient, so that a
-wrong one looks like a wrong other, and two may make up for each other.
+Unit, focal length and baselines enter disparity as one quotient. So the pictures do not show which
+of them is wrong, and two wrong ones may cancel out.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -20,31 +20,28 @@ import numpy as np
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis, diagnose_scene
 from stereogenbench_data.audit.contract.matching import SceneFrames
 from stereogenbench_data.audit.contract.verdict import Verdict, group_by_contract, judge
-from stereogenbench_data.engine import LOCAL, Advance
+from stereogenbench_data.audit.scene_access import SceneAccess
+from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.streams import Streams
-from stereogenbench_data.schema.records import DepthEncoding, Scene, ShardFacts
+from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
-from stereogenbench_data.sources.members import MemberSource
-from stereogenbench_data.sources.retry import RetryPolicy
 
 MOST_RESIDUAL_PX: Final = 0.5
-"""Rigs that are further from rectified are left out: disparity alone does not explain them."""
-
-Progress = Callable[[int, int], None]
+"""Rigs with a larger rectification residual are left out: they need more than disparity."""
 
 
 @dataclass(frozen=True, slots=True)
 class DoctorReport:
-    """What the pictures say.
+    """The diagnosis of a data set.
 
     Attributes:
         data: The root of the data.
         declared: The contract under test.
         scenes: Each scene's own diagnosis, sorted by key.
-        verdicts: One for each group of scenes with one contract, the largest group first.
-        left_out: Key to the reason, for scenes that could not be judged.
+        verdicts: One for each group of scenes with the same contract, the largest group first.
+        left_out: Maps the keys of scenes that cannot be judged to the reason.
     """
 
     data: str
@@ -55,28 +52,23 @@ class DoctorReport:
 
     @property
     def is_wrong(self) -> bool:
-        """Whether for some scene another contract is clearly better, or a camera does not fit."""
+        """Whether another contract is clearly better, or a camera does not fit, in any scene."""
         return any(verdict.is_wrong for verdict in self.verdicts)
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisTask:
-    """One scene to be judged, in whatever process."""
+    """One scene to diagnose; can be sent to worker processes."""
 
-    scene: Scene
-    root: str
-    shards: dict[str, ShardFacts]
-    revision: str
+    access: SceneAccess
     frames: int
     encoding: DepthEncoding
-    retry: RetryPolicy | None = None
 
-    def streams(self) -> Streams:
-        """Return the scene's videos."""
-        source = MemberSource(
-            self.root, shards=self.shards, revision=self.revision, retry=self.retry
-        )
-        return Streams(source)
+    @contextmanager
+    def scene_frames(self) -> Iterator[SceneFrames]:
+        """Open the scene's videos."""
+        with closing(Streams(self.access.source())) as streams:
+            yield SceneFrames(self.access.scene, streams, encoding=self.encoding)
 
 
 def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
@@ -86,6 +78,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
     frames: int = 4,
     depth: DepthEncoding | None = None,
     workers: int | None = None,
+    engine: Engine = LOCAL,
     progress: Progress | None = None,
     filters: SceneFilters | None = None,
 ) -> DoctorReport:
@@ -93,11 +86,12 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
 
     Args:
         data: What `SceneIndex.open` takes, or an index.
-        scenes: How many scenes to look at, spread over those that pass the filters.
-        frames: How many frames of each, in up to five pairs.
-        depth: The contract to ask about; None for what files and release state.
-        workers: Processes, None for one a core.
-        progress: Called with the scenes done and all there are.
+        scenes: How many scenes to diagnose, spread over those that pass the filters.
+        frames: How many frames of each scene.
+        depth: The contract under test; None for what files and release state.
+        workers: Number of processes, None for one a core.
+        engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster`.
+        progress: Called with the number of scenes done and of all scenes.
         filters: Which scenes; None for all.
 
     Raises:
@@ -122,39 +116,23 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
     chosen = usable[
         np.unique(np.linspace(0, len(usable) - 1, min(scenes, len(usable))).astype(int))
     ]
-    tasks = [_task(index, int(row), frames=frames, encoding=encoding) for row in chosen]
+    tasks = [
+        DiagnosisTask(SceneAccess.of(index, index.scene(int(row))), frames, encoding)
+        for row in chosen
+    ]
     found = []
-    for diagnosis in _diagnoses(tasks, workers=workers):
-        found.append(diagnosis)
-        if progress is not None:
-            progress(len(found), len(tasks))
+    results = engine.map(_diagnose, tasks, name=lambda task: task.access.key, workers=workers)
+    with closing(results):
+        for diagnosis in results:
+            found.append(diagnosis)
+            if progress is not None:
+                progress(len(found), len(tasks))
     found.sort(key=lambda diagnosis: diagnosis.key)
     verdicts = tuple(judge(group, declared=encoding) for group in group_by_contract(found))
     return DoctorReport(index.where, encoding, tuple(found), verdicts, left_out)
 
 
-def scene_task(data: SceneIndex, key: str, *, encoding: DepthEncoding) -> DiagnosisTask:
-    """Return the task that judges one scene by one frame."""
-    (row,) = filter_scenes(data, {"scenes": key})
-    return _task(data, int(row), frames=1, encoding=encoding)
-
-
-def _task(index: SceneIndex, row: int, *, frames: int, encoding: DepthEncoding) -> DiagnosisTask:
-    scene = index.scene(row)
-    paths = {member.path for member in scene.members.values()}
-    shards = {path: facts for path, facts in index.shards.items() if path in paths}
-    return DiagnosisTask(scene, index.root, shards, index.digest, frames, encoding, index.retry)
-
-
-def _diagnoses(tasks: list[DiagnosisTask], *, workers: int | None) -> Iterator[SceneDiagnosis]:
-    with closing(
-        LOCAL.map(_diagnose, tasks, name=lambda task: task.scene.id.key, workers=workers)
-    ) as results:
-        yield from results
-
-
 def _diagnose(task: DiagnosisTask, after_bytes: Advance) -> SceneDiagnosis:
     after_bytes(0)
-    with closing(task.streams()) as streams:
-        views = SceneFrames(task.scene, streams, encoding=task.encoding)
+    with task.scene_frames() as views:
         return diagnose_scene(views, frames=task.frames)

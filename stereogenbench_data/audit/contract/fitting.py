@@ -1,18 +1,17 @@
 """A contract's scale and offsets, found from matches and refined on the pictures.
 
-The scale is voted for by the ratios of found to predicted disparities, which no wrong start can
-mislead. It is then refined by Gauss-Newton steps on the difference of the pictures (Lucas and
-Kanade, 1981, with disparity a scale and an offset of what depth predicts), robustly weighted.
+The ratios of found to predicted disparities vote for a scale, which needs no starting value. Robust
+Gauss-Newton steps on the difference of the pictures then refine it (Lucas and Kanade, 1981, with
+disparity as a scale and an offset of the predicted one).
 
-Planar and ray depth differ in shape: `ray_power` fits with which power of the ray's length
-disparity grows. The two differ by a few per cent towards the corners, and less behind a long lens.
-Their scores in dB then hardly differ, and a unit that is a little off makes up for most of it. The
-power is fitted beside the scale, so no unit can stand in for it: 0 is depth along the optical axis,
-1 along the ray.
+Planar and ray depth differ by a few per cent towards the corners, and by less with a long lens.
+Their scores in dB hardly differ then, and a slightly different unit explains most of the rest. So
+`ray_power` fits, beside the scale, the power of the ray's length with which disparity grows: 0 is
+depth along the optical axis, 1 along the ray.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -40,53 +39,39 @@ _LARGEST_STEP_PX: Final = 1.0
 _DRAWS: Final = 300
 _FEWEST_USABLE: Final = 10
 _NEAR_PX: Final = 3 * _TOLERANCE_PX
-"""RowMatches that a prediction misses by more take no part in refining it."""
+"""Matches further from the prediction are not used to refine it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Term:
-    """A frame match, its pixels with known depth alone, and the disparity that is predicted there.
+class _Term:
+    """The pixels of a frame match where depth is known, and the disparity predicted there.
 
-    ``large_px`` is the 90th percentile of the predicted sizes.
+    ``large_px`` is the 90th percentile of the predicted disparities' size. ``sign`` is 1 if the
+    pixels are those of the file with the lower number, from which offsets are counted, else -1.
     """
 
     match: FrameMatch
     predicted_px: Points
     large_px: float
-
-    @property
-    def matched_px(self) -> Points:
-        """The disparity that was found."""
-        return self.match.matched_px
-
-    @property
-    def pair(self) -> Pair:
-        """The two files, the lower number first."""
-        return self.match.pair
-
-    @property
-    def sign(self) -> int:
-        """1 if the pixels are those of the lower number, whose way offsets are counted, else -1."""
-        return 1 if self.match.left < self.match.right else -1
+    sign: int
 
 
 def fit_hypothesis(
     views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis, *, free: Free
 ) -> ScoredContract:
-    """Return a hypothesis with the scale and offsets that explain the pictures best."""
-    terms = [] if free == "nothing" else fit_terms(views, matches, hypothesis)
+    """Return a hypothesis with the scale and the offsets that explain the pictures best."""
+    terms = [] if free == "nothing" else _fit_terms(views, matches, hypothesis)
     if not terms:
         return score_hypothesis(views, matches, hypothesis)
-    scale, offsets_px = _start(terms, free=free)
-    scale, offsets_px, error = _refined(views, terms, scale, offsets_px, free=free)
+    scale, offsets_px, error = _refined(views, terms, *_start(terms, free=free), free=free)
     return score_hypothesis(
         views, matches, hypothesis, scale=scale, offsets_px=offsets_px, scale_error=error
     )
 
 
-def fit_terms(
+def _fit_terms(
     views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
-) -> list[Term]:
+) -> list[_Term]:
     """Return the frame matches for which a hypothesis predicts anything, with its predictions."""
     terms = []
     for match in matches:
@@ -95,7 +80,8 @@ def fit_terms(
             disparity_px, known = predicted
             predicted_px = disparity_px[known]
             large_px = float(np.percentile(np.abs(predicted_px), 90))
-            terms.append(Term(match.at(known), predicted_px, large_px))
+            sign = 1 if match.left < match.right else -1
+            terms.append(_Term(match.at(known), predicted_px, large_px, sign))
     return terms
 
 
@@ -103,47 +89,47 @@ def voted_agreement(
     views: SceneFrames, matches: Sequence[FrameMatch], hypothesis: Hypothesis
 ) -> float:
     """Return how many matches a hypothesis explains at the scale that most of them agree on."""
-    terms = fit_terms(views, matches, hypothesis)
+    terms = _fit_terms(views, matches, hypothesis)
     if not terms:
         return 0.0
-    found = np.concatenate([term.matched_px for term in terms])
-    predicted = np.concatenate([term.predicted_px for term in terms])
+    found, predicted = _joined(terms)
     return _agreement(found, voted_scale(found, predicted) * predicted)
 
 
-def _start(terms: Sequence[Term], *, free: Free) -> tuple[float, dict[Pair, float]]:
+def _joined(terms: Iterable[_Term]) -> tuple[Points, Points]:
+    """Return the disparities found and predicted, counted from the files with the lower number."""
+    found, predicted = zip(
+        *((term.sign * term.match.matched_px, term.sign * term.predicted_px) for term in terms),
+        strict=True,
+    )
+    return np.concatenate(found), np.concatenate(predicted)
+
+
+def _start(terms: Sequence[_Term], *, free: Free) -> tuple[float, dict[Pair, float]]:
     """Return a scale and offsets from the matches alone."""
-    found = np.concatenate([term.matched_px for term in terms])
-    predicted = np.concatenate([term.predicted_px for term in terms])
     if free == "scale":
-        return voted_scale(found, predicted), {}
+        return voted_scale(*_joined(terms)), {}
+    by_pair = {
+        pair: _joined(term for term in terms if term.match.pair == pair)
+        for pair in dict.fromkeys(term.match.pair for term in terms)
+    }
     scale = 1.0
     if free == "both":
-        widest = max(terms, key=lambda term: len(term.matched_px)).pair
-        own = [term for term in terms if term.pair == widest]
-        scale = _drawn_scale(
-            np.concatenate([term.sign * term.matched_px for term in own]),
-            np.concatenate([term.sign * term.predicted_px for term in own]),
-        )
-    offsets_px = {}
-    for pair in dict.fromkeys(term.pair for term in terms):
-        rest = [
-            term.sign * (term.matched_px - scale * term.predicted_px)
-            for term in terms
-            if term.pair == pair
-        ]
-        offsets_px[pair] = _densest(np.concatenate(rest))
-    return scale, offsets_px
+        most_matches = max(terms, key=lambda term: len(term.predicted_px)).match.pair
+        scale = _drawn_scale(*by_pair[most_matches])
+    return scale, {
+        pair: _densest(found - scale * predicted) for pair, (found, predicted) in by_pair.items()
+    }
 
 
 def _agreement(found: Points, predicted: Points) -> float:
-    """Return how many matches a prediction explains, each counted by how near it is."""
+    """Return how many matches a prediction explains; a near one counts nearly 1."""
     away = (found - predicted) / _TOLERANCE_PX
     return float((1 / (1 + away * away)).sum())
 
 
 def voted_scale(found: Points, predicted: Points) -> float:
-    """Return the scale that most matches agree on, of those that their ratios propose."""
+    """Return the scale, among those that the ratios propose, on which most matches agree."""
     usable = (found * predicted > 0) & (np.abs(found) > 0.1)
     if not usable.any():
         return 1.0
@@ -158,7 +144,7 @@ def voted_scale(found: Points, predicted: Points) -> float:
 
 
 def _drawn_scale(found: Points, predicted: Points) -> float:
-    """Return the scale of the line, offset and all, on which most matches are."""
+    """Return the scale of the line, with any offset, on which most matches lie."""
     rng = np.random.default_rng(0)
     first, second = rng.integers(len(found), size=(2, _DRAWS))
     apart = predicted[first] - predicted[second]
@@ -176,7 +162,7 @@ def _drawn_scale(found: Points, predicted: Points) -> float:
 
 
 def _densest(values: Points) -> float:
-    """Return where most values are, to half a pixel or better."""
+    """Return where most values lie, to half a pixel or better."""
     places = np.round(values * 4)
     numbers, counts = np.unique(places, return_counts=True)
     tallest = numbers[counts.argsort()[-8:]] / 4
@@ -187,22 +173,21 @@ def _densest(values: Points) -> float:
 
 def _refined(
     views: SceneFrames,
-    terms: Sequence[Term],
+    terms: Sequence[_Term],
     scale: float,
     offsets_px: dict[Pair, float],
     *,
     free: Free,
 ) -> tuple[float, dict[Pair, float], float]:
     """Return scale and offsets after Gauss-Newton steps, and the error of log(scale)."""
-    pairs = list(dict.fromkeys(term.pair for term in terms))
+    pairs = list(dict.fromkeys(term.match.pair for term in terms))
     fits_scale = free in ("scale", "both")
-    fits_offset = free in ("offset", "both")
-    unknowns = [*(["scale"] if fits_scale else []), *(pairs if fits_offset else [])]
+    unknowns = [*(["scale"] if fits_scale else []), *(pairs if free in ("offset", "both") else [])]
     error = math.inf
     for _ in range(_STEPS):
         normals, rights = _equations(views, terms, scale, offsets_px, unknowns=unknowns)
         step, spread = _solved(normals, rights)
-        limit = max(np.abs(_moved(term, scale, step, unknowns)).max() for term in terms)
+        limit = max(_moved_px(term, scale, step, unknowns) for term in terms)
         step *= min(1.0, _LARGEST_STEP_PX / max(limit, 1e-12))
         for name, change in zip(unknowns, step, strict=True):
             if isinstance(name, tuple):
@@ -216,20 +201,16 @@ def _refined(
     return scale, offsets_px, error
 
 
-def _moved(term: Term, scale: float, step: Points, unknowns: Sequence[object]) -> Points:
-    """Return how far a step moves a term's matches, but for those that tell nothing."""
-    moved = np.zeros(1)
-    for name, change in zip(unknowns, step, strict=True):
-        if name == "scale":
-            moved = moved + np.array([scale * term.large_px * change])
-        elif name == term.pair:
-            moved = moved + change
-    return moved
+def _moved_px(term: _Term, scale: float, step: Points, unknowns: Sequence[object]) -> float:
+    """Return how far a step moves a term's matches with large disparities."""
+    of_unknown: dict[object, float] = {"scale": scale * term.large_px, term.match.pair: 1.0}
+    changes = zip(unknowns, step.tolist(), strict=True)
+    return float(abs(sum(of_unknown.get(name, 0.0) * change for name, change in changes)))
 
 
 def _equations(
     views: SceneFrames,
-    terms: Sequence[Term],
+    terms: Sequence[_Term],
     scale: float,
     offsets_px: dict[Pair, float],
     *,
@@ -243,23 +224,23 @@ def _equations(
         difference, slope, weight = _compared(views, term, disparity_px)
         if weight is None:
             continue
-        # Of all unknowns a frame match depends on its own pair's, and on the scale.
+        # A frame match depends on the scale and on its own pair's offset.
         columns = {
             place: slope * scale * term.predicted_px if name == "scale" else term.sign * slope
             for place, name in enumerate(unknowns)
-            if name in ("scale", term.pair)
+            if name in ("scale", term.match.pair)
         }
         _add_columns(normals[number], rights[number], columns, weight=weight, difference=difference)
     return normals, rights
 
 
 def _compared(
-    views: SceneFrames, term: Term, disparity_px: Points
+    views: SceneFrames, term: _Term, disparity_px: Points
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], Float64[np.ndarray, " n"] | None]:
     """Return right less left at a disparity, the mean slope of both, and each pixel's weight.
 
-    The weight is robust, and 0 for pixels that leave the picture or were matched elsewhere. It is
-    None where too few are left.
+    The weight is robust, and 0 for pixels that leave the picture or whose match is elsewhere. It
+    is None if too few pixels are left.
     """
     match = term.match
     there, slope, inside = sample_with_slope(
@@ -285,7 +266,7 @@ def _add_columns(
     weight: Points,
     difference: Float32[np.ndarray, " n"],
 ) -> None:
-    """Write one frame match's weighted normal equations, from derivatives by unknown."""
+    """Fill in one frame match's weighted normal equations, from its derivatives by unknown."""
     for place, column in columns.items():
         rights[place] = (column * weight * difference).sum()
         for other, beside in columns.items():
@@ -295,7 +276,7 @@ def _add_columns(
 def _solved(
     normals: Float64[np.ndarray, "terms k k"], rights: Float64[np.ndarray, "terms k"]
 ) -> tuple[Points, Points]:
-    """Return the step and its standard errors, from how much frame matches disagree."""
+    """Return the step and its standard errors, from the disagreement of frame matches."""
     total = normals.sum(axis=0)
     inverse = np.linalg.pinv(total, rcond=1e-12)
     step = inverse @ rights.sum(axis=0)
@@ -312,7 +293,7 @@ def _solved(
 _RAY_STEPS: Final = 5
 _LARGEST_RAY_STEP: Final = 0.5
 _RAY_BIAS: Final = 0.15
-"""How far the power may be off however many pixels agree; measured up to 0.19 at long focal."""
+"""Systematic error of the power; up to 0.19 was measured at long focal lengths."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,7 +305,7 @@ class RayPower:
 
     @property
     def kind(self) -> DepthKind | None:
-        """The kind of depth: None where the power is unsure, or near neither 0 nor 1."""
+        """The kind of depth, None if the power is uncertain or near neither 0 nor 1."""
         doubt = _RAY_BIAS + LEAST_ERRORS * self.error
         if not abs(self.power - 0.5) > doubt:
             return None
@@ -334,15 +315,15 @@ class RayPower:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The power and half its 95 % interval, what it is off by on any data included."""
+        """The power and half its 95 % interval, its systematic error included."""
         return self.power, math.hypot(1.96 * self.error, _RAY_BIAS)
 
 
 def ray_power(
     views: SceneFrames, matches: Sequence[FrameMatch], contract: ScoredContract
 ) -> RayPower:
-    """Return the power that fits a contract's pictures best, scale and its offsets fitted too."""
-    terms = fit_terms(views, matches, contract.hypothesis)
+    """Return the power that fits the pictures best, together with the scale and the offsets."""
+    terms = _fit_terms(views, matches, contract.hypothesis)
     pairs = list(contract.offsets_px)
     log_scale, bend = math.log(contract.scale), 0.0
     offsets_px = dict(contract.offsets_px)
@@ -360,8 +341,8 @@ def ray_power(
             if weight is None:
                 continue
             columns = {0: slope * grown_px, 1: slope * grown_px * log_ray}
-            if term.pair in offsets_px:
-                columns[2 + pairs.index(term.pair)] = term.sign * slope
+            if match.pair in offsets_px:
+                columns[2 + pairs.index(match.pair)] = term.sign * slope
             _add_columns(
                 normals[number], rights[number], columns, weight=weight, difference=difference
             )

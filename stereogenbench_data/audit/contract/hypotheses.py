@@ -1,4 +1,4 @@
-"""What may be wrong with a depth contract: questions, and hypotheses that answer them."""
+"""The questions that the doctor asks about a depth contract, and hypotheses that answer them."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, get_args
@@ -19,7 +19,7 @@ _KINDS_OF_FILES: Final[dict[str, tuple[Content, ...]]] = {
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """Which camera each file of some kinds is of; every such exchange is its own inverse."""
+    """The camera of each file of some kinds; every such exchange is its own inverse."""
 
     cameras: tuple[int, ...] = _SAME
     contents: tuple[Content, ...] = ()
@@ -54,16 +54,16 @@ QUESTIONS: Final = tuple(_ANSWERS)
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """All of a contract that is not a length: one answer to each question.
+    """A contract without its lengths: one answer to each question.
 
     Attributes:
         kind: "planar" or "ray".
         form: "depth" or "inverse".
         frame_lag: RGB frame t shows what depth frame t + frame_lag measured.
-        order: Which camera each file is of. "mirrored": the recorded places run the other way;
-            "exchanged": the files of two cameras are; "reversed": files of camera c are those of
-            camera 5 - c. Of pictures, of depth, or of both.
-        flip: How stored depth is turned over.
+        order: The camera of each file. "mirrored": the recorded positions run the other way;
+            "exchanged": the files of two cameras are exchanged; "reversed": camera c has the files
+            of camera 5 - c. It concerns pictures, depth, or both.
+        flip: How stored depth is flipped.
     """
 
     kind: DepthKind = "planar"
@@ -74,7 +74,7 @@ class Hypothesis:
 
     @classmethod
     def declared(cls, encoding: DepthEncoding) -> "Hypothesis":
-        """Return what a depth contract says, pictures and cameras as they are recorded."""
+        """Return the hypothesis of a depth contract, with pictures and cameras as recorded."""
         return cls(kind=encoding.kind, form=encoding.form, frame_lag=encoding.frame_lag)
 
     def changed(self, question: Question, answer: Any) -> "Hypothesis":
@@ -86,7 +86,7 @@ class Hypothesis:
         return tuple(name for name in QUESTIONS if getattr(self, name) != getattr(other, name))
 
     def alternatives(self, question: Question) -> tuple["Hypothesis", ...]:
-        """Return the hypotheses that differ from this one in the answer to one question."""
+        """Return the hypotheses with another answer to one question."""
         return tuple(
             self.changed(question, answer)
             for answer in _ANSWERS[question]
@@ -95,20 +95,20 @@ class Hypothesis:
 
     @property
     def is_mirrored(self) -> bool:
-        """Whether the recorded places of the cameras run the other way."""
+        """Whether the recorded positions of the cameras run the other way."""
         return _ORDERS[self.order].is_mirrored
 
     def camera_of(self, file: int, *, content: Content) -> int:
-        """Return the camera that a numbered file is of."""
+        """Return the camera of a file by its number."""
         order = _ORDERS[self.order]
         return order.cameras[file] if content in order.contents else file
 
     def depth_file(self, rgb_file: int) -> int:
-        """Return the number of the depth file that belongs to a numbered picture."""
+        """Return the number of the depth file that belongs to a picture's file."""
         return self.camera_of(self.camera_of(rgb_file, content="rgb"), content="depth")
 
     def reads_alike(self, other: "Hypothesis", *, left: int, right: int) -> bool:
-        """Tell whether both take the same numbers and places for the pictures of two files."""
+        """Tell whether both use the same depth and positions for the pictures of two files."""
         return self.changed("order", other.order) == other and all(
             mine == theirs
             for mine, theirs in (

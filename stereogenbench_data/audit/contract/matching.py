@@ -1,25 +1,25 @@
-"""What the pictures of a scene have in common, found without any depth.
+"""Stereo matches of a scene's pictures, found without depth, and the disparity that depth predicts.
 
-Rows of two rectified pictures are correlated: every pixel of a row is compared with every pixel of
-the same row of the other picture. So no range of disparities is assumed, and no near optimum is
-locked to, whatever the depth claims. RowMatches that hold in both directions are kept. numpy alone
-does it: a row's comparisons are one product of matrices.
+Each pixel of a row is correlated with every pixel of the same row of the other, rectified picture.
+So no range of disparities is assumed, and wrong depth cannot mislead the search. Matches that hold
+in both directions are kept. A row's correlations are one matrix product.
 
-`SceneFrames` holds one scene's pictures and stored depth, and predicts by a hypothesis which
-disparity each matched pixel should have.
+`SceneFrames` holds one scene's pictures and stored depth, and predicts the disparity of matched
+pixels by a hypothesis.
 """
 
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16
 from numpy.lib.stride_tricks import sliding_window_view
 
 from stereogenbench_data.audit.contract.hypotheses import LAGS, Flip, Hypothesis
+from stereogenbench_data.audit.picture_check import Luma, luma_of
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.samples.streams import Streams
@@ -36,27 +36,25 @@ _ROWS: Final = 64
 _RADIUS_PX: Final = 4
 _LEAST_CORRELATION: Final = 0.75
 _LEAST_LEAD: Final = 0.04
-"""How much better than the second best place, more than `_NEAR_PX` away, a match must be."""
+"""How much a match must beat the best place more than `_NEAR_PX` away from it."""
 _NEAR_PX: Final = 3
 _LEAST_SLOPE: Final = 2.0
-"""Root mean square of the horizontal slope in a patch, in grey levels a pixel: texture."""
+"""Least root mean square of the horizontal slope in a patch with texture, grey levels a pixel."""
 _BLOCK: Final = 2**18
-"""Multiplications in one product of matrices. BLAS starts threads for more; in several processes
-on a busy machine they wait for one another (25 times slower, measured)."""
-
-Luma = Float32[np.ndarray, "h w"]
+"""Multiplications in one matrix product. For more BLAS starts threads, which wait for one another
+where several processes share a machine (25 times slower, measured)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowMatches:
-    """Pixels of a left picture that were found again in the right one.
+    """Pixels of a left picture that were found in the right one.
 
     Attributes:
         rows: (n,) rows.
         columns: (n,) columns.
-        disparity_px: (n,) how far to the left each was found, negative for to the right.
-        textured: How many pixels were looked for.
-        grain_px: Size of the pixels that were compared.
+        disparity_px: (n,) how far to the left each was found, negative to the right.
+        textured: How many pixels were searched for.
+        grain_px: Size of the compared pixels, in pixels of the picture.
     """
 
     rows: Int64[np.ndarray, " n"]
@@ -67,17 +65,17 @@ class RowMatches:
 
 
 def match_rows(left: Luma, right: Luma) -> RowMatches:
-    """Return what a left picture has in common with the right one of a rectified pair."""
+    """Return the matches of a rectified pair."""
     return match_pairs({0: left, 1: right}, [(0, 1)])[0, 1]
 
 
 def match_pairs(
     pictures: Mapping[int, Luma], pairs: Sequence[tuple[int, int]]
 ) -> dict[tuple[int, int], RowMatches]:
-    """Return what the left and the right picture of each pair have in common.
+    """Return the matches of each pair.
 
-    Large pictures are matched at 512 columns or fewer, and then disparity is good to half a pixel
-    of the full size; else to about 0.2 pixels. The patches of a row are cut once for all pairs.
+    Disparity is accurate to about 0.2 pixels. Pictures wider than 512 columns are reduced first;
+    then it is accurate to half a pixel of the full size.
 
     Args:
         pictures: (h, w) grey levels of views by number, all of one size, rows aligned.
@@ -85,8 +83,13 @@ def match_pairs(
     """
     height, width = next(iter(pictures.values())).shape
     factor = -(-width // _WIDEST_PX)
-    small = {number: _reduced(picture, factor=factor) for number, picture in pictures.items()}
     height, width = height // factor, width // factor
+    small = {  # the means of blocks of factor x factor pixels
+        number: picture[: height * factor, : width * factor]
+        .reshape(height, factor, width, factor)
+        .mean(axis=(1, 3), dtype=np.float32)
+        for number, picture in pictures.items()
+    }
     if min(height, width) <= 2 * _RADIUS_PX:
         return {pair: _gathered([], factor=factor, textured=0) for pair in pairs}
     inner = np.arange(_RADIUS_PX, height - _RADIUS_PX)
@@ -95,10 +98,21 @@ def match_pairs(
     found = {pair: [] for pair in pairs}
     textured = dict.fromkeys(pairs, 0)
     left_numbers = {left for left, _ in pairs}
+    side = 2 * _RADIUS_PX + 1
     for row in rows:
-        windows = {number: _windows(picture, row) for number, picture in small.items()}
+        # The patches around the row's inner columns, (columns, side, side), cut once for all pairs.
+        windows = {
+            number: sliding_window_view(
+                picture[row - _RADIUS_PX : row + _RADIUS_PX + 1], (side, side)
+            )[0]
+            for number, picture in small.items()
+        }
         patches = {number: _normalised(each) for number, each in windows.items()}
-        has_texture = {number: _has_texture(windows[number]) for number in left_numbers}
+        slopes = {number: np.diff(windows[number], axis=-1) for number in left_numbers}
+        has_texture = {
+            number: np.sqrt((each**2).mean(axis=(1, 2))) >= _LEAST_SLOPE
+            for number, each in slopes.items()
+        }
         for left, right in pairs:
             is_textured = has_texture[left]
             textured[left, right] += int(is_textured.sum())
@@ -107,30 +121,6 @@ def match_pairs(
                 (np.full(len(columns), row), columns + _RADIUS_PX, disparity_px)
             )
     return {pair: _gathered(found[pair], factor=factor, textured=textured[pair]) for pair in pairs}
-
-
-def _reduced(picture: Luma, *, factor: int) -> Luma:
-    """Return the means of blocks of factor x factor pixels."""
-    height, width = (side // factor * factor for side in picture.shape)
-    blocks = picture[:height, :width].reshape(height // factor, factor, width // factor, factor)
-    reduced: Luma = blocks.mean(axis=(1, 3), dtype=np.float32)
-    return reduced
-
-
-def _windows(picture: Luma, row: int) -> Float32[np.ndarray, "columns side side"]:
-    """Return the patches around a row's inner columns, as views of the picture."""
-    band = picture[row - _RADIUS_PX : row + _RADIUS_PX + 1]
-    side = 2 * _RADIUS_PX + 1
-    windows: Float32[np.ndarray, "columns side side"]
-    windows = sliding_window_view(band, (side, side))[0]
-    return windows
-
-
-def _has_texture(windows: Float32[np.ndarray, "columns side side"]) -> Bool[np.ndarray, " columns"]:
-    slopes = np.diff(windows, axis=-1)
-    textured: Bool[np.ndarray, " columns"]
-    textured = np.sqrt((slopes**2).mean(axis=(1, 2))) >= _LEAST_SLOPE
-    return textured
 
 
 def _normalised(
@@ -158,7 +148,7 @@ def _product(
 def _match_row(
     correlation: Float32[np.ndarray, "left right"], textured: np.ndarray
 ) -> tuple[Int64[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """Return the columns that match one place well, alone and both ways, and their disparity."""
+    """Return the columns with one good match that holds both ways, and their disparity."""
     width = correlation.shape[1]
     columns = np.flatnonzero(textured)
     scores = correlation[columns]
@@ -166,7 +156,7 @@ def _match_row(
     each = np.arange(len(columns))
     top = scores[each, best]
     back = correlation.argmax(axis=0)[best]
-    # A copy of the rows is masked near the best place: what is left is the second best.
+    # In a copy, the scores near the best place are masked to find the second best.
     for step in range(-_NEAR_PX, _NEAR_PX + 1):
         scores[each, np.clip(best + step, 0, width - 1)] = -1.0
     second = scores.max(axis=1)
@@ -182,7 +172,7 @@ def _match_row(
 def _gathered(
     found: list[tuple[np.ndarray, np.ndarray, np.ndarray]], *, factor: int, textured: int
 ) -> RowMatches:
-    """Put rows together and return to the full size, where a block's centre is a pixel or near."""
+    """Join the rows, and scale to the full size; a block's centre is a pixel or nearly so."""
     empty = (np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
     rows, columns, disparity_px = (
         np.concatenate(part) for part in zip(*[empty, *found], strict=True)
@@ -200,33 +190,33 @@ Points = Float64[np.ndarray, " n"]
 _Prediction = tuple[Points, Bool[np.ndarray, " n"]]
 _Numbers = tuple[UInt16[np.ndarray, " n"], Bool[np.ndarray, " n"]]
 
-_LUMA: Final = np.array([0.299, 0.587, 0.114], dtype=np.float32)
+
 _BLUR: Final = np.array([1, 4, 6, 4, 1], dtype=np.float32) / 16
 _MEAN_RADIUS_PX: Final = 6
 _MOST_POINTS: Final = 2000
 _MOST_DEPTH_BYTES: Final = 96 * 2**20
-"""Decoded depth that is kept: every lag of every camera of small pictures."""
+"""How much decoded depth is kept: every lag of every camera for small pictures."""
 SIDE_CELLS: Final = 4
-"""Parts of a picture along each side. Their spread gives the error of a comparison."""
+"""Number of parts along each side of a picture. Their spread gives a comparison's error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameMatch:
-    """What one frame of two cameras has in common, found in the pictures alone.
+    """The matches of one frame of two cameras, found in the pictures alone.
 
     Attributes:
         frame: The RGB frame.
-        left: Number of the file whose pixels these are.
-        right: Number of the file in which they were found again.
+        left: Number of the file that has these pixels.
+        right: Number of the file in which they were found.
         rows: (n,) rows of the pixels.
         columns: (n,) columns.
         matched_px: (n,) how far to the left they were found.
         brightness: (n,) band-passed grey levels there.
         slope: (n,) their horizontal derivative.
-        cells: (n,) in which part of the picture each pixel lies.
-        cap: The square of a difference between pixels that have nothing to do with each other.
-        textured: How many pixels were looked for.
-        grain_px: Size of the pixels that were matched: those of large pictures are put together.
+        cells: (n,) the part of the picture that each pixel lies in.
+        cap: The squared difference between unrelated pixels.
+        textured: How many pixels were searched for.
+        grain_px: Size of the compared pixels, in pixels of the picture.
     """
 
     frame: int
@@ -248,7 +238,7 @@ class FrameMatch:
         return min(self.left, self.right), max(self.left, self.right)
 
     def at(self, pixels: Bool[np.ndarray, " n"]) -> "FrameMatch":
-        """Return the frame match of some of its pixels alone."""
+        """Return the match with some of its pixels."""
         return replace(
             self, rows=self.rows[pixels], columns=self.columns[pixels],
             matched_px=self.matched_px[pixels], brightness=self.brightness[pixels],
@@ -256,7 +246,7 @@ class FrameMatch:
         )  # fmt: skip
 
     def shift_px(self, offsets_px: dict[tuple[int, int], float]) -> float:
-        """Return the constant disparity here, of those of pairs seen from their lower number."""
+        """Return this match's offset; ``offsets_px`` count from each pair's lower number."""
         offset_px = offsets_px.get(self.pair, 0.0)
         return offset_px if self.left < self.right else -offset_px
 
@@ -265,7 +255,7 @@ class SceneFrames:
     """One scene's pictures and depth, each decoded once."""
 
     def __init__(self, scene: Scene, streams: Streams, *, encoding: DepthEncoding) -> None:
-        """Take a scene; ``encoding`` is the declared contract, whose unit may wait for the tags."""
+        """Take a scene and the declared contract, whose unit may come from the tags."""
         self.scene = scene
         self.encoding = encoding
         self.intrinsics: Intrinsics = rig_intrinsics(scene.rig)
@@ -283,7 +273,7 @@ class SceneFrames:
         return left, right
 
     def unit_m(self, file: int) -> float:
-        """Return the declared unit of a depth file; the release's default where there is none."""
+        """Return the declared unit of a depth file; the release's default if there is none."""
         unit_m = self.encoding.unit_m or self.scene.depth_unit_m[file]
         return unit_m if np.isfinite(unit_m) else DEFAULT_DEPTH_UNIT_M
 
@@ -297,10 +287,9 @@ class SceneFrames:
         return picture
 
     def band(self, frame: int, file: int) -> Luma:
-        """Return a picture's grey levels without noise and without slow changes of brightness."""
+        """Return a picture's grey levels, band-passed."""
         if (frame, file) not in self._bands:
-            luma = np.tensordot(_LUMA, self.rgb(frame, file).astype(np.float32), axes=1)
-            self._bands[frame, file] = band_passed(luma)
+            self._bands[frame, file] = band_passed(luma_of(self.rgb(frame, file)))
         return self._bands[frame, file]
 
     def depth(
@@ -320,9 +309,9 @@ class SceneFrames:
         return self._depths[frame, file]
 
     def _numbers(self, match: FrameMatch, *, frame: int, file: int) -> dict[Flip, _Numbers]:
-        """Return what a depth frame stores at a frame match's pixels, as it is and turned over.
+        """Return what a depth frame stores at a match's pixels, as it is and flipped.
 
-        Only these numbers are kept: whole maps of all lags and cameras would fill the memory.
+        Only these numbers are kept, because maps of all lags and cameras would fill the memory.
         """
         key = (id(match), frame, file)
         if key not in self._stored:
@@ -334,14 +323,9 @@ class SceneFrames:
                 "horizontal": (match.rows, width - 1 - match.columns),
             }
             numbers = {flip: (units[place], known[place]) for flip, place in places.items()}
-            # The frame match is kept too, so that no other can get its identity.
+            # The match is kept too, so that no other can get its id.
             self._stored[key] = (match, numbers)
         return self._stored[key][1]
-
-    def depth_step(self, frame: int) -> float:
-        """Return how far apart neighbouring depths of a frame lie, as a share: `relative_step`."""
-        units, known = self.depth(frame, self.primary[0])
-        return relative_step(units[known])
 
     @cached_property
     def ray_per_planar(self) -> Float64[np.ndarray, "h w"]:
@@ -354,9 +338,9 @@ class SceneFrames:
     def frame_matches(
         self, *, frames: int, hypothesis: Hypothesis | None = None
     ) -> list[FrameMatch]:
-        """Return what pairs of several frames have in common, seen from either side.
+        """Return the matches of several frames, from either side of each chosen pair.
 
-        The pairs are those that stand beside each other by a hypothesis's order of cameras.
+        The hypothesis's order of cameras decides which cameras are neighbours.
         """
         pairs = self.chosen_pairs(hypothesis or Hypothesis())
         files = dict.fromkeys(itertools.chain.from_iterable(pairs))
@@ -368,22 +352,19 @@ class SceneFrames:
         return matches
 
     def chosen_pairs(self, hypothesis: Hypothesis) -> list[tuple[int, int]]:
-        """Return pairs in which every camera stands beside others: next to it, and next but one.
-
-        The primary and the widest pair are among them. The lower number comes first.
-        """
+        """Return the `neighbours`, and the pairs next but one; the lower number comes first."""
         across = self._across(hypothesis)
         beside = ((min(pair), max(pair)) for pair in zip(across, across[2:], strict=False))
         return list(dict.fromkeys([*self.neighbours(hypothesis), *beside]))
 
     def neighbours(self, hypothesis: Hypothesis) -> list[tuple[int, int]]:
-        """Return the primary pair, those that stand next to each other, and the widest."""
+        """Return the primary pair, the pairs next to each other, and the widest pair."""
         across = self._across(hypothesis)
         pairs = [self.primary, *itertools.pairwise(across), (across[0], across[-1])]
         return list(dict.fromkeys((min(pair), max(pair)) for pair in pairs))
 
     def _across(self, hypothesis: Hypothesis) -> list[int]:
-        """Return the numbers of the pictures' files from left to right."""
+        """Return the file numbers of the pictures from left to right."""
         return sorted(
             range(CAMERA_COUNT),
             key=lambda file: self.scene.lateral_m[hypothesis.camera_of(file, content="rgb")],
@@ -392,41 +373,38 @@ class SceneFrames:
     def _both_ways(
         self, frame: int, left: int, right: int, row_matches: RowMatches
     ) -> tuple[FrameMatch, FrameMatch]:
-        """Return one set of matches from both sides, so that either camera's depth is tested."""
+        """Return one set of matches from both sides, so that both cameras' depth is tested."""
         here, there = self.band(frame, left), self.band(frame, right)
         keep = np.arange(len(row_matches.rows))
         if len(keep) > _MOST_POINTS:
-            chosen = np.random.default_rng(0).choice(keep, _MOST_POINTS, replace=False)
-            keep = np.sort(chosen)
+            keep = np.sort(np.random.default_rng(0).choice(keep, _MOST_POINTS, replace=False))
         rows, columns = row_matches.rows[keep], row_matches.columns[keep]
         matched_px = row_matches.disparity_px[keep].astype(np.float64)
         width = here.shape[1]
         found = np.clip(np.rint(columns - matched_px), 0, width - 1).astype(np.int64)
-        matches = (
-            _frame_match(here, rows, columns, matched_px, frame=frame, files=(left, right)),
-            _frame_match(there, rows, found, -matched_px, frame=frame, files=(right, left)),
+        counts: dict[str, Any] = {
+            "frame": frame, "textured": row_matches.textured, "grain_px": row_matches.grain_px
+        }  # fmt: skip
+        return (
+            _frame_match(here, rows, columns, matched_px, left=left, right=right, **counts),
+            _frame_match(there, rows, found, -matched_px, left=right, right=left, **counts),
         )
-        here_seen, there_seen = (
-            replace(match, textured=row_matches.textured, grain_px=row_matches.grain_px)
-            for match in matches
-        )
-        return here_seen, there_seen
 
     def predicted(
         self, match: FrameMatch, hypothesis: Hypothesis, *, depth_file: int | None = None
     ) -> _Prediction | None:
         """Return the disparity of matched pixels at the declared unit, and where it is known.
 
-        None where the frame of depth does not exist. ``depth_file`` is read in place of the one
-        that the hypothesis names. The predictions of one hypothesis are kept, read-only, until
-        another is asked for: it is fitted, scored and drawn at many scales.
+        None if the frame of depth does not exist. ``depth_file`` replaces the file that the
+        hypothesis names. The predictions of one hypothesis are kept, read-only, until another is
+        asked for, because it is fitted, scored and drawn at many scales.
         """
         file = hypothesis.depth_file(match.left) if depth_file is None else depth_file
         if hypothesis != self._predicted_by:
             self._predicted_by, self._predictions = hypothesis, {}
         key = (id(match), file)
         if key not in self._predictions:
-            # The frame match is kept too, so that no other can get its identity.
+            # The match is kept too, so that no other can get its id.
             prediction = self._predict(match, hypothesis, file=file)
             self._predictions[key] = (match, prediction)
         return self._predictions[key][1]
@@ -453,7 +431,7 @@ class SceneFrames:
         place: tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]],
         file: int,
     ) -> Points:
-        """Return the disparity, between a frame match's files, that stored depths mean."""
+        """Return the disparity between a match's files by stored depths."""
         unit_m = self.unit_m(file)
         per_m = 1 / (unit_m * number) if hypothesis.form == "depth" else number / unit_m
         if hypothesis.kind == "ray":
@@ -462,7 +440,7 @@ class SceneFrames:
         return disparity_px
 
     def baseline_m(self, match: FrameMatch, hypothesis: Hypothesis) -> float:
-        """Return the signed baseline of a frame match's two files."""
+        """Return the signed baseline of a match's two files."""
         left, right = (
             hypothesis.camera_of(file, content="rgb") for file in (match.left, match.right)
         )
@@ -476,17 +454,14 @@ def _frame_match(
     rows: Int64[np.ndarray, " n"],
     columns: Int64[np.ndarray, " n"],
     matched_px: Points,
-    *,
-    frame: int,
-    files: tuple[int, int],
+    **counts: Any,
 ) -> FrameMatch:
+    """Return a match of a band-passed picture; ``counts`` are the other fields."""
     brightness = here[rows, columns]
     height, width = here.shape
     after, before = np.minimum(columns + 1, width - 1), np.maximum(columns - 1, 0)
     return FrameMatch(
-        frame=frame,
-        left=files[0],
-        right=files[1],
+        **counts,
         rows=rows,
         columns=columns,
         matched_px=matched_px,
@@ -494,7 +469,6 @@ def _frame_match(
         slope=(here[rows, after] - here[rows, before]) / 2,
         cells=rows * SIDE_CELLS // height * SIDE_CELLS + columns * SIDE_CELLS // width,
         cap=2 * float((brightness**2).mean()) if len(rows) else 1.0,
-        textured=0,
     )
 
 
@@ -510,16 +484,16 @@ def spread_px(matches: Sequence[FrameMatch]) -> float:
 
 
 def chosen_frames(available: int, *, count: int) -> list[int]:
-    """Return frames spread over a scene, where it is long enough with room for every lag."""
+    """Return frames spread over a scene, with room for every lag if it is long enough."""
     margin = min(max(LAGS), max(0, (available - 1) // 2))
     spread = np.linspace(margin, available - 1 - margin, min(count, available - 2 * margin))
     return sorted({round(float(frame)) for frame in spread})
 
 
 def relative_step(numbers: UInt16[np.ndarray, " n"]) -> float:
-    """Return the step to the next number that occurs, over the number: the pixels' upper quartile.
+    """Return the upper quartile, over pixels, of the distance to the next number over the number.
 
-    0 where there is no number at all.
+    0 for no numbers.
     """
     values, counts = np.unique(numbers, return_counts=True)
     if not len(values):
@@ -543,7 +517,7 @@ def band_passed(luma: Luma) -> Luma:
 
 
 def _along(picture: Luma, taps: Float32[np.ndarray, " k"], *, axis: int) -> Luma:
-    """Return a picture convolved along one axis, its border repeated."""
+    """Return a picture convolved along one axis, with its border repeated."""
     radius = len(taps) // 2
     margins = [(radius, radius) if each == axis else (0, 0) for each in (0, 1)]
     padded = np.pad(picture, margins, mode="edge")

@@ -1,8 +1,7 @@
-"""The doctor's picture: a pair warped by two contracts, and the scores of all of them."""
+"""The doctor's picture: one pair warped by two contracts, and the scores of the others."""
 
 import math
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,12 +9,15 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from stereogenbench_data.audit.contract.diagnosis import SceneDiagnosis
-from stereogenbench_data.audit.contract.doctor import DoctorReport, scene_task
+from stereogenbench_data.audit.contract.doctor import DiagnosisTask, DoctorReport
 from stereogenbench_data.audit.contract.hypotheses import Hypothesis
 from stereogenbench_data.audit.contract.matching import FrameMatch, SceneFrames
 from stereogenbench_data.audit.contract.scoring import score_hypothesis
-from stereogenbench_data.errors import ExtraError, SelectionError
+from stereogenbench_data.audit.drawing import figure_class
+from stereogenbench_data.audit.scene_access import SceneAccess
+from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.selection.filters import filter_scenes
 from stereogenbench_data.sources.files import open_output
 
 _ENDINGS: Final = (".png", ".pdf", ".svg", ".jpg")
@@ -27,35 +29,43 @@ _LONGEST_PX: Final = 640
 
 
 def require_picture_file(path: Path) -> None:
-    """Refuse, before anything is read, a file that no picture can be written to.
+    """Refuse a file to which no picture can be written, before anything is read.
 
     Raises:
-        SelectionError: If the name has no ending that matplotlib writes.
+        SelectionError: If the name's ending is not one of a picture.
         ExtraError: If matplotlib is not installed.
     """
     if path.suffix.lower() not in _ENDINGS:
         raise SelectionError(f"{path}: name a picture: one of *{', *'.join(_ENDINGS)}.")
-    _figure_class()
+    figure_class()
 
 
 def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
     """Write the picture of the scene with the most to report.
 
-    Left, right, the right one warped to the left by the declared and by the best contract, what
-    differs; the score over metres a unit; and by how much every other answer is worse.
+    It shows the left and right pictures, the right one warped to the left by the declared and by
+    the best contract, the differences, the score over the unit, and how far each other answer is
+    behind.
 
     Raises:
         SelectionError: If no scene was judged.
         ExtraError: If matplotlib is not installed.
     """
     if not report.scenes:
-        raise SelectionError(f"{report.data}: no scene was judged, so there is nothing to draw.")
-    diagnosis = max(report.scenes, key=_report_rank)
-    task = scene_task(index, diagnosis.key, encoding=report.declared)
-    figure = _figure_class()(figsize=(14, 13.5), layout="constrained")
+        raise SelectionError(
+            f"{report.data}: no scene was judged, so there is nothing to draw. Choose other scenes."
+        )
+    diagnosis = max(
+        report.scenes,
+        key=lambda each: (
+            not each.problem, bool(each.check.faults), each.gain.mean_db, each.matches
+        ),
+    )  # fmt: skip
+    (row,) = filter_scenes(index, {"scenes": diagnosis.key})
+    task = DiagnosisTask(SceneAccess.of(index, index.scene(int(row))), 1, report.declared)
+    figure = figure_class()(figsize=(14, 13.5), layout="constrained")
     above, below = figure.subfigures(2, 1, height_ratios=(2, 1))
-    with closing(task.streams()) as streams:
-        views = SceneFrames(task.scene, streams, encoding=report.declared)
+    with task.scene_frames() as views:
         matches = views.frame_matches(frames=task.frames)
         figure.suptitle(f"{diagnosis.key}: {_title(diagnosis)}", fontsize=12)
         _draw_views(above.subplots(2, 3).ravel(), views, matches, diagnosis)
@@ -68,21 +78,6 @@ def draw_report(path: Path, report: DoctorReport, index: SceneIndex) -> None:
         figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=90)
 
 
-def _report_rank(scene: SceneDiagnosis) -> tuple[bool, bool, float, int]:
-    """Return the sort key of a scene: the largest has the most to report."""
-    return not scene.problem, bool(scene.check.faults), scene.gain.mean_db, scene.matches
-
-
-def _figure_class() -> Any:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ExtraError(
-            "a picture of scores needs matplotlib: pip install 'stereogenbench-data[plots]'."
-        ) from error
-    return Figure
-
-
 def _title(diagnosis: SceneDiagnosis) -> str:
     if diagnosis.problem:
         return f"cannot tell ({diagnosis.problem})"
@@ -92,7 +87,7 @@ def _title(diagnosis: SceneDiagnosis) -> str:
         f"{question} {getattr(diagnosis.best, question)}"
         for question in diagnosis.best.changes_from(diagnosis.declared)
     ]
-    if diagnosis.changed in ("scale", "both") or diagnosis.best.form != diagnosis.declared.form:
+    if diagnosis.fits_scale:
         changes.append(f"unit / (focal length x baseline) {1 / diagnosis.scale:.4g} x declared")
     if diagnosis.changed in ("offset", "both"):
         changes.append("an offset")
@@ -111,9 +106,7 @@ def _draw_views(
     left, right = (
         views.rgb(match.frame, file).transpose(1, 2, 0) for file in (match.left, match.right)
     )
-    best_scale = 1.0
-    if diagnosis.changed in ("scale", "both") or diagnosis.best.form != diagnosis.declared.form:
-        best_scale = diagnosis.scale
+    best_scale = diagnosis.scale if diagnosis.fits_scale else 1.0
     shift_px = 0.0
     if diagnosis.changed in ("offset", "both"):
         shift_px = match.shift_px(diagnosis.offsets_px)
@@ -144,7 +137,7 @@ def _warped(
     scale: float,
     shift_px: float,
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Return the right picture seen from the left one, and where depth and picture tell of it."""
+    """Return the right picture warped to the left, and where depth and picture are known."""
     height, width = right.shape[:2]
     rows, columns = np.divmod(np.arange(height * width), width)
     everywhere = FrameMatch(
@@ -173,7 +166,7 @@ def _difference(
     warped: UInt8[np.ndarray, "h w 3"],
     is_known: Bool[np.ndarray, "h w"],
 ) -> Float32[np.ndarray, "h w"]:
-    """Return the mean absolute difference, nan where nothing was warped."""
+    """Return the mean absolute difference, nan where unknown."""
     away: Float32[np.ndarray, "h w"] = np.abs(left.astype(np.float32) - warped).mean(axis=-1)
     away[~is_known] = np.nan
     return away
@@ -187,22 +180,18 @@ def _draw_curves(
     *,
     units_m: Float64[np.ndarray, " k"],
 ) -> None:
-    """Draw how well the pictures agree over metres a unit, for planar, ray and inverse depth."""
+    """Draw how well the pictures agree over the unit, for planar, ray and inverse depth."""
     best = diagnosis.best
     for name, hypothesis in {
         "along the axis": best.changed("kind", "planar").changed("form", "depth"),
         "along the ray": best.changed("kind", "ray").changed("form", "depth"),
         "inverse": best.changed("kind", "planar").changed("form", "inverse"),
     }.items():
-        axis.plot(
-            units_m,
-            [
-                _score_db(views, matches, hypothesis, scale=diagnosis.unit_m / unit_m)
-                for unit_m in units_m
-            ],
-            label=name,
-            linewidth=1.2,
-        )
+        scores_db = [
+            _score_db(views, matches, hypothesis, scale=diagnosis.unit_m / unit_m)
+            for unit_m in units_m
+        ]
+        axis.plot(units_m, scores_db, label=name, linewidth=1.2)
     if units_m[0] <= diagnosis.unit_m <= units_m[-1]:
         axis.axvline(diagnosis.unit_m, color="grey", linestyle=":", label="declared unit")
     axis.set(
@@ -227,7 +216,7 @@ def _score_db(
 
 
 def _draw_rivals(axis: Any, diagnosis: SceneDiagnosis) -> None:
-    """Draw by how much each other answer is worse than the best contract."""
+    """Draw how far each other answer is behind the best contract."""
     tested = [rival for rival in diagnosis.rivals if math.isfinite(rival.behind.mean_db)]
     if not tested:
         axis.set_axis_off()

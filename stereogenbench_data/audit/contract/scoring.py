@@ -1,7 +1,7 @@
-"""How well a contract explains pictures, in dB, and how sure a difference is.
+"""How well a contract explains pictures, in dB, and how certain a difference is.
 
-A contract is scored by the squared differences of the pictures after the warp. Scores are compared
-in one scene (`evidence`), and pooled over several (`pooled`).
+A contract's score are the squared differences of the pictures after the warp. `evidence` compares
+scores in one scene; `pooled` takes several scenes together.
 """
 
 import math
@@ -16,16 +16,16 @@ from stereogenbench_data.audit.contract.hypotheses import Hypothesis
 from stereogenbench_data.audit.contract.matching import (
     SIDE_CELLS,
     FrameMatch,
-    Luma,
     Points,
     SceneFrames,
 )
+from stereogenbench_data.audit.picture_check import Luma
 
 LEAST_DB: Final = 0.15
-"""A smaller mean difference is not believed, however sure: interpolation and codecs make such."""
+"""Smaller mean differences, which interpolation and codecs cause, are not believed."""
 LEAST_DB_ELSEWHERE: Final = 0.4
-"""The same between contracts that take depth from other places (lag, order, flip) or another form:
-where disparity is of few pixels, interpolation alone makes 0.3 dB between neighbouring lags."""
+"""The same between contracts that read depth elsewhere (lag, order, flip) or in another form: with
+small disparities interpolation alone causes 0.3 dB between neighbouring lags."""
 LEAST_ERRORS: Final = 3.0
 _NORMAL_975: Final = 1.96
 _T_975: Final = (
@@ -38,12 +38,16 @@ _T_975: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """By how many dB one contract is better than another in one scene, and its standard error.
+    """By how many dB one contract is better than another in one scene.
 
-    ``by_shape`` is whether it is the better one by the shape of disparity over the picture, which
-    then decides; None where that does not tell. ``shape`` is the power of the ray's length and half
-    its 95 % interval. Less than ``least_db`` is not believed. ``error_db`` is the smaller of two
-    estimates, by which contracts are searched; ``wide_db`` the larger, which intervals use.
+    Attributes:
+        mean_db: The mean difference.
+        error_db: Its standard error, the smaller of two estimates; the search uses it.
+        by_shape: Whether the shape of disparity over the picture decides for this contract; None
+            if it does not decide.
+        least_db: Smaller differences are not believed.
+        wide_db: The larger estimate of the error; intervals use it.
+        shape: The power of the ray's length, and half its 95 % interval.
     """
 
     mean_db: float
@@ -54,7 +58,7 @@ class Evidence:
     shape: tuple[float, float] | None = None
 
     def is_clear(self, *, least_db: float | None = None, errors: float = LEAST_ERRORS) -> bool:
-        """Tell whether the difference is large and sure enough to be believed."""
+        """Tell whether the difference is large and certain enough to be believed."""
         if self.by_shape is not None:
             return self.by_shape
         least = self.least_db if least_db is None else least_db
@@ -66,15 +70,15 @@ class Gain:
     """A mean difference in dB with its 95 % confidence interval.
 
     Attributes:
-        mean_db: The mean; nan where there is nothing to compare.
+        mean_db: The mean; nan if there is nothing to compare.
         low_db: Lower end.
         high_db: Upper end.
-        over: What the interval is over: scenes or, where there is one alone, parts of its pictures.
-        count: How many scenes tell.
+        over: What varies in the interval: scenes or, for one scene, parts of its pictures.
+        count: How many scenes were compared.
         is_clear: Whether the difference may be believed.
-        by_shape: Whether that is so by the shape of disparity, however few dB it makes.
-        shape: The power of the ray's length, and half its 95 % interval; None where not known.
-        margin_db: What the interval must keep away by, to confirm.
+        by_shape: Whether the shape of disparity decides, however few dB it makes.
+        shape: The power of the ray's length, and half its 95 % interval; None if not known.
+        margin_db: How far the interval must be from 0 to confirm.
     """
 
     mean_db: float
@@ -89,7 +93,7 @@ class Gain:
 
     @property
     def is_excluded(self) -> bool:
-        """Whether the other answer is kept away: the whole interval is beyond the margin."""
+        """Whether the other answer is excluded: the whole interval is beyond the margin."""
         return self.by_shape or self.low_db >= self.margin_db
 
 
@@ -109,9 +113,9 @@ def interval(values: Sequence[float]) -> tuple[float, float, float]:
 def pooled(scenes: Sequence[Evidence]) -> Gain:
     """Return the mean over scenes.
 
-    It is clear if the interval over scenes leaves no doubt, or if it is clear in some scene and
-    its opposite in none: what one scene rules out is ruled out for all with the same contract,
-    however little the others tell (of a lag where nothing moves).
+    It is clear if the interval over scenes is, or if it is clear in some scene and its opposite in
+    none: one scene rules out an answer for all with the same contract, even if the others show
+    nothing (such as a lag where nothing moves).
     """
     tested = [scene for scene in scenes if math.isfinite(scene.mean_db)]
     by_shape = any(scene.by_shape for scene in tested)
@@ -126,10 +130,10 @@ def pooled(scenes: Sequence[Evidence]) -> Gain:
     mean, low, high = interval([scene.mean_db for scene in tested])
     against = (replace(scene, mean_db=-scene.mean_db) for scene in tested if scene.by_shape is None)
     opposed = any(scene.is_clear() for scene in against)
-    clear = (mean >= max(scene.least_db for scene in tested) and low > 0) or (
+    least_db = max(scene.least_db for scene in tested)
+    clear = (mean >= least_db and low > 0) or (
         not opposed and any(scene.is_clear() for scene in tested)
     )
-    least_db = max(scene.least_db for scene in tested)
     return Gain(mean, low, high, "scenes", len(tested), clear, by_shape, margin_db=least_db)
 
 
@@ -147,11 +151,11 @@ class ScoredContract:
     Attributes:
         hypothesis: Its answers.
         scale: Measured disparity over that at the declared unit: the unit is declared / scale.
-        offsets_px: Constant disparity that is added, by pair (lower number first, seen from it);
-            what is missing is 0.
-        scale_error: Standard error of log(scale), inf where it was not fitted.
-        errors: For each frame match the squared difference at each pixel, capped; nan where the
-            contract does not tell.
+        offsets_px: Constant disparity to add, by pair (lower number first, counted from it); 0 for
+            pairs that are missing.
+        scale_error: Standard error of log(scale), inf if it was not fitted.
+        errors: For each frame match the capped squared difference at each pixel; nan where the
+            contract predicts nothing.
     """
 
     hypothesis: Hypothesis
@@ -164,7 +168,7 @@ class ScoredContract:
 def sample_along_rows(
     band: Luma, rows: np.ndarray, columns: Points
 ) -> tuple[Float32[np.ndarray, " n"], np.ndarray]:
-    """Return a picture's values between its pixels along rows, and which places are inside it."""
+    """Return a picture's values between pixels along rows, and which places are inside it."""
     here, (linear, square, cube), t, inside = _cubic(band, rows, columns)
     return here + t * (linear + t * (square + t * cube)), inside
 
@@ -172,16 +176,16 @@ def sample_along_rows(
 def sample_with_slope(
     band: Luma, rows: np.ndarray, columns: Points
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"], np.ndarray]:
-    """Return a picture between its pixels along rows, its slope there, and what is inside it."""
+    """Return a picture's values between pixels along rows, their slope, and which are inside it."""
     here, (linear, square, cube), t, inside = _cubic(band, rows, columns)
     value = here + t * (linear + t * (square + t * cube))
     return value, linear + t * (2 * square + 3 * t * cube), inside
 
 
 def _cubic(band: Luma, rows: np.ndarray, columns: Points) -> tuple[Any, tuple[Any, ...], Any, Any]:
-    """Return the pixel before each place, the cubic's coefficients, the part to go, and inside.
+    """Return the pixel before each place, the cubic's coefficients, the fraction, and inside.
 
-    Catmull and Rom's cubic: between pixels a straight line is a blur, which favours some places.
+    Catmull and Rom's cubic: linear interpolation would blur, which favours some places.
     """
     width = band.shape[1]
     inside = (columns >= 0) & (columns <= width - 1)
@@ -210,7 +214,7 @@ def score_hypothesis(
 ) -> ScoredContract:
     """Return a contract's score on the frame matches of a scene.
 
-    A pixel counts as its capped squared difference, and as the cap where it leaves the picture.
+    A pixel counts with its capped squared difference, or with the cap if it leaves the picture.
     """
     offsets_px = offsets_px or {}
     errors = []
@@ -237,16 +241,15 @@ def evidence(
 ) -> Evidence:
     """Return by how many dB one contract explains a scene better than another.
 
-    Both are judged by the pixels of which both tell, in the views that they do not read alike (an
-    exchange of two cameras leaves the others as they are). Contracts that take the same numbers
-    from the same places (another unit, ray, offset) differ by a little at many pixels: there a
-    pixel counts at most a small part of the cap, so that wrong matches do not outweigh it. Others
-    (lag, order, flips) differ by much at some pixels, which then count in full.
+    Only pixels for which both predict something are compared, in the views that they do not read
+    alike (an exchange of two cameras leaves the others as they are). Contracts that read the same
+    depth (another unit, ray, offset) differ a little at many pixels: there a pixel counts at most
+    a small part of the cap, so that wrong matches do not outweigh it. Others (lag, order, flips)
+    differ much at some pixels, which count in full.
 
-    There are two errors, and the smaller holds: by how much views (a pair in a frame) differ, which
-    is large where something is wrong with some cameras; and a jackknife over parts of the picture,
-    each left out of all views at once, which is large where only a part matters (of a lag, what
-    moves).
+    The error is the smaller of two: one from the differences between views (a pair in a frame),
+    which is large if some cameras are wrong; and a jackknife over parts of the picture, each left
+    out of all views at once, which is large if only some parts matter (such as moving ones).
     """
     same_places = better.hypothesis.changed("kind", worse.hypothesis.kind) == worse.hypothesis
     share = _FINE_CAP if same_places else 1.0
@@ -289,7 +292,7 @@ def evidence(
 
 
 def _mean_db(ours: np.ndarray, theirs: np.ndarray) -> Float64[np.ndarray, " k"]:
-    """Return the mean over frame matches (the first axis) of the ratio of two sums in dB."""
+    """Return the mean over frame matches (the first axis) of the ratio of two sums, in dB."""
     ratios = np.maximum(theirs, _SMALLEST) / np.maximum(ours, _SMALLEST)
     mean: Float64[np.ndarray, " k"] = 10 * np.log10(ratios).mean(axis=0)
     return mean

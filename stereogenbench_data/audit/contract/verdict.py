@@ -1,8 +1,8 @@
 """From the diagnoses of scenes to an answer for each question, and the contract to paste.
 
-Questions are answered one by one: on the hypothesis (kind, form, lag, order, flip), on a constant
-offset, and on the lengths. Of these disparity shows one quotient, unit / (focal length x baseline).
-`judge` puts the answers together; `grouped` decides which scenes are judged together.
+The questions concern the hypothesis (kind, form, lag, order, flip), a constant offset, and the
+lengths, of which disparity shows one quotient: unit / (focal length x baseline). `judge` answers
+them all; `group_by_contract` decides which scenes are judged together.
 """
 
 import math
@@ -21,14 +21,15 @@ from stereogenbench_data.audit.contract.diagnosis import (
     SceneDiagnosis,
     allowed_log_scale,
 )
+from stereogenbench_data.audit.contract.fitting import Free
 from stereogenbench_data.audit.contract.hypotheses import LAGS, QUESTIONS, Hypothesis, Question
 from stereogenbench_data.audit.contract.scoring import LEAST_ERRORS, Gain, interval, pooled
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT
 
 Status = Literal["confirmed", "not contradicted", "wrong", "cannot tell", "not seen alone"]
-"""Confirmed: a 95 % interval keeps every tested rival away by a stated margin, in
-every scene. Not contradicted: the declared answer fits best, and some rival is not kept away."""
+"""Confirmed: in every scene a 95 % interval excludes every tested rival by a stated margin. Not
+contradicted: the declared answer fits best, but some rival is not excluded."""
 
 TOPICS: Final[dict[Question, str]] = {
     "kind": "depth along",
@@ -37,7 +38,7 @@ TOPICS: Final[dict[Question, str]] = {
     "order": "left and right",
     "flip": "flip of depth",
 }
-CAMERAS_DIFFER: Final = "not told while cameras do not fit, see below"
+CAMERAS_DIFFER: Final = "not answered while cameras do not fit, see below"
 _WORDS: Final[dict[Any, str]] = {
     "planar": "the optical axis",
     "ray": "the ray",
@@ -55,12 +56,12 @@ class Answer:
     Attributes:
         topic: The question.
         declared: What the data declare.
-        found: What the pictures say; empty where they do not tell.
+        found: What the pictures show; empty if they show nothing.
         status: Whether that confirms what is declared.
-        behind: By how much the next best answer is worse, where that is known in dB: in the
-            scene in which it comes nearest.
-        note: Why, in words; may be empty.
-        is_sure: Whether every tested rival is kept away by the margin.
+        behind: By how much the next best answer is worse, in the scene where it comes nearest;
+            None if not known.
+        note: The reason, in words; may be empty.
+        is_sure: Whether every tested rival is excluded by the margin.
     """
 
     topic: str
@@ -77,20 +78,23 @@ def has_camera_faults(scenes: Sequence[SceneDiagnosis]) -> bool:
     return any(scene.check.faults or scene.check.unexplained for scene in scenes)
 
 
-def question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> Answer:
-    """Return the answer to one question, and how far the next best is behind.
+def _no_answer(scenes: Sequence[SceneDiagnosis], topic: str, declared: str) -> Answer:
+    """Return the answer "cannot tell", with a note if no question can be answered."""
+    note = scenes[0].problem or (CAMERAS_DIFFER if has_camera_faults(scenes) else "")
+    return Answer(topic, declared, "", "cannot tell", note=note)
 
-    What is declared is confirmed only where the other answers were tested, and lost, in every
-    scene. Of lags the two next to it are enough: how well a lag fits falls with its distance from
-    the right one.
+
+def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> Answer:
+    """Return the answer to one question, and how far the next best answer is behind.
+
+    The declared answer is confirmed only if all others were tested and lost in every scene. For
+    lags, the two neighbours are enough: the further a lag is from the right one, the worse it fits.
     """
     first = scenes[0]
     declared, best = (getattr(part, question) for part in (first.declared, first.best))
-    blank = Answer(TOPICS[question], describe(declared), "", "cannot tell", note=first.problem)
-    if first.problem:
+    blank = _no_answer(scenes, TOPICS[question], describe(declared))
+    if blank.note:
         return blank
-    if has_camera_faults(scenes):
-        return replace(blank, note=CAMERAS_DIFFER)
     rivals = [rival for rival in first.rivals if rival.question == question]
     gains = {rival.answer: behind(scenes, rival) for rival in rivals}
     tested = {answer: gain for answer, gain in gains.items() if not math.isnan(gain.mean_db)}
@@ -100,69 +104,54 @@ def question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> Ans
         answer for answer in untested
         if question != "frame_lag" or min(abs(answer - lag) for lag in [best, *close]) == 1
     ]  # fmt: skip
-    every = {rival.answer: _each(scenes, rival) for rival in rivals if rival.answer in tested}
-    nearest = min(
-        (gain for each in every.values() for gain in each), key=lambda gain: gain.low_db,
-        default=None,
-    )  # fmt: skip
-    doubtful = [answer for answer, each in every.items() if not all(g.is_excluded for g in each)]
+    # By how much each scene's own best contract is better than each other answer.
+    each_gain = [
+        (rival.answer, pooled([other.behind]))
+        for rival in rivals if rival.answer in tested
+        for scene in scenes for other in scene.rivals
+        if (other.question, other.answer) == (rival.question, rival.answer)
+    ]  # fmt: skip
+    nearest = min((gain for _, gain in each_gain), key=lambda gain: gain.low_db, default=None)
+    doubtful = list(dict.fromkeys(answer for answer, gain in each_gain if not gain.is_excluded))
     is_sure = not (close or lacking or doubtful) and bool(tested)
     words = _words_beside(best, close, untested, question=question)
     if best == "as recorded" and question == "order" and first.recorded_pair is not None:
         left, right = first.recorded_pair
         named, seen = f"primary: left {left}, right {right}", f"left {right}, right {left}"
         note = "by poses and pictures alike"
-        return Answer(TOPICS[question], named, seen, "wrong", nearest, note)
+        return Answer(blank.topic, named, seen, "wrong", nearest, note)
     if question == "order" and best.startswith("depth of") and changes(first, "offset"):
-        note = f"a shifted picture, which is not where its depth is, looks like {describe(best)}"
+        note = f"a picture that is shifted against its depth looks like {describe(best)}"
         return replace(blank, behind=gains.get(declared), note=note)
     if best == declared:
         if close or lacking or not tested:
             return replace(blank, behind=nearest, note=words)
         if not is_sure:
-            note = f"not kept away by the margin: {_named(doubtful)}"
+            note = f"not excluded by the margin: {_named(doubtful)}"
             note = f"{note}; {words}" if words else note
             return replace(
                 blank, found=describe(best), status="not contradicted", behind=nearest, note=note
             )
-        shape = next(
-            (g.shape for each in every.values() for g in each if g.by_shape and g.shape), None
-        )
+        shape = next((gain.shape for _, gain in each_gain if gain.by_shape and gain.shape), None)
         if shape is not None:
             words = f"by shape: the ray's power is {shape[0]:.2f} ± {shape[1]:.2f} (0 axis, 1 ray)"
         return replace(
-            blank,
-            found=describe(best),
-            status="confirmed",
-            behind=nearest,
-            note=words,
+            blank, found=describe(best), status="confirmed", behind=nearest, note=words,
             is_sure=True,
-        )
+        )  # fmt: skip
     # To be called wrong the declared answer must be behind; to be pasted, by the margin too.
-    if declared in close or not (declared in gains and _is_behind(gains[declared])):
+    of_declared = gains.get(declared)
+    is_behind = of_declared is not None and (of_declared.by_shape or of_declared.low_db > 0)
+    if declared in close or not is_behind:
         note = f"{describe(best)} fits best, but not surely better"
-        return replace(blank, behind=gains[declared], note=f"{note}; {words}" if words else note)
+        return replace(blank, behind=of_declared, note=f"{note}; {words}" if words else note)
     others = [answer for answer in [*close, *lacking, *doubtful] if answer != declared]
     found = " or ".join(describe(answer) for answer in dict.fromkeys([best, *others]))
     at_end = question == "frame_lag" and abs(best) == max(LAGS)
     return replace(
         blank, found=f"{found} or beyond" if at_end else found, status="wrong",
-        behind=gains.get(declared), note=words, is_sure=is_sure and not at_end,
+        behind=of_declared, note=words, is_sure=is_sure and not at_end,
     )  # fmt: skip
-
-
-def _each(scenes: Sequence[SceneDiagnosis], rival: Rival) -> list[Gain]:
-    """Return by how much each scene's own best contract is better than another answer."""
-    return [
-        pooled([other.behind])
-        for scene in scenes
-        for other in scene.rivals
-        if (other.question, other.answer) == (rival.question, rival.answer)
-    ]
-
-
-def _is_behind(gain: Gain) -> bool:
-    return gain.by_shape or gain.low_db > 0
 
 
 def _named(answers: Sequence[Any]) -> str:
@@ -174,20 +163,20 @@ def _named(answers: Sequence[Any]) -> str:
 def _words_beside(
     best: Any, close: Sequence[Any], untested: Sequence[Any], *, question: Question
 ) -> str:
-    """Return which answers fit as well as the best one, and of which nothing is known."""
+    """Return which answers fit as well as the best one, and which were not tested."""
     words = []
     if close:
         words.append(f"fit alike: {_named([best, *close])}")
     if untested:
         want = "frames" if question == "frame_lag" else "depth where it would be"
-        words.append(f"not tested, for want of {want}: {', '.join(map(describe, untested))}")
+        words.append(f"not tested, for lack of {want}: {', '.join(map(describe, untested))}")
     if question == "frame_lag" and abs(best) == max(LAGS):
-        words.append("lags beyond are not asked about")
+        words.append(f"lags beyond {max(LAGS)} frames are not examined")
     return "; ".join(words)
 
 
 def behind(scenes: Sequence[SceneDiagnosis], rival: Rival) -> Gain:
-    """Return by how much the scenes' best contract is better than another answer."""
+    """Return by how much the scenes' common best contract is better than another answer."""
     return pooled([
         other.behind
         for scene in scenes
@@ -207,40 +196,37 @@ def changes(scene: SceneDiagnosis, length: str) -> bool:
     return scene.changed in (length, "both")
 
 
-def offset_answer(scenes: Sequence[SceneDiagnosis]) -> Answer:
+def _offset_answer(scenes: Sequence[SceneDiagnosis]) -> Answer:
     """Return whether disparity is off by a constant, and by which.
 
-    No interval is known for it, so that nothing is confirmed.
+    It is never confirmed, because no interval is known for it.
     """
     first = scenes[0]
-    topic = "disparity offset"
-    if first.problem:
-        return Answer(topic, "0 px", "", "cannot tell", note=first.problem)
-    if has_camera_faults(scenes):
-        return Answer(topic, "0 px", "", "cannot tell", note=CAMERAS_DIFFER)
+    blank = _no_answer(scenes, "disparity offset", "0 px")
+    if blank.note:
+        return blank
     if changes(first, "offset"):
         gain = pooled([scene.gain for scene in scenes])
         note = "or pictures of another moment, which look alike where little moves"
-        return Answer(topic, "0 px", offset_words(first.offsets_px), "wrong", gain, note)
+        found = offset_words(first.offsets_px)
+        return replace(blank, found=found, status="wrong", behind=gain, note=note)
     largest_px = max((abs(px) for scene in scenes for px in scene.offsets_px.values()), default=0.0)
     if largest_px > LEAST_OFFSET_PX or math.isnan(first.agreement):
-        note = f"fits up to {largest_px:.2g} px, none clearly better than 0"
-        return Answer(topic, "0 px", "", "cannot tell", note=note)
-    return Answer(topic, "0 px", f"0 px (all pairs within {largest_px:.2f})", "not contradicted")
+        return replace(blank, note=f"fits up to {largest_px:.2g} px, none clearly better than 0")
+    found = f"0 px (all pairs within {largest_px:.2f})"
+    return replace(blank, found=found, status="not contradicted")
 
 
 def offset_words(offsets_px: dict[tuple[int, int], float]) -> str:
-    """Return constant disparities in words: of all pairs, of one camera, or pair by pair."""
+    """Return constant disparities in words: for all pairs, for one camera, or pair by pair."""
     values = list(offsets_px.values())
     if max(values) - min(values) < LEAST_OFFSET_PX:
         return f"{np.mean(values):+.2f} px for every pair"
-    for camera in range(6):
-        # A picture shifted to the right by s adds s to the disparity of its own pixels, and takes
-        # s from pairs in which it is the right one.
+    for camera in range(CAMERA_COUNT):
+        # A picture shifted to the right by s adds s to the disparity of its own pixels, and
+        # subtracts s in pairs in which it is the right one.
         shifts = [
-            px * (1 if pair[0] == camera else -1)
-            for pair, px in offsets_px.items()
-            if camera in pair
+            px if pair[0] == camera else -px for pair, px in offsets_px.items() if camera in pair
         ]
         others = [px for pair, px in offsets_px.items() if camera not in pair]
         alike = bool(shifts) and max(shifts) - min(shifts) < max(
@@ -252,14 +238,12 @@ def offset_words(offsets_px: dict[tuple[int, int], float]) -> str:
 
 
 _BIAS: Final = 0.002
-"""Share by which quotients may be off however many pixels agree: interpolation, rounding."""
+"""Systematic error of a quotient, as a share, by interpolation and rounding."""
 MARGIN: Final = 0.02
-"""A quotient is confirmed if its 95 % interval lies within this share of what is declared."""
+"""A quotient is confirmed if its 95 % interval is within this share of the declared one."""
 _LEAST_TOLERANCE: Final = 0.005
 
 QUOTIENT: Final = "unit / (focal length x baseline)"
-UNIT: Final = "metres a unit"
-FOCAL: Final = "focal length"
 _ALONE: Final = "not seen alone: only the quotient above is"
 
 
@@ -285,12 +269,12 @@ class Unit:
         return float(f"{self.metres:.4e}")
 
 
-def common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
+def _common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     """Return the unit that scenes agree on, weighted by how sure each is."""
     fitted = [scene for scene in scenes if math.isfinite(scene.scale_error)]
     coarse = max(allowed_log_scale(scene.depth_step) for scene in scenes)
     seen_px = max(
-        # An offset leaves to the scale what is no offset.
+        # Beside an offset, only the spread of disparities determines the scale.
         scene.spread_px if changes(scene, "offset") else scene.disparity_px
         for scene in scenes
     )
@@ -307,8 +291,8 @@ def common_unit(scenes: Sequence[SceneDiagnosis]) -> Unit:
     return Unit(math.exp(float(weights @ logs)), math.hypot(half, bias))
 
 
-def length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer, ...]:
-    """Return the answers on the quotient, on the unit and on the focal length.
+def _length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer, ...]:
+    """Return the answers for the quotient, the unit and the focal length.
 
     The last two are never known by themselves.
     """
@@ -316,60 +300,52 @@ def length_answers(scenes: Sequence[SceneDiagnosis], unit: Unit) -> tuple[Answer
     where = {"tag": "by the files' tag", "default": "by default", "user": "as given"}
     declared = f"{first.unit_m:g} m, {where.get(first.unit_source, 'tags unreadable')}"
     quotient = _quotient(scenes, unit)
+    of_unit = Answer("metres a unit", declared, "", "not seen alone", note=_ALONE)
+    of_focal = replace(of_unit, topic="focal length", declared="from the sensor's width")
     if first.problem:
-        blank = (
-            Answer(topic, "", "", "cannot tell", note=first.problem) for topic in (UNIT, FOCAL)
-        )
-        return quotient, *blank
-    found = ""
+        blank: dict[str, Any] = {"declared": "", "status": "cannot tell", "note": first.problem}
+        return quotient, replace(of_unit, **blank), replace(of_focal, **blank)
     if quotient.found:
         found = f"{unit.metres:.5g} m ± {unit.uncertainty:.2%} if the rest is right"
-    return (
-        quotient,
-        Answer(UNIT, declared, found, "not seen alone", note=_ALONE),
-        Answer(FOCAL, "from the sensor's width", "", "not seen alone", note=_ALONE),
-    )
+        of_unit = replace(of_unit, found=found)
+    return quotient, of_unit, of_focal
 
 
 def _quotient(scenes: Sequence[SceneDiagnosis], unit: Unit) -> Answer:
     first = scenes[0]
-    blank = Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=first.problem)
-    if first.problem:
+    blank = _no_answer(scenes, QUOTIENT, "1 x declared")
+    if blank.note:
         return blank
-    if has_camera_faults(scenes):
-        return Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=CAMERAS_DIFFER)
     found = f"{unit.metres / first.unit_m:.5g} x declared ± {unit.uncertainty:.2%}"
     if first.best.form != first.declared.form:
         note = f"numbers of another form: {describe(first.best.form)} has a unit of its own"
-        return Answer(QUOTIENT, "1 x declared", found, "cannot tell", note=note)
+        return replace(blank, found=found, note=note)
     if changes(first, "scale"):
-        gain = pooled([scene.gain for scene in scenes])
-        if kind_explains_scale(scenes):
-            note = (
-                f"{found} if depth is along {describe(first.best.kind)}, as declared if it is not"
-            )
-            return Answer(QUOTIENT, "1 x declared", "", "cannot tell", gain, note)
+        blank = replace(blank, behind=pooled([scene.gain for scene in scenes]))
+        if _kind_explains_scale(scenes):
+            kind = describe(first.best.kind)
+            note = f"{found} if depth is along {kind}, as declared if it is not"
+            return replace(blank, note=note)
         if unit.uncertainty > abs(math.log(unit.metres / first.unit_m)):
-            note = f"{found} fits best, but is not surely another"
-            return Answer(QUOTIENT, "1 x declared", "", "cannot tell", gain, note)
-        note = "the unit, the focal length or the baselines: they are not told apart"
-        return Answer(QUOTIENT, "1 x declared", found, "wrong", gain, note)
+            return replace(blank, note=f"{found} fits best, but may be equal")
+        note = "the unit, the focal length or the baselines: the pictures do not show which"
+        return replace(blank, found=found, status="wrong", note=note)
     doubt = _doubt(first, unit, found=found)
     if doubt:
-        return Answer(QUOTIENT, "1 x declared", "", "cannot tell", note=doubt)
+        return replace(blank, note=doubt)
     if first.unit_source == "unreadable":
-        return Answer(QUOTIENT, "tags unreadable", found, "cannot tell")
+        return replace(blank, declared="tags unreadable", found=found)
     note = f"the 95 % interval lies within {MARGIN:.0%} of what is declared"
-    return Answer(QUOTIENT, "1 x declared", found, "confirmed", note=note)
+    return replace(blank, found=found, status="confirmed", note=note)
 
 
 def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
-    """Return why a quotient that nothing is clearly better than is not confirmed, if so."""
+    """Return why the declared quotient is not confirmed although none is clearly better, if so."""
     off = abs(math.log(unit.metres / first.unit_m))
     is_coarse = allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE
     why = "depth is stored in too large steps" if is_coarse else "too little parallax"
     if unit.uncertainty > MARGIN:
-        return f"known to {unit.uncertainty:.0%} alone: {why}"
+        return f"known only to {unit.uncertainty:.0%}: {why}"
     if off > LEAST_LOG_SCALE:
         return f"{found} fits best, but is not clearly better{': ' + why if is_coarse else ''}"
     if off > max(unit.uncertainty, _LEAST_TOLERANCE):
@@ -379,10 +355,10 @@ def _doubt(first: SceneDiagnosis, unit: Unit, *, found: str) -> str:
     return ""
 
 
-def length_choices(scenes: Sequence[SceneDiagnosis], unit: Unit, pasted: str) -> tuple[str, ...]:
-    """Return what would each by itself explain the quotient, none of them certain.
+def _length_choices(scenes: Sequence[SceneDiagnosis], unit: Unit, pasted: str) -> tuple[str, ...]:
+    """Return the lengths that would explain the quotient, each by itself.
 
-    ``pasted`` is the contract with the unit that it would take if the rest is right.
+    ``pasted`` is the contract with the unit that would be right if the other lengths are.
     """
     first = scenes[0]
     factor = first.unit_m / unit.metres
@@ -401,8 +377,8 @@ def length_choices(scenes: Sequence[SceneDiagnosis], unit: Unit, pasted: str) ->
     return tuple(words)
 
 
-def kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
-    """Tell whether the other kind of depth explains all that a scale does, and is not ruled out."""
+def _kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
+    """Tell whether the other kind of depth explains as much as a scale, and is not ruled out."""
     first = scenes[0]
     if first.best != first.declared or first.changed != "scale":
         return False
@@ -417,7 +393,7 @@ def kind_explains_scale(scenes: Sequence[SceneDiagnosis]) -> bool:
 
 
 def _focal_reading(scenes: Sequence[SceneDiagnosis], unit: Unit) -> str | None:
-    """Return another reading of the sensor that gives the quotient found, if one does."""
+    """Return the reading of the sensor that gives the quotient found, None if there is none."""
     first = scenes[0]
     tolerance = max(LEAST_ERRORS * unit.uncertainty / 1.96, _LEAST_TOLERANCE)
     may_be = [
@@ -437,26 +413,27 @@ def _focal_reading(scenes: Sequence[SceneDiagnosis], unit: Unit) -> str | None:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What scenes with the same contract say together.
+    """The verdict on scenes with the same contract.
 
     Attributes:
         scenes: Their keys.
         answers: One for each question.
         gain: By how much the best contract is better than the declared one.
         agreement: Share of the matches of neighbouring cameras that the best contract explains.
-        encoding: The contract to use in place of the declared one; None where there is none, or
-            none that is sure: nothing is given for what explains less than half of the matches, for
-            a unit (the quotient of lengths alone is seen), or while single cameras do not fit.
-        quotient: Unit / (focal length x baseline) over what is declared; nan where not known.
+        encoding: The contract to use instead of the declared one; None if none is certain. None is
+            given if it explains less than half of the matches, for another unit (only the quotient
+            of lengths is seen), or while single cameras do not fit.
+        quotient: Unit / (focal length x baseline) over the declared one; nan if not known.
         quotient_error: Half its 95 % interval, as a share.
-        choices: What would each by itself explain that quotient, in words; empty where it is right.
+        choices: The lengths that would explain that quotient, each by itself, in words.
         faults: What is wrong with single cameras, in words.
-        tested_cameras: Those whose depth was tested in every scene.
-        untested_cameras: Those whose depth was not, in some scene.
-        unexplained_cameras: Those whose depth explains less than half of their matches somewhere.
-        beside: What a `DepthEncoding` cannot express, and other words of advice.
+        tested_cameras: Cameras whose depth was tested in every scene.
+        untested_cameras: Cameras whose depth was not tested in some scene.
+        unexplained_cameras: Cameras whose depth explains less than half of their matches in some
+            scene.
+        beside: Advice that a `DepthEncoding` cannot express.
         is_wrong: Whether another contract is clearly better, or a camera does not fit.
-        fits: Whether the declared contract was found to fit, all cameras tested.
+        fits: Whether the declared contract fits, with all cameras tested.
     """
 
     scenes: tuple[str, ...]
@@ -480,16 +457,14 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     """Return the verdict on scenes that have one best contract.
 
     Args:
-        scenes: One or more scenes with the same changes; of those without a word to say
-            (``problem``) there must be no other.
-        declared: The contract under test; its unit is None where files state it.
+        scenes: One or more scenes with the same changes, or only scenes with a ``problem``.
+        declared: The contract under test; its unit is None if files state it.
     """
     first = scenes[0]
-    unit = common_unit(scenes)
-    hypothesis = [question_answer(scenes, question) for question in QUESTIONS]
-    quotient, *lengths = length_answers(scenes, unit)
-    offset = offset_answer(scenes)
-    answers = (quotient, *lengths, *hypothesis, offset)
+    unit = _common_unit(scenes)
+    hypothesis = [_question_answer(scenes, question) for question in QUESTIONS]
+    quotient, *lengths = _length_answers(scenes, unit)
+    answers = (quotient, *lengths, *hypothesis, _offset_answer(scenes))
     faults = tuple(
         f"{scene.key}: {fault}" if len(scenes) > 1 else fault
         for scene in scenes
@@ -514,7 +489,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
     choices: tuple[str, ...] = ()
     if is_told and quotient.status != "confirmed" and explains and not faults:
         with_unit = _pasted(first, declared, unit_m=unit.rounded_m)
-        choices = length_choices(scenes, unit, encoding_line(with_unit))
+        choices = _length_choices(scenes, unit, encoding_line(with_unit))
     return Verdict(
         scenes=tuple(scene.key for scene in scenes),
         answers=answers,
@@ -540,7 +515,7 @@ def judge(scenes: Sequence[SceneDiagnosis], *, declared: DepthEncoding) -> Verdi
 def _pasted(
     first: SceneDiagnosis, declared: DepthEncoding, *, unit_m: float | None
 ) -> DepthEncoding:
-    """Return the contract with the answers that were found, and a unit where one is given."""
+    """Return the contract with the answers found, and with the given unit."""
     return replace(
         declared, unit_m=unit_m, kind=first.best.kind, form=first.best.form,
         frame_lag=first.best.frame_lag,
@@ -548,7 +523,7 @@ def _pasted(
 
 
 def encoding_line(encoding: DepthEncoding) -> str:
-    """Return the Python expression of a contract, defaults left out."""
+    """Return the Python expression of a contract, without defaults."""
     default = replace(encoding, unit_m=None, kind="planar", form="depth", frame_lag=0)
     arguments = [
         f"{field.name}={getattr(encoding, field.name)!r}"
@@ -559,12 +534,12 @@ def encoding_line(encoding: DepthEncoding) -> str:
 
 
 def _beside(scenes: Sequence[SceneDiagnosis], answers: Sequence[Answer]) -> list[str]:
-    """Return the advice that no `DepthEncoding` can express."""
+    """Return advice that a `DepthEncoding` cannot express."""
     first = scenes[0]
     wrong = {answer.topic for answer in answers if answer.status == "wrong"}
     lines = []
     if TOPICS["flip"] in wrong:
-        lines.append(f"Depth is flipped ({first.best.flip}ly turned over): store it anew.")
+        lines.append(f"Depth is flipped {first.best.flip}ly: store it anew.")
     if first.best.order != first.declared.order and TOPICS["order"] in wrong:
         lines.append(f"Files: {first.best.order}. Rename the files, or correct the metadata.")
     if first.recorded_pair is not None and TOPICS["order"] in wrong:
@@ -577,26 +552,24 @@ def _beside(scenes: Sequence[SceneDiagnosis], answers: Sequence[Answer]) -> list
     if not first.problem and allowed_log_scale(first.depth_step) > LEAST_LOG_SCALE:
         lines.append(
             f"Stored depth is coarse: its steps are {first.depth_step:.1%} of it or more in a "
-            "quarter of the picture, and the quotient is no better known."
+            "quarter of the picture, so the quotient is not known better."
         )
-    if kind_explains_scale(scenes):
+    if _kind_explains_scale(scenes):
         (other,) = first.best.alternatives("kind")
         lines.append(f"Fits alike: depth along {describe(other.kind)}, the unit as declared.")
     if has_camera_faults(scenes):
         return lines
-    for hypothesis, free, scale in dict.fromkeys(
-        other for scene in scenes[:1] for other in scene.equals
-    ):
-        lines.append(f"Fits alike: {_contract_words(hypothesis, first, free=free, scale=scale)}.")
+    for equal in dict.fromkeys(first.equals):
+        lines.append(f"Fits alike: {_contract_words(*equal, declared=first.declared)}.")
     return lines
 
 
 def _contract_words(
-    hypothesis: Hypothesis, first: SceneDiagnosis, *, free: str, scale: float
+    hypothesis: Hypothesis, free: Free, scale: float, *, declared: Hypothesis
 ) -> str:
     words = [
         f"{TOPICS[question]} {describe(getattr(hypothesis, question))}"
-        for question in hypothesis.changes_from(first.declared)
+        for question in hypothesis.changes_from(declared)
     ]
     if free in ("scale", "both"):
         words.append(f"{QUOTIENT} {1 / scale:.4g} x declared")
@@ -606,10 +579,10 @@ def _contract_words(
 
 
 def group_by_contract(scenes: Sequence[SceneDiagnosis]) -> list[list[SceneDiagnosis]]:
-    """Return scenes in groups with one contract, the largest first; scenes without a finding join.
+    """Return scenes in groups with one contract, the largest first.
 
-    Scenes for which the declared contract holds join those for which another is better where
-    their own pictures do not rule that one out.
+    Scenes with the declared contract join a group with another one unless their own pictures rule
+    that one out.
     """
     judged = [scene for scene in scenes if not scene.problem]
     if not judged:
@@ -634,7 +607,7 @@ def _fits(scene: SceneDiagnosis, leader: SceneDiagnosis) -> bool:
     if scene.declared != leader.declared:
         return False
     if has_camera_faults([scene, leader]):
-        # What is wrong with single cameras of a scene is its own.
+        # Faults of single cameras are the scene's own.
         return False
     error = allowed_log_scale(max(scene.depth_step, leader.depth_step))
     error += LEAST_ERRORS * min(scene.scale_error, 1.0)

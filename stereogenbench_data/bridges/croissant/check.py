@@ -10,7 +10,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +20,7 @@ import pyarrow.parquet as pq
 from stereogenbench_data.bridges.croissant.nodes import (
     CONTEXT,
     CROISSANT,
+    GIT,
     PARQUET,
     RAI,
     TAR,
@@ -71,54 +72,7 @@ _SHA256: Final = re.compile(r"[0-9a-f]{64}")
 _MOVING: Final = re.compile(r"/(?:resolve|raw|blob|tree)/(?:main|master|HEAD)(?:/|$)")
 _DATA_SUFFIXES: Final = (".tar", ".parquet", ".txt")
 _NO_PATH: Final = re.compile(r"^[/~]|\\|:|[\x00-\x1f]")
-_CHUNK_BYTES: Final = 1 << 20
 _PROPERTIES: Final = ("fullpath", "filename", "filepath", "content", "lines", "lineNumbers")
-
-
-@dataclass(slots=True)
-class _CheckedDescriptor:
-    """A descriptor and the problems found in it."""
-
-    node: Node
-    folder: Path
-    mapping: Mapping[str, Path]
-    problems: list[str] = field(default_factory=list)
-    _members: dict[str, list[str] | None] = field(default_factory=dict)
-
-    def report(self, where: str, what: str) -> None:
-        """Add a problem with its place."""
-        self.problems.append(f"{where}: {what}")
-
-    @property
-    def files(self) -> dict[str, Node]:
-        """Files and sets of files by id."""
-        return {str(each.get("@id")): each for each in self.node.get("distribution", [])}
-
-    @property
-    def fields(self) -> dict[str, Node]:
-        """The fields of all record sets by id."""
-        return {
-            str(each.get("@id")): each
-            for records in self.node.get("recordSet", [])
-            for each in records.get("field", [])
-        }
-
-    def local(self, file: Node) -> Path | None:
-        """Return the local path of a file, None where it is behind a URL or must not be read.
-
-        Anybody can write a descriptor. So a path in it must be relative to its folder and lead to
-        a table or a shard; `_check_files` reports any other path.
-        """
-        name, url = str(file.get("@id")), str(file.get("contentUrl", ""))
-        if name in self.mapping:
-            return self.mapping[name]
-        return None if "://" in url or not _is_data_path(url) else self.folder / url
-
-    def members(self, name: str) -> list[str] | None:
-        """Return the files in a container, None if it is not available or not a container."""
-        if name not in self._members:
-            self._members[name] = _members(self, name)
-        return self._members[name]
 
 
 def check_descriptor(path: Path, *, mapping: Mapping[str, Path] | None = None) -> list[str]:
@@ -142,82 +96,392 @@ def check_descriptor(path: Path, *, mapping: Mapping[str, Path] | None = None) -
         raise DescriptorError(
             f"{path}: must be a JSON object, found a {type(node).__name__}. Name a descriptor."
         )
-    checked = _CheckedDescriptor(node, path.parent, mapping or {})
+    check = _Check(node, path.parent, mapping or {})
     try:
-        for check in (
-            _context,
-            _properties,
-            _ids,
-            _check_files,
-            _check_sets,
-            _records,
-            _check_fields,
-        ):
-            check(checked)
+        check.run()
     except (AttributeError, TypeError) as error:
-        checked.report(
+        check.report(
             path.name, f"does not have the structure of a descriptor ({error}): write it again"
         )
-    return checked.problems
+    return check.problems
 
 
-def _context(checked: _CheckedDescriptor) -> None:
-    conforms = _listed(checked.node.get("conformsTo"))
-    for wanted in (CROISSANT, RAI):
-        if wanted not in conforms:
-            checked.report("conformsTo", f"lacks {wanted} (it has {', '.join(map(str, conforms))})")
-    context = checked.node.get("@context")
-    if not isinstance(context, dict):
-        checked.report("@context", f"is {context!r}, and must be an object with every term")
-        return
-    for term, meaning in CONTEXT.items():
-        if context.get(term) != meaning:
-            checked.report(
-                "@context",
-                f"{term} is {context.get(term)!r} and must be {meaning!r}: with another version's "
-                "context no file is found and no record loads",
+class _Check:
+    """A descriptor, what it describes, and the problems found so far."""
+
+    def __init__(self, node: Node, folder: Path, mapping: Mapping[str, Path]) -> None:
+        self.problems: list[str] = []
+        self._node = node
+        self._folder = folder
+        self._mapping = mapping
+        self._members: dict[str, list[str] | None] = {}
+
+    def report(self, where: str, what: str) -> None:
+        """Add a problem with its place."""
+        self.problems.append(f"{where}: {what}")
+
+    def run(self) -> None:
+        """Check the whole descriptor."""
+        self._check_context()
+        self._check_properties()
+        self._check_names()
+        self._check_ids()
+        self._check_files()
+        self._check_sets()
+        for records in self._record_sets:
+            self._check_records(records)
+        for records in self._record_sets:
+            read: dict[tuple[str, str], str] = {}
+            for field in records.get("field", []):
+                self._check_file_property(field, read=read)
+                self._check_values(field)
+
+    # What the descriptor describes.
+
+    @cached_property
+    def _record_sets(self) -> list[Node]:
+        return list(self._node.get("recordSet", []))
+
+    @cached_property
+    def _files(self) -> dict[str, Node]:
+        """Files and sets of files by id."""
+        return {str(each.get("@id")): each for each in self._node.get("distribution", [])}
+
+    @cached_property
+    def _fields(self) -> dict[str, Node]:
+        """The fields of all record sets by id."""
+        nodes = [field for records in self._record_sets for field in records.get("field", [])]
+        return {str(node.get("@id")): node for node in nodes}
+
+    @cached_property
+    def _columns(self) -> dict[str, list[str]]:
+        """The columns of every table that is available locally."""
+        columns = {}
+        for name, file in self._files.items():
+            path = self._local(file)
+            if (
+                path is not None
+                and path.is_file()
+                and PARQUET in _listed(file.get("encodingFormat"))
+            ):
+                try:
+                    columns[name] = pq.read_schema(path).names
+                except (pa.ArrowException, OSError) as error:
+                    self.report(name, f"cannot be read as Parquet ({error})")
+        return columns
+
+    def _local(self, file: Node) -> Path | None:
+        """Return the local path of a file, None where it is behind a URL or must not be read.
+
+        Anybody can write a descriptor. So a path in it must be relative to its folder and lead to
+        a table or a shard; `_check_files` reports any other path.
+        """
+        name, path = str(file.get("@id")), str(file.get("contentUrl", ""))
+        if name in self._mapping:
+            return self._mapping[name]
+        is_data = path.endswith(_DATA_SUFFIXES) and not _NO_PATH.search(path)
+        return self._folder / path if is_data else None
+
+    def _members_of(self, name: str) -> list[str] | None:
+        """Return the files in a container, None if it is not available or not a container."""
+        if name not in self._members:
+            self._members[name] = self._read_members(name)
+        return self._members[name]
+
+    def _read_members(self, name: str) -> list[str] | None:
+        file = self._files[name]
+        path = self._local(file)
+        if path is None:
+            return None
+        if path.is_dir():
+            return [each.relative_to(path).as_posix() for each in path.rglob("*") if each.is_file()]
+        if not path.is_file():
+            return None
+        encodings = _listed(file.get("encodingFormat"))
+        if TAR in encodings:
+            try:
+                with path.open("rb") as opened:
+                    size = path.stat().st_size
+                    return [each.name for each in read_members(opened, size, where=str(path))]
+            except StorageError as error:
+                self.report(name, str(error))
+                return None
+        return path.read_text().splitlines() if TEXT in encodings else None
+
+    def _files_of_set(self, name: str) -> list[str] | None:
+        """Return the paths of a set's files in its containers, None if one is not available."""
+        files = self._files.get(name, {})
+        found = [self._members_of(each) for each in _containers(files) if each in self._files]
+        if any(members is None for members in found) or not found:
+            return None
+        patterns = [str(each) for each in _listed(files.get("includes"))]
+        return [
+            member
+            for members in found
+            for member in members or ()
+            if any(fnmatch.fnmatch(member, pattern) for pattern in patterns)
+        ]
+
+    # The dataset as a whole.
+
+    def _check_context(self) -> None:
+        conforms = _listed(self._node.get("conformsTo"))
+        for wanted in (CROISSANT, RAI):
+            if wanted not in conforms:
+                found = ", ".join(map(str, conforms))
+                self.report("conformsTo", f"lacks {wanted} (it has {found})")
+        context = self._node.get("@context")
+        if not isinstance(context, dict):
+            self.report("@context", f"is {context!r}, and must be an object with every term")
+            return
+        for term, meaning in CONTEXT.items():
+            if context.get(term) != meaning:
+                self.report(
+                    "@context",
+                    f"{term} is {context.get(term)!r} and must be {meaning!r}: with another "
+                    "version's context no file is found and no record loads",
+                )
+        if "value" in context:
+            self.report(
+                "@context", "defines value, and then constant fields have no value: remove it"
             )
-    if "value" in context:
-        checked.report(
-            "@context", "defines value, and then constant fields have no value: remove it"
-        )
 
+    def _check_properties(self) -> None:
+        for name in (*REQUIRED, *REQUIRED_RAI):
+            if self._node.get(name) in (None, "", [], {}):
+                self.report(name, "is missing" if name not in self._node else "is empty")
+        for local in RAI_ONCE:
+            if len(_listed(self._node.get(f"rai:{local}"))) > 1:
+                self.report(
+                    f"rai:{local}", "has several values, but readers keep only the first: join them"
+                )
+        version = self._node.get("version")
+        if not _VERSION.fullmatch(str(version or "")):
+            self.report("version", f"is {version!r}, and must be MAJOR.MINOR.PATCH")
 
-def _properties(checked: _CheckedDescriptor) -> None:
-    for name in (*REQUIRED, *REQUIRED_RAI):
-        if checked.node.get(name) in (None, "", [], {}):
-            checked.report(name, "is missing" if name not in checked.node else "is empty")
-    for local in RAI_ONCE:
-        if len(_listed(checked.node.get(f"rai:{local}"))) > 1:
-            checked.report(
-                f"rai:{local}", "has several values, but readers keep only the first: join them"
-            )
-    if not _VERSION.fullmatch(str(checked.node.get("version", ""))):
-        checked.report(
-            "version", f"is {checked.node.get('version')!r}, and must be MAJOR.MINOR.PATCH"
-        )
-    _known_names(checked)
+    def _check_names(self) -> None:
+        """Check the spelling of every property."""
+        for place, name in _names(self._node, at=""):
+            prefix, _, local = name.rpartition(":")
+            problem = ""
+            if prefix == "rai" and local not in RAI_NAMES:
+                problem = "is not a property of RAI 1.0: check its spelling"
+            elif prefix == "prov" and local not in PROV_NAMES:
+                problem = f"must be one of {', '.join(sorted(PROV_NAMES))}: check its spelling"
+            elif not prefix and name not in _KNOWN:
+                problem = "is not a property of Croissant 1.1: check its spelling"
+            elif prefix not in {"", "rai", "prov", "sc", "cr", "dct"}:
+                problem = (
+                    "has a prefix that the context does not define: add it or remove the property"
+                )
+            if problem:
+                self.report(f"{place}{name}", problem)
 
+    def _check_ids(self) -> None:
+        seen: set[str] = set()
+        nodes = [*self._node.get("distribution", []), *self._record_sets]
+        nodes += [field for records in self._record_sets for field in records.get("field", [])]
+        for node in nodes:
+            name = str(node.get("@id", ""))
+            if not name or re.search(r"\s", name):
+                self.report(name or "a node", "must have an @id without a space")
+            elif name in seen:
+                self.report(
+                    name, "is the @id of two nodes, and only one of them is read: rename one"
+                )
+            seen.add(name)
 
-def _known_names(checked: _CheckedDescriptor) -> None:
-    for place, name in _names(checked.node, at=""):
-        prefix, _, local = name.rpartition(":")
-        if prefix == "rai" and local not in RAI_NAMES:
-            checked.report(f"{place}{name}", "is not a property of RAI 1.0: check its spelling")
-        elif prefix == "prov" and local not in PROV_NAMES:
-            checked.report(
-                f"{place}{name}",
-                f"must be one of {', '.join(sorted(PROV_NAMES))}: check its spelling",
+    # Files and sets of files.
+
+    def _check_files(self) -> None:
+        """Check that files exist, match their description, and have pinned addresses."""
+        for name in self._mapping.keys() - self._files.keys():
+            self.report(name, "is mapped to a path, but the descriptor has no such file")
+        for name, file in self._files.items():
+            if file.get("@type") != "cr:FileObject":
+                continue
+            if "contentUrl" not in file or "encodingFormat" not in file:
+                self.report(name, "must have a contentUrl and an encodingFormat")
+                continue
+            encodings, url = _listed(file["encodingFormat"]), str(file["contentUrl"])
+            is_repository = GIT in encodings
+            if not is_repository and not _SHA256.fullmatch(str(file.get("sha256", ""))):
+                self.report(
+                    name, f"has the sha256 {file.get('sha256')!r}, and must have 64 hex digits"
+                )
+            if _MOVING.search(url) and not is_repository:
+                self.report(name, f"{url} is a branch, which changes: pin a revision")
+            if name.endswith(".tar") and TAR not in encodings:
+                self.report(
+                    name, f"has the encodingFormat {file['encodingFormat']!r}, and must be {TAR}"
+                )
+            if not is_repository:
+                self._check_local_file(name, file)
+
+    def _check_local_file(self, name: str, file: Node) -> None:
+        path, url = self._local(file), str(file["contentUrl"])
+        if path is None:
+            if "://" not in url:
+                self.report(
+                    name,
+                    f"has the contentUrl {url!r}, and a path must be relative and end in "
+                    f"{', '.join(_DATA_SUFFIXES)}",
+                )
+            return
+        if not path.is_file():
+            self.report(name, f"{path} does not exist: write the descriptor again beside its files")
+            return
+        size = f"{path.stat().st_size} B"
+        if file.get("contentSize", size) != size:
+            self.report(
+                name,
+                f"has {size}, and the descriptor says {file['contentSize']}: fetch the file again",
             )
-        elif not prefix and name not in _KNOWN:
-            checked.report(
-                f"{place}{name}", "is not a property of Croissant 1.1: check its spelling"
+        with path.open("rb") as opened:
+            found = hashlib.file_digest(opened, "sha256").hexdigest()
+        if found != file.get("sha256"):
+            self.report(
+                name,
+                f"has the sha256 {found}, and the descriptor says {file.get('sha256')}: the file "
+                "was replaced or damaged: fetch it again, or write the descriptor again",
             )
-        elif prefix and prefix not in {"rai", "prov", "sc", "cr", "dct"}:
-            checked.report(
-                f"{place}{name}",
-                "has a prefix that the context does not define: add it or remove the property",
+
+    def _check_sets(self) -> None:
+        """Check that each set of files has containers that exist, and matches files in them."""
+        for name, files in self._files.items():
+            if files.get("@type") != "cr:FileSet":
+                continue
+            if not files.get("includes"):
+                self.report(name, "has no includes: list the patterns of its files")
+                continue
+            for container in _containers(files):
+                if container not in self._files:
+                    self.report(
+                        name, f"is contained in {container!r}, which is not in the descriptor"
+                    )
+            if self._files_of_set(name) == []:
+                patterns = ", ".join(map(str, _listed(files["includes"])))
+                self.report(
+                    name, f"includes {patterns}, which matches no file: correct the pattern"
+                )
+
+    # Record sets and their fields.
+
+    def _check_records(self, records: Node) -> None:
+        name = str(records.get("@id"))
+        own = {str(each.get("@id")) for each in records.get("field", [])}
+        for key in _listed(records.get("key")):
+            if str(key.get("@id")) not in own:
+                self.report(name, f"has the key {key.get('@id')}, which is not one of its fields")
+        for row in _listed(records.get("data")):
+            if set(row) - own:
+                strange = ", ".join(sorted(set(row) - own))
+                self.report(name, f"has data for {strange}, which it has no field for")
+        for field in records.get("field", []):
+            self._check_reference(field)
+            self._check_source(field, has_data="data" in records)
+
+    def _check_reference(self, node: Node) -> None:
+        if "references" not in node:
+            return
+        name = str(node.get("@id"))
+        target = node["references"].get("field", {}).get("@id")
+        if target is None:
+            self.report(
+                name,
+                'has a reference without a field: write {"references": {"field": {"@id": ...}}}',
             )
+        elif target not in self._fields:
+            self.report(name, f"refers to {target!r}, which is not in the descriptor")
+        elif "references" in self._fields[target]:
+            self.report(
+                name, f"refers to {target}, which is itself a reference: chains load wrong rows"
+            )
+
+    def _check_source(self, node: Node, *, has_data: bool) -> None:
+        name, source = str(node.get("@id")), node.get("source")
+        if source is None:
+            if not has_data:
+                self.report(name, "has neither a source nor inline data")
+            return
+        of = source.get("fileObject") or source.get("fileSet") or source.get("field") or {}
+        origin = of.get("@id")
+        if origin not in self._files and origin not in self._fields:
+            self.report(name, f"is read from {origin!r}, which is not in the descriptor")
+        column, columns = source.get("extract", {}).get("column"), self._columns.get(str(origin))
+        if column is not None and columns is not None and column not in columns:
+            self.report(name, f"reads the column {column!r} of {origin}; its columns are {columns}")
+        regex = source.get("transform", {}).get("regex")
+        if regex is not None and not _has_group(regex):
+            self.report(name, f"takes the first group of the regex {regex!r}, which has no group")
+
+    def _check_file_property(self, node: Node, *, read: dict[tuple[str, str], str]) -> None:
+        """Check what a field reads of each file of a set.
+
+        A regex that matches nothing, or that changes its own result, gives empty or wrong records
+        without an error. A join rewrites the property in place, so no other field may read it.
+
+        Args:
+            node: The field.
+            read: Set of files and property to the first field that reads it; extended.
+        """
+        name, source = str(node.get("@id")), node.get("source", {})
+        wanted = source.get("extract", {}).get("fileProperty")
+        if wanted is None:
+            return
+        files = str(source.get("fileSet", {}).get("@id"))
+        other = read.setdefault((files, str(wanted)), name)
+        if other != name and ("references" in node or "references" in self._fields[other]):
+            self.report(name, f"reads what {other} reads, {wanted} of {files}: a join rewrites it")
+        if wanted not in _PROPERTIES:
+            self.report(
+                name, f"reads {wanted!r} of each file; must be one of {', '.join(_PROPERTIES)}"
+            )
+        regex = source.get("transform", {}).get("regex")
+        paths = self._files_of_set(files)
+        if not paths or wanted not in {"fullpath", "filename"} or not _has_group(regex or ""):
+            return
+        texts = [path if wanted == "fullpath" else path.rpartition("/")[2] for path in paths]
+        missed = [text for text in texts if not re.match(regex, text)]
+        if missed:
+            self.report(name, f"has the regex {regex!r}, which does not match {missed[0]}")
+        elif "references" in node and not _is_kept(regex, texts[0]):
+            self.report(
+                name,
+                f"has the regex {regex!r}, which changes its own result, but a join applies it "
+                "twice",
+            )
+
+    def _check_values(self, node: Node) -> None:
+        """Check that every value of a column is among those of the field that it refers to."""
+        target = self._fields.get(node.get("references", {}).get("field", {}).get("@id"))
+        if target is None:
+            return
+        here, meant = self._values_of(node), str(target.get("@id"))
+        there = self._inline_values_of(meant) or self._values_of(target)
+        strange = sorted(here - there) if here is not None and there is not None else []
+        if strange:
+            self.report(
+                str(node.get("@id")), f"has the value {strange[0]!r}, which {meant} does not have"
+            )
+
+    def _values_of(self, node: Node) -> set[str] | None:
+        """Return the texts in the column that a field reads, None if it is not available."""
+        source = node.get("source", {})
+        file = str(source.get("fileObject", {}).get("@id"))
+        column = source.get("extract", {}).get("column")
+        path = self._local(self._files[file]) if column in self._columns.get(file, ()) else None
+        if path is None:
+            return None
+        values: pa.ChunkedArray = pq.read_table(path, columns=[column]).column(0)
+        return {str(value) for value in values.unique().to_pylist() if value not in (None, "")}
+
+    def _inline_values_of(self, name: str) -> set[str]:
+        """Return a field's values in inline data, none if it has none."""
+        for records in self._record_sets:
+            if name in {str(each.get("@id")) for each in records.get("field", [])}:
+                return {str(row.get(name)) for row in _listed(records.get("data"))}
+        return set()
 
 
 def _names(node: Any, *, at: str) -> Iterator[tuple[str, str]]:
@@ -233,72 +497,10 @@ def _names(node: Any, *, at: str) -> Iterator[tuple[str, str]]:
                 yield from _names(value, at=here)
 
 
-def _ids(checked: _CheckedDescriptor) -> None:
-    seen: set[str] = set()
-    nodes = [*checked.node.get("distribution", []), *checked.node.get("recordSet", [])]
-    nodes += [field for records in checked.node.get("recordSet", []) for field in records["field"]]
-    for node in nodes:
-        name = str(node.get("@id", ""))
-        if not name or re.search(r"\s", name):
-            checked.report(name or "a node", "must have an @id without a space")
-        elif name in seen:
-            checked.report(
-                name, "is the @id of two nodes, and only one of them is read: rename one"
-            )
-        seen.add(name)
-
-
-def _records(checked: _CheckedDescriptor) -> None:
-    columns = _local_columns(checked)
-    for records in checked.node.get("recordSet", []):
-        name = str(records.get("@id"))
-        own = {str(each.get("@id")) for each in records.get("field", [])}
-        keys = [str(each.get("@id")) for each in _listed(records.get("key"))]
-        for key in keys:
-            if key not in own:
-                checked.report(name, f"has the key {key}, which is not one of its fields")
-        for row in _listed(records.get("data")):
-            if set(row) - own:
-                checked.report(
-                    name,
-                    f"has data for {', '.join(sorted(set(row) - own))}, which it has no field for",
-                )
-        for each in records.get("field", []):
-            _field(checked, each, columns=columns, has_data="data" in records)
-
-
-def _field(
-    checked: _CheckedDescriptor, node: Node, *, columns: dict[str, list[str]], has_data: bool
-) -> None:
-    name = str(node.get("@id"))
-    target = node.get("references", {}).get("field", {}).get("@id")
-    if "references" in node and target is None:
-        checked.report(
-            name, 'has a reference without a field: write {"references": {"field": {"@id": ...}}}'
-        )
-    elif target is not None and target not in checked.fields:
-        checked.report(name, f"refers to {target!r}, which is not in the descriptor")
-    elif target is not None and "references" in checked.fields[target]:
-        checked.report(
-            name, f"refers to {target}, which is itself a reference: chains load wrong rows"
-        )
-    source = node.get("source")
-    if source is None:
-        if not has_data:
-            checked.report(name, "has neither a source nor inline data")
-        return
-    of = source.get("fileObject") or source.get("fileSet") or source.get("field") or {}
-    origin = of.get("@id")
-    if origin not in checked.files and origin not in checked.fields:
-        checked.report(name, f"is read from {origin!r}, which is not in the descriptor")
-    column = source.get("extract", {}).get("column")
-    if column is not None and origin in columns and column not in columns[origin]:
-        checked.report(
-            name, f"reads the column {column!r} of {origin}; its columns are {columns[origin]}"
-        )
-    regex = source.get("transform", {}).get("regex")
-    if regex is not None and not _has_group(regex):
-        checked.report(name, f"takes the first group of the regex {regex!r}, which has no group")
+def _containers(files: Node) -> list[str]:
+    """Return the ids of the files that contain a set of files."""
+    nodes = _listed(files.get("containedIn"))
+    return [str(each.get("fileObject", each).get("@id")) for each in nodes]
 
 
 def _has_group(regex: str) -> bool:
@@ -308,223 +510,6 @@ def _has_group(regex: str) -> bool:
         return False
 
 
-def _is_data_path(path: str) -> bool:
-    """Return whether a path is relative and that of a table or a shard."""
-    return path.endswith(_DATA_SUFFIXES) and not _NO_PATH.search(path)
-
-
-def _check_files(checked: _CheckedDescriptor) -> None:
-    """Check that files exist, match their description, and have pinned addresses."""
-    for name in checked.mapping.keys() - checked.files.keys():
-        checked.report(name, "is mapped to a path, but the descriptor has no such file")
-    for name, file in checked.files.items():
-        if file.get("@type") != "cr:FileObject":
-            continue
-        if "contentUrl" not in file or "encodingFormat" not in file:
-            checked.report(name, "must have a contentUrl and an encodingFormat")
-            continue
-        is_repository = "git+https" in _listed(file["encodingFormat"])
-        if not is_repository and not _SHA256.fullmatch(str(file.get("sha256", ""))):
-            checked.report(
-                name, f"has the sha256 {file.get('sha256')!r}, and must have 64 hex digits"
-            )
-        if _MOVING.search(str(file["contentUrl"])) and not is_repository:
-            checked.report(name, f"{file['contentUrl']} is a branch, which changes: pin a revision")
-        if name.endswith(".tar") and TAR not in _listed(file["encodingFormat"]):
-            checked.report(
-                name, f"has the encodingFormat {file['encodingFormat']!r}, and must be {TAR}"
-            )
-        if not is_repository:
-            _local_file(checked, name, file)
-
-
-def _local_file(checked: _CheckedDescriptor, name: str, file: Node) -> None:
-    """Check a file that is available locally."""
-    path = checked.local(file)
-    if path is None and "://" not in str(file["contentUrl"]):
-        checked.report(
-            name,
-            f"has the contentUrl {file['contentUrl']!r}, and a path must be relative and end in "
-            f" {', '.join(_DATA_SUFFIXES)}",
-        )
-    elif path is not None and not path.is_file():
-        checked.report(name, f"{path} does not exist: write the descriptor again beside its files")
-    elif path is not None:
-        _content(checked, name, file, path)
-
-
-def _content(checked: _CheckedDescriptor, name: str, file: Node, path: Path) -> None:
-    size = f"{path.stat().st_size} B"
-    if file.get("contentSize", size) != size:
-        checked.report(
-            name, f"has {size}, and the descriptor says {file['contentSize']}: fetch the file again"
-        )
-    found = _sha256(path)
-    if found != file.get("sha256"):
-        checked.report(
-            name,
-            f"has the sha256 {found}, and the descriptor says {file.get('sha256')}: the file was "
-            "replaced or damaged: fetch it again, or write the descriptor again",
-        )
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.hexdigest()
-
-
-def _check_sets(checked: _CheckedDescriptor) -> None:
-    """Check that each set of files has containers that exist, and matches files in them."""
-    for name, files in checked.files.items():
-        if files.get("@type") != "cr:FileSet":
-            continue
-        if not files.get("includes"):
-            checked.report(name, "has no includes: list the patterns of its files")
-            continue
-        containers = [_container(each) for each in _listed(files.get("containedIn"))]
-        for container in containers:
-            if container not in checked.files:
-                checked.report(
-                    name, f"is contained in {container!r}, which is not in the descriptor"
-                )
-        if _files_of_set(checked, name) == []:
-            patterns = ", ".join(str(each) for each in _listed(files["includes"]))
-            checked.report(name, f"includes {patterns}, which matches no file: correct the pattern")
-
-
-def _files_of_set(checked: _CheckedDescriptor, name: str) -> list[str] | None:
-    """Return the paths of a set's files in its containers, None if one is not available."""
-    files = checked.files.get(name, {})
-    containers = [_container(each) for each in _listed(files.get("containedIn"))]
-    found = [checked.members(each) for each in containers if each in checked.files]
-    if any(members is None for members in found) or not found:
-        return None
-    patterns = [str(each) for each in _listed(files.get("includes"))]
-    return [
-        member
-        for members in found
-        for member in members or ()
-        if any(fnmatch.fnmatch(member, pattern) for pattern in patterns)
-    ]
-
-
-def _container(node: Node) -> str:
-    source = node.get("fileObject", node)
-    return str(source.get("@id"))
-
-
-def _members(checked: _CheckedDescriptor, name: str) -> list[str] | None:
-    """Return the files in a container, None if it is not available or not a container."""
-    file = checked.files[name]
-    path = checked.local(file)
-    if path is None:
-        return None
-    if path.is_dir():
-        return [each.relative_to(path).as_posix() for each in path.rglob("*") if each.is_file()]
-    if not path.is_file():
-        return None
-    encodings = _listed(file.get("encodingFormat"))
-    if TAR in encodings:
-        try:
-            with path.open("rb") as opened:
-                size = path.stat().st_size
-                return [each.name for each in read_members(opened, size, where=str(path))]
-        except StorageError as error:
-            checked.report(name, str(error))
-            return None
-    return path.read_text().splitlines() if TEXT in encodings else None
-
-
-def _local_columns(checked: _CheckedDescriptor) -> dict[str, list[str]]:
-    """Return the columns of every table that is available locally."""
-    columns = {}
-    for name, file in checked.files.items():
-        path = checked.local(file)
-        if path is not None and path.is_file() and PARQUET in _listed(file.get("encodingFormat")):
-            try:
-                columns[name] = pq.read_schema(path).names
-            except (pa.ArrowException, OSError) as error:
-                checked.report(name, f"cannot be read as Parquet ({error})")
-    return columns
-
-
-def _listed(value: Any) -> list[Any]:
-    """Return a single value, a list of values or None as a list."""
-    if value is None:
-        return []
-    return value if isinstance(value, list) else [value]
-
-
-def _check_fields(checked: _CheckedDescriptor) -> None:
-    """Check what fields read from files, and what their references lead to.
-
-    A regex that matches nothing, or that changes its own result, gives empty or wrong records
-    without an error; so do values that refer to no record.
-    """
-    columns = _local_columns(checked)
-    for records in checked.node.get("recordSet", []):
-        read: dict[tuple[str, str], str] = {}
-        for each in records.get("field", []):
-            _joined_once(checked, each, read=read)
-            _property(checked, each)
-            _values(checked, each, columns=columns)
-
-
-def _joined_once(
-    checked: _CheckedDescriptor, node: Node, *, read: dict[tuple[str, str], str]
-) -> None:
-    """Check that no other field reads the property that a reference joins on.
-
-    The join rewrites that property in place.
-    """
-    place = _file_property(node)
-    if place is None:
-        return
-    name = str(node.get("@id"))
-    other = read.setdefault(place, name)
-    references = [each for each in (name, other) if "references" in checked.fields[each]]
-    if other != name and references:
-        checked.report(
-            name, f"reads what {other} reads, {place[1]} of {place[0]}: a join rewrites it"
-        )
-
-
-def _file_property(node: Node) -> tuple[str, str] | None:
-    source = node.get("source", {})
-    wanted = source.get("extract", {}).get("fileProperty")
-    return None if wanted is None else (str(source.get("fileSet", {}).get("@id")), str(wanted))
-
-
-def _property(checked: _CheckedDescriptor, node: Node) -> None:
-    place = _file_property(node)
-    if place is None:
-        return
-    name = str(node.get("@id"))
-    files, wanted = place
-    if wanted not in _PROPERTIES:
-        checked.report(
-            name, f"reads {wanted!r} of each file; must be one of {', '.join(_PROPERTIES)}"
-        )
-    regex = node["source"].get("transform", {}).get("regex")
-    paths = _files_of_set(checked, files)
-    if regex is None or not paths or wanted not in {"fullpath", "filename"}:
-        return
-    if not _has_group(regex):
-        return
-    texts = [path if wanted == "fullpath" else path.rpartition("/")[2] for path in paths]
-    missed = [text for text in texts if not re.match(regex, text)]
-    if missed:
-        checked.report(name, f"has the regex {regex!r}, which does not match {missed[0]}")
-    elif "references" in node and not _is_kept(regex, texts[0]):
-        checked.report(
-            name,
-            f"has the regex {regex!r}, which changes its own result, but a join applies it twice",
-        )
-
-
 def _is_kept(regex: str, text: str) -> bool:
     """Return whether a regex applied to its own result gives the same result."""
     once = re.match(regex, text)
@@ -532,39 +517,8 @@ def _is_kept(regex: str, text: str) -> bool:
     return once is not None and again is not None and again[1] == once[1]
 
 
-def _values(checked: _CheckedDescriptor, node: Node, *, columns: dict[str, list[str]]) -> None:
-    """Check that every value of a column is among those of the field that it refers to."""
-    target = checked.fields.get(node.get("references", {}).get("field", {}).get("@id"))
-    here = None if target is None else _column(checked, node, columns=columns)
-    if target is None or here is None:
-        return
-    name, meant = str(node.get("@id")), str(target.get("@id"))
-    there = _inline(checked, meant)
-    if there is None:
-        there = _column(checked, target, columns=columns)
-    strange = sorted(here - there) if there is not None else []
-    if strange:
-        checked.report(name, f"has the value {strange[0]!r}, which {meant} does not have")
-
-
-def _column(
-    checked: _CheckedDescriptor, node: Node, *, columns: dict[str, list[str]]
-) -> set[str] | None:
-    """Return the texts in the column that a field reads, None if it is not available."""
-    source = node.get("source", {})
-    file = str(source.get("fileObject", {}).get("@id"))
-    column = source.get("extract", {}).get("column")
-    path = checked.local(checked.files[file]) if file in columns else None
-    if path is None or column not in columns[file]:
-        return None
-    values: pa.ChunkedArray = pq.read_table(path, columns=[column]).column(0)
-    return {str(value) for value in values.unique().to_pylist() if value not in (None, "")}
-
-
-def _inline(checked: _CheckedDescriptor, name: str) -> set[str] | None:
-    """Return a field's values in inline data, None if it has none."""
-    for records in checked.node.get("recordSet", []):
-        rows: list[dict[str, Any]] = _listed(records.get("data"))
-        if rows and name in {str(each.get("@id")) for each in records.get("field", [])}:
-            return {str(row.get(name)) for row in rows}
-    return None
+def _listed(value: Any) -> list[Any]:
+    """Return a single value, a list of values or None as a list."""
+    if value is None:
+        return []
+    return value if isinstance(value, list) else [value]

@@ -18,7 +18,7 @@ from stereogenbench_data.bridges import about
 from stereogenbench_data.bridges.croissant.folders import folder_nodes
 from stereogenbench_data.bridges.croissant.nodes import CONTEXT, CROISSANT, RAI, Node
 from stereogenbench_data.bridges.croissant.shards import packed_nodes, write_tables
-from stereogenbench_data.errors import DescriptorError, cure_of
+from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import shown
@@ -93,8 +93,9 @@ def write_descriptor(
         write_atomic(path, text.encode())
     except OSError as error:
         raise DescriptorError(
-            f"{path}: cannot be written ({error.strerror or error}). "
-            + cure_of(error, "Choose another place with --out.")
+            describe_os_error(
+                f"{path}: cannot be written", error, "Choose another place with --out."
+            )
         ) from error
     return descriptor
 

@@ -4,7 +4,7 @@ JSON files outside tars can be parsed, so scenes and pairs are read from each ``
 the descriptor does not depend on the number of scenes.
 """
 
-from typing import Any, Final
+from typing import Final
 
 from stereogenbench_data.bridges.croissant.nodes import (
     ENCODINGS,
@@ -94,67 +94,52 @@ def _file_sets(suffixes: dict[str, str]) -> dict[str, tuple[str | list[str], str
     }
 
 
-def _in_json(files: str, path: str, *, then: str | None = None) -> dict[str, Any]:
-    source: Node = {"fileSet": {"@id": files}, "extract": {"jsonPath": path}}
-    if then is not None:
-        source["transform"] = {"jsonPath": then}
-    return {"source": source}
+def _in_json(files: str, path: str) -> Node:
+    return {"source": {"fileSet": {"@id": files}, "extract": {"jsonPath": path}}}
+
+
+def _scene_of(records: str, files: str, about: str = "Path of the scene.") -> Node:
+    return field(f"{records}/scene_id", "sc:Text", about, **of_file(files, "fullpath", regex=_KEY))
 
 
 def _scenes() -> Node:
+    intrinsics = "$.camera_intrinsics"
     fields = [
-        field(
-            "scenes/scene_id", "sc:Text", "Path of the scene: split, subset, family, map, number.",
-            **of_file("scene-files", "fullpath", regex=_KEY),
+        _scene_of(
+            "scenes", "scene-files", "Path of the scene: split, subset, family, map, number."
         ),
         field(
             "scenes/focal_mm", "sc:Float", "Focal length of all six cameras, in mm.",
-            **_in_json("scene-files", "$.camera_intrinsics.focal_length_mm"),
+            **_in_json("scene-files", f"{intrinsics}.focal_length_mm"),
         ),
         field(
             "scenes/sensor_width_mm", "sc:Float", "Width of the sensor, in mm.",
-            **_in_json("scene-files", "$.camera_intrinsics.sensor_width_mm"),
+            **_in_json("scene-files", f"{intrinsics}.sensor_width_mm"),
         ),
     ]  # fmt: skip
     return record_set("scenes", "Every scene once.", fields, key={"@id": "scenes/scene_id"})
 
 
 def _pairs() -> Node:
+    each_pair = "$.pairwise_pairs[*]"
     fields = [
-        field(
-            "pairs/scene_id", "sc:Text", "Path of the scene.",
-            **of_file("pair-files", "fullpath", regex=_KEY),
-        ),
+        _scene_of("pairs", "pair-files"),
         *(
-            field(f"pairs/{name}", kind, text, **_in_json("pair-files", path))
-            for name, kind, text, path in (
-                (
-                    "camera_left", "sc:Integer", "Number of the left camera.",
-                    "$.pairwise_pairs[*].camera_index_a",
-                ),
-                (
-                    "camera_right", "sc:Integer", "Number of the right camera.",
-                    "$.pairwise_pairs[*].camera_index_b",
-                ),
-                (
-                    "baseline_cm", "sc:Float", "Distance of the two cameras, in cm.",
-                    "$.pairwise_pairs[*].baseline_cm",
-                ),
+            field(f"pairs/{name}", kind, about, **_in_json("pair-files", f"{each_pair}.{key}"))
+            for name, key, kind, about in (
+                ("camera_left", "camera_index_a", "sc:Integer", "Number of the left camera."),
+                ("camera_right", "camera_index_b", "sc:Integer", "Number of the right camera."),
+                ("baseline_cm", "baseline_cm", "sc:Float", "Distance of the two cameras, in cm."),
             )
         ),
-    ]  # fmt: skip
+    ]
     return record_set("pairs", "Every stereo pair once: 15 a scene.", fields)
 
 
 def _descriptions() -> Node:
-    fields = [
-        field(
-            "descriptions/scene_id", "sc:Text", "Path of the scene.",
-            **of_file("description-files", "fullpath", regex=_KEY),
-        ),
-        field(
-            "descriptions/text", "sc:Text", "What a model says of the scene.",
-            **of_file("description-files", "content"),
-        ),
-    ]  # fmt: skip
+    text = field(
+        "descriptions/text", "sc:Text", "What a model says of the scene.",
+        **of_file("description-files", "content"),
+    )  # fmt: skip
+    fields = [_scene_of("descriptions", "description-files"), text]
     return record_set("descriptions", "Machine-written descriptions, where there are any.", fields)

@@ -24,52 +24,32 @@ Node = dict[str, Any]
 CROISSANT: Final = "http://mlcommons.org/croissant/1.1"
 RAI: Final = "http://mlcommons.org/croissant/RAI/1.0"
 
-CONTEXT: Final[Node] = {
+_OTHER_TERMS: Final[Node] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
-    "arrayShape": "cr:arrayShape",
-    "citeAs": "cr:citeAs",
-    "column": "cr:column",
     "conformsTo": "dct:conformsTo",
-    "containedIn": "cr:containedIn",
     "cr": "http://mlcommons.org/croissant/",
     "data": {"@id": "cr:data", "@type": "@json"},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
     "dct": "http://purl.org/dc/terms/",
     "description": {"@container": "@language"},
-    "equivalentProperty": "cr:equivalentProperty",
     "examples": {"@id": "cr:examples", "@type": "@json"},
-    "extract": "cr:extract",
-    "field": "cr:field",
-    "fileObject": "cr:fileObject",
-    "fileProperty": "cr:fileProperty",
-    "fileSet": "cr:fileSet",
-    "format": "cr:format",
-    "includes": "cr:includes",
-    "isArray": "cr:isArray",
-    "isLiveDataset": "cr:isLiveDataset",
-    "jsonPath": "cr:jsonPath",
-    "key": "cr:key",
-    "md5": "cr:md5",
     "name": {"@container": "@language"},
-    "parentField": "cr:parentField",
-    "path": "cr:path",
     "prov": "http://www.w3.org/ns/prov#",
     "rai": "http://mlcommons.org/croissant/RAI/",
-    "readLines": "cr:readLines",
-    "recordSet": "cr:recordSet",
-    "references": "cr:references",
-    "regex": "cr:regex",
-    "repeated": "cr:repeated",
-    "replace": "cr:replace",
-    "samplingRate": "cr:samplingRate",
     "sc": "https://schema.org/",
-    "separator": "cr:separator",
-    "source": "cr:source",
-    "subField": "cr:subField",
-    "transform": "cr:transform",
-    "unArchive": "cr:unArchive",
 }
+_CROISSANT_TERMS: Final = (
+    "arrayShape", "citeAs", "column", "containedIn", "equivalentProperty", "extract", "field",
+    "fileObject", "fileProperty", "fileSet", "format", "includes", "isArray", "isLiveDataset",
+    "jsonPath", "key", "md5", "parentField", "path", "readLines", "recordSet", "references",
+    "regex", "repeated", "replace", "samplingRate", "separator", "source", "subField",
+    "transform", "unArchive",
+)  # fmt: skip
+CONTEXT: Final[Node] = dict(
+    sorted((_OTHER_TERMS | {term: f"cr:{term}" for term in _CROISSANT_TERMS}).items())
+)
+"""The terms of a descriptor, in alphabetical order."""
 
 TAR: Final = "application/x-tar"
 PARQUET: Final = "application/x-parquet"
@@ -78,7 +58,6 @@ TEXT: Final = "text/plain"
 
 GIT_CHECKSUM: Final = "https://github.com/mlcommons/croissant/issues/80"
 """The checksum of a git repository, by common practice: it has none of its own."""
-
 
 RELEASED_SUFFIXES: Final = {"rgb": "mp4", "depth": "mkv"}
 ENCODINGS: Final = {"mp4": "video/mp4", "mkv": "video/x-matroska"}

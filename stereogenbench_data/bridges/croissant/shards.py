@@ -7,7 +7,7 @@ The same index gives the same bytes.
 """
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -36,10 +36,11 @@ from stereogenbench_data.bridges.croissant.nodes import (
     text_records,
     video_records,
 )
-from stereogenbench_data.errors import DescriptorError, cure_of
+from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
+    CAMERA_COUNT,
     CAMERA_PAIRS,
     COMPLETE_JSON,
     TRAJECTORY_JSON,
@@ -64,6 +65,47 @@ _TABLES: Final = {
     SHARDS: "One row a shard, with its checksum.",
     SHARD_LIST: "The paths of all shards, one a line.",
 }
+
+
+_SCENE_COLUMNS: Final = (
+    ("scene_id", pa.string(), "Path of the scene: split, subset, family, map, number."),
+    ("split", pa.string(), "train or eval."),
+    ("eval_subset", pa.string(), "seen_map or unseen_map; none in train."),
+    ("family", pa.string(), "Family of baselines."),
+    ("map", pa.string(), "Environment."),
+    ("scene_label", pa.string(), "The scene's label in its own metadata."),
+    ("character", pa.string(), "The avatar's mesh."),
+    ("animation", pa.string(), "The avatar's animation."),
+    ("frames", pa.int64(), "Frames of each video."),
+    ("frame_rate_hz", pa.float64(), "Frames a second."),
+    ("image_width_px", pa.int64(), "Width of all videos."),
+    ("image_height_px", pa.int64(), "Height of all videos."),
+    ("focal_mm", pa.float64(), "Focal length of all six cameras, in mm."),
+    ("sensor_width_mm", pa.float64(), "Width of the sensor, in mm."),
+    ("sensor_height_mm", pa.float64(), "Height of the sensor, in mm."),
+    ("primary_left", pa.int64(), "Left camera of the primary pair."),
+    ("primary_right", pa.int64(), "Right camera of the primary pair."),
+    (
+        "pairwise_baselines_cm", pa.list_(pa.float64()),
+        "Baselines of the 15 pairs 0-1, 0-2 ... 4-5, in cm.",
+    ),
+    (
+        "depth_unit_m", pa.list_(pa.float64()),
+        "Metres in a stored unit of depth, for each camera.",
+    ),
+    ("description", pa.string(), "Machine-written description; empty where there is none."),
+)  # fmt: skip
+"""Columns of the table of scenes: name, type, meaning."""
+_INDEX_COLUMNS: Final = {
+    "scene_id": "key",
+    "eval_subset": "subset",
+    "map": "map_name",
+    "pairwise_baselines_cm": "baselines_cm",
+    "description": "caption",
+}
+"""Columns that the index has under another name."""
+_KINDS: Final = {pa.string(): "sc:Text", pa.int64(): "sc:Integer", pa.float64(): "sc:Float"}
+_LENGTHS: Final = {"pairwise_baselines_cm": len(CAMERA_PAIRS), "depth_unit_m": CAMERA_COUNT}
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,42 +213,16 @@ def _listed_shards() -> Node:
 
 
 def _scenes() -> Node:
-    fields = [
-        field(f"scenes/{name}", kind, text, **column(SCENES, name))
-        for name, kind, text in (
-            ("scene_id", "sc:Text", "Path of the scene: split, subset, family, map, number."),
-            ("split", "sc:Text", "train or eval."),
-            ("eval_subset", "sc:Text", "seen_map or unseen_map; none in train."),
-            ("family", "sc:Text", "Family of baselines."),
-            ("map", "sc:Text", "Environment."),
-            ("scene_label", "sc:Text", "The scene's label in its own metadata."),
-            ("character", "sc:Text", "The avatar's mesh."),
-            ("animation", "sc:Text", "The avatar's animation."),
-            ("frames", "sc:Integer", "Frames of each video."),
-            ("frame_rate_hz", "sc:Float", "Frames a second."),
-            ("image_width_px", "sc:Integer", "Width of all videos."),
-            ("image_height_px", "sc:Integer", "Height of all videos."),
-            ("focal_mm", "sc:Float", "Focal length of all six cameras, in mm."),
-            ("sensor_width_mm", "sc:Float", "Width of the sensor, in mm."),
-            ("sensor_height_mm", "sc:Float", "Height of the sensor, in mm."),
-            ("primary_left", "sc:Integer", "Left camera of the primary pair."),
-            ("primary_right", "sc:Integer", "Right camera of the primary pair."),
-            ("description", "sc:Text", "Machine-written description; empty where there is none."),
-        )
-    ]
-    arrays = [
-        field(
-            "scenes/pairwise_baselines_cm", "sc:Float",
-            "Baselines of the 15 pairs 0-1, 0-2 ... 4-5, in cm.",
-            isArray=True, arrayShape="15", **column(SCENES, "pairwise_baselines_cm"),
-        ),
-        field(
-            "scenes/depth_unit_m", "sc:Float", "Metres in a stored unit of depth, for each camera.",
-            isArray=True, arrayShape="6", **column(SCENES, "depth_unit_m"),
-        ),
-    ]  # fmt: skip
+    scalars, arrays = [], []
+    for name, kind, about in _SCENE_COLUMNS:
+        at, source = f"scenes/{name}", column(SCENES, name)
+        if name in _LENGTHS:
+            shape = {"isArray": True, "arrayShape": str(_LENGTHS[name])}
+            arrays.append(field(at, _KINDS[kind.value_type], about, **shape, **source))
+        else:
+            scalars.append(field(at, _KINDS[kind], about, **source))
     return record_set(
-        "scenes", "Every scene once.", [*fields, *arrays], key={"@id": "scenes/scene_id"}
+        "scenes", "Every scene once.", [*scalars, *arrays], key={"@id": "scenes/scene_id"}
     )
 
 
@@ -217,71 +233,59 @@ def _scene_categories() -> Node:
         "family": "families",
         "map": "maps",
     }
-    fields = [
+    fields = _columns("scene_categories", SCENES, [("scene_id", "sc:Text", "Path of the scene.")])
+    fields += [
         field(
-            "scene_categories/scene_id", "sc:Text", "Path of the scene.",
-            **column(SCENES, "scene_id"),
-        ),
-        *(
-            field(
-                f"scene_categories/{name}", "sc:Text", f"One of {target}.",
-                **column(SCENES, name), **refers_to(f"{target}/name"),
-            )
-            for name, target in targets.items()
-        ),
+            f"scene_categories/{name}", "sc:Text", f"One of {target}.",
+            **column(SCENES, name), **refers_to(f"{target}/name"),
+        )
+        for name, target in targets.items()
     ]  # fmt: skip
     return record_set("scene_categories", "Which part every scene belongs to.", fields)
 
 
 def _pairs() -> Node:
-    fields = [
-        field("pairs/pair_id", "sc:Text", "Scene and cameras.", **column(PAIRS, "pair_id")),
-        field(
-            "pairs/scene_id", "sc:Text", "Path of the scene.",
-            **column(PAIRS, "scene_id"), **refers_to("scenes/scene_id"),
-        ),
-        *(
-            field(f"pairs/{name}", kind, text, **column(PAIRS, name))
-            for name, kind, text in (
-                ("camera_left", "sc:Integer", "Number of the left camera."),
-                ("camera_right", "sc:Integer", "Number of the right camera."),
-                ("baseline_cm", "sc:Float", "Distance of the two cameras, in cm."),
-                ("baseline_bin", "sc:Text", "Bin of the distance, in cm."),
-                ("is_adjacent", "sc:Boolean", "Whether the cameras stand next to each other."),
-                ("is_primary", "sc:Boolean", "Whether the scene records it as its primary pair."),
-            )
-        ),
-    ]  # fmt: skip
+    fields = _columns("pairs", PAIRS, [
+        ("pair_id", "sc:Text", "Scene and cameras."),
+        ("scene_id", "sc:Text", "Path of the scene."),
+        ("camera_left", "sc:Integer", "Number of the left camera."),
+        ("camera_right", "sc:Integer", "Number of the right camera."),
+        ("baseline_cm", "sc:Float", "Distance of the two cameras, in cm."),
+        ("baseline_bin", "sc:Text", "Bin of the distance, in cm."),
+        ("is_adjacent", "sc:Boolean", "Whether the cameras stand next to each other."),
+        ("is_primary", "sc:Boolean", "Whether the scene records it as its primary pair."),
+    ])  # fmt: skip
+    fields[1] |= refers_to("scenes/scene_id")
     return record_set(
         "pairs", "Every stereo pair once: 15 a scene.", fields, key={"@id": "pairs/pair_id"}
     )
 
 
 def _shards() -> Node:
-    fields = [
-        field(f"shards/{name}", kind, text, **column(SHARDS, name))
-        for name, kind, text in (
-            ("shard", "sc:Text", "Path of the shard."),
-            ("size_bytes", "sc:Integer", "Its size."),
-            ("sha256", "sc:Text", "Its checksum, in hex."),
-            ("scenes", "sc:Integer", "How many scenes it holds."),
-            ("members", "sc:Integer", "How many files it holds."),
-        )
-    ]
+    fields = _columns("shards", SHARDS, [
+        ("shard", "sc:Text", "Path of the shard."),
+        ("size_bytes", "sc:Integer", "Its size."),
+        ("sha256", "sc:Text", "Its checksum, in hex."),
+        ("scenes", "sc:Integer", "How many scenes it holds."),
+        ("members", "sc:Integer", "How many files it holds."),
+    ])  # fmt: skip
     return record_set("shards", "Every shard once.", fields, key={"@id": "shards/shard"})
 
 
 def _descriptions() -> Node:
-    fields = [
-        field(
-            "descriptions/scene_id", "sc:Text", "Path of the scene.", **column(SCENES, "scene_id")
-        ),
-        field(
-            "descriptions/text", "sc:Text", "Machine-written; empty where there is none.",
-            **column(SCENES, "description"),
-        ),
-    ]  # fmt: skip
-    return record_set("descriptions", "What a model says of every scene.", fields)
+    text = field(
+        "descriptions/text", "sc:Text", "Machine-written; empty where there is none.",
+        **column(SCENES, "description"),
+    )  # fmt: skip
+    keys = _columns("descriptions", SCENES, [("scene_id", "sc:Text", "Path of the scene.")])
+    return record_set("descriptions", "What a model says of every scene.", [*keys, text])
+
+
+def _columns(records: str, file: str, rows: Iterable[tuple[str, str, str]]) -> list[Node]:
+    """Return fields of a record set that are columns of a table: name, type, meaning."""
+    return [
+        field(f"{records}/{name}", kind, about, **column(file, name)) for name, kind, about in rows
+    ]
 
 
 def _media(suffixes: dict[str, str]) -> list[Node]:
@@ -329,37 +333,18 @@ def write_tables(index: SceneIndex, folder: Path) -> list[WrittenTable]:
             names.append(SHARD_LIST)
     except OSError as error:
         raise DescriptorError(
-            f"{folder}: tables cannot be written ({error.strerror or error}). "
-            + cure_of(error, "Choose another place with --out.")
+            describe_os_error(
+                f"{folder}: tables cannot be written", error, "Choose another place with --out."
+            )
         ) from error
     return [_written(folder / name) for name in names]
 
 
 def scenes_table(index: SceneIndex) -> pa.Table:
     """Return one row per scene: identity, camera, 15 baselines, description."""
-    keys = index.column("key")
-    baselines_cm = index.column("baselines_cm")
-    columns: dict[str, pa.Array] = {
-        "scene_id": pa.array(keys, pa.string()),
-        "split": pa.array(index.column("split"), pa.string()),
-        "eval_subset": pa.array(index.column("subset"), pa.string()),
-        "family": pa.array(index.column("family"), pa.string()),
-        "map": pa.array(index.column("map_name"), pa.string()),
-        "scene_label": pa.array(index.column("scene_label"), pa.string()),
-        "character": pa.array(index.column("character"), pa.string()),
-        "animation": pa.array(index.column("animation"), pa.string()),
-        "frames": pa.array(index.column("frames"), pa.int64()),
-        "frame_rate_hz": pa.array(index.column("frame_rate_hz"), pa.float64()),
-        "image_width_px": pa.array(index.column("image_width_px"), pa.int64()),
-        "image_height_px": pa.array(index.column("image_height_px"), pa.int64()),
-        "focal_mm": pa.array(index.column("focal_mm"), pa.float64()),
-        "sensor_width_mm": pa.array(index.column("sensor_width_mm"), pa.float64()),
-        "sensor_height_mm": pa.array(index.column("sensor_height_mm"), pa.float64()),
-        "primary_left": pa.array(index.column("primary_left"), pa.int64()),
-        "primary_right": pa.array(index.column("primary_right"), pa.int64()),
-        "pairwise_baselines_cm": pa.array(baselines_cm.tolist(), pa.list_(pa.float64())),
-        "depth_unit_m": pa.array(index.column("depth_unit_m").tolist(), pa.list_(pa.float64())),
-        "description": pa.array(index.column("caption"), pa.string()),
+    columns = {
+        name: pa.array(index.column(_INDEX_COLUMNS.get(name, name)).tolist(), kind)
+        for name, kind, _ in _SCENE_COLUMNS
     }
     if index.shards:
         columns["shard"] = pa.array([_shard_of(index, row) for row in range(len(index))])

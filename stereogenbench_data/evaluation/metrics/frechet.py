@@ -1,10 +1,10 @@
 """The Fréchet distance of two sets of features, accumulated in parts and across processes.
 
-No covariance matrix is formed, and no root of one is taken. Of a set is kept its mean and a root
-R of its scatter, with R'R the sum over samples of (x - mean)(x - mean)'. The trace of the root of
-the product of two covariances, which the distance needs, is then the nuclear norm of R1 R2'
-over sqrt((n1 - 1)(n2 - 1)): a sum of singular values, real whatever the ranks, and without the
-loss of half of the digits that squaring brings.
+No covariance matrix is formed, and no root of one is taken. Each set is kept as its mean and a root
+R of its scatter, where R'R is the sum over samples of (x - mean)(x - mean)'. The distance needs the
+trace of the root of the product of two covariances. That is the nuclear norm of R1 R2' over
+sqrt((n1 - 1)(n2 - 1)): a sum of singular values, real at any rank, and without the loss of half of
+the digits that squaring brings.
 """
 
 import math
@@ -20,13 +20,12 @@ from stereogenbench_data.errors import EvaluationError
 class FeatureStatistics:
     """Count, mean and scatter of a set of features, in float64.
 
-    Its arrays may be stored and given back. Sets are merged in any grouping with the same result
-    up to rounding; merged in the same order, to the last digit.
+    Merging in another grouping changes the result by rounding alone; in the same order, not at all.
 
     Attributes:
-        count: How many samples.
+        count: How many samples there are.
         mean: Their mean.
-        root: A root of their scatter, of at most twice as many rows as there are features.
+        root: A root of their scatter, with at most twice as many rows as there are features.
     """
 
     count: int
@@ -92,9 +91,9 @@ class FrechetDistance:
         value: The distance (squared, as FID and FVD are); nan below two samples on a side.
         samples: How many samples the predicted and the target side have.
         dim: How many features a sample has.
-        underdetermined: The smaller side has no more samples than features, so its covariance
-            has not full rank, and the value is biased upwards by an amount that depends on the
-            number of samples: compare only with values of as many samples.
+        underdetermined: Whether the smaller side has no more samples than features. Its covariance
+            then lacks full rank and the value is biased upwards, the more the fewer samples there
+            are: compare it only with values of as many samples.
     """
 
     value: float

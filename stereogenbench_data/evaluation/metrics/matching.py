@@ -1,5 +1,6 @@
 """E_match: how much the set of left keypoints matched in the right picture changes."""
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,55 +18,52 @@ from stereogenbench_data.evaluation.models.interfaces import (
 )
 
 EPIPOLAR_PX: Final = 2.0
+"""How many rows a match may be off."""
 RATIO: Final = 0.9
 KEYPOINTS: Final = 2048
 
 
 @dataclass(frozen=True, slots=True)
 class MatchScore:
-    """E_match of one prediction.
+    """E_match of one prediction; its numbers are called as their columns are.
 
     Attributes:
-        error: 100 (1 - common / union), in percent; nan if neither right picture has a match.
+        e_match: 100 (1 - common / union), in percent; nan if neither right picture has a match.
         keypoints: How many keypoints the left picture has.
         target_matches: How many of them are found again in the target.
         predicted_matches: How many of them are found again in the prediction.
-        common: How many in both.
+        common_matches: How many in both.
     """
 
-    error: float
+    e_match: float
     keypoints: int
     target_matches: int
     predicted_matches: int
-    common: int
+    common_matches: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetMatches:
-    """The left keypoints, and which are found again in the target: the same for all predictions.
+    """The left keypoints, and which the target shows: the same for all predictions.
 
     Attributes:
         left: Keypoints of the left picture.
-        matched: Which are found again in the target.
-        epipolar_px: How many rows a match may be off.
+        matched: Which of them are found again in the target.
         size_px: Height and width of the pictures.
         matcher: The name of the matcher they were found by.
     """
 
     left: Keypoints
     matched: Bool[np.ndarray, " n"]
-    epipolar_px: float
     size_px: tuple[int, int]
     matcher: str
 
 
-def target_matches(
-    left: Picture, target: Picture, *, matcher: KeypointMatcher, epipolar_px: float = EPIPOLAR_PX
-) -> TargetMatches:
+def target_matches(left: Picture, target: Picture, *, matcher: KeypointMatcher) -> TargetMatches:
     """Return the left keypoints and which of them the rendered target shows.
 
-    The left keypoints are detected once, so that a keypoint is the same element of both sets
-    exactly if it is the same keypoint.
+    The left keypoints are detected once, so the two sets that E_match compares are of the same
+    keypoints.
 
     Raises:
         EvaluationError: If the two are not pictures of one size.
@@ -74,8 +72,7 @@ def target_matches(
     keypoints = matcher.detect(left)
     return TargetMatches(
         left=keypoints,
-        matched=_matched(keypoints, target, matcher=matcher, epipolar_px=epipolar_px),
-        epipolar_px=epipolar_px,
+        matched=_matched(keypoints, target, matcher=matcher),
         size_px=(left.shape[1], left.shape[2]),
         matcher=matcher.name,
     )
@@ -90,45 +87,44 @@ def match_error(
         EvaluationError: If it is not a picture of the target's size, or the matcher another.
     """
     require_pictures(predicted)
+    height, width = against.size_px
     if predicted.shape[1:] != against.size_px or matcher.name != against.matcher:
         raise EvaluationError(
-            f"the target was matched at {against.size_px[1]}x{against.size_px[0]} by "
-            f"{against.matcher}, the prediction is to be at {predicted.shape[2]}x"
-            f"{predicted.shape[1]} by {matcher.name}: both must be the same."
+            f"the target was matched at {width}x{height} by {against.matcher}, and the prediction "
+            f"is {predicted.shape[2]}x{predicted.shape[1]}, by {matcher.name}: match both at one "
+            f"size by one matcher."
         )
-    matched = _matched(against.left, predicted, matcher=matcher, epipolar_px=against.epipolar_px)
+    matched = _matched(against.left, predicted, matcher=matcher)
     common = int(np.count_nonzero(matched & against.matched))
     union = int(np.count_nonzero(matched | against.matched))
     return MatchScore(
-        error=100 * (1 - common / union) if union else float("nan"),
+        e_match=100 * (1 - common / union) if union else math.nan,
         keypoints=len(matched),
         target_matches=int(np.count_nonzero(against.matched)),
         predicted_matches=int(np.count_nonzero(matched)),
-        common=common,
+        common_matches=common,
     )
 
 
-def match_settings(matcher: KeypointMatcher, *, epipolar_px: float = EPIPOLAR_PX) -> Settings:
+def match_settings(matcher: KeypointMatcher) -> Settings:
     """Return every choice that E_match depends on."""
     return {
         "matcher": matcher.name,
-        "epipolar_px": epipolar_px,
+        "epipolar_px": EPIPOLAR_PX,
         "element": "a keypoint of the left picture, detected once",
         **matcher.settings,
     }
 
 
-def mutual_matches(
-    left: Keypoints, right: Keypoints, *, ratio: float = RATIO
-) -> Int64[np.ndarray, "m 2"]:
+def mutual_matches(left: Keypoints, right: Keypoints) -> Int64[np.ndarray, "m 2"]:
     """Return mutual nearest neighbours that pass the ratio test in both directions.
 
-    Clearly: the distance of descriptors to the nearest is at most ``ratio`` times that to the
-    second nearest. As kornia's match_smnn, in float64.
+    The distance of descriptors to the nearest must be at most 0.9 times that to the second
+    nearest. Same as kornia's match_smnn, in float64.
 
     Returns:
-        Pairs (left, right) in ascending order of the left; none where a side has below two
-        keypoints, as there is no second nearest then.
+        Pairs (left, right), the left ascending; none where a side has fewer than two keypoints
+        and so no second nearest.
     """
     if min(len(left.xy_px), len(right.xy_px)) < 2:
         return np.zeros((0, 2), dtype=np.int64)
@@ -138,28 +134,28 @@ def mutual_matches(
     squared = (one @ two.T).mul_(-2)
     squared += (one**2).sum(dim=1)[:, None]
     squared += (two**2).sum(dim=1)
-    forward, clear = _nearest(squared, ratio=ratio)
-    backward, clear_back = _nearest(squared.T.contiguous(), ratio=ratio)
+    forward, clear = _nearest(squared)
+    backward, clear_back = _nearest(squared.T.contiguous())
     here = torch.arange(len(one))
     mutual = clear & clear_back[forward] & (backward[forward] == here)
     pairs: Int64[np.ndarray, "m 2"] = torch.stack([here, forward], dim=1)[mutual].numpy()
     return pairs
 
 
-def _nearest(squared: torch.Tensor, *, ratio: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return which column is nearest to each row, and whether it is so clearly."""
+def _nearest(squared: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return which column is nearest to each row, and whether it passes the ratio test."""
     nearest, index = squared.clamp(min=0).topk(2, dim=1, largest=False)
-    clear = (nearest[:, 0] <= ratio**2 * nearest[:, 1]) & (nearest[:, 1] > 0)
+    clear = (nearest[:, 0] <= RATIO**2 * nearest[:, 1]) & (nearest[:, 1] > 0)
     return index[:, 0], clear
 
 
 def _matched(
-    left: Keypoints, right: Picture, *, matcher: KeypointMatcher, epipolar_px: float
+    left: Keypoints, right: Picture, *, matcher: KeypointMatcher
 ) -> Bool[np.ndarray, " n"]:
     """Return which left keypoints are found again in nearly the same row of a right picture."""
     found = matcher.detect(right)
     pairs = matcher.match(left, found)
     rows_apart = np.abs(left.xy_px[pairs[:, 0], 1] - found.xy_px[pairs[:, 1], 1])
     matched = np.zeros(len(left.xy_px), dtype=bool)
-    matched[pairs[rows_apart <= epipolar_px, 0]] = True
+    matched[pairs[rows_apart <= EPIPOLAR_PX, 0]] = True
     return matched

@@ -25,7 +25,7 @@ _SIGMA_PX: Final = 1.5
 _K1: Final = 0.01
 _K2: Final = 0.03
 _BAND_ROWS: Final = 64
-"""How many rows of windows are worked on at once: so many that they stay in the cache."""
+"""How many rows of windows are worked on at once, so that they stay in the cache."""
 
 PSNR_SETTINGS: Final[Settings] = {
     "data_range": _PEAK,
@@ -49,10 +49,10 @@ SSIM_SETTINGS: Final[Settings] = {
 def psnr_db(predicted: Picture, target: Picture) -> float:
     """Return 10 log10(255^2 / mean squared error) of two uint8 RGB pictures (3, h, w), in dB.
 
-    The squared error is summed in integers, so the result does not depend on an order.
+    The squared error is summed in integers, so the result does not depend on the order.
 
     Returns:
-        Infinity where the two are identical: count these, an average of them says nothing.
+        Infinity where the two are identical: count these, since an average of them says nothing.
 
     Raises:
         EvaluationError: If they are not pictures of one size.
@@ -70,8 +70,8 @@ def ssim(predicted: Picture, target: Picture) -> float:
     """Return the structural similarity of two uint8 RGB pictures (3, h, w).
 
     11 x 11 Gaussian window of sigma 1.5, K = (0.01, 0.03), population covariance, mean over the
-    windows that lie wholly inside, then over the channels. What skimage's structural_similarity
-    gives with gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255.
+    windows that lie wholly inside, then over the channels. Equals skimage's structural_similarity
+    with gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255.
 
     Raises:
         EvaluationError: If they are not pictures of one size, or smaller than the window.
@@ -132,20 +132,16 @@ def _filtered(cv2: Any, values: Float64[np.ndarray, "h w"]) -> Float64[np.ndarra
     return np.asarray(filtered[inside, inside])
 
 
-def _gaussian() -> Float64[np.ndarray, " window"]:
-    offsets = np.arange(_WINDOW_PX) - _WINDOW_PX // 2
-    weights = np.exp(-0.5 * (offsets / _SIGMA_PX) ** 2)
-    return np.asarray(weights / weights.sum())
-
-
-_KERNEL: Final = _gaussian()
+_OFFSETS_PX: Final = np.arange(_WINDOW_PX) - _WINDOW_PX // 2
+_WEIGHTS: Final = np.exp(-0.5 * (_OFFSETS_PX / _SIGMA_PX) ** 2)
+_KERNEL: Final = np.asarray(_WEIGHTS / _WEIGHTS.sum())
 
 
 _PATCH_PX: Final = 16
 _LEAST_PX: Final = 2
 _LARGEST_PX: Final = 48
 _MSE_FLOOR: Final = 1 / 12
-"""The error of rounding to whole numbers: two 8-bit patches cannot be told to be closer."""
+"""The error of rounding to whole numbers: 8-bit patches can show no smaller one."""
 
 PATCH_SETTINGS: Final[Settings] = {
     "patch_px": _PATCH_PX,
@@ -168,7 +164,7 @@ class PatchScore:
         mean_db: Mean over the patches of the PSNR of their best match; nan without patches.
         pooled_db: PSNR of the mean squared error of all patches' best matches.
         patches: How many patches have a candidate.
-        floored: Of how many the squared error was raised to the floor.
+        floored: How many of them had their squared error raised to the floor.
     """
 
     mean_db: float
@@ -180,13 +176,9 @@ class PatchScore:
 def patch_psnr(left: Picture, right: Picture) -> PatchScore:
     """Return the P-PSNR of a predicted right picture; of the rendered target, its ceiling.
 
-    Patches of 16 x 16 pixels stand side by side from the top left; what is left over at the
-    right and at the bottom is not scored, nor are patches that no candidate lies inside of the
-    picture for.
-
-    Args:
-        left: The left picture (3, h, w).
-        right: The right picture of the same size.
+    Both are uint8 (3, h, w). Patches of 16 x 16 pixels stand side by side from the top left. What
+    is left over at the right and at the bottom is not scored, nor is a patch all of whose
+    candidates leave the picture.
 
     Raises:
         EvaluationError: If they are not pictures of one size.
@@ -194,7 +186,7 @@ def patch_psnr(left: Picture, right: Picture) -> PatchScore:
     require_pictures(left, right)
     squared = _least_squared_error(left, right).reshape(-1)
     if squared.size == 0:
-        return PatchScore(mean_db=float("nan"), pooled_db=float("nan"), patches=0, floored=0)
+        return PatchScore(mean_db=math.nan, pooled_db=math.nan, patches=0, floored=0)
     mse = squared / (3 * _PATCH_PX**2)
     floored = np.maximum(mse, _MSE_FLOOR)
     return PatchScore(
@@ -224,7 +216,7 @@ def outside_window(disparity_px: Float[np.ndarray, "h w"], valid: Bool[np.ndarra
         )
     known = disparity_px[valid]
     if len(known) == 0:
-        return float("nan")
+        return math.nan
     inside = (known >= _LEAST_PX) & (known <= _LARGEST_PX)
     return 1 - int(np.count_nonzero(inside)) / len(known)
 
@@ -232,10 +224,10 @@ def outside_window(disparity_px: Float[np.ndarray, "h w"], valid: Bool[np.ndarra
 def _least_squared_error(left: Picture, right: Picture) -> Int64[np.ndarray, "rows columns"]:
     """Return the summed squared error of each patch's best match.
 
-    The sum is that of the squares less twice the products, and the products of a patch with all
-    candidates are one matrix product summed along diagonals. Values are centred on 128, so that
-    every partial sum is a whole number of at most 3 * 16^2 * 128^2 < 2^24: exact in float32, in
-    whatever order it is added up.
+    It is the sum of the squares less twice the products, and the products of a patch with all
+    candidates are one matrix product, summed along diagonals. Values are centred on 128, so every
+    partial sum is a whole number of at most 3 * 16^2 * 128^2 < 2^24: exact in float32, added up in
+    any order.
     """
     rows, columns = left.shape[1] // _PATCH_PX, left.shape[2] // _PATCH_PX
     if rows == 0 or columns < 2:
@@ -257,7 +249,7 @@ def _least_squared_error(left: Picture, right: Picture) -> Int64[np.ndarray, "ro
 def _strips(
     picture: Picture, *, rows: int, columns: int, pad_px: int
 ) -> Float[np.ndarray, "rows values width"]:
-    """Return rows of patches, each with the values of a column of all channels together."""
+    """Return rows of patches; the values of a column are those of all channels together."""
     whole = picture[:, : rows * _PATCH_PX, : columns * _PATCH_PX]
     strips = np.zeros((rows, 3, _PATCH_PX, pad_px + whole.shape[2]), dtype=np.float32)
     split = whole.reshape(3, rows, _PATCH_PX, -1).swapaxes(0, 1)

@@ -1,5 +1,6 @@
 """SD: the factor by which a predicted pair's disparity misses the true one."""
 
+import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -17,7 +18,7 @@ _MAD_TO_SIGMA: Final = 1.4826
 _FEWEST_PIXELS: Final = 100
 _FEWEST_SHARE: Final = 0.01
 _MEDIAN_PIXELS: Final = 20_000
-"""Of about how many pixels, evenly spaced in reading order, medians are taken for the fit."""
+"""About how many pixels, evenly spaced in reading order, the medians of a fit are taken of."""
 
 REPORTED_FITS: Final[tuple[FitMethod, ...]] = ("filtered", "least_squares")
 """The fits that every report shows, because SD depends on the choice and the paper leaves it open.
@@ -47,8 +48,10 @@ _METHODS: Final[dict[FitMethod, str]] = {
 class ScaleFit:
     """The line true = slope * estimated + offset through the disparities of one pair.
 
+    Where there is no line, its numbers are nan and ``reason`` says why.
+
     Attributes:
-        drift: SD, |slope - 1|; nan where there is no line.
+        drift: SD, |slope - 1|.
         slope: Below 1 where the predicted pair's disparity is too large.
         offset_px: True disparity where none is estimated.
         pixels: How many pixels the line was fitted to.
@@ -61,22 +64,22 @@ class ScaleFit:
         reason: Why there is no line; empty where there is one.
     """
 
-    drift: float
-    slope: float
-    offset_px: float
-    pixels: int
-    outliers: int
-    valid_ratio: float
-    answered_ratio: float
-    residual_std_px: float
-    residual_mad_px: float
-    r_squared: float
-    reason: str
+    drift: float = math.nan
+    slope: float = math.nan
+    offset_px: float = math.nan
+    pixels: int = 0
+    outliers: int = 0
+    valid_ratio: float = 0.0
+    answered_ratio: float = math.nan
+    residual_std_px: float = math.nan
+    residual_mad_px: float = math.nan
+    r_squared: float = math.nan
+    reason: str = ""
 
     @property
     def outlier_ratio(self) -> float:
         """The share of the answered pixels that were left out of the fit; nan without a fit."""
-        return self.outliers / (self.pixels + self.outliers) if self.pixels else float("nan")
+        return self.outliers / (self.pixels + self.outliers) if self.pixels else math.nan
 
 
 def fit_scale(
@@ -88,9 +91,9 @@ def fit_scale(
 ) -> ScaleFit:
     """Return the line through true over estimated disparity, and SD.
 
-    A random prediction has a slope near 0 and so an SD near 1; one whose disparity is twice the
-    true one has a slope of 0.5 and an SD of 0.5; one with half of it, a slope of 2 and an SD of 1.
-    Errors of the matcher alone make the slope smaller, the more the less the disparity varies.
+    A random prediction has a slope near 0 and so an SD near 1. Twice the true disparity gives a
+    slope of 0.5 and an SD of 0.5; half of it, a slope of 2 and an SD of 1. Errors of the matcher
+    alone make the slope smaller, the more the less the disparity varies.
 
     Args:
         estimated_px: A matcher's disparity of (left, predicted right); nan where it has none.
@@ -111,23 +114,41 @@ def fit_scale(
     estimated, true = (
         values.reshape(-1)[answered].astype(np.float64) for values in (estimated_px, true_px)
     )
-    reason = _no_line(estimated, wanted=int(np.count_nonzero(scored)))
+    wanted = int(np.count_nonzero(scored))
+    kept = np.ones(true.size, dtype=bool)
+    line = None
+    reason = _no_line(estimated, wanted=wanted)
+    if not reason and method != "least_squares":
+        some = slice(None, None, max(1, len(answered) // _MEDIAN_PIXELS))
+        if estimated[some].min() == estimated[some].max():
+            some = slice(None)
+        line = _median_line(estimated[some], true[some])
+        if method == "filtered":
+            apart = np.abs(true - line[0] * estimated - line[1])
+            sigma = _MAD_TO_SIGMA * float(np.median(apart[some]))
+            kept = apart <= max(_OUTLIER_SIGMAS * sigma, _OUTLIER_PX)
+            reason = _no_line(estimated[kept], wanted=wanted)
+            line = None
+    answered_ratio = estimated.size / wanted if wanted else math.nan
     if reason:
-        return _fitted(estimated, true, None, scored=scored, reason=reason)
-    if method == "least_squares":
-        return _fitted(estimated, true, np.ones(true.size, dtype=bool), scored=scored)
-    some = slice(None, None, max(1, len(answered) // _MEDIAN_PIXELS))
-    if estimated[some].min() == estimated[some].max():
-        some = slice(None)
-    slope, offset = _median_line(estimated[some], true[some])
-    if method == "theil_sen":
-        kept = np.ones(true.size, dtype=bool)
-        return _fitted(estimated, true, kept, scored=scored, line=(slope, offset))
-    apart = np.abs(true - slope * estimated - offset)
-    sigma = _MAD_TO_SIGMA * float(np.median(apart[some]))
-    kept = apart <= max(_OUTLIER_SIGMAS * sigma, _OUTLIER_PX)
-    reason = _no_line(estimated[kept], wanted=int(np.count_nonzero(scored)))
-    return _fitted(estimated, true, None if reason else kept, scored=scored, reason=reason)
+        return ScaleFit(answered_ratio=answered_ratio, reason=reason)
+    slope, offset = line or _least_squares(estimated[kept], true[kept])
+    residual = true - slope * estimated - offset
+    pixels = int(np.count_nonzero(kept))
+    variance = float(np.var(true[kept]))
+    mean_squared = float(np.mean(residual[kept] ** 2))
+    return ScaleFit(
+        drift=abs(slope - 1),
+        slope=slope,
+        offset_px=offset,
+        pixels=pixels,
+        outliers=estimated.size - pixels,
+        valid_ratio=pixels / scored.size,
+        answered_ratio=answered_ratio,
+        residual_std_px=math.sqrt(mean_squared),
+        residual_mad_px=float(np.median(np.abs(residual))),
+        r_squared=1 - mean_squared / variance if variance else math.nan,
+    )
 
 
 def require_fit(method: str) -> None:
@@ -168,7 +189,7 @@ def scale_settings(matcher: StereoMatcher, *, method: FitMethod = "filtered") ->
 def _no_line(estimated: Float64[np.ndarray, " n"], *, wanted: int) -> str:
     """Return why no line can be fitted, or an empty text.
 
-    A line through the few answers that a matcher gives of unlike pictures can have any slope.
+    A matcher answers few pixels of unlike pictures, and a line through those can have any slope.
     """
     if estimated.size < max(_FEWEST_PIXELS, _FEWEST_SHARE * wanted):
         return (
@@ -198,8 +219,8 @@ def _median_line(
 ) -> tuple[float, float]:
     """Return slope and offset by medians.
 
-    In order of the estimate each pixel of the lower half is paired with one of the upper half,
-    half of all pixels further on; the slope is the median of those of the pairs.
+    Pixels are sorted by their estimate, and each of the lower half is paired with the one half of
+    all pixels further on. The slope is the median of the slopes of these pairs.
     """
     order = np.argsort(estimated, kind="stable")
     half = estimated.size // 2
@@ -210,42 +231,3 @@ def _median_line(
         return _least_squares(estimated, true)
     slope = float(np.median((true[high] - true[low])[apart] / run[apart]))
     return slope, float(np.median(true - slope * estimated))
-
-
-def _fitted(
-    estimated: Float64[np.ndarray, " n"],
-    true: Float64[np.ndarray, " n"],
-    kept: Bool[np.ndarray, " n"] | None,
-    *,
-    scored: Bool[np.ndarray, "h w"],
-    line: tuple[float, float] | None = None,
-    reason: str = "",
-) -> ScaleFit:
-    """Return the record of a fit to the kept pixels, by least squares where no line is given."""
-    nan = float("nan")
-    wanted = int(np.count_nonzero(scored))
-    answered_ratio = estimated.size / wanted if wanted else nan
-    if kept is None:
-        return ScaleFit(
-            drift=nan, slope=nan, offset_px=nan, pixels=0, outliers=0, valid_ratio=0.0,
-            answered_ratio=answered_ratio, residual_std_px=nan, residual_mad_px=nan,
-            r_squared=nan, reason=reason,
-        )  # fmt: skip
-    slope, offset = line or _least_squares(estimated[kept], true[kept])
-    residual = true - slope * estimated - offset
-    pixels = int(np.count_nonzero(kept))
-    variance = float(np.var(true[kept]))
-    mean_squared = float(np.mean(residual[kept] ** 2))
-    return ScaleFit(
-        drift=abs(slope - 1),
-        slope=slope,
-        offset_px=offset,
-        pixels=pixels,
-        outliers=estimated.size - pixels,
-        valid_ratio=pixels / scored.size,
-        answered_ratio=answered_ratio,
-        residual_std_px=float(np.sqrt(mean_squared)),
-        residual_mad_px=float(np.median(np.abs(residual))),
-        r_squared=1 - mean_squared / variance if variance else nan,
-        reason="",
-    )

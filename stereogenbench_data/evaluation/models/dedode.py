@@ -19,13 +19,7 @@ from stereogenbench_data.evaluation.models.interfaces import (
     Settings,
     require_pictures,
 )
-from stereogenbench_data.evaluation.models.weights import (
-    Weights,
-    fetch,
-    fingerprint,
-    install,
-    load_weights,
-)
+from stereogenbench_data.evaluation.models.weights import Weights, load_weights
 
 _RELEASE: Final = "https://github.com/Parskatt/DeDoDe/releases/download/dedode_pretrained_models/"
 DETECTOR: Final = Weights(
@@ -45,19 +39,10 @@ DESCRIPTOR: Final = Weights(
 
 
 class DeDoDeMatcher:
-    """DeDoDe keypoints, matched as mutual nearest neighbours by the distance of descriptors.
-
-    Attributes:
-        name: What tables call it.
-        settings: Every choice that its answers depend on.
-    """
+    """DeDoDe keypoints, matched as mutual nearest neighbours; a `KeypointMatcher`."""
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the networks.
-
-        Args:
-            weights: The folder of the two files; None for that of torch.hub's checkpoints.
-            device: Where to compute.
+        """Load the networks; the arguments are those of `ModelOptions`.
 
         Raises:
             ExtraError: If kornia or a file is missing.
@@ -67,8 +52,8 @@ class DeDoDeMatcher:
             kornia = importlib.import_module("kornia")
         except ImportError as error:
             raise ExtraError(
-                f"DeDoDe needs kornia: {install(DETECTOR.extra)}; and its weights: "
-                f"{fetch(DETECTOR, folder=weights)}; {fetch(DESCRIPTOR, folder=weights)}; or name "
+                f"DeDoDe needs kornia: {DETECTOR.how_to_install}; and its weights: "
+                f"{DETECTOR.how_to_fetch(weights)}; {DESCRIPTOR.how_to_fetch(weights)}; or name "
                 f"the folder that they are in (--weights)."
             ) from error
         network: Any = kornia.feature.DeDoDe(
@@ -81,9 +66,9 @@ class DeDoDeMatcher:
         self.name = f"DeDoDe (kornia {kornia.__version__})"
         self.settings: Settings = {
             "detector": "L-upright",
-            "detector_sha256": fingerprint(detector),
+            "detector_sha256": detector["weights_sha256"],
             "descriptor": "B-upright",
-            "descriptor_sha256": fingerprint(descriptor),
+            "descriptor_sha256": descriptor["weights_sha256"],
             "keypoints": KEYPOINTS,
             "ratio": RATIO,
             "matching": "mutual nearest neighbours, ratio in both directions",

@@ -5,8 +5,7 @@ Neither its code nor its weights come with this package: both are for non-commer
 
 import importlib
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +18,6 @@ from stereogenbench_data.evaluation.models.interfaces import Picture, Settings, 
 from stereogenbench_data.evaluation.models.weights import (
     Weights,
     fingerprint,
-    install,
     load_into,
     read_weights,
     weights_path,
@@ -39,23 +37,15 @@ _SIDE_MULTIPLE: Final = 32
 
 
 class FoundationStereoMatcher:
-    """FoundationStereo's disparity, at the pictures' own size, 32 iterations.
-
-    Attributes:
-        name: What tables call it.
-        settings: Every choice that its answers depend on.
-    """
+    """FoundationStereo's disparity at the pictures' own size; a `StereoMatcher`."""
 
     def __init__(
         self, *, checkout: Path | None, weights: Path | None = None, device: str = "cpu"
     ) -> None:
-        """Load the network.
+        """Load the network; the arguments are those of `ModelOptions`.
 
-        Args:
-            checkout: The folder of a clone of FoundationStereo's repository.
-            weights: The folder of model_best_bp2.pth and cfg.yaml; None for
-                pretrained_models/23-51-11 in the checkout.
-            device: Where to compute.
+        The folder of weights has model_best_bp2.pth and cfg.yaml; it is pretrained_models/23-51-11
+        in the checkout unless given.
 
         Raises:
             ExtraError: If the checkout, what it needs or a file is missing.
@@ -66,7 +56,7 @@ class FoundationStereoMatcher:
             place = Path("CHECKOUT") if checkout is None else checkout
             raise ExtraError(
                 f"FoundationStereo {lacking}: clone {REPOSITORY} (licence: {CHECKPOINT.licence}), "
-                f"install what it asks for and {install(CHECKPOINT.extra)}, fetch its weights and "
+                f"install what it asks for and {CHECKPOINT.how_to_install}, fetch its weights and "
                 f"{_CONFIGURATION} from {CHECKPOINT.source} into "
                 f"{weights or place / _DEFAULT_FOLDER}, and name the clone (--checkout)."
             )
@@ -111,8 +101,9 @@ class FoundationStereoMatcher:
 
 
 def _network(checkout: Path, *, configuration: Path) -> torch.nn.Module:
-    """Return FoundationStereo without its weights."""
-    with _first_on_path(checkout):
+    """Return FoundationStereo without its weights, imported from its checkout."""
+    sys.path.insert(0, str(checkout))
+    try:
         try:
             options = importlib.import_module("omegaconf").OmegaConf.load(configuration)
             module = importlib.import_module("core.foundation_stereo")
@@ -133,14 +124,6 @@ def _network(checkout: Path, *, configuration: Path) -> torch.nn.Module:
             )
         options.setdefault("vit_size", "vitl")
         network: torch.nn.Module = module.FoundationStereo(options)
-    return network
-
-
-@contextmanager
-def _first_on_path(folder: Path) -> Iterator[None]:
-    """Import from a folder first."""
-    sys.path.insert(0, str(folder))
-    try:
-        yield
     finally:
-        sys.path.remove(str(folder))
+        sys.path.remove(str(checkout))
+    return network

@@ -12,9 +12,8 @@ from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.models.interfaces import Clips, Settings, require_clips
-from stereogenbench_data.evaluation.models.weights import Weights, fingerprint, load_weights
+from stereogenbench_data.evaluation.models.weights import Weights, load_weights
 
 I3D: Final = Weights(
     what="FVD's I3D",
@@ -24,49 +23,32 @@ I3D: Final = Weights(
 )
 _SIDE_PX: Final = 224
 _CLASSES: Final = 400
-_MIN_FRAMES: Final = 10
 
 Size = tuple[int, int, int]
 
 
 class I3dFeatures:
-    """FVD's features of clips.
-
-    Attributes:
-        name: What tables call it.
-        distance: What a Fréchet distance of these features is called.
-        dim: How many features there are.
-        min_frames: How many frames a clip needs.
-        settings: Every choice that the features depend on.
-    """
+    """FVD's features of clips; `VideoFeatures`."""
 
     name = "I3D (Kinetics-400)"
-    distance = "FVD"
-    dim = _CLASSES
-    min_frames = _MIN_FRAMES
+    min_frames = 10
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the network.
-
-        Args:
-            weights: The folder of its file; None for that of torch.hub's checkpoints.
-            device: Where to compute.
+        """Load the network; the arguments are those of `ModelOptions`.
 
         Raises:
-            ExtraError: If the file is missing.
+            ExtraError: If the file of weights is missing.
             EvaluationError: If it does not hold this network's weights.
         """
         network = InflatedInception()
-        path = load_weights(network, I3D, folder=weights)
-        self._network = network.to(device)
-        self._device = device
         self.settings: Settings = {
             "layer": "logits, mean over time",
             "resize": "bilinear to 224x224, aspect not kept, no smoothing",
-            "weights": path.name,
-            "weights_sha256": fingerprint(path),
+            **load_weights(network, I3D, folder=weights),
             "precision": "float32",
         }
+        self._network = network.to(device)
+        self._device = device
 
     def __call__(self, clips: Clips) -> Float64[np.ndarray, "n dim"]:
         """Return the features of each clip.
@@ -74,11 +56,7 @@ class I3dFeatures:
         Raises:
             EvaluationError: If they are not clips, or too short.
         """
-        require_clips(clips)
-        if clips.shape[1] < _MIN_FRAMES:
-            raise EvaluationError(
-                f"I3D needs clips of at least {_MIN_FRAMES} frames, got {clips.shape[1]}."
-            )
+        require_clips(clips, frames=self.min_frames, name=self.name)
         features = np.empty((len(clips), _CLASSES))
         with torch.inference_mode():
             for index, clip in enumerate(clips):
@@ -99,16 +77,16 @@ class InflatedInception(nn.Module):
         self.Conv3d_1a_7x7 = _Unit(3, 64, kernel=(7, 7, 7), stride=(2, 2, 2))
         self.Conv3d_2b_1x1 = _Unit(64, 64)
         self.Conv3d_2c_3x3 = _Unit(64, 192, kernel=(3, 3, 3))
-        self.Mixed_3b = _Mixed(192, (64, 96, 128, 16, 32, 32))
-        self.Mixed_3c = _Mixed(256, (128, 128, 192, 32, 96, 64))
-        self.Mixed_4b = _Mixed(480, (192, 96, 208, 16, 48, 64))
-        self.Mixed_4c = _Mixed(512, (160, 112, 224, 24, 64, 64))
-        self.Mixed_4d = _Mixed(512, (128, 128, 256, 24, 64, 64))
-        self.Mixed_4e = _Mixed(512, (112, 144, 288, 32, 64, 64))
-        self.Mixed_4f = _Mixed(528, (256, 160, 320, 32, 128, 128))
-        self.Mixed_5b = _Mixed(832, (256, 160, 320, 32, 128, 128))
-        self.Mixed_5c = _Mixed(832, (384, 192, 384, 48, 128, 128))
-        self.logits = _Logits()
+        self.Mixed_3b = _InflatedBlock(192, (64, 96, 128, 16, 32, 32))
+        self.Mixed_3c = _InflatedBlock(256, (128, 128, 192, 32, 96, 64))
+        self.Mixed_4b = _InflatedBlock(480, (192, 96, 208, 16, 48, 64))
+        self.Mixed_4c = _InflatedBlock(512, (160, 112, 224, 24, 64, 64))
+        self.Mixed_4d = _InflatedBlock(512, (128, 128, 256, 24, 64, 64))
+        self.Mixed_4e = _InflatedBlock(512, (112, 144, 288, 32, 64, 64))
+        self.Mixed_4f = _InflatedBlock(528, (256, 160, 320, 32, 128, 128))
+        self.Mixed_5b = _InflatedBlock(832, (256, 160, 320, 32, 128, 128))
+        self.Mixed_5c = _InflatedBlock(832, (384, 192, 384, 48, 128, 128))
+        self.logits = nn.ModuleDict({"conv3d": nn.Conv3d(1024, _CLASSES, 1)})
 
     def forward(self, video: torch.Tensor) -> torch.Tensor:
         """Return logits (n, 400)."""
@@ -121,12 +99,12 @@ class InflatedInception(nn.Module):
         x = self.Mixed_4f(self.Mixed_4e(x))
         x = _max_pool(x, kernel=(2, 2, 2), stride=(2, 2, 2))
         x = functional.avg_pool3d(self.Mixed_5c(self.Mixed_5b(x)), (2, 7, 7), stride=1)
-        logits: torch.Tensor = self.logits(x)
+        logits: torch.Tensor = self.logits["conv3d"](x)
         return logits.mean(dim=(2, 3, 4))
 
 
 class _Unit(nn.Module):
-    """Convolution, normalisation and rectification, of the input's size over the stride."""
+    """Convolution, batch normalisation and ReLU; the size is the input's over the stride."""
 
     def __init__(
         self, inputs: int, outputs: int, *, kernel: Size = (1, 1, 1), stride: Size = (1, 1, 1)
@@ -141,7 +119,9 @@ class _Unit(nn.Module):
         return functional.relu(self.bn(self.conv3d(padded)))
 
 
-class _Mixed(nn.Module):
+class _InflatedBlock(nn.Module):
+    """Four parallel branches, concatenated."""
+
     def __init__(self, inputs: int, outputs: tuple[int, int, int, int, int, int]) -> None:
         super().__init__()
         self.b0 = _Unit(inputs, outputs[0])
@@ -157,24 +137,14 @@ class _Mixed(nn.Module):
         return torch.cat(branches, dim=1)
 
 
-class _Logits(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv3d = nn.Conv3d(1024, _CLASSES, 1)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        logits: torch.Tensor = self.conv3d(x)
-        return logits
-
-
 def _max_pool(x: torch.Tensor, *, kernel: Size, stride: Size) -> torch.Tensor:
     return functional.max_pool3d(_padded(x, kernel=kernel, stride=stride), kernel, stride)
 
 
 def _padded(x: torch.Tensor, *, kernel: Size, stride: Size) -> torch.Tensor:
-    """Return x with zeros around it, so that its size over the stride comes out, rounded up.
+    """Return x padded with zeros as TensorFlow's "same" does: its size over the stride, rounded up.
 
-    TensorFlow's "same": an odd zero goes to the end; and pools see the zeros as values.
+    An odd zero goes to the end. Pools see the zeros as values.
     """
     padding: list[int] = []
     for size, window, step in zip(x.shape[:1:-1], kernel[::-1], stride[::-1], strict=True):

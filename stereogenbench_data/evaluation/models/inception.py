@@ -1,17 +1,18 @@
 """The features of FID: the 2048 pooled numbers of the Inception network that FID was defined with.
 
-That network is not the one of torchvision: its average pools leave the border out, its last pool
-takes the maximum, and pictures come to it through TensorFlow 1's bilinear resize, which samples
-at the corner of a pixel and does not smooth. Layers are named as in the file of its weights.
+It differs from torchvision's network: its average pools leave out the border, its last pool takes
+the maximum, and it resizes pictures as TensorFlow 1 does, bilinearly from pixel corners and
+without smoothing. Layers are named as in the file of its weights.
 
-The network of torch-fidelity 0.4 gives the same features bit for bit. It is not used, because
-importing it needs torchvision, each release of which fits one release of torch only, and because
-it unpickles the file of weights without restriction.
+The network of torch-fidelity 0.4 gives the same features bit for bit. It is not used because it
+imports torchvision, each release of which fits one release of torch only, and because it unpickles
+the file of weights without restriction.
 """
 
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from torch import nn
 from torch.nn import functional
 
 from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings, require_batch
-from stereogenbench_data.evaluation.models.weights import Weights, fingerprint, load_weights
+from stereogenbench_data.evaluation.models.weights import Weights, load_weights
 
 INCEPTION: Final = Weights(
     what="FID's Inception",
@@ -36,41 +37,26 @@ _BATCH: Final = 8
 
 
 class InceptionFeatures:
-    """FID's features of pictures.
-
-    Attributes:
-        name: What tables call it.
-        distance: What a Fréchet distance of these features is called.
-        dim: How many features there are.
-        settings: Every choice that the features depend on.
-    """
+    """FID's features of pictures; `ImageFeatures`."""
 
     name = "Inception-v3 (TensorFlow, 2015-12-05)"
-    distance = "FID"
-    dim = _DIM
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the network.
-
-        Args:
-            weights: The folder of its file; None for that of torch.hub's checkpoints.
-            device: Where to compute.
+        """Load the network; the arguments are those of `ModelOptions`.
 
         Raises:
-            ExtraError: If the file is missing.
+            ExtraError: If the file of weights is missing.
             EvaluationError: If it does not hold this network's weights.
         """
         network = Inception()
-        path = load_weights(network, INCEPTION, folder=weights)
-        self._network = network.to(device)
-        self._device = device
         self.settings: Settings = {
             "layer": "pool3, 2048",
             "resize": "TensorFlow 1 bilinear to 299x299, corners not aligned, no smoothing",
-            "weights": path.name,
-            "weights_sha256": fingerprint(path),
+            **load_weights(network, INCEPTION, folder=weights),
             "precision": "float32",
         }
+        self._network = network.to(device)
+        self._device = device
 
     def __call__(self, pictures: Pictures) -> Float64[np.ndarray, "n dim"]:
         """Return the features of each picture.
@@ -92,22 +78,22 @@ class Inception(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.Conv2d_1a_3x3 = _Conv(3, 32, 3, stride=2)
-        self.Conv2d_2a_3x3 = _Conv(32, 32, 3)
-        self.Conv2d_2b_3x3 = _Conv(32, 64, 3, padding=1)
-        self.Conv2d_3b_1x1 = _Conv(64, 80, 1)
-        self.Conv2d_4a_3x3 = _Conv(80, 192, 3)
-        self.Mixed_5b = _Mixed(192, _layers_5(pooled=32), pool="mean")
-        self.Mixed_5c = _Mixed(256, _layers_5(pooled=64), pool="mean")
-        self.Mixed_5d = _Mixed(288, _layers_5(pooled=64), pool="mean")
-        self.Mixed_6a = _Mixed(288, _LAYERS_6A, pool="halve")
-        self.Mixed_6b = _Mixed(768, _layers_6(between=128), pool="mean")
-        self.Mixed_6c = _Mixed(768, _layers_6(between=160), pool="mean")
-        self.Mixed_6d = _Mixed(768, _layers_6(between=160), pool="mean")
-        self.Mixed_6e = _Mixed(768, _layers_6(between=192), pool="mean")
-        self.Mixed_7a = _Mixed(768, _LAYERS_7A, pool="halve")
-        self.Mixed_7b = _Mixed(1280, _LAYERS_7, pool="mean")
-        self.Mixed_7c = _Mixed(2048, _LAYERS_7, pool="max")
+        self.Conv2d_1a_3x3 = _conv(3, 32, (3, 3), stride=2)
+        self.Conv2d_2a_3x3 = _conv(32, 32, (3, 3))
+        self.Conv2d_2b_3x3 = _conv(32, 64, (3, 3), padding=(1, 1))
+        self.Conv2d_3b_1x1 = _conv(64, 80, (1, 1))
+        self.Conv2d_4a_3x3 = _conv(80, 192, (3, 3))
+        self.Mixed_5b = _Block(192, _layers_5(pooled=32), pool="mean")
+        self.Mixed_5c = _Block(256, _layers_5(pooled=64), pool="mean")
+        self.Mixed_5d = _Block(288, _layers_5(pooled=64), pool="mean")
+        self.Mixed_6a = _Block(288, _LAYERS_6A, pool="halve")
+        self.Mixed_6b = _Block(768, _layers_6(between=128), pool="mean")
+        self.Mixed_6c = _Block(768, _layers_6(between=160), pool="mean")
+        self.Mixed_6d = _Block(768, _layers_6(between=160), pool="mean")
+        self.Mixed_6e = _Block(768, _layers_6(between=192), pool="mean")
+        self.Mixed_7a = _Block(768, _LAYERS_7A, pool="halve")
+        self.Mixed_7b = _Block(1280, _LAYERS_7, pool="mean")
+        self.Mixed_7c = _Block(2048, _LAYERS_7, pool="max")
         self.fc = nn.Linear(_DIM, _CLASSES)
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
@@ -122,26 +108,23 @@ class Inception(nn.Module):
         return pooled
 
 
-class _Conv(nn.Module):
-    def __init__(
-        self,
-        inputs: int,
-        outputs: int,
-        kernel: int | tuple[int, int],
-        *,
-        stride: int = 1,
-        padding: int | tuple[int, int] = 0,
-    ) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=False)
-        self.bn = nn.BatchNorm2d(outputs, eps=0.001)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return functional.relu(self.bn(self.conv(x)))
+def _conv(
+    inputs: int,
+    outputs: int,
+    kernel: tuple[int, int],
+    *,
+    stride: int = 1,
+    padding: tuple[int, int] = (0, 0),
+) -> nn.Sequential:
+    layers: OrderedDict[str, nn.Module] = OrderedDict(
+        conv=nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=False),
+        bn=nn.BatchNorm2d(outputs, eps=0.001),
+        relu=nn.ReLU(),
+    )
+    return nn.Sequential(layers)
 
 
-@dataclass(frozen=True, slots=True)
-class _Layer:
+class _Layer(NamedTuple):
     """A convolution within a block.
 
     Attributes:
@@ -157,7 +140,7 @@ class _Layer:
     step: Literal["same", "halve"] = "same"
 
 
-_Layers = dict[str, _Layer]
+_Layers = Mapping[str, _Layer]
 
 
 def _layers_5(*, pooled: int) -> _Layers:
@@ -217,7 +200,7 @@ _LAYERS_7: Final[_Layers] = {
 }
 
 
-class _Mixed(nn.Module):
+class _Block(nn.Module):
     """A block of parallel branches; outputs that no other layer uses are concatenated in order."""
 
     def __init__(
@@ -227,30 +210,28 @@ class _Mixed(nn.Module):
         self.layers = layers
         self.pool = pool
         channels = {"input": inputs, "pool": inputs}
-        for name, layer in layers.items():
-            same = layer.step == "same"
-            padding = (layer.kernel[0] // 2, layer.kernel[1] // 2) if same else 0
-            conv = _Conv(
-                channels[layer.of], layer.outputs, layer.kernel, stride=1 if same else 2,
-                padding=padding,
-            )  # fmt: skip
+        for name, (of, outputs, kernel, step) in layers.items():
+            halves = step == "halve"
+            padding = (0, 0) if halves else (kernel[0] // 2, kernel[1] // 2)
+            stride = 2 if halves else 1
+            conv = _conv(channels[of], outputs, kernel, stride=stride, padding=padding)
             self.add_module(name, conv)
-            channels[name] = layer.outputs
+            channels[name] = outputs
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        made = {"input": x, "pool": self._pooled(x)}
+        if self.pool == "mean":
+            pooled = functional.avg_pool2d(x, 3, stride=1, padding=1, count_include_pad=False)
+        elif self.pool == "max":
+            pooled = functional.max_pool2d(x, 3, stride=1, padding=1)
+        else:
+            pooled = functional.max_pool2d(x, 3, stride=2)
+        made = {"input": x, "pool": pooled}
         for name, layer in self.layers.items():
             made[name] = self.get_submodule(name)(made[layer.of])
         taken = {"input", *(layer.of for layer in self.layers.values())}
-        pool_last = [*self.layers, "pool"]
-        return torch.cat([made[name] for name in pool_last if name not in taken], dim=1)
-
-    def _pooled(self, x: torch.Tensor) -> torch.Tensor:
-        if self.pool == "mean":
-            return functional.avg_pool2d(x, 3, stride=1, padding=1, count_include_pad=False)
-        if self.pool == "max":
-            return functional.max_pool2d(x, 3, stride=1, padding=1)
-        return functional.max_pool2d(x, 3, stride=2)
+        return torch.cat(
+            [made[name] for name in (*self.layers, "pool") if name not in taken], dim=1
+        )
 
 
 def _resized(pictures: torch.Tensor) -> torch.Tensor:

@@ -1,7 +1,6 @@
 """The interfaces of the models that metrics use; any object with these members will do.
 
-Pictures are uint8 RGB, channel first. Each model states in ``settings`` every choice that its
-answers depend on, so that scores measured in different ways can be distinguished.
+Pictures are uint8 RGB, channel first.
 """
 
 from collections.abc import Mapping
@@ -32,40 +31,31 @@ class Keypoints:
     descriptors: Float32[np.ndarray, "n d"]
 
 
-class Measured(Protocol):
-    """What every model has.
-
-    Attributes:
-        name: What tables call it, with its version.
-        settings: Every choice that its answers depend on.
-    """
+class Model(Protocol):
+    """What every model has."""
 
     @property
     def name(self) -> str:
-        """What tables call it."""
-        ...
+        """What tables call it, with its version."""
 
     @property
     def settings(self) -> Settings:
-        """Every choice that its answers depend on."""
-        ...
+        """Every choice that its answers depend on, so that scores of other choices differ."""
 
 
 @runtime_checkable
-class KeypointMatcher(Measured, Protocol):
+class KeypointMatcher(Model, Protocol):
     """Finds keypoints in one picture, and the same keypoints in another."""
 
     def detect(self, picture: Picture) -> Keypoints:
         """Return a picture's keypoints: of the same picture, always the same in the same order."""
-        ...
 
     def match(self, left: Keypoints, right: Keypoints) -> Int64[np.ndarray, "m 2"]:
         """Return indices of matched keypoints (left, right), each left keypoint at most once."""
-        ...
 
 
 @runtime_checkable
-class StereoMatcher(Measured, Protocol):
+class StereoMatcher(Model, Protocol):
     """Estimates the disparity of a rectified pair."""
 
     def __call__(self, left: Picture, right: Picture) -> Float32[np.ndarray, "h w"]:
@@ -73,98 +63,76 @@ class StereoMatcher(Measured, Protocol):
 
         x_right = x_left - disparity: positive in front of the cameras.
         """
-        ...
 
 
 @runtime_checkable
-class PairMetric(Measured, Protocol):
-    """Scores pictures against their targets, one number each."""
-
-    @property
-    def higher_is_better(self) -> bool:
-        """Which way is better."""
-        ...
+class PairMetric(Model, Protocol):
+    """Scores pictures against their targets."""
 
     def __call__(self, predicted: Pictures, target: Pictures) -> Float64[np.ndarray, " n"]:
-        """Return the score of each picture."""
-        ...
-
-
-class Features(Measured, Protocol):
-    """What a feature extractor for a Fréchet distance has."""
-
-    @property
-    def distance(self) -> str:
-        """What the Fréchet distance of these features is called: "FID" of Inception's alone."""
-        ...
-
-    @property
-    def dim(self) -> int:
-        """How many features there are."""
-        ...
+        """Return one number for each picture."""
 
 
 @runtime_checkable
-class ImageFeatures(Features, Protocol):
+class ImageFeatures(Model, Protocol):
     """Describes pictures by numbers."""
 
     def __call__(self, pictures: Pictures) -> Float64[np.ndarray, "n dim"]:
         """Return the features of each picture."""
-        ...
 
 
 @runtime_checkable
-class VideoFeatures(Features, Protocol):
+class VideoFeatures(Model, Protocol):
     """Describes clips by numbers."""
 
     @property
     def min_frames(self) -> int:
         """How many frames a clip needs."""
-        ...
 
     def __call__(self, clips: Clips) -> Float64[np.ndarray, "n dim"]:
         """Return the features of each clip."""
-        ...
+
+
+def require_rgb(pixels: Picture | Pictures | Clips, what: str, *, axes: str) -> None:
+    """Raise unless these are uint8 pixels with the given axes, three channels before the last two.
+
+    Args:
+        pixels: What was given.
+        what: What messages call them, with the verb: "a picture".
+        axes: Names of the axes, such as "(n, 3, h, w)".
+
+    Raises:
+        EvaluationError: Naming the dtype and the shape that were found.
+    """
+    dims = axes.count(",") + 1
+    if pixels.dtype != np.uint8 or pixels.ndim != dims or pixels.shape[-3] != 3:
+        raise EvaluationError(
+            f"{what} must be uint8 RGB of shape {axes}, got {pixels.dtype} of shape {pixels.shape}."
+        )
 
 
 def require_pictures(*pictures: Picture) -> None:
-    """Raise unless all are (3, h, w) uint8 pictures of one size.
+    """Raise unless all are uint8 pictures (3, h, w) of one size.
 
     Raises:
-        EvaluationError: Else; it says what was found.
+        EvaluationError: Naming what was found.
     """
     for picture in pictures:
-        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[0] != 3:
-            raise EvaluationError(
-                "a picture must be uint8 RGB of shape (3, h, w), "
-                f"got {picture.dtype} of shape {picture.shape}."
-            )
+        require_rgb(picture, "a picture", axes="(3, h, w)")
     if len({picture.shape for picture in pictures}) > 1:
         sizes = " and ".join("x".join(map(str, picture.shape[:0:-1])) for picture in pictures)
         raise EvaluationError(f"the pictures of one score must be of one size, got {sizes}.")
 
 
 def require_batch(pictures: Pictures) -> None:
-    """Raise unless these are (n, 3, h, w) uint8 pictures.
+    """Raise EvaluationError unless these are uint8 pictures (n, 3, h, w)."""
+    require_rgb(pictures, "pictures", axes="(n, 3, h, w)")
 
-    Raises:
-        EvaluationError: Else; it says what was found.
-    """
-    if pictures.dtype != np.uint8 or pictures.ndim != 4 or pictures.shape[1] != 3:
+
+def require_clips(clips: Clips, *, frames: int, name: str) -> None:
+    """Raise EvaluationError unless these are uint8 clips (n, t, 3, h, w) of enough frames."""
+    require_rgb(clips, "clips", axes="(n, t, 3, h, w)")
+    if clips.shape[1] < frames:
         raise EvaluationError(
-            "pictures must be uint8 RGB of shape (n, 3, h, w), "
-            f"got {pictures.dtype} of shape {pictures.shape}."
-        )
-
-
-def require_clips(clips: Clips) -> None:
-    """Raise unless these are (n, t, 3, h, w) uint8 clips.
-
-    Raises:
-        EvaluationError: Else; it says what was found.
-    """
-    if clips.dtype != np.uint8 or clips.ndim != 5 or clips.shape[2] != 3:
-        raise EvaluationError(
-            "clips must be uint8 RGB of shape (n, t, 3, h, w), "
-            f"got {clips.dtype} of shape {clips.shape}."
+            f"{name} needs clips of at least {frames} frames, got {clips.shape[1]}."
         )

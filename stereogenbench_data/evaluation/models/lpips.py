@@ -1,8 +1,8 @@
 """LPIPS, version 0.1 on AlexNet: a weighted distance of two pictures' normalised activations.
 
-The network of the package lpips gives the same distances to 1e-8. It is not used, because
-importing it needs torchvision, each release of which fits one release of torch only; the package
-is needed for its file of weights.
+The network of the package lpips gives the same distances to 1e-8. It is not used because it imports
+torchvision, each release of which fits one release of torch only. The package is needed for its
+file of weights, and is not imported.
 """
 
 from importlib.util import find_spec
@@ -19,9 +19,7 @@ from stereogenbench_data.errors import EvaluationError, ExtraError
 from stereogenbench_data.evaluation.models.interfaces import Pictures, Settings, require_batch
 from stereogenbench_data.evaluation.models.weights import (
     Weights,
-    fetch,
     fingerprint,
-    install,
     load_into,
     read_weights,
     weights_path,
@@ -42,38 +40,36 @@ _BATCH: Final = 8
 
 
 class Lpips:
-    """LPIPS of pictures against their targets.
-
-    Attributes:
-        name: What tables call it.
-        higher_is_better: False.
-        settings: Every choice that the scores depend on.
-    """
+    """LPIPS of pictures against their targets; a `PairMetric`."""
 
     name = "LPIPS"
-    higher_is_better = False
 
     def __init__(self, *, weights: Path | None = None, device: str = "cpu") -> None:
-        """Load the network.
+        """Load the network; the arguments are those of `ModelOptions`.
 
-        Args:
-            weights: The folder of AlexNet's file; None for that of torch.hub's checkpoints. The
-                few numbers on top of it come from the installed package lpips.
-            device: Where to compute.
+        AlexNet's file is in the folder of weights; the few numbers on top of it come from the
+        installed package lpips.
 
         Raises:
             ExtraError: If the package or the file is missing.
             EvaluationError: If a file does not hold this network's weights.
         """
-        heads = _heads_path(weights)
+        package = find_spec("lpips")
+        if package is None or package.origin is None:
+            raise ExtraError(
+                f"LPIPS needs the package lpips: {TRUNK.how_to_install}; and the weights of "
+                f"AlexNet: {TRUNK.how_to_fetch(weights)}, or name the folder that it is in "
+                f"(--weights)."
+            )
         path = weights_path(TRUNK, folder=weights)
+        heads = read_weights(Path(package.origin).parent / HEADS, what="LPIPS")
         trunk = {
             name: value
             for name, value in read_weights(path, what=TRUNK.what).items()
             if name.startswith("features.")
         }
         network = PerceptualDistance()
-        load_into(network, trunk | dict(read_weights(heads, what="LPIPS")), path=path)
+        load_into(network, trunk | dict(heads), path=path)
         self._network = network.to(device)
         self._device = device
         self.settings: Settings = {
@@ -146,7 +142,7 @@ class PerceptualDistance(nn.Module):
         return total
 
     def _activations(self, pictures: torch.Tensor) -> list[torch.Tensor]:
-        """Return what follows each rectification, of unit length at each pixel."""
+        """Return the output of each ReLU, of unit length at each pixel."""
         shift, scale = (
             torch.tensor(values, device=pictures.device)[:, None, None]
             for values in (_SHIFT, _SCALE)
@@ -158,18 +154,3 @@ class PerceptualDistance(nn.Module):
             if isinstance(step, nn.ReLU):
                 found.append(functional.normalize(x, dim=1, eps=1e-10))
         return found
-
-
-def _heads_path(weights: Path | None) -> Path:
-    """Return the file of LPIPS' own weights, in its package, which is not imported.
-
-    Raises:
-        ExtraError: If the package is not installed.
-    """
-    package = find_spec("lpips")
-    if package is None or package.origin is None:
-        raise ExtraError(
-            f"LPIPS needs the package lpips: {install(TRUNK.extra)}; and the weights of AlexNet: "
-            f"{fetch(TRUNK, folder=weights)}, or name the folder that it is in (--weights)."
-        )
-    return Path(package.origin).parent / HEADS

@@ -36,16 +36,12 @@ def require_opencv() -> ModuleType:
 class Sift:
     """SIFT keypoints of the luma, described upright, as rectified views are not turned.
 
-    Of points that SIFT finds in several orientations one is kept, and of all those with the
+    Points that SIFT finds in several orientations are kept once, and of all points those with the
     strongest response. Descriptors are whole numbers, so matches are the same on every machine.
-
-    Attributes:
-        name: What tables call it.
-        settings: Every choice that its answers depend on.
     """
 
-    def __init__(self, *, keypoints: int = KEYPOINTS, ratio: float = RATIO) -> None:
-        """Make a matcher of up to so many keypoints a picture.
+    def __init__(self, *, keypoints: int = KEYPOINTS) -> None:
+        """Make a matcher that keeps at most ``keypoints`` of each picture.
 
         Raises:
             ExtraError: If OpenCV is not installed.
@@ -53,13 +49,12 @@ class Sift:
         self._cv2 = require_opencv()
         self._sift = self._cv2.SIFT_create(enable_precise_upscale=True)
         self._keypoints = keypoints
-        self._ratio = ratio
         self.name = f"SIFT (OpenCV {self._cv2.__version__})"
         self.settings: Settings = {
             "keypoints": keypoints,
             "orientation": "upright",
             "upscale": "precise",
-            "ratio": ratio,
+            "ratio": RATIO,
             "matching": "mutual nearest neighbours, ratio in both directions",
         }
 
@@ -85,7 +80,7 @@ class Sift:
 
     def match(self, left: Keypoints, right: Keypoints) -> Int64[np.ndarray, "m 2"]:
         """Return mutual nearest neighbours."""
-        return mutual_matches(left, right, ratio=self._ratio)
+        return mutual_matches(left, right)
 
 
 def _strongest(points: Any, *, at_most: int) -> list[Any]:
@@ -101,61 +96,51 @@ def _strongest(points: Any, *, at_most: int) -> list[Any]:
 _SUBPIXELS: Final = 16
 _LEAST_PX: Final = -16
 _BLOCK_PX: Final = 5
-_UNIQUENESS_PERCENT: Final = 10
-_SPECKLE_PIXELS: Final = 100
-_SPECKLE_PX: Final = 2
-_LEFT_RIGHT_PX: Final = 1
-_GRADIENT_CAP: Final = 63
 
 
 class Sgbm:
     """Semi-global matching with left-right check, disparities from -16 up to 175 px.
 
-    The few negative ones tell a view that is shifted the wrong way, or not at all, from one that
-    is shifted a little. It has no answer in the columns at both sides whose search range leaves
-    the picture, and none for larger disparities.
-
-    Attributes:
-        name: What tables call it.
-        settings: Every choice that its answers depend on.
+    The negative ones distinguish a view that is shifted the wrong way, or not at all, from one that
+    is shifted a little. There is no answer for larger disparities, nor in the columns at both sides
+    whose search range leaves the picture.
     """
 
     def __init__(self, *, disparities: int = 192) -> None:
-        """Make a matcher of so many disparities, a multiple of 16.
+        """Make a matcher that searches ``disparities`` values, a multiple of 16.
 
         Raises:
             ExtraError: If OpenCV is not installed.
         """
         self._cv2 = require_opencv()
         self._disparities = disparities
-        small_step, large_step = 8 * 3 * _BLOCK_PX**2, 32 * 3 * _BLOCK_PX**2
-        self._matcher = self._cv2.StereoSGBM_create(
-            minDisparity=_LEAST_PX,
-            numDisparities=disparities,
-            blockSize=_BLOCK_PX,
-            P1=small_step,
-            P2=large_step,
-            disp12MaxDiff=_LEFT_RIGHT_PX,
-            preFilterCap=_GRADIENT_CAP,
-            uniquenessRatio=_UNIQUENESS_PERCENT,
-            speckleWindowSize=_SPECKLE_PIXELS,
-            speckleRange=_SPECKLE_PX,
-            mode=self._cv2.STEREO_SGBM_MODE_SGBM,
-        )
-        self.name = f"SGBM (OpenCV {self._cv2.__version__})"
-        self.settings: Settings = {
+        chosen = {
             "least_disparity_px": _LEAST_PX,
             "disparities": disparities,
             "block_px": _BLOCK_PX,
-            "p1": small_step,
-            "p2": large_step,
-            "left_right_px": _LEFT_RIGHT_PX,
-            "uniqueness_percent": _UNIQUENESS_PERCENT,
-            "speckle_pixels": _SPECKLE_PIXELS,
-            "speckle_px": _SPECKLE_PX,
-            "prefilter_cap": _GRADIENT_CAP,
-            "mode": "five directions",
+            "p1": 8 * 3 * _BLOCK_PX**2,
+            "p2": 32 * 3 * _BLOCK_PX**2,
+            "left_right_px": 1,
+            "uniqueness_percent": 10,
+            "speckle_pixels": 100,
+            "speckle_px": 2,
+            "prefilter_cap": 63,
         }
+        self._matcher = self._cv2.StereoSGBM_create(
+            minDisparity=chosen["least_disparity_px"],
+            numDisparities=chosen["disparities"],
+            blockSize=chosen["block_px"],
+            P1=chosen["p1"],
+            P2=chosen["p2"],
+            disp12MaxDiff=chosen["left_right_px"],
+            preFilterCap=chosen["prefilter_cap"],
+            uniquenessRatio=chosen["uniqueness_percent"],
+            speckleWindowSize=chosen["speckle_pixels"],
+            speckleRange=chosen["speckle_px"],
+            mode=self._cv2.STEREO_SGBM_MODE_SGBM,
+        )
+        self.name = f"SGBM (OpenCV {self._cv2.__version__})"
+        self.settings: Settings = {**chosen, "mode": "five directions"}
 
     def __call__(self, left: Picture, right: Picture) -> Float32[np.ndarray, "h w"]:
         """Return the left picture's disparity in pixels; nan where it has no answer.

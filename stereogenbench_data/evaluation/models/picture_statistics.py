@@ -1,7 +1,7 @@
 """Features without learned weights: stand-ins where Inception and I3D are not available.
 
-They see colour, contrast and change, not content: distances of them tell nothing about realism,
-have other units than FID and FVD, and are never called so.
+They see colour, contrast and change, not content. Their distances say nothing about realism, have
+other units than FID and FVD, and never bear these names.
 """
 
 from typing import ClassVar, Final
@@ -27,18 +27,9 @@ _LEAST_SIDE_PX: Final = 8
 
 
 class ColourStatistics:
-    """Mean colours of a grid of tiles, and mean differences of near pixels.
-
-    Attributes:
-        name: What tables call it.
-        distance: What a Fréchet distance of these features is called.
-        dim: How many features there are.
-        settings: Every choice that the features depend on.
-    """
+    """Mean colours of a grid of tiles, and mean differences of near pixels; `ImageFeatures`."""
 
     name = "colour statistics (stand-in)"
-    distance = "FD-colour"
-    dim = _TILES + _EDGES
     settings: ClassVar[Settings] = {
         "features": f"mean RGB of {_GRID}x{_GRID} tiles; mean |difference| of pixels "
         f"{', '.join(map(str, _STEPS_PX))} px apart along rows and columns",
@@ -54,23 +45,16 @@ class ColourStatistics:
         require_batch(pictures)
         _require_size(pictures)
         features = [_described(picture) for picture in pictures]
-        return np.array(features, dtype=np.float64).reshape(len(pictures), self.dim)
+        return np.array(features, dtype=np.float64).reshape(len(pictures), _TILES + _EDGES)
 
 
 class MotionStatistics:
     """Colour statistics, mean over a clip, and mean changes from frame to frame of its tiles.
 
-    Attributes:
-        name: What tables call it.
-        distance: What a Fréchet distance of these features is called.
-        dim: How many features there are.
-        min_frames: How many frames a clip needs.
-        settings: Every choice that the features depend on.
+    They are `VideoFeatures`.
     """
 
     name = "motion statistics (stand-in)"
-    distance = "FD-motion"
-    dim = _TILES + _EDGES + _TILES
     min_frames = 2
     settings: ClassVar[Settings] = {
         "features": "colour statistics, mean over time; mean |difference| of consecutive frames "
@@ -84,14 +68,9 @@ class MotionStatistics:
         Raises:
             EvaluationError: If they are not clips of two frames and 8 x 8 pixels or more.
         """
-        require_clips(clips)
+        require_clips(clips, frames=self.min_frames, name=self.name)
         _require_size(clips)
-        if clips.shape[1] < self.min_frames:
-            raise EvaluationError(
-                f"{self.name} need clips of at least {self.min_frames} frames, "
-                f"got {clips.shape[1]}."
-            )
-        features = np.empty((len(clips), self.dim))
+        features = np.empty((len(clips), _TILES + _EDGES + _TILES))
         for row, clip in zip(features, clips, strict=True):
             row[:-_TILES] = np.mean([_described(frame) for frame in clip], axis=0)
             changes = (_apart(one, two) for one, two in zip(clip[1:], clip[:-1], strict=True))
@@ -100,13 +79,9 @@ class MotionStatistics:
 
 
 def _described(picture: Picture) -> Float64[np.ndarray, " dim"]:
-    edges = [
-        _apart(picture[:, :, step:], picture[:, :, :-step]).mean(axis=(1, 2), dtype=np.float64)
-        for step in _STEPS_PX
-    ] + [
-        _apart(picture[:, step:], picture[:, :-step]).mean(axis=(1, 2), dtype=np.float64)
-        for step in _STEPS_PX
-    ]
+    along_rows = [_apart(picture[:, :, step:], picture[:, :, :-step]) for step in _STEPS_PX]
+    along_columns = [_apart(picture[:, step:], picture[:, :-step]) for step in _STEPS_PX]
+    edges = [apart.mean(axis=(1, 2), dtype=np.float64) for apart in (*along_rows, *along_columns)]
     return np.concatenate([_tiles(picture), *edges])
 
 
@@ -116,12 +91,11 @@ def _apart(one: Picture, two: Picture) -> Picture:
 
 
 def _tiles(picture: Picture) -> Float64[np.ndarray, " tiles"]:
-    """Return the mean colours of a grid of tiles, all but equally large."""
-    rows, columns = (np.linspace(0, side, _GRID + 1).astype(int)[:-1] for side in picture.shape[1:])
-    sums = np.add.reduceat(np.add.reduceat(picture, rows, axis=1, dtype=np.int64), columns, axis=2)
-    heights = np.diff(np.append(rows, picture.shape[1]))
-    widths = np.diff(np.append(columns, picture.shape[2]))
-    return np.asarray(sums / (heights[:, None] * widths)).reshape(-1)
+    """Return the mean colours of a grid of tiles of nearly equal size."""
+    rows, columns = (np.linspace(0, side, _GRID + 1).astype(int) for side in picture.shape[1:])
+    by_row = np.add.reduceat(picture, rows[:-1], axis=1, dtype=np.int64)
+    sums = np.add.reduceat(by_row, columns[:-1], axis=2)
+    return np.asarray(sums / (np.diff(rows)[:, None] * np.diff(columns))).reshape(-1)
 
 
 def _require_size(pictures: Pictures | Clips) -> None:

@@ -1,10 +1,12 @@
 """The models that metrics are computed with, by name; each is imported when first used.
 
-To add a model, write a class with the members of its kind in `interfaces` and name it here.
+To add a model, write a class with the members of its kind in `interfaces` and name it here. Of the
+`ModelOptions` it is given those that its constructor has a parameter for.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -13,7 +15,6 @@ from stereogenbench_data.errors import EvaluationError
 ModelKind = Literal[
     "keypoint matcher", "stereo matcher", "pair metric", "image features", "video features"
 ]
-OptionName = Literal["device", "weights", "checkout"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,43 +33,26 @@ class ModelOptions:
     checkout: Path | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class ModelEntry:
-    """One model.
-
-    Attributes:
-        path: Its class, as "module:class" within `stereogenbench_data.evaluation.models`.
-        options: The `ModelOptions` that the class takes.
-    """
-
-    path: str
-    options: tuple[OptionName, ...] = ()
-
-
-_LEARNED: Final[tuple[OptionName, ...]] = ("device", "weights")
-
-MODELS: Final[dict[ModelKind, dict[str, ModelEntry]]] = {
+MODELS: Final[dict[ModelKind, dict[str, str]]] = {
     "keypoint matcher": {
-        "sift": ModelEntry("opencv:Sift"),
-        "dedode": ModelEntry("dedode:DeDoDeMatcher", _LEARNED),
+        "sift": "opencv:Sift",
+        "dedode": "dedode:DeDoDeMatcher",
     },
     "stereo matcher": {
-        "sgbm": ModelEntry("opencv:Sgbm"),
-        "foundation-stereo": ModelEntry(
-            "foundation_stereo:FoundationStereoMatcher", (*_LEARNED, "checkout")
-        ),
+        "sgbm": "opencv:Sgbm",
+        "foundation-stereo": "foundation_stereo:FoundationStereoMatcher",
     },
-    "pair metric": {"lpips": ModelEntry("lpips:Lpips", _LEARNED)},
+    "pair metric": {"lpips": "lpips:Lpips"},
     "image features": {
-        "colour-statistics": ModelEntry("picture_statistics:ColourStatistics"),
-        "inception": ModelEntry("inception:InceptionFeatures", _LEARNED),
+        "colour-statistics": "picture_statistics:ColourStatistics",
+        "inception": "inception:InceptionFeatures",
     },
     "video features": {
-        "motion-statistics": ModelEntry("picture_statistics:MotionStatistics"),
-        "i3d": ModelEntry("i3d:I3dFeatures", _LEARNED),
+        "motion-statistics": "picture_statistics:MotionStatistics",
+        "i3d": "i3d:I3dFeatures",
     },
 }
-"""Every model by kind and name."""
+"""The class of every model, by kind and name, as "module:class" of this folder."""
 
 
 def load_model(kind: ModelKind, name: str, options: ModelOptions | None = None) -> Any:
@@ -81,8 +65,8 @@ def load_model(kind: ModelKind, name: str, options: ModelOptions | None = None) 
     known = MODELS[kind]
     if name not in known:
         raise EvaluationError(f"{kind} must be one of {', '.join(known)}, got {name!r}.")
-    entry = known[name]
-    module, _, class_name = entry.path.partition(":")
+    module, _, class_name = known[name].partition(":")
     model = getattr(import_module(f"{__package__}.{module}"), class_name)
-    options = options or ModelOptions()
-    return model(**{option: getattr(options, option) for option in entry.options})
+    taken = signature(model).parameters
+    given = asdict(options or ModelOptions())
+    return model(**{option: value for option, value in given.items() if option in taken})

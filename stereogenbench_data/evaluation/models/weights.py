@@ -30,51 +30,43 @@ class Weights:
     licence: str
     extra: str = "evaluation"
 
+    def path(self, folder: Path | None) -> Path:
+        """Return where the file belongs: in a folder, or None for torch.hub's checkpoints."""
+        return (folder or Path(torch.hub.get_dir()) / "checkpoints") / self.file
 
-def install(extra: str) -> str:
-    """Return the command that installs an extra.
+    def how_to_fetch(self, folder: Path | None) -> str:
+        """Return where to fetch the file, under which terms, and where to put it."""
+        return f"fetch {self.source} (licence: {self.licence}) and put it at {self.path(folder)}"
 
-    >>> install("lpips")
-    "pip install 'stereogenbench-data[lpips]'"
-    """
-    return f"pip install 'stereogenbench-data[{extra}]'"
-
-
-def fetch(weights: Weights, *, folder: Path | None) -> str:
-    """Return where to fetch a file of weights, under which terms, and where to put it."""
-    return (
-        f"fetch {weights.source} (licence: {weights.licence}) and put it at "
-        f"{_place(weights, folder)}"
-    )
-
-
-def _place(weights: Weights, folder: Path | None) -> Path:
-    place = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
-    return place / weights.file
+    @property
+    def how_to_install(self) -> str:
+        """The command that installs what the network needs."""
+        return f"pip install 'stereogenbench-data[{self.extra}]'"
 
 
 def weights_path(weights: Weights, *, folder: Path | None) -> Path:
     """Return where the file of weights is.
 
-    Args:
-        weights: Which.
-        folder: Where to look; None for the folder of torch.hub's checkpoints.
-
     Raises:
-        ExtraError: If it is not there; it says where to fetch it and where to put it.
+        ExtraError: If it is not there, saying where to fetch it and where to put it.
     """
-    path = _place(weights, folder)
+    path = weights.path(folder)
     if not path.is_file():
         raise ExtraError(
-            f"the weights of {weights.what} are not at {path}: {fetch(weights, folder=folder)}, or "
+            f"the weights of {weights.what} are not at {path}: {weights.how_to_fetch(folder)}, or "
             f"name the folder that it is in (--weights). The packages it needs: "
-            f"{install(weights.extra)}."
+            f"{weights.how_to_install}."
         )
     return path
 
 
-def load_weights(network: torch.nn.Module, weights: Weights, *, folder: Path | None) -> Path:
-    """Give a network its weights, make it ready for use and freeze it; return the file's path.
+def load_weights(
+    network: torch.nn.Module, weights: Weights, *, folder: Path | None
+) -> dict[str, str]:
+    """Give a network its weights, make it ready for use and freeze it.
+
+    Returns:
+        The name of the file and its sha256, for the settings.
 
     Raises:
         ExtraError: If the file is not there.
@@ -82,11 +74,11 @@ def load_weights(network: torch.nn.Module, weights: Weights, *, folder: Path | N
     """
     path = weights_path(weights, folder=folder)
     load_into(network, read_weights(path, what=weights.what), path=path)
-    return path
+    return {"weights": path.name, "weights_sha256": fingerprint(path)}
 
 
 def fingerprint(path: Path) -> str:
-    """Return the sha256 of a file of weights, as 64 hexadecimal digits, for the settings."""
+    """Return the sha256 of a file, as 64 hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -100,9 +92,9 @@ def read_weights(path: Path, *, what: str) -> Mapping[str, Any]:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (UnpicklingError, RuntimeError, EOFError, KeyError, ValueError) as error:
+        reason = next(iter(str(error).splitlines()), "") or type(error).__name__
         raise EvaluationError(
-            f"{path}: these weights of {what} cannot be read as tensors only "
-            f"({str(error).splitlines()[0] if str(error) else type(error).__name__}). Fetch the "
+            f"{path}: these weights of {what} cannot be read as tensors only ({reason}). Fetch the "
             "file again; if you trust it, load it once by its authors' code and store its tensors "
             "with torch.save."
         ) from error
@@ -114,7 +106,7 @@ def read_weights(path: Path, *, what: str) -> Mapping[str, Any]:
 
 
 def load_into(network: torch.nn.Module, tensors: Mapping[str, Any], *, path: Path) -> None:
-    """Give a network its weights, make it ready for use and freeze it.
+    """Give a network tensors that were read from a file, make it ready for use and freeze it.
 
     Raises:
         EvaluationError: If the tensors are not this network's.

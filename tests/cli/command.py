@@ -1,0 +1,26 @@
+"""The command ``stereogenbench`` as tests call it: in this process, or in one of its own."""
+
+import subprocess
+import sys
+
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.commands import app
+
+COMMAND = (sys.executable, "-m", "stereogenbench_data")
+
+
+def invoke(*words, **options):
+    """Return the result of the command in this process."""
+    return CliRunner().invoke(app, [str(word) for word in words], **options)
+
+
+def run(*words, **options):
+    """Return the ended process of the command, as a user runs it."""
+    given = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True} | options
+    return subprocess.run([*COMMAND, *map(str, words)], check=False, timeout=120, **given)
+
+
+def one_line(text):
+    """Return a text without line breaks and the frame that typer draws around errors."""
+    return " ".join(text.replace("│", " ").split())
