@@ -78,7 +78,7 @@ class SampleDecoder:
             self._poses_needed = "always" if "always" in poses else "unless rectified"
         # A transform may write into what it is given.
         self._is_changed = request.transform is not None
-        self._most_depths = OPEN_STREAMS
+        self._most_depths, self._kept_frames = OPEN_STREAMS, 1
         self._streams = Streams(self._source)
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
@@ -107,7 +107,9 @@ class SampleDecoder:
         Copies of this decoder do as well.
         """
         self._streams.keep(videos, frames=frames)
-        self._most_depths = videos * frames
+        kinds = {stream.partition("_")[2] for stream in self._needs}
+        self._most_depths = videos // len(kinds | {"depth"}) * frames
+        self._kept_frames = frames
 
     def release(self, address: Address) -> None:
         """Close the videos of a run that has been read to its end."""
@@ -265,6 +267,9 @@ class SampleDecoder:
         self._depths[key] = stored
         if len(self._depths) > self._most_depths:
             self._depths.popitem(last=False)
+        if self._kept_frames > 1:
+            # Stored depth is kept for other pairs; what is computed from it would be too much.
+            stored = StoredDepth(stored.units, stored.measured)
         if self._is_changed:
             return StoredDepth(stored.units.copy(), stored.measured.copy())
         return stored
