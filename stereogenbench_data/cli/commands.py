@@ -16,6 +16,7 @@ from stereogenbench_data.cli.browse import browse
 from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
 from stereogenbench_data.cli.evaluate import controls, evaluate, export_inputs
+from stereogenbench_data.cli.export_clips import EXPORTS
 from stereogenbench_data.cli.index import index
 from stereogenbench_data.cli.outcome import ErrorsReported
 from stereogenbench_data.cli.pack import pack, unpack, verify
@@ -105,6 +106,20 @@ for _panel, _examples in _COMMANDS.items():
             epilog=f"Example: `stereogenbench {_example}`",
             context_settings=_HELP_OPTIONS,
         )(_function)
+
+export = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
+app.add_typer(
+    export,
+    name="export",
+    rich_help_panel="Take them elsewhere",
+    epilog=f"Example: `stereogenbench {EXPORTS[0][2]}`",
+    help="Write scenes in the layouts of other projects.",
+    context_settings=_HELP_OPTIONS,
+)
+for _name, _function, _example in EXPORTS:
+    export.command(
+        _name, epilog=f"Example: `stereogenbench {_example}`", context_settings=_HELP_OPTIONS
+    )(_function)
 
 
 def _print_version(value: bool) -> None:

@@ -279,6 +279,13 @@ class PairSample:
         return len(self.views.frames), intrinsics.height_px, intrinsics.width_px
 
     @property
+    def frame_rate_hz(self) -> float:
+        """Frames of the sample a second: the video's rate, divided by the stride of a clip."""
+        frames = self.facts.frames
+        stride = frames[1] - frames[0] if len(frames) > 1 else 1
+        return self.facts.scene.frame_rate_hz / stride
+
+    @property
     def key(self) -> str:
         """Scene, cameras and frames: scene/00-01/017, or scene/00-01/016-031 for a clip."""
         cameras = f"{self.views.source:02d}"

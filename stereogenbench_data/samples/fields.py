@@ -163,6 +163,11 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
         make=lambda s: np.array(s.views.frames, dtype=np.int64),
     ),
     Field(
+        "frame_rate_hz", "float64", "()",
+        "frames a second: the video's, of a clip divided by its stride; 0 if the file has none",
+        make=lambda s: np.float64(s.frame_rate_hz), per_frame=False,
+    ),
+    Field(
         "pair", "int64", "(2,)", "numbers of the two cameras",
         make=lambda s: np.array([s.views.source, s.target], dtype=np.int64),
         per_target=True, per_frame=False,
@@ -236,8 +241,8 @@ VIEW_FIELDS: Final[dict[str, Field]] = _table(
     *(
         PAIR_FIELDS[name]
         for name in (
-            "frame_index", "scene", "family", "map", "split", "subset", "caption", "__key__",
-            "__url__",
+            "frame_index", "frame_rate_hz", "scene", "family", "map", "split", "subset", "caption",
+            "__key__", "__url__",
         )
     ),
 )  # fmt: skip

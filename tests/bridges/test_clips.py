@@ -1,0 +1,546 @@
+"""Clips as files: what the videos show, what each trainer's manifest says, going on, refusals."""
+
+import csv
+import gc
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import av
+import numpy as np
+import pandas
+import pytest
+
+from stereogenbench_data import Crop, SelectionError, StereoPairs
+from stereogenbench_data.bridges.clip_layouts import LAYOUTS
+from stereogenbench_data.bridges.clips import (
+    ClipForm,
+    ClipSizeWarning,
+    ExportRun,
+    export_clips,
+)
+from stereogenbench_data.errors import MediaError, StorageError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.encoder import Encoding
+from tests.servers.tools import require_module, small_disk
+
+FIELDS = ("left", "right", "warped_right", "hole", "disparity", "depth", "valid", "baseline_m",
+          "frame_rate_hz", "caption", "scene", "pair")  # fmt: skip
+SHARP = Encoding(crf=1, pixel_format="yuv444p", preset="ultrafast")
+QUICK = Encoding(preset="ultrafast")
+HERE = ExportRun(workers=1)
+
+pytestmark = pytest.mark.filterwarnings("ignore::stereogenbench_data.bridges.clips.ClipSizeWarning")
+
+
+def decoded(path):
+    """Return the pictures of a video, (t, 3, h, w) uint8."""
+    with av.open(path) as container:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    return np.stack(pictures).transpose(0, 3, 1, 2)
+
+
+def difference(one, other):
+    return float(np.abs(one.astype(int) - np.asarray(other)).mean())
+
+
+def records(out):
+    return [json.loads(line) for line in (out / "clips.jsonl").read_text().splitlines()]
+
+
+def exported(data, out, layout="diffsynth", *, run=HERE, form=None, **selection):
+    selection = {"split": "train"} | selection
+    return export_clips(
+        data, out, layout=layout, form=form or ClipForm(encoding=QUICK), run=run, **selection
+    )
+
+
+@pytest.fixture(scope="module")
+def everything(small_release, tmp_path_factory):
+    """An export of two pairs a scene with all videos, sharp enough to be compared."""
+    out = tmp_path_factory.mktemp("clips") / "out"
+    form = ClipForm(also=("depth", "disparity"), encoding=SHARP)
+    exported(small_release, out, form=form, pairs=[(0, 1), (1, 4)])
+    return out
+
+
+@pytest.fixture(scope="module")
+def expected(small_release):
+    options = {"split": "train", "pairs": [(0, 1), (1, 4)], "frames": ("clips", 5)}
+    return StereoPairs(small_release, fields=FIELDS, **options)
+
+
+def test_each_video_shows_its_field(everything, expected):
+    found = records(everything)
+
+    assert len(found) == len(expected) == 6
+    for record, sample in zip(found, expected, strict=True):
+        videos = {kind: decoded(everything / path) for kind, path in record["videos"].items()}
+        assert {video.shape for video in videos.values()} == {(5, 3, 64, 64)}
+        for kind, name in (("right", "right"), ("left", "left"), ("warped", "warped_right")):
+            assert difference(videos[kind], sample[name]) < 1.5
+        white = np.repeat(sample["hole"].numpy() * 255, 3, axis=1)
+        np.testing.assert_array_equal(videos["mask"], white)
+        assert (videos["warped"][white == 255] < 8).mean() > 0.9
+
+
+def test_depth_and_disparity_are_grey_by_the_ranges_that_are_noted(everything, expected):
+    for record, sample in zip(records(everything), expected, strict=True):
+        valid = sample["valid"].numpy()
+        near, far = record["depth_m"]
+        inverse = 1 / np.where(valid, sample["depth"].numpy(), 1)
+        depth = np.where(valid, (inverse - 1 / far) / (1 / near - 1 / far), 0) * 255
+        disparity = sample["disparity"].numpy() / record["disparity_max_px"] * 255
+
+        assert far > near > 0
+        assert disparity.max() == pytest.approx(255)
+        for kind, grey in (("depth", depth), ("disparity", disparity)):
+            video = decoded(everything / record["videos"][kind])
+            assert difference(video, np.repeat(grey, 3, axis=1).round()) < 1.5
+
+
+def test_a_record_says_what_a_clip_is_of(everything, expected):
+    for record, sample in zip(records(everything), expected, strict=True):
+        assert record["scene"] == sample["scene"]
+        assert record["pair"] == sample["pair"].tolist()
+        assert record["frames"] == [0, 1, 2, 3, 4]
+        assert record["baseline_m"] == float(sample["baseline_m"])
+        assert record["frame_rate_hz"] == float(sample["frame_rate_hz"])
+        assert record["caption"] == sample["caption"]
+        assert (record["height"], record["width"], record["split"]) == (64, 64, "train")
+
+
+def test_the_files_state_the_rate_of_the_clip(everything, small_release, tmp_path):
+    thin = ClipForm(stride=3, length=3, length_rule="any", encoding=QUICK)
+    exported(small_release, tmp_path / "thin", form=thin)
+    exported(small_release, tmp_path / "said", form=ClipForm(rate_hz=16, encoding=QUICK))
+
+    for out, rate_hz in ((everything, 15), (tmp_path / "thin", 5), (tmp_path / "said", 16)):
+        record = records(out)[0]
+        with av.open(out / record["videos"]["right"]) as container:
+            assert container.streams.video[0].average_rate == rate_hz
+        assert record["frame_rate_hz"] == rate_hz
+
+
+def test_diffsynth_reads_its_table_with_pandas(everything, expected):
+    table = pandas.read_csv(everything / "metadata.csv")
+
+    assert list(table["prompt"]) == [sample["caption"] for sample in expected]
+    assert list(table["baseline_m"]) == [float(sample["baseline_m"]) for sample in expected]
+    assert set(table["num_frames"]) == {5}
+    columns = ("video", "left_video", "control_video", "vace_video", "vace_video_mask")
+    assert {name: set(table[name].str.split("/").str[0]) for name in columns} == {
+        "video": {"right"}, "left_video": {"left"}, "control_video": {"warped"},
+        "vace_video": {"warped"}, "vace_video_mask": {"mask"},
+    }  # fmt: skip
+    assert all((everything / path).is_file() for name in columns for path in table[name])
+
+
+@pytest.mark.filterwarnings(
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
+def test_diffsynth_reads_videos_with_imageio(everything, expected):
+    imageio = require_module("imageio")
+    table = pandas.read_csv(everything / "metadata.csv")
+    reader = imageio.get_reader(everything / table["video"][0])
+
+    assert (reader.count_frames(), reader.get_meta_data()["fps"]) == (5, 15.0)
+    for number, picture in enumerate(expected[0]["right"]):
+        assert difference(reader.get_data(number).transpose(2, 0, 1), picture) < 1.5
+    reader.close()
+    gc.collect()
+
+
+@pytest.mark.parametrize("caption", ["", "NA", "null", 'Two "quoted" words,\na line\u2028and more'])
+def test_a_caption_is_one_line_of_text_for_every_trainer(small_release, tmp_path, caption):
+    index = described(small_release, caption)
+    for layout in ("diffsynth", "finetrainers", "musubi"):
+        report = exported(index, tmp_path / layout, layout, family="IPD_Gaussian")
+        assert report.without_caption == (caption == "")
+
+    line = " ".join(caption.split())
+    read = pandas.read_csv(tmp_path / "diffsynth" / "metadata.csv")["prompt"][0]
+    assert isinstance(read, str)
+    assert read.strip() == line
+    assert (tmp_path / "finetrainers" / "prompt.txt").read_text().splitlines() == [line]
+    (text,) = (tmp_path / "musubi" / "right").glob("*.txt")
+    assert text.read_text().strip() == line
+
+
+def described(root, caption):
+    index = SceneIndex.open(root)
+    scenes = [index.scene(row) for row in range(len(index))]
+    changed = [type(scene)(**(fields_of(scene) | {"caption": caption})) for scene in scenes]
+    return SceneIndex.from_scenes(changed, root)
+
+
+def fields_of(record):
+    return {name: getattr(record, name) for name in record.__dataclass_fields__}
+
+
+def test_finetrainers_gets_two_lists_of_equal_length(small_release, tmp_path):
+    exported(small_release, tmp_path, "finetrainers", pairs="adjacent")
+
+    captions = (tmp_path / "prompt.txt").read_text().splitlines()
+    videos = (tmp_path / "videos.txt").read_text().splitlines()
+    (dataset,) = json.loads((tmp_path / "dataset.json").read_text())["datasets"]
+    assert len(captions) == len(videos) == 15
+    assert all((tmp_path / video).is_file() for video in videos)
+    assert dataset["data_root"] == str(tmp_path)
+    assert dataset["video_resolution_buckets"] == [[5, 64, 64]]
+    assert not list(tmp_path.glob("metadata.*"))
+
+
+def test_finetrainers_gets_a_control_by_hugging_faces_video_folder(small_release, tmp_path):
+    datasets = require_module("datasets")
+    out = tmp_path / "out"
+    form = ClipForm(control="warped", encoding=QUICK)
+    exported(small_release, out, "finetrainers", form=form)
+
+    table = datasets.load_dataset(
+        "videofolder", data_dir=str(out), split="train", cache_dir=str(tmp_path / "cache")
+    )
+
+    assert set(table.features) >= {"video", "control_video", "caption", "baseline_m"}
+    raw = datasets.Video(decode=False)
+    rows = [*table.cast_column("video", raw).cast_column("control_video", raw)]
+    assert [Path(row["video"]["path"]).parent.name for row in rows] == ["right"] * 3
+    assert [Path(row["control_video"]["path"]).parent.name for row in rows] == ["warped"] * 3
+    assert not (out / "prompt.txt").exists()
+
+
+def test_musubi_gets_a_configuration_and_a_caption_beside_each_video(small_release, tmp_path):
+    out = tmp_path / 'a "folder" \u00fc\U0001f600'
+    exported(small_release, out, "musubi")
+
+    config = tomllib.loads((out / "dataset.toml").read_text())
+    (dataset,) = config["datasets"]
+    assert config["general"]["resolution"] == [64, 64]
+    assert dataset["target_frames"] == [5]
+    assert (dataset["video_directory"], dataset["control_directory"]) == (
+        str(out / "right"), str(out / "warped"),
+    )  # fmt: skip
+    videos = sorted((out / "right").glob("*.mp4"))
+    assert len(videos) == 3
+    for video in videos:
+        assert video.with_suffix(".txt").read_text().startswith("A figure walks")
+        assert (out / "warped" / video.name).is_file()
+    assert not (out / "cache").exists()
+
+
+@pytest.mark.parametrize(
+    ("control", "folder"), [("left", "left"), ("depth", "depth"), ("none", None)]
+)
+def test_the_control_is_chosen(small_release, tmp_path, control, folder):
+    form = ClipForm(control=control, encoding=QUICK)
+    exported(small_release, tmp_path, "musubi", form=form, family="IPD_Gaussian")
+
+    (dataset,) = tomllib.loads((tmp_path / "dataset.toml").read_text())["datasets"]
+    found = dataset.get("control_directory")
+    assert found == (None if folder is None else str(tmp_path / folder))
+    assert folder is None or len([*Path(found).glob("*.mp4")]) == 1
+
+
+def test_stereocrafter_gets_grids_of_four(small_release, tmp_path):
+    form = ClipForm(size=(128, 128), encoding=SHARP)
+    exported(small_release, tmp_path, "stereocrafter", form=form)
+    options = {"split": "train", "frames": ("clips", 7), "size": (128, 128)}
+    samples = StereoPairs(small_release, fields=FIELDS, **options)
+
+    grids = sorted((tmp_path / "grid").glob("*_splatting_results.mp4"))
+
+    assert len(grids) == len(samples) == 3
+    for record, sample in zip(records(tmp_path), samples, strict=True):
+        grid = decoded(tmp_path / record["videos"]["grid"])
+        height, width = grid.shape[2] // 2, grid.shape[3] // 2
+        assert (len(grid), height, width) == (7, 128, 128)
+        assert difference(grid[..., :height, :width], sample["left"]) < 1.5
+        assert difference(grid[..., height:, width:], sample["warped_right"]) < 1.5
+        mask = grid[..., height:, :width].mean(axis=1, keepdims=True) / 255
+        assert np.array_equal(mask > 0.5, sample["hole"])
+        assert np.abs(mask - sample["hole"].numpy()).mean() < 0.01
+        valid = sample["valid"].numpy()
+        near = 1 / np.where(valid, sample["depth"].numpy(), np.inf)
+        shown = grid[..., :height, width:].mean(axis=1, keepdims=True)
+        assert np.corrcoef(shown[valid], near[valid])[0, 1] > 0.99
+        assert difference(decoded(tmp_path / record["videos"]["right"]), sample["right"]) < 1.5
+
+
+@pytest.mark.parametrize(("size", "top", "left"), [((32, 64), 16, 0), ((64, 32), 0, 16)])
+def test_pictures_are_cut_to_the_middle_instead_of_stretched(
+    small_release, tmp_path, size, top, left
+):
+    form = ClipForm(size=size, fit="crop", also=("depth",), encoding=SHARP)
+    exported(small_release, tmp_path, form=form, family="IPD_Gaussian")
+    options = {"split": "train", "family": "IPD_Gaussian", "frames": ("clips", 5)}
+    sample = StereoPairs(small_release, transform=Crop(top, left, *size), fields=FIELDS, **options)[
+        0
+    ]
+
+    (record,) = records(tmp_path)
+    videos = {kind: decoded(tmp_path / path) for kind, path in record["videos"].items()}
+
+    assert (record["height"], record["width"]) == size
+    assert difference(videos["right"], sample["right"]) < 1.5
+    assert difference(videos["warped"], sample["warped_right"]) < 1.5
+    assert np.array_equal(videos["mask"][:, :1] > 0, sample["hole"])
+
+
+def test_the_same_export_is_the_same_bytes_with_more_processes(small_release, tmp_path):
+    first = exported(small_release, tmp_path / "one")
+    second = exported(small_release, tmp_path / "two", run=ExportRun(workers=2))
+
+    assert first.written == second.written
+    assert contents(tmp_path / "one") == contents(tmp_path / "two")
+
+
+def contents(out):
+    files = [path for path in out.rglob("*") if path.is_file() and path.name != ".export.lock"]
+    return {str(path.relative_to(out)): path.read_bytes() for path in files}
+
+
+def test_clips_may_overlap_and_have_their_own_names(small_release, tmp_path):
+    form = ClipForm(length=5, step=1, encoding=QUICK)
+    report = exported(small_release, tmp_path, form=form, family="IPD_Gaussian", pairs="all")
+
+    assert len(set(report.written)) == 45
+    frames = [record["frames"] for record in records(tmp_path)]
+    assert frames.count([0, 1, 2, 3, 4]) == frames.count([2, 3, 4, 5, 6]) == 15
+
+
+def test_filters_choose_what_is_exported(small_release, tmp_path):
+    exported(small_release, tmp_path, family="Uniform", pairs="all", baseline_cm=(0, 12))
+
+    found = records(tmp_path)
+    assert found
+    assert all(0 < record["baseline_m"] <= 0.12 for record in found)
+    assert {record["scene"].split("/")[1] for record in found} == {"Uniform"}
+
+
+def test_the_baseline_is_told_in_captions_where_it_is_wanted(small_release, tmp_path):
+    form = ClipForm(captions="with baseline", encoding=QUICK)
+    exported(small_release, tmp_path, "musubi", form=form)
+
+    for record in records(tmp_path):
+        told = f" Stereo baseline {record['baseline_m'] * 100:.1f} cm."
+        text = (tmp_path / record["videos"]["right"]).with_suffix(".txt").read_text()
+        assert text.endswith(f"{told}\n")
+
+
+# Going on.
+
+
+def test_a_run_that_is_repeated_keeps_what_is_finished(small_release, tmp_path):
+    first = exported(small_release, tmp_path)
+    before = contents(tmp_path)
+
+    again = exported(small_release, tmp_path)
+
+    assert (len(first.written), first.kept) == (3, ())
+    assert (again.written, again.kept) == ((), first.written)
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("damage", ["video removed", "video cut", "record removed", "mask removed"])
+def test_a_clip_that_is_not_whole_is_written_again(small_release, tmp_path, damage):
+    names = exported(small_release, tmp_path).written
+    before = contents(tmp_path)
+    video = tmp_path / "right" / f"{names[1]}.mp4"
+    if damage == "video removed":
+        video.unlink()
+    elif damage == "video cut":
+        video.write_bytes(video.read_bytes()[:-100])
+    elif damage == "record removed":
+        (tmp_path / "clips" / f"{names[1]}.json").unlink()
+    else:
+        shutil.rmtree(tmp_path / "mask")
+
+    again = exported(small_release, tmp_path)
+
+    assert again.written == (names if damage == "mask removed" else names[1:2])
+    assert contents(tmp_path) == before
+
+
+def test_a_killed_run_goes_on_to_the_bytes_of_an_unbroken_one(small_release, tmp_path):
+    out, form = tmp_path / "killed", ClipForm(encoding=Encoding())
+    command = [
+        sys.executable, "-m", "stereogenbench_data", "export", "clips", small_release, out,
+        "--layout", "musubi", "--split", "train", "--pairs", "all", "--workers", "1",
+    ]  # fmt: skip
+    running = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    deadline_s = time.monotonic() + 120
+    while len([*out.glob("clips/*.json")]) < 3 and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    running.send_signal(signal.SIGKILL)
+    running.wait()
+
+    assert not (out / "dataset.toml").exists()
+    report = exported(small_release, out, "musubi", form=form, pairs="all")
+    exported(small_release, tmp_path / "whole", "musubi", form=form, pairs="all")
+
+    assert len(report.kept) >= 3
+    assert len(report.written) + len(report.kept) == 45
+    found, whole = contents(out), contents(tmp_path / "whole")
+    assert found.keys() == whole.keys()
+    assert {name for name in found if found[name] != whole[name]} == {"dataset.toml"}
+
+
+def test_progress_tells_frames_and_begins_with_those_that_are_there(small_release, tmp_path):
+    told = []
+    run = ExportRun(workers=1, progress=lambda done, total: told.append((done, total)))
+    names = exported(small_release, tmp_path, run=run).written
+    assert (told[0], told[-1]) == ((1, 15), (15, 15))
+
+    told.clear()
+    (tmp_path / "clips" / f"{names[0]}.json").unlink()
+    exported(small_release, tmp_path, run=run)
+
+    assert (told[0], told[-1]) == ((11, 15), (15, 15))
+
+
+# Refusals.
+
+
+def test_evaluation_scenes_need_an_explicit_word(small_release, tmp_path):
+    plain = exported(small_release, tmp_path / "plain", split=None)
+    named = exported(small_release, tmp_path / "named", split="eval")
+    both = exported(small_release, tmp_path / "both", split=("train", "eval"))
+
+    assert [plain.evaluation_scenes, named.evaluation_scenes, both.evaluation_scenes] == [1, 0, 0]
+    assert [record["split"] for record in records(tmp_path / "plain")] == ["train"] * 3
+    assert [record["split"] for record in records(tmp_path / "named")] == ["eval"]
+    assert [record["split"] for record in records(tmp_path / "both")].count("eval") == 1
+    for selection in ({"subset": "seen_map"}, {"scenes": records(tmp_path / "named")[0]["scene"]}):
+        with pytest.raises(SelectionError, match=r"evaluation scenes \(1\).*--split eval"):
+            exported(small_release, tmp_path / "none", split=None, **selection)
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_folder_of_another_export_is_refused_by_what_differs(small_release, tmp_path):
+    exported(small_release, tmp_path)
+    before = contents(tmp_path)
+
+    for change, named in (
+        ({"layout": "musubi"}, "layout"),
+        ({"form": ClipForm(encoding=QUICK, size=(32, 32))}, "form"),
+        ({"form": ClipForm()}, "form"),
+        ({"form": ClipForm(encoding=QUICK, also=("depth",))}, "videos"),
+        ({"family": "Uniform"}, "selection"),
+        ({"pairs": "all"}, "selection"),
+    ):
+        with pytest.raises(StorageError, match=rf"holds an export with another {named} .*remove"):
+            exported(small_release, tmp_path, **change)
+    assert contents(tmp_path) == before
+
+
+def test_a_folder_of_something_else_is_refused(small_release, tmp_path):
+    (tmp_path / "thesis.tex").write_text("")
+
+    with pytest.raises(StorageError, match="is not empty and holds no export"):
+        exported(small_release, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_two_exports_into_one_folder_are_refused(small_release, tmp_path):
+    from stereogenbench_data.sources.files import try_locked
+
+    tmp_path.mkdir(exist_ok=True)
+    with (
+        try_locked(tmp_path / ".export.lock"),
+        pytest.raises(StorageError, match="another process exports into it"),
+    ):
+        exported(small_release, tmp_path)
+
+
+@pytest.mark.parametrize("layout", ["diffsynth", "finetrainers", "musubi"])
+def test_a_length_that_the_trainer_cuts_is_refused(small_release, tmp_path, layout):
+    with pytest.raises(SelectionError, match=rf"length=7: {layout} takes .* 4N\+1 .* 5 or 9"):
+        exported(small_release, tmp_path, layout, form=ClipForm(length=7))
+
+    form = ClipForm(length=7, length_rule="any", encoding=QUICK)
+    exported(small_release, tmp_path, layout, form=form, family="IPD_Gaussian")
+    assert len(records(tmp_path)[0]["frames"]) == 7
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_without_a_length_a_clip_is_as_long_as_scene_and_trainer_allow(
+    small_release, tmp_path, layout
+):
+    form = ClipForm(encoding=QUICK)
+    exported(small_release, tmp_path, layout, form=form, family="IPD_Gaussian")
+
+    assert len(records(tmp_path)[0]["frames"]) == (7 if layout == "stereocrafter" else 5)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.filterwarnings("default::stereogenbench_data.bridges.clips.ClipSizeWarning")
+def test_a_size_that_the_trainer_cuts_is_warned_of(small_release, tmp_path, layout):
+    side = LAYOUTS[layout].side_px
+    options = {"family": "IPD_Gaussian"}
+    form = ClipForm(length=1, size=(side + 2, 2 * side + 6), encoding=QUICK)
+
+    with pytest.warns(ClipSizeWarning, match=rf"layout {layout} .* such as {2 * side}x{side}\."):
+        exported(small_release, tmp_path, layout, form=form, **options)
+
+
+@pytest.mark.parametrize(
+    ("form", "error", "said"),
+    [
+        (ClipForm(size=(33, 64)), MediaError, r"64x33 pixels .* yuv420p .* yuv444p"),
+        (ClipForm(length=81), SelectionError, r"81 frames .* spans 81 frames; a scene has 7"),
+        (ClipForm(length=0), SelectionError, r"give 1 or 5"),
+        (ClipForm(stride=0), SelectionError, r"at least 1, got 0"),
+        (ClipForm(step=0), SelectionError, r"at least 1, got 0"),
+        (ClipForm(fit="pad"), SelectionError, r"fit must be one of .*'crop'.*, got 'pad'"),
+        (ClipForm(rate_hz=0), MediaError, r"rate is 0 frames a second: give rate_hz"),
+        (ClipForm(also=("sound",)), SelectionError, r"also: videos are right, .*; got 'sound'"),
+        (ClipForm(control="right"), SelectionError, r"control='right': the layout .* takes left"),
+    ],
+)
+def test_a_form_that_cannot_be_is_refused(small_release, tmp_path, form, error, said):
+    with pytest.raises(error, match=said):
+        exported(small_release, tmp_path, form=form)
+    assert not list(tmp_path.rglob("*.mp4"))
+
+
+def test_what_no_layout_has_is_refused(small_release, tmp_path):
+    with pytest.raises(SelectionError, match=r"layout must be one of diffsynth, .*, got 'sora'"):
+        exported(small_release, tmp_path, "sora")
+    with pytest.raises(SelectionError, match=r"control='left': the layout stereocrafter takes"):
+        exported(small_release, tmp_path, "stereocrafter", form=ClipForm(control="left"))
+    with pytest.raises(SelectionError, match="frames= is not known here"):
+        exported(small_release, tmp_path, frames="all")
+    for wrong in ({"direction": "right_to_left"}, {"pairs": "sweep"}):
+        with pytest.raises(SelectionError, match="choose pairs='primary'"):
+            exported(small_release, tmp_path, **wrong)
+
+
+def test_a_video_that_does_not_state_its_rate_is_named(small_release, tmp_path):
+    index = SceneIndex.open(small_release)
+    scenes = [index.scene(row) for row in range(len(index))]
+    timeless = [type(scene)(**(fields_of(scene) | {"frame_rate_hz": 0.0})) for scene in scenes]
+    changed = SceneIndex.from_scenes(timeless, small_release)
+
+    with pytest.raises(MediaError, match=r"train/.*: the clip's rate is 0 .*--rate-hz"):
+        exported(changed, tmp_path)
+
+
+def test_a_full_disk_is_named_and_leaves_whole_files(small_release, tmp_path):
+    with small_disk(tmp_path / "disk", size="128k") as place:
+        with pytest.raises(StorageError, match=r"cannot be written \(No space left .*Make room"):
+            exported(small_release, place / "out", pairs="all")
+        for path in place.rglob("*.mp4"):
+            assert len(decoded(path)) == 5
+
+
+def test_the_table_has_no_line_of_its_own_for_a_quoted_caption(small_release, tmp_path):
+    exported(described(small_release, 'A "sign", and more'), tmp_path, family="IPD_Gaussian")
+
+    with (tmp_path / "metadata.csv").open(newline="") as file:
+        rows = [*csv.DictReader(file)]
+    assert [row["prompt"] for row in rows] == ['A "sign", and more']

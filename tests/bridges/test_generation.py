@@ -1,0 +1,167 @@
+"""Generation: items as GenStereo's loop takes them, and clips for video diffusion."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from stereogenbench_data import FieldError, HorizontalFlip, Letterbox, SelectionError, StereoPairs
+from stereogenbench_data.bridges.generation import GenStereo, StereoClips, describe_pair
+from tests.servers.tools import require_module
+
+FIELDS = ("left", "right", "disparity", "valid", "warped_right", "hole")
+
+
+def in_unit_range(pictures):
+    return (pictures.float() / 255 - 0.5) / 0.5
+
+
+@pytest.fixture(scope="module")
+def item(detailed_release):
+    return GenStereo(detailed_release)[0]
+
+
+def test_a_batch_of_genstereo_has_what_its_loop_reads(small_release):
+    batch = next(iter(GenStereo(small_release, split="train").loader(batch_size=2)))
+
+    assert {name: (tuple(value.shape), value.dtype) for name, value in batch.items()} == {
+        "source": ((2, 3, 64, 64), torch.float32),
+        "correspondence": ((2, 1, 64, 64), torch.float32),
+        "target": ((2, 3, 64, 64), torch.float32),
+        "src_coords_embed": ((2, 14, 64, 64), torch.float32),
+        "trg_coords_embed": ((2, 14, 64, 64), torch.float32),
+        "clip_images": ((2, 3, 224, 224), torch.float32),
+        "converted_right": ((2, 3, 64, 64), torch.float32),
+        "mask": ((2, 1, 64, 64), torch.uint8),
+    }
+    for name in ("source", "target", "converted_right"):
+        assert -1 <= batch[name].min() < -0.5 < 0.5 < batch[name].max() <= 1
+
+
+@pytest.mark.parametrize("transform", [None, HorizontalFlip(1.0), Letterbox(160, 240)])
+def test_the_warped_view_and_the_mask_are_the_fields(detailed_release, transform):
+    plain = StereoPairs(detailed_release, fields=FIELDS, transform=transform)[0]
+    item = GenStereo(detailed_release, transform=transform)[0]
+
+    assert torch.equal(item["mask"] == 1, plain["hole"])
+    assert torch.equal(item["converted_right"], in_unit_range(plain["warped_right"]))
+    assert (item["converted_right"][:, plain["hole"][0]] == -1).all()
+    assert torch.equal(item["correspondence"], plain["disparity"])
+    assert torch.equal(item["source"], in_unit_range(plain["left"]))
+    assert torch.equal(item["target"], in_unit_range(plain["right"]))
+
+
+def test_the_warped_view_is_close_to_the_target_where_it_is_no_hole(item):
+    seen = item["mask"][0] == 0
+    error = (item["converted_right"] - item["target"])[:, seen].abs().mean()
+    unwarped = (item["source"] - item["target"])[:, seen].abs().mean()
+
+    assert error < unwarped / 2
+
+
+def test_embedded_coordinates_say_where_a_warped_pixel_came_from(item):
+    embedded = item["trg_coords_embed"]
+    seen = item["mask"][0] == 0
+    rows, columns = torch.nonzero(seen, as_tuple=True)
+    x, y = (embedded[axis][seen] * 160 for axis in (0, 1))
+    source_columns = x.round().long()
+
+    torch.testing.assert_close(x, source_columns.float(), atol=1e-3, rtol=0)
+    torch.testing.assert_close(y, rows.float(), atol=1e-3, rtol=0)
+    moved = item["correspondence"][0, rows, source_columns]
+    assert ((source_columns - columns) - moved).abs().max() <= 0.5 + 1e-4
+    torch.testing.assert_close(embedded[2][seen], torch.sin(embedded[0][seen]))
+    torch.testing.assert_close(embedded[9][seen], torch.cos(2 * embedded[1][seen]))
+    assert (embedded[:10, ~seen] == 0).all()
+    assert torch.equal(embedded[10], item["mask"][0].float())
+    assert torch.equal(embedded[11:], item["converted_right"])
+    assert (item["src_coords_embed"][10] == 0).all()
+    assert torch.equal(item["src_coords_embed"][11:], item["source"])
+
+
+@pytest.mark.parametrize("size", [(160, 160), (120, 200), (200, 120)])
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.samples.size.SwappedSizeWarning")
+def test_clip_is_given_what_its_own_processor_makes(detailed_release, size):
+    transformers = require_module("transformers")
+    left = StereoPairs(detailed_release, fields=("left",), size=size)[0]["left"]
+    kind = getattr(transformers, "CLIPImageProcessorPil", None) or transformers.CLIPImageProcessor
+    picture = Image.fromarray(left.permute(1, 2, 0).numpy())
+
+    made = kind()(images=picture, return_tensors="pt").pixel_values[0]
+
+    found = GenStereo(detailed_release, size=size)[0]["clip_images"]
+    torch.testing.assert_close(found, torch.as_tensor(np.asarray(made)), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("layout", ["tchw", "cthw"])
+def test_clips_have_time_and_channels_in_the_order_asked(small_release, layout):
+    options = {"split": "train", "pairs": "adjacent", "frames": ("clips", 3)}
+    plain = StereoPairs(small_release, fields=FIELDS, **options)[4]
+
+    clip = StereoClips(small_release, layout=layout, **options)[4]
+
+    shape = (3, 3, 64, 64)
+    assert clip["source"].shape == clip["target"].shape == clip["warped"].shape == shape
+    as_stored = {
+        name: clip[name].transpose(0, 1) if layout == "cthw" else clip[name]
+        for name in ("source", "target", "warped", "mask", "correspondence")
+    }
+    assert torch.equal(as_stored["source"], in_unit_range(plain["left"]))
+    assert torch.equal(as_stored["target"], in_unit_range(plain["right"]))
+    assert torch.equal(as_stored["warped"], in_unit_range(plain["warped_right"]))
+    assert torch.equal(as_stored["mask"], plain["hole"].float())
+    assert torch.equal(as_stored["correspondence"], plain["disparity"])
+    assert all(clip[name].is_contiguous() for name in as_stored)
+
+
+def test_clips_tell_their_caption_baseline_and_rate(small_release):
+    options = {"split": "train", "family": "Uniform", "frames": ("clips", 3, 2)}
+    plain, told = (
+        StereoClips(small_release, captions=captions, **options)[0]
+        for captions in ("plain", "with baseline")
+    )
+
+    scene = StereoPairs(small_release, **options).index.scene(1)
+    centimetres = float(plain["baseline_m"]) * 100
+    assert plain["caption"].startswith("A figure walks")
+    assert told["caption"] == f"{plain['caption']} Stereo baseline {centimetres:.1f} cm."
+    assert float(plain["frame_rate_hz"]) == scene.frame_rate_hz / 2 > 0
+
+
+def test_a_batch_of_clips_has_captions_as_a_list(small_release):
+    clips = StereoClips(small_release, frames=("clips", 3), split="train")
+
+    batch = next(iter(clips.loader(batch_size=3, num_workers=1)))
+
+    assert batch["target"].shape == (3, 3, 3, 64, 64)
+    assert [type(caption) for caption in batch["caption"]] == [str] * 3
+    assert batch["baseline_m"].shape == batch["frame_rate_hz"].shape == (3,)
+
+
+def test_a_pair_without_a_description_is_described_by_its_baseline():
+    assert describe_pair("", baseline_m=0.1) == "Stereo baseline 10.0 cm."
+
+
+def test_what_cannot_be_is_refused(small_release):
+    with pytest.raises(FieldError, match=r"layout must be one of .*'cthw'.*, got 'thwc'"):
+        StereoClips(small_release, layout="thwc", frames=("clips", 2))
+    with pytest.raises(FieldError, match=r"captions must be one of .*'plain'.*, got 'long'"):
+        StereoClips(small_release, captions="long", frames=("clips", 2))
+    with pytest.raises(SelectionError, match="StereoClips takes clips"):
+        StereoClips(small_release)
+    with pytest.raises(SelectionError, match="GenStereo takes frames"):
+        GenStereo(small_release, frames=("clips", 2))
+
+
+@pytest.mark.parametrize(
+    ("frames", "stride"), [("all", 1), ([3], 1), (("clips", 2, 3), 3), (("clips", 1), 1)]
+)
+def test_the_frame_rate_is_a_field(small_release, frames, stride):
+    from stereogenbench_data import SceneViews
+
+    pair = StereoPairs(small_release, fields=("frame_rate_hz",), frames=frames)
+    views = SceneViews(small_release, fields=("frame_rate_hz",), frames=frames)
+
+    rate = pair.index.scene(0).frame_rate_hz / stride
+    assert pair[0]["frame_rate_hz"].dtype == torch.float64
+    assert float(pair[0]["frame_rate_hz"]) == float(views[0]["frame_rate_hz"]) == rate > 0

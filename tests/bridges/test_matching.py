@@ -1,0 +1,283 @@
+"""Matching: each adapter's items, and what the project's own training loop does with batches."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from stereogenbench_data import (
+    Compose,
+    FieldError,
+    HorizontalFlip,
+    RandomCrop,
+    SelectionError,
+    StereoPairs,
+)
+from stereogenbench_data.bridges.matching import (
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    DynamicStereo,
+    IgevStereo,
+    RaftStereo,
+    UniMatch,
+)
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
+
+ADAPTERS = [
+    pytest.param(RaftStereo, {}, id="RAFT-Stereo"),
+    pytest.param(IgevStereo, {}, id="IGEV-Stereo"),
+    pytest.param(UniMatch, {}, id="UniMatch"),
+    pytest.param(DynamicStereo, {"frames": ("clips", 2)}, id="DynamicStereo"),
+]
+FLIPPED = [None, HorizontalFlip(1.0)]
+
+
+def fetched(right, shift_px):
+    """Return the right picture (..., c, h, w) at x + shift of each left pixel, between centres."""
+    *_, height, width = right.shape
+    columns = torch.arange(width) + shift_px
+    rows = torch.arange(height)[:, None].expand(height, width)
+    grid = torch.stack([2 * (columns + 0.5) / width - 1, 2 * (rows + 0.5) / height - 1], dim=-1)
+    return torch.nn.functional.grid_sample(right[None], grid[None].float(), align_corners=False)[0]
+
+
+def psnr(one, other, where):
+    error = ((one - other) ** 2).mean(0)[where].mean()
+    return float(10 * torch.log10(255**2 / error))
+
+
+def visible_pixels(data, **options):
+    return StereoPairs(data, fields=("visible",), **options)[0]["visible"]
+
+
+def test_the_loop_of_raft_stereo_unpacks_four_after_the_names(small_release):
+    train = RaftStereo(small_release, split="train", pairs="all", frames="all")
+
+    for _, (_, *data_blob) in enumerate(train.loader(batch_size=3, num_workers=1)):
+        image1, image2, flow, valid = data_blob
+        break
+
+    assert [each.dtype for each in data_blob] == [torch.float32] * 4
+    assert image1.shape == image2.shape == (3, 3, 64, 64)
+    assert (flow.shape, valid.shape) == ((3, 1, 64, 64), (3, 64, 64))
+    assert 1 < float(image1.max()) <= 255
+    mag = torch.sum(flow**2, dim=1).sqrt()
+    used = ((valid >= 0.5) & (mag < 700)).unsqueeze(1)
+    assert used.shape == flow.shape
+    assert (flow[used] < 0).all()
+    assert not flow.isinf().any()
+
+
+@pytest.mark.parametrize(("adapter", "sign"), [(RaftStereo, 1), (IgevStereo, -1)])
+@pytest.mark.parametrize("transform", FLIPPED)
+def test_the_right_picture_fetched_by_the_flow_is_the_left_one(
+    detailed_release, adapter, sign, transform
+):
+    _, image1, image2, flow, valid = adapter(detailed_release, transform=transform)[0]
+    visible = visible_pixels(detailed_release, transform=transform)[0]
+
+    there = fetched(image2, sign * flow[0])
+    assert psnr(there, image1, visible) > 27
+    assert psnr(image2, image1, visible) < 22
+    assert (valid[visible] == 1).all()
+
+
+def test_raft_stereo_names_both_pictures_and_the_ground_truth(small_release):
+    names = RaftStereo(small_release, family="Uniform", split="train", pairs=[(1, 4)], frames=[3])[
+        0
+    ][0]
+    flipped = RaftStereo(
+        small_release, family="Uniform", split="train", pairs=[(1, 4)], transform=HorizontalFlip(1)
+    )[0][0]
+
+    scene = "train/Uniform/SynthStage/scene_000000"
+    assert names == [f"{scene}/cam_{each}/003" for each in ("01_rgb", "04_rgb", "01_depth")]
+    assert flipped == [f"{scene}/cam_{each}/000" for each in ("04_rgb", "01_rgb", "04_depth")]
+
+
+@pytest.mark.parametrize("adapter", [RaftStereo, IgevStereo])
+def test_pixels_of_large_disparity_are_not_valid(small_release, adapter):
+    largest = StereoPairs(small_release)[0]["disparity"].max()
+    whole = adapter(small_release)[0]
+    cut = adapter(small_release, valid_below_px=float(largest) / 2)[0]
+
+    np.testing.assert_array_equal(cut[3], whole[3])
+    assert torch.equal(cut[4], whole[4] * (whole[3][0].abs() < largest / 2))
+    assert 0 < cut[4].sum() < whole[4].sum()
+
+
+def test_unmeasured_pixels_are_not_valid(shared_scenes):
+    sample = StereoPairs(shared_scenes, size=(64, 64))[0]
+    *_, flow, valid = RaftStereo(shared_scenes, size=(64, 64))[0]
+
+    assert not sample["valid"].all()
+    assert torch.equal(valid, sample["valid"][0].float())
+    assert (flow[~sample["valid"]] == 0).all()
+
+
+def test_the_loop_of_unimatch_takes_normalised_tensors(small_release):
+    plain = StereoPairs(small_release)[0]
+    batch = next(iter(DataLoader(UniMatch(small_release), batch_size=2)))
+
+    assert {name: tuple(value.shape) for name, value in batch.items()} == {
+        "left": (2, 3, 64, 64), "right": (2, 3, 64, 64), "disp": (2, 64, 64),
+    }  # fmt: skip
+    assert {value.dtype for value in batch.values()} == {torch.float32}
+    mean, std = (torch.tensor(each)[:, None, None] for each in (IMAGENET_MEAN, IMAGENET_STD))
+    back = (batch["right"][0] * std + mean) * 255
+    torch.testing.assert_close(back, plain["right"].float(), atol=1e-3, rtol=0)
+    mask = (batch["disp"] > 0) & (batch["disp"] < 400)
+    assert torch.equal(mask[0], plain["valid"][0])
+
+
+@pytest.mark.parametrize("transform", FLIPPED)
+def test_the_right_picture_of_unimatch_fetched_by_its_disparity_is_the_left_one(
+    detailed_release, transform
+):
+    item = UniMatch(detailed_release, transform=transform)[0]
+    visible = visible_pixels(detailed_release, transform=transform)[0]
+    mean, std = (torch.tensor(each)[:, None, None] for each in (IMAGENET_MEAN, IMAGENET_STD))
+    left, right = ((item[name] * std + mean) * 255 for name in ("left", "right"))
+
+    assert psnr(fetched(right, -item["disp"]), left, visible) > 27
+    assert psnr(right, left, visible) < 22
+
+
+def test_transforms_of_unimatch_get_arrays_of_height_width_channels(small_release):
+    plain = StereoPairs(small_release)[0]
+
+    item = UniMatch(small_release, sample_transform=lambda sample: sample)[0]
+
+    assert {name: (value.shape, value.dtype) for name, value in item.items()} == {
+        "left": ((64, 64, 3), np.float32),
+        "right": ((64, 64, 3), np.float32),
+        "disp": ((64, 64), np.float32),
+    }
+    np.testing.assert_array_equal(item["left"].transpose(2, 0, 1), plain["left"])
+    np.testing.assert_array_equal(item["disp"], plain["disparity"][0])
+
+
+def test_the_loop_of_dynamic_stereo_takes_clips_of_both_views(small_release):
+    clips = DynamicStereo(small_release, pairs="adjacent", frames=("clips", 3))
+
+    batch = next(iter(clips.loader(batch_size=2)))
+
+    assert {name: tuple(value.shape) for name, value in batch.items()} == {
+        "img": (2, 3, 2, 3, 64, 64), "disp": (2, 3, 2, 1, 64, 64), "valid_disp": (2, 3, 2, 64, 64),
+    }  # fmt: skip
+    assert {value.dtype for value in batch.values()} == {torch.float32}
+    for moment in range(3):
+        flow, valid = batch["disp"][:, moment, 0], batch["valid_disp"][:, moment, 0]
+        used = (valid >= 0.5).unsqueeze(1)
+        assert used.shape == flow.shape
+        assert (flow[used] < 0).all()
+
+
+@pytest.mark.parametrize("transform", FLIPPED)
+def test_both_views_of_dynamic_stereo_have_the_disparity_of_their_own_pixels(
+    detailed_release, transform
+):
+    options = {"frames": ("clips", 2), "transform": transform}
+    item = DynamicStereo(detailed_release, **options)[0]
+    there = StereoPairs(detailed_release, fields=("visible", "visible_right"), **options)[0]
+
+    left, right = item["img"][0]
+    ahead, back = item["disp"][0]
+    assert psnr(fetched(right, ahead[0]), left, there["visible"][0, 0]) > 27
+    assert psnr(fetched(left, -back[0]), right, there["visible_right"][0, 0]) > 27
+    assert torch.equal(item["valid_disp"] > 0, item["disp"][:, :, 0] < 0)
+
+
+@pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
+def test_torchs_own_loader_and_ours_give_the_same_items(small_release, adapter, options):
+    dataset = adapter(
+        small_release, pairs="adjacent", transform=RandomCrop(32, 48), seed=3, **options
+    )
+
+    ours = next(iter(dataset.loader(2, order="sequential")))
+    torchs = next(iter(DataLoader(dataset, batch_size=2, num_workers=1)))
+
+    assert flat(ours).keys() == flat(torchs).keys()
+    for name, value in flat(ours).items():
+        assert (
+            torch.equal(value, flat(torchs)[name])
+            if torch.is_tensor(value)
+            else (value == flat(torchs)[name])
+        )
+
+
+def flat(batch):
+    return batch if isinstance(batch, dict) else dict(enumerate(batch))
+
+
+@pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
+def test_a_pass_draws_other_transforms_than_the_one_before(small_release, adapter, options):
+    dataset = adapter(small_release, transform=RandomCrop(16, 16), **options)
+    loader = dataset.loader(4, order="sequential", drop_last=False)
+
+    first, second = (flat(next(iter([*loader]))) for _ in range(2))
+
+    name = next(key for key in first if torch.is_tensor(first[key]))
+    assert not torch.equal(first[name], second[name])
+
+
+@pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
+def test_items_are_repeated_and_added_as_the_projects_own_datasets(small_release, adapter, options):
+    dataset = adapter(small_release, **options)
+
+    assert len(2 * dataset + dataset) == len(dataset * 3) == 3 * len(dataset)
+    assert len((dataset * 3)[len(dataset)]) == len(dataset[0])
+
+
+@pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
+def test_a_dataset_can_be_pickled_for_other_processes(small_release, adapter, options):
+    dataset = pickle.loads(pickle.dumps(adapter(small_release, **options)))
+
+    assert len(dataset[0]) == len(adapter(small_release, **options)[0])
+    assert type(dataset).__name__ in repr(dataset)
+
+
+@pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
+def test_what_the_project_cannot_take_is_refused(small_release, adapter, options):
+    name = adapter.__name__
+
+    with pytest.raises(SelectionError, match=f"direction='right_to_left'.*{name}.*HorizontalFlip"):
+        adapter(small_release, direction="right_to_left", **options)
+    with pytest.raises(SelectionError, match=f"{name} takes single pairs, got pairs='sweep'"):
+        adapter(small_release, pairs="sweep", **options)
+    with pytest.raises(FieldError, match=f"{name} takes no fields"):
+        adapter(small_release, fields=("left",), **options)
+    with pytest.raises(FieldError, match=f"{name} takes what StereoPairs takes, not the dataset"):
+        adapter(StereoPairs(small_release), **options)
+    with pytest.raises(SelectionError, match=f"tail='wrap'.*{name}.*tail='drop'"):
+        adapter(small_release, **options).loader(2, tail="wrap")
+
+
+def test_clips_and_single_frames_are_not_mixed_up(small_release):
+    with pytest.raises(SelectionError, match=r"RaftStereo takes frames: .* got \('clips', 2\)"):
+        RaftStereo(small_release, frames=("clips", 2))
+    with pytest.raises(SelectionError, match=r"DynamicStereo takes clips: .* got 'first'"):
+        DynamicStereo(small_release)
+
+
+def test_a_batch_of_several_sizes_is_refused_with_the_cure(tmp_path):
+    for number, size_px in enumerate((32, 48)):
+        family = ("Uniform", "IPD_Gaussian")[number]
+        request = SynthRequest(family=family, scenes=1, size_px=size_px, frames=1)
+        synthesise(tmp_path, request, workers=1)
+    loader = RaftStereo(tmp_path).loader(2)
+
+    with pytest.raises(FieldError, match=r"pictures of 32x32 and 48x48 pixels: give size="):
+        next(iter(loader))
+
+
+def test_a_transform_of_ours_moves_what_the_project_reads(detailed_release):
+    transform = Compose([HorizontalFlip(1.0), RandomCrop(96, 128)])
+    item = RaftStereo(detailed_release, transform=transform)[0]
+    visible = visible_pixels(detailed_release, transform=transform)[0]
+
+    assert item[1].shape == (3, 96, 128)
+    assert psnr(fetched(item[2], item[3][0]), item[1], visible) > 27
