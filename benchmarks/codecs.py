@@ -1,9 +1,9 @@
 """`python -m benchmarks.codecs SCENES...`: which codec training shards should use.
 
 Each way of storing pictures and depth at training size is encoded, decoded and compared: processor
-time a frame (in order, and one random frame), bytes a frame, PSNR and SSIM of the pictures, and what
-the loss does to stereo: the photometric error of warping by the true disparity, and the end-point
-error of semi-global matching. Depth is always lossless: only time and bytes are compared.
+time a frame (in order, and one random frame), bytes a frame, PSNR and SSIM of the pictures, and
+what the loss does to stereo: the photometric error of warping by the true disparity, and the
+end-point error of semi-global matching. Depth is always lossless: only time and bytes are compared.
 
 Middlebury pairs (``--middlebury FOLDER``) are stills: they tell what a codec does to real textures,
 not what it gains from frame to frame.
@@ -12,8 +12,8 @@ not what it gains from frame to frame.
 import argparse
 import io
 import json
-import math
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -30,9 +30,12 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from benchmarks.results import machine
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.depth import open_depth, read_depth_units
 from stereogenbench_data.media.depth_frames import blosc2_module
 from stereogenbench_data.media.video import VideoReader, read_rgb
 from stereogenbench_data.samples.size import parse_size
+from stereogenbench_data.samples.views import resized_nearest
+from stereogenbench_data.schema.records import DepthEncoding
 
 FRAMES: Final = 48
 """Frames of a scene that are encoded: several groups of pictures of the longest kind."""
@@ -309,11 +312,6 @@ def depth_rows(data: Path, *, size: tuple[int, int], rounds: int) -> list[dict[s
     scene = index.scene(0)
     name = "cam_00_depth.mkv"
     path = Path(index.root, scene.members[name].path)
-    from stereogenbench_data.media.depth import open_depth
-    from stereogenbench_data.samples.views import resized_nearest
-    from stereogenbench_data.schema.records import DepthEncoding
-    from stereogenbench_data.media.depth import read_depth_units
-
     count = min(FRAMES, scene.frames)
 
     def released() -> np.ndarray:
@@ -425,6 +423,95 @@ def _grey_png(units: np.ndarray) -> list[bytes]:
     return files
 
 
+def _moving(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the rows of videos, not of stills, averaged over them."""
+    names = dict.fromkeys(row["codec"] for row in rows if row["codec"] != "original")
+    found = []
+    for name in names:
+        same = [row for row in rows if row["codec"] == name and row["released_ms"] > 0]
+        found.append(
+            {
+                "codec": name,
+                **{
+                    key: statistics.mean(row[key] for row in same)
+                    for key, value in same[0].items()
+                    if isinstance(value, float)
+                },
+            }
+        )
+    return found
+
+
+def table(content: dict[str, Any]) -> str:
+    """Return what was measured as Markdown: means over the videos, then the stills by name."""
+    rows = content["pictures"]
+    lines = [
+        f"# Codecs for training shards at {content['size']}",
+        "",
+        "Processor time of one thread; speed is a multiple of decoding and scaling the released",
+        "video. Made by `python -m benchmarks.codecs`.",
+        "",
+        "| pictures | speed in order | random | ms | kB a frame | of released | PSNR dB | worst |"
+        " SSIM | warp error | SGBM px | over 1 px |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row['codec']} | {row['released_ms'] / row['ms']:.1f} "
+        f"| {row['released_random_ms'] / row['random_ms']:.0f} | {row['ms']:.1f} "
+        f"| {row['bytes_a_frame'] / 1e3:.0f} | {row['bytes_a_frame'] / row['released_bytes']:.2f} "
+        f"| {row['psnr_db']:.1f} | {row['worst_psnr_db']:.1f} | {row['ssim']:.4f} "
+        f"| {row['warp_error']:.2f} | {row['sgbm_epe_px']:.3f} | {row['sgbm_bad1']:.1%} |"
+        for row in _moving(rows)
+    ]
+    lines += [
+        "",
+        "| pictures | material | PSNR dB | warp error | SGBM px |",
+        "|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {row['codec']} | {row['material']} | {row.get('psnr_db', float('inf')):.1f} "
+        f"| {row['warp_error']:.2f} | {row['sgbm_epe_px']:.3f} |"
+        for row in rows
+        if row["codec"] == "original" or not row["released_ms"] > 0
+    ]
+    lines += ["", "| depth | material | ms | kB a frame |", "|---|---|---|---|"]
+    lines += [
+        f"| {row['codec']} | {row['material']} | {row['ms']:.2f} "
+        f"| {row['bytes_a_frame'] / 1e3:.0f} |"
+        for row in content["depth"]
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def plot(rows: list[dict[str, Any]], place: Path) -> None:
+    """Draw error against bytes and against time, a line for each kind of codec."""
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.5), sharey=True, layout="constrained")
+    kinds: dict[str, list[dict[str, Any]]] = {}
+    for row in _moving(rows):
+        kind = row["codec"].replace(" fast", "").rsplit(" crf", 1)[0].rsplit(" q", 1)[0]
+        if " fast" in row["codec"]:
+            kind += ", fast decode"
+        kinds.setdefault(kind, []).append(row)
+    for number, (kind, found) in enumerate(kinds.items()):
+        style = {"marker": "osv^D<>pP*"[number % 10], "color": f"C{number % 10}", "label": kind}
+        style |= {"linestyle": "--" if "fast" in kind else "-", "markersize": 4}
+        for axis, key, unit in ((axes[0], "bytes_a_frame", 1e3), (axes[1], "ms", 1)):
+            axis.plot(
+                [row[key] / unit for row in found], [row["sgbm_epe_px"] for row in found], **style
+            )
+    original = statistics.mean(
+        row["sgbm_epe_px"] for row in rows if row["codec"] == "original" and row["moves"]
+    )
+    for axis, name in zip(axes, ("kB a frame", "processor time a frame, ms"), strict=True):
+        axis.axhline(original, color="grey", linewidth=0.8)
+        axis.set_xscale("log")
+        axis.set_xlabel(name)
+    axes[0].set_ylabel("SGBM end-point error, px")
+    axes[0].annotate("original", (axes[0].get_xlim()[0], original), va="bottom", color="grey")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
+    figure.savefig(place, dpi=110)
+
+
 def main() -> None:
     """Measure, and write codecs.json and codecs.png."""
     parser = argparse.ArgumentParser(prog="benchmarks.codecs", description=__doc__)
@@ -443,17 +530,20 @@ def main() -> None:
     for pictures in material:
         frames = sorted({round(p) for p in np.linspace(0, len(pictures.left) - 1, MATCHED)})
         errors = stereo_errors(pictures, pictures.left[frames], pictures.right[frames], frames)
-        rows.append({"codec": "original", "material": pictures.name, **errors})
+        moves = pictures.released_ms > 0
+        rows.append({"codec": "original", "material": pictures.name, "moves": moves, **errors})
         for codec in codecs():
             if options.only in codec.name:
                 rows.append(compared(codec, pictures, rounds=options.rounds))
-                print(json.dumps(rows[-1]), flush=True)
+                sys.stderr.write(json.dumps(rows[-1]) + "\n")
     depth = [
         row for data in options.scenes for row in depth_rows(data, size=size, rounds=options.rounds)
     ]
     options.out.mkdir(parents=True, exist_ok=True)
     content = {"machine": machine(), "size": options.size, "pictures": rows, "depth": depth}
     (options.out / "codecs.json").write_text(json.dumps(content, indent=1))
+    (options.out / "codecs.md").write_text(table(content))
+    plot(rows, options.out / "codecs.png")
 
 
 if __name__ == "__main__":

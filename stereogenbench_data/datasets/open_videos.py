@@ -24,7 +24,7 @@ SPARE_FILES = 128
 """Open files that are left to everything else."""
 
 
-GROUP_BYTES: Final = 1_150_000_000
+GROUP_BYTES: Final = 900_000_000
 """Memory for the open scenes of a shuffle group, where nobody asks for a number of them."""
 
 _DECODER_BYTES: Final = 17
