@@ -285,7 +285,7 @@ def _require_key_frames(table: pa.Table, *, where: str) -> None:
     frames = as_numpy(table.column("frames"))
     is_first = np.diff(scenes, prepend=-1) != 0
     fits = np.where(is_first, flat == 0, flat > np.roll(flat, 1)) & (flat < frames[scenes])
-    is_empty = (as_numpy(pc.fill_null(pc.list_value_length(lists), 1)) == 0).any()
+    is_empty = (as_numpy(pc.list_value_length(lists)) == 0).any()
     if not fits.all() or is_empty:
         odd = [] if is_empty else flat[~fits][:1].tolist()
         raise _odd(where, "key_frames", odd, "not frames of the scene, ascending from 0")

@@ -190,12 +190,11 @@ class SceneIndex:
         Returns:
             The lists, and (n,) int64, for each row the place of its list among them.
         """
-        column = self._table.column("key_frames").combine_chunks()
-        column = column.chunk(0) if isinstance(column, pa.ChunkedArray) else column
+        column = one_array(self._table.column("key_frames"))
         which = np.zeros(len(self), dtype=np.int64)
         kinds: list[tuple[int, ...]] = [(0,)]
         if column.null_count < len(self):
-            lengths = as_numpy(pc.fill_null(pc.list_value_length(column), 0))
+            lengths = np.nan_to_num(as_numpy(pc.list_value_length(column))).astype(np.int64)
             flat = as_numpy(column.flatten())
             starts = np.cumsum(lengths) - lengths
             for length in np.unique(lengths[lengths > 0]).tolist():

@@ -466,6 +466,8 @@ def _dealt(pieces: _Pieces, *, streams: int) -> list[Numbers]:
     shortest stream.
     """
     lengths = pieces.stop - pieces.begin
+    if streams == 0:
+        return []
     if len(lengths) >= _MANY_RUNS * streams and lengths.max() * streams <= lengths.sum():
         ends = np.cumsum(lengths)
         shares = ends[-1] * np.arange(1, streams) // streams
