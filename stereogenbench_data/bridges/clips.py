@@ -479,7 +479,7 @@ def _works(
     """
     index, works, scenes = clips.index, [], {}
     for number in range(len(clips)):
-        row, source, targets, frames = clips.plan.locate(number, epoch=0)
+        row, source, targets, frames, _ = clips.plan.locate(number, epoch=0)
         if row not in scenes:
             scenes = {
                 row: SceneIndex.from_scenes(
@@ -595,9 +595,8 @@ def _write_clip(work: _ClipWork, advance: Advance) -> None:
 
 
 def _frames(work: _ClipWork, loader: SampleLoader) -> Iterator[Sample]:
-    _, source, targets, frames = work.address
-    for frame in frames:
-        address = Address(0, source, targets, (frame,))
+    for frame in work.address.frames:
+        address = Address(0, work.address.source, work.address.targets, (frame,))
         yield loader.load(address, clip="frame", generator=np.random.default_rng(0))
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from stereogenbench_data.cli.errors import resumable
-from stereogenbench_data.cli.evaluate import parse_pairs, parse_picture_size
+from stereogenbench_data.cli.evaluate import pairs_option, parse_picture_size
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
@@ -54,7 +54,7 @@ class PairOptions(SceneOptions):
             typer.BadParameter: If the text of the pairs cannot be parsed.
         """
         baseline = {} if self.baseline_cm is None else {"baseline_cm": self.baseline_cm}
-        return self.filters() | baseline | {"pairs": parse_pairs(self.pairs)}
+        return self.filters() | baseline | {"pairs": pairs_option(self.pairs)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,27 +1,25 @@
 """The batches of an epoch for one rank, and positions in them that can be saved."""
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final, Protocol, TypedDict, Unpack
 
 import numpy as np
 import torch.distributed
 from torch.utils.data import Sampler
 
-from stereogenbench_data.datasets.open_videos import scenes_at_once
+from stereogenbench_data.datasets.open_videos import fitting_rule
 from stereogenbench_data.datasets.shared_epoch import SharedEpoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.order import (
-    GROUPS_OF_LARGE,
-    OPEN_SCENES,
     ORDER_VERSION,
-    SHUFFLE_GROUPS,
     EpochOrder,
     OrderKind,
     OrderRule,
+    Start,
     Tail,
     last_batch,
     rank_share,
@@ -30,9 +28,6 @@ from stereogenbench_data.selection.plan import Plan
 
 State = dict[str, Any]
 """A position: a flat dict of numbers and texts, which JSON and `torch.save` take."""
-
-_RENAMED: Final = {"lanes": "shuffle_groups"}
-"""Names in positions that earlier versions saved."""
 
 _STATES: Final = (
     "Pass what state_dict() of a loader, of EpochBatches or of a stream returned, unchanged."
@@ -66,6 +61,13 @@ class EpochOptions(TypedDict, total=False):
             0.9 GB of decoders hold: of 1280x1280 pixels 16 with one pair a scene, and 4 with all
             pairs. Fewer take less memory and shuffle less well. A process has so many of each group
             that it reads.
+        open_frames: How many neighbouring frames of each open scene are interleaved, where several
+            samples show a frame (all pairs): they stay in memory. By default so many that a batch
+            shows about as many moments as it has samples, as far as that memory goes.
+        start: Where in its first scene each of the interleaved streams starts. "anywhere" (the
+            default): else the first batches would show first frames alone, and where scenes are
+            as long as one another, all batches frames of one number. What lies before is decoded
+            twice, once an epoch for each open scene. "beginning" spares that.
         order: "shuffled" (the default) or "sequential".
     """
 
@@ -77,6 +79,8 @@ class EpochOptions(TypedDict, total=False):
     tail: Tail
     shuffle_groups: int
     open_scenes: int
+    open_frames: int
+    start: Start
     order: OrderKind
 
 
@@ -95,23 +99,30 @@ class EpochBatch(list[int]):
         epoch: The epoch: of random frames and transforms, too, whatever epoch the dataset is at.
         is_padding: For each sample whether it fills up after the epoch's end; None where no sample
             ever does (all tails but "wrap").
+        ends_of_runs: The samples after which their videos are wanted no more for now.
     """
 
     def __init__(
-        self, numbers: Iterable[int], *, epoch: int, is_padding: list[bool] | None = None
+        self,
+        numbers: Iterable[int],
+        *,
+        epoch: int,
+        is_padding: list[bool] | None = None,
+        ends_of_runs: Collection[int] = (),
     ) -> None:
         """Hold the numbers."""
         super().__init__(numbers)
         self.epoch = epoch
         self.is_padding = is_padding
+        self.ends_of_runs = ends_of_runs
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what a worker process makes the same batch from."""
-        return _epoch_batch, (list(self), self.epoch, self.is_padding)
+        options = {name: getattr(self, name) for name in _BATCH_OPTIONS}
+        return partial(EpochBatch, **options), (list(self),)
 
 
-def _epoch_batch(numbers: list[int], epoch: int, is_padding: list[bool] | None) -> EpochBatch:
-    return EpochBatch(numbers, epoch=epoch, is_padding=is_padding)
+_BATCH_OPTIONS: Final = ("epoch", "is_padding", "ends_of_runs")
 
 
 class EpochBatches(Sampler[list[int]]):
@@ -153,17 +164,19 @@ class EpochBatches(Sampler[list[int]]):
             )
         self.dataset = dataset
         self._epoch = dataset._epoch
-        at_once = scenes_at_once(dataset.index, dataset.plan)
         rule = OrderRule(
             batch_size=batch_size,
             seed=options.get("seed", dataset.plan.seed),
-            shuffle_groups=options.get(
-                "shuffle_groups", SHUFFLE_GROUPS if at_once >= OPEN_SCENES else GROUPS_OF_LARGE
-            ),
+            start=options.get("start", "anywhere"),
             kind=_order_kind(options),
         )
-        most_open = min(max(OPEN_SCENES, rule.batch_size), at_once)
-        self.rule = replace(rule, open_scenes=options.get("open_scenes", most_open))
+        rule = fitting_rule(rule, dataset.index, dataset.plan)
+        self.rule = replace(
+            rule,
+            shuffle_groups=options.get("shuffle_groups", rule.shuffle_groups),
+            open_scenes=options.get("open_scenes", rule.open_scenes),
+            open_frames=options.get("open_frames", rule.open_frames),
+        )
         self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
         self.tail = _tail(options, world_size=self.world_size)
         self._follows_the_group = "rank" not in options
@@ -334,12 +347,15 @@ class EpochBatches(Sampler[list[int]]):
     def batch(self, number: int, *, epoch: int) -> EpochBatch:
         """Return the samples of a global batch."""
         order = self.order(epoch)
+        samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
+        ends = samples[order.ends_run(number)].tolist() if len(samples) else []
         if self.tail != "wrap":
-            return EpochBatch(order.batch(number).tolist(), epoch=epoch)
+            return EpochBatch(samples.tolist(), epoch=epoch, ends_of_runs=ends)
         return EpochBatch(
             order.full_batch(number).tolist(),
             epoch=epoch,
             is_padding=self.is_padding(number).tolist(),
+            ends_of_runs=ends,
         )
 
     def is_padding(self, number: int) -> np.ndarray:
@@ -350,7 +366,7 @@ class EpochBatches(Sampler[list[int]]):
     def order(self, epoch: int) -> EpochOrder:
         """Return the order of an epoch; the last one is kept."""
         if self._order is None or self._order.epoch != epoch:
-            self._order = EpochOrder(self.dataset.plan.first_sample, self.rule, epoch=epoch)
+            self._order = EpochOrder(self.dataset.plan.runs, self.rule, epoch=epoch)
         return self._order
 
     def state_at(self, epoch: int, batches: int) -> State:
@@ -372,8 +388,12 @@ class EpochBatches(Sampler[list[int]]):
             raise StateError(
                 f"a state is a dict as state_dict() returns it, got {state!r:.60}: {_STATES}"
             )
-        if "lanes" in state:
-            state = {_RENAMED.get(name, name): value for name, value in state.items()}
+        if state.get("version", ORDER_VERSION) != ORDER_VERSION:
+            raise StateError(
+                f"the state was saved for other batches: version is {ORDER_VERSION} here and "
+                f"{state['version']!r} there. Begin the epoch anew without it, or go on with the "
+                "version of the package that saved it."
+            )
         own = {"version": ORDER_VERSION, **self._identity}
         missing = sorted({*own, "epoch", "batches_consumed"} - state.keys())
         if missing:
@@ -402,12 +422,14 @@ class EpochBatches(Sampler[list[int]]):
     @cached_property
     def _identity(self) -> State:
         """What must be the same when a state is saved and when it is loaded."""
-        rule = self.rule.in_effect(np.diff(self.dataset.plan.first_sample))
+        rule = self.rule.in_effect(self.dataset.plan.runs)
         return {
             "seed": rule.seed,
             "batch_size": rule.batch_size,
             "shuffle_groups": rule.shuffle_groups,
             "open_scenes": rule.open_scenes,
+            "open_frames": rule.open_frames,
+            "start_of_streams": rule.start,
             "order": rule.kind,
             "tail": self.tail,
             "selection": self.dataset.plan.digest,

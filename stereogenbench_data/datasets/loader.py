@@ -4,7 +4,7 @@ import os
 import sys
 import threading
 from collections.abc import Iterator, Mapping
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Final, NamedTuple, Protocol, cast
 from weakref import WeakSet
 
@@ -28,6 +28,11 @@ from stereogenbench_data.errors import (
     WorkerError,
 )
 from stereogenbench_data.samples.streams import StreamStats
+from stereogenbench_data.selection.order import EpochOrder
+from stereogenbench_data.selection.quality import order_quality
+
+_DESCRIBED: Final = 200
+"""From so many batches `LoaderStats.shows` is computed."""
 
 _ORDERED: Final = "or torch's own DataLoader over the dataset"
 _INSTEAD: Final = {
@@ -77,6 +82,8 @@ class LoaderStats(NamedTuple):
         videos_limit: How many videos a process opens for it at most.
         batches_held: How many batches of its workers are open in shared slots: the loop holds a
             part of them, or they arrived early.
+        shows: What a batch shows, beside one of a fully shuffled sampler, in one line: scenes,
+            moments, the spread of frame numbers (of the first batches of epoch 0).
     """
 
     epoch: int
@@ -85,6 +92,7 @@ class LoaderStats(NamedTuple):
     videos_open: int
     videos_limit: int
     batches_held: int
+    shows: str
 
 
 class PairsLoader(AcceleratedLoader, DataLoader[Any]):
@@ -217,7 +225,15 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             videos_open=videos.videos_open,
             videos_limit=videos.videos_limit,
             batches_held=held_batches(pids),
+            shows=self._shows,
         )
+
+    @cached_property
+    def _shows(self) -> str:
+        # Epochs differ little, and the order of the current one stays as it is kept.
+        batches = self.batches
+        order = EpochOrder(batches.dataset.plan.runs, batches.rule, epoch=0)
+        return str(order_quality(order, batches.dataset.plan, batches=_DESCRIBED))
 
     def __repr__(self) -> str:
         """Return a summary."""

@@ -109,7 +109,7 @@ class _MappedScenes(Dataset[Sample]):
             StorageError: If a file is missing or altered.
             MediaError: If a video does not decode to what the index says.
         """
-        return to_tensors(self._sample(number, self.epoch))
+        return to_tensors(self._sample(number, EpochBatch((), epoch=self.epoch)))
 
     def __getitems__(self, numbers: Sequence[int]) -> list[Sample]:
         """Return several samples in the order asked, each stream read forwards on the way.
@@ -132,10 +132,10 @@ class _MappedScenes(Dataset[Sample]):
     ) -> Sample:
         """Return a sample of a batch, as slices of the batch's arrays if they are given."""
         if arrays is None:
-            sample = to_tensors(self._sample(number, batch.epoch))
+            sample = to_tensors(self._sample(number, batch))
         else:
             allocate = arrays.of_sample(place)
-            sample = arrays.as_tensors(place, self._sample(number, batch.epoch, allocate))
+            sample = arrays.as_tensors(place, self._sample(number, batch, allocate))
         if batch.is_padding is not None:
             is_padding = torch.tensor(batch.is_padding[place])
             if arrays is not None:
@@ -143,23 +143,25 @@ class _MappedScenes(Dataset[Sample]):
             sample["is_padding"] = is_padding
         return sample
 
-    def _sample(self, number: int, epoch: int, allocate: Allocate = new_array) -> Sample:
-        """Return a sample of arrays, written into what is allocated for them."""
+    def _sample(self, number: int, batch: EpochBatch, allocate: Allocate = new_array) -> Sample:
+        """Return a sample of a batch as arrays, written into what is allocated for them."""
         number = operator.index(number)
         count = len(self.plan)
         if not -count <= number < count:
             raise IndexError(f"no sample {number}: there are {count}")
         number %= count
-        address = self.plan.locate(number, epoch=epoch)
-        seeds = np.random.SeedSequence((self.plan.seed, epoch, number))
+        address = self.plan.locate(number, epoch=batch.epoch)
+        if self._access == "random":
+            address = address._replace(run=0)
+        seeds = np.random.SeedSequence((self.plan.seed, batch.epoch, number))
         sample = self._loader.load(
             address,
             clip="clip" if self.plan.windows.is_clip else "frame",
             generator=np.random.default_rng(seeds),
             allocate=allocate,
         )
-        if self._access == "in order" and self.plan.is_last_of_scene(number):
-            self._loader.release(address.row)
+        if number in batch.ends_of_runs:
+            self._loader.release(address)
         return sample
 
     def loader(
@@ -198,14 +200,14 @@ class _MappedScenes(Dataset[Sample]):
     def _keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Read by these batches, in one of so many processes: each video is opened once.
 
-        Videos are kept open for as many scenes as the batches interleave, and closed after a
-        scene's last sample.
+        Videos are kept open for as many runs as the batches interleave, and closed after a run's
+        last sample.
         """
         if batches.rule.kind == "shuffled":
             videos = videos_to_keep(
                 self.plan, batches.rule, streams=self._streams, processes=processes
             )
-            self._loader.keep_open(videos)
+            self._loader.keep_open(videos, frames=batches.rule.open_frames)
         self._access = "in order"
 
     def stats(self) -> StreamStats:

@@ -11,7 +11,13 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Stream
 from stereogenbench_data.samples.streams import OPEN_STREAMS
 from stereogenbench_data.schema.release import CAMERA_COUNT
-from stereogenbench_data.selection.order import Numbers, OrderRule
+from stereogenbench_data.selection.order import (
+    GROUPS_OF_LARGE,
+    OPEN_SCENES,
+    SHUFFLE_GROUPS,
+    Numbers,
+    OrderRule,
+)
 from stereogenbench_data.selection.plan import Plan
 
 SPARE_FILES = 128
@@ -25,8 +31,8 @@ _DECODER_BYTES: Final = 17
 """Of a camera's decoders for each pixel: 12.6 of H.264 with its reference pictures, 4.3 of FFV1,
 measured at 1280x1280."""
 
-_KEPT_BYTES: Final = 4
-"""Of the current picture and what is measured in it, kept for each pixel for other pairs."""
+_KEPT_BYTES: Final = 6
+"""Of a picture, its depth and where it is measured, kept for each pixel for other pairs."""
 
 
 class OpenVideosWarning(UserWarning):
@@ -46,7 +52,7 @@ def videos_to_keep(
     warning says what to do if the process may not open so many files, or if several processes
     decode the same videos and more groups would avoid it.
     """
-    lengths = np.diff(plan.first_sample)
+    lengths = plan.runs.lengths
     groups = rule.groups_of(lengths)
     _warn_of_repeated_decoding(rule, lengths=lengths, processes=processes)
     scenes = groups // math.gcd(groups, processes) * rule.most_open(lengths)
@@ -80,18 +86,36 @@ def _warn_of_repeated_decoding(rule: OrderRule, *, lengths: Numbers, processes: 
         )
 
 
-def scenes_at_once(index: SceneIndex, plan: Plan) -> int:
-    """Return how many scenes with all their videos fit into the memory meant for a shuffle group.
+def fitting_rule(rule: OrderRule, index: SceneIndex, plan: Plan) -> OrderRule:
+    """Return a rule with as many open scenes and frames as fit into the memory of a shuffle group.
 
-    It depends on the selected pairs and the stored size of their pictures alone, not on fields,
-    ranks or workers: so does the order.
+    They depend on the selected pairs and the stored size of their pictures alone, not on fields,
+    ranks or workers: so does the order. Where pairs share frames, as many moments as a batch has
+    samples are wanted, or as many as fit: of frames of the same scene where that takes less memory
+    than the decoders of another scene, but of two scenes at least.
     """
     rows = plan.scene_rows
     pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
     cameras = videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
-    is_shared = (np.diff(plan.first_pair) > 1).any()
-    scene_bytes = int(pixels) * cameras * (_DECODER_BYTES + (_KEPT_BYTES if is_shared else 0))
-    return max(2, GROUP_BYTES // max(1, scene_bytes))
+    budget = GROUP_BYTES / max(1, int(pixels) * cameras)
+    wanted = max(OPEN_SCENES, rule.batch_size)
+    if not (plan.runs.pairs > 1).any():
+        scenes, frames = min(wanted, max(2, int(budget // _DECODER_BYTES))), 1
+    else:
+        fitting = [
+            (
+                scenes,
+                min(-(-wanted // scenes), int((budget / scenes - _DECODER_BYTES) / _KEPT_BYTES)),
+            )
+            for scenes in range(2, wanted + 1)
+        ]
+        scenes, frames = max(
+            ((scenes, frames) for scenes, frames in fitting if frames > 0),
+            key=lambda each: (min(wanted, each[0] * each[1]), each[0]),
+            default=(2, 1),
+        )
+    groups = SHUFFLE_GROUPS if scenes >= OPEN_SCENES else GROUPS_OF_LARGE
+    return replace(rule, shuffle_groups=groups, open_scenes=scenes, open_frames=frames)
 
 
 def _most_files() -> int:

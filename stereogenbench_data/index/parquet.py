@@ -15,13 +15,14 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import StorageError, cure_of, describe_os_error, explain_os_errors
-from stereogenbench_data.index.arrow import as_numpy
-from stereogenbench_data.index.rows import SCHEMA, row_of
+from stereogenbench_data.index.arrow import as_numpy, one_array
+from stereogenbench_data.index.rows import ADDED, SCHEMA, row_of
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.sources.files import open_atomic
@@ -75,7 +76,7 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
         with pq.ParquetFile(file) as parquet:
             metadata = (parquet.schema_arrow.metadata or {}).get(_METADATA_KEY)
             head = _parse_head(metadata, where=where)
-            table = parquet.read().replace_schema_metadata().combine_chunks()
+            table = _with_added(parquet.read().replace_schema_metadata()).combine_chunks()
         table.validate(full=True)
     except StorageError:
         raise
@@ -89,6 +90,15 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
         ) from error
     require_sound(table, where=where)
     return table, head
+
+
+def _with_added(table: pa.Table) -> pa.Table:
+    """Return a table of an earlier version with the columns that came later, which say nothing."""
+    for name in ADDED:
+        if name not in table.column_names:
+            field = SCHEMA.field(name)
+            table = table.append_column(field, pa.nulls(table.num_rows, field.type))
+    return table
 
 
 def write_index_file(path: Path, table: pa.Table, head: IndexHead) -> None:
@@ -262,9 +272,23 @@ def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
             raise _odd(where, name, odd[0].item(), f"not {least:g} to {most:g}")
     if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
         raise StorageError(f"{where}: a primary pair has a camera twice. {made_again(where)}")
+    _require_key_frames(table, where=where)
     halves = [pc.is_null(table.column(f"principal_{axis}_px")) for axis in "xy"]
     if pc.any(pc.not_equal(*halves)).as_py():
         raise StorageError(f"{where}: a principal point has one number only. {made_again(where)}")
+
+
+def _require_key_frames(table: pa.Table, *, where: str) -> None:
+    lists = one_array(table.column("key_frames"))
+    flat = as_numpy(lists.flatten()).astype(np.int64)
+    scenes = as_numpy(pc.list_parent_indices(lists))
+    frames = as_numpy(table.column("frames"))
+    is_first = np.diff(scenes, prepend=-1) != 0
+    fits = np.where(is_first, flat == 0, flat > np.roll(flat, 1)) & (flat < frames[scenes])
+    is_empty = (as_numpy(pc.list_value_length(lists)) == 0).any()
+    if not fits.all() or is_empty:
+        odd = [] if is_empty else flat[~fits][:1].tolist()
+        raise _odd(where, "key_frames", odd, "not frames of the scene, ascending from 0")
 
 
 def _odd(where: str, name: str, found: Any, why: str) -> StorageError:

@@ -69,9 +69,13 @@ _COLUMNS: Final[dict[str, tuple[pa.DataType, bool, tuple[str | int, ...]]]] = {
     "depth_codec": (_TEXTS, _REQUIRED, ("depth_codec",)),
     "depth_pixel_format": (_TEXTS, _REQUIRED, ("depth_pixel_format",)),
     "valid_depth_ratio": (_NUMBER, _NULLABLE, ("valid_depth_ratio",)),
+    "key_frames": (_list(pa.int32()), _NULLABLE, ("key_frames",)),
     "members": (_list(_MEMBER), _REQUIRED, ("members",)),
 }
 """Name of a column to its type, whether it may be null, and where `Scene` holds its value."""
+
+ADDED: Final = ("key_frames",)
+"""Columns that indexes of earlier versions lack: null means what these knew."""
 
 SCHEMA: Final = pa.schema(
     pa.field(name, kind, nullable=nullable)
@@ -93,6 +97,8 @@ def row_of(scene: Scene) -> dict[str, Any]:
             elif value is not None:
                 value = value[part]
         row[name] = list(value) if isinstance(value, tuple) else value
+    if scene.key_frames == (0,):
+        row["key_frames"] = None
     row["members"] = [
         {"name": name, **asdict(member)} for name, member in sorted(scene.members.items())
     ]
@@ -115,6 +121,7 @@ def scene_of(row: Mapping[str, Any]) -> Scene:
 
     x_px, y_px = row["principal_x_px"], row["principal_y_px"]
     scene = values()
+    scene["key_frames"] = scene["key_frames"] or (0,)
     scene["members"] = {
         item["name"]: Member(item["path"], item["offset"], item["size"], item["crc32"])
         for item in row["members"]

@@ -212,6 +212,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         depth_codec=tuple(facts[name].codec for name in depth_names),
         depth_pixel_format=tuple(facts[name].pixel_format for name in depth_names),
         valid_depth_ratio=ratio,
+        key_frames=_common_key_frames(facts, frames=frames),
         members={name: Member(f"{key}/{name}", 0, size) for name, (size, _) in files.items()},
     )
 
@@ -265,6 +266,13 @@ def _merged_labels(labels: SceneLabels, marked: SceneLabels) -> SceneLabels:
     """Return the labels of baseline.json; those it lacks come from the completion mark."""
     known = {name: value for name, value in asdict(labels).items() if value is not None}
     return SceneLabels(**(asdict(marked) | known))
+
+
+def _common_key_frames(facts: Mapping[str, StreamFacts], *, frames: int) -> tuple[int, ...]:
+    """Return the frames at which all videos of pictures have a key frame."""
+    listed = [set(fact.key_frames) for name, fact in facts.items() if name.endswith(".mp4")]
+    common = set(range(frames)).intersection(*listed) if listed else set()
+    return tuple(sorted(common | {0}))
 
 
 def _common(key: str, found: Mapping[str, _T], *, what: str, unit: str) -> _T:

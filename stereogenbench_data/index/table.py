@@ -164,7 +164,9 @@ class SceneIndex:
         return scene_of(self._table.slice(int(row), 1).to_pylist()[0])
 
     def column(self, name: str) -> np.ndarray:
-        """Return a column as a read-only array; `rows.SCHEMA` names them all but ``members``.
+        """Return a column as a read-only array; `rows.SCHEMA` names them.
+
+        ``members`` and ``key_frames`` are not among them: see `scene` and `key_frames`.
 
         Returns:
             (n,) numbers (nan where unknown) or, for texts, objects (None where unknown); (n, 15)
@@ -174,12 +176,34 @@ class SceneIndex:
             StorageError: If there is no such column.
         """
         if name not in self._columns:
-            if name not in SCHEMA.names or name == "members":
-                known = ", ".join(column for column in SCHEMA.names if column != "members")
+            columns = [each for each in SCHEMA.names if each not in ("members", "key_frames")]
+            if name not in columns:
+                known = ", ".join(columns)
                 raise StorageError(f"the index has no column {name!r}; it has {known}.")
             self._columns[name] = as_numpy(self._table.column(name))
             self._columns[name].setflags(write=False)
         return self._columns[name]
+
+    def key_frames(self) -> tuple[list[tuple[int, ...]], np.ndarray]:
+        """Return the different lists of key frames that scenes have, and which each scene has.
+
+        Returns:
+            The lists, and (n,) int64, for each row the place of its list among them.
+        """
+        column = one_array(self._table.column("key_frames"))
+        which = np.zeros(len(self), dtype=np.int64)
+        kinds: list[tuple[int, ...]] = [(0,)]
+        if column.null_count < len(self):
+            lengths = np.nan_to_num(as_numpy(pc.list_value_length(column))).astype(np.int64)
+            flat = as_numpy(column.flatten())
+            starts = np.cumsum(lengths) - lengths
+            for length in np.unique(lengths[lengths > 0]).tolist():
+                rows = np.flatnonzero(lengths == length)
+                lists = flat[starts[rows][:, None] + np.arange(length)]
+                found, of_row = np.unique(lists, axis=0, return_inverse=True)
+                which[rows] = len(kinds) + of_row.reshape(-1)
+                kinds += [tuple(each) for each in found.tolist()]
+        return kinds, which
 
     def video_counts(self) -> np.ndarray:
         """Return how many videos each scene has, (n,) int64: below 12 in a part of a release."""

@@ -122,6 +122,8 @@ class StreamFacts:
         is_colour: Whether its pictures hold colours only, see `is_colour_format`; None if only
             a decoded picture could show it.
         pixel_aspect: Width of a pixel over its height; 0.0 if the file does not give it.
+        key_frames: The frames at which decoding can begin, from 0, as an MP4 header lists them;
+            (0,) where no header does.
         container: FFmpeg's names of the container, such as "matroska,webm".
     """
 
@@ -134,6 +136,7 @@ class StreamFacts:
     tags: Mapping[str, str]
     is_colour: bool | None = None
     pixel_aspect: float = 0.0
+    key_frames: tuple[int, ...] = (0,)
     container: str = field(default="", compare=False)
 
 
@@ -262,8 +265,21 @@ def stream_facts(
         tags=merged_tags(text_tags(container.metadata), text_tags(stream.metadata)),
         is_colour=is_colour,
         pixel_aspect=float(exact(stream.sample_aspect_ratio) or 0),
+        key_frames=_key_frames(container),
         container=container.format.name,
     )
+
+
+def _key_frames(container: InputContainer) -> tuple[int, ...]:
+    """Return the frames at which decoding can begin.
+
+    An MP4 header lists the packets whose pictures refer to none before. Such a picture is shown
+    after all those that come before it, so the packet's number is the frame's.
+    """
+    if "mp4" not in container.format.name:
+        return (0,)
+    entries = container.streams.video[0].index_entries
+    return tuple(number for number, each in enumerate(entries) if each.is_keyframe) or (0,)
 
 
 @cache

@@ -3,6 +3,7 @@
 import copy
 from collections import OrderedDict
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Final, Literal, Self
 
 import numpy as np
@@ -18,7 +19,6 @@ from stereogenbench_data.samples.streams import OPEN_STREAMS, Streams, StreamSta
 from stereogenbench_data.samples.views import StoredDepth, Views
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import (
-    CAMERA_COUNT,
     TRAJECTORY_JSON,
     depth_name,
     rgb_name,
@@ -78,11 +78,11 @@ class SampleDecoder:
             self._poses_needed = "always" if "always" in poses else "unless rectified"
         # A transform may write into what it is given.
         self._is_changed = request.transform is not None
-        self._most_videos = OPEN_STREAMS
+        self._most_depths, self._kept_frames = OPEN_STREAMS, 1
         self._streams = Streams(self._source)
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
-        self._depths: OrderedDict[tuple[int, int], tuple[int, StoredDepth]] = OrderedDict()
+        self._depths: OrderedDict[tuple[int, ...], StoredDepth] = OrderedDict()
 
     @property
     def stats(self) -> StreamStats:
@@ -101,17 +101,21 @@ class SampleDecoder:
         twin._scenes, twin._depths, twin._poses = OrderedDict(), OrderedDict(), OrderedDict()
         return twin
 
-    def keep_open(self, videos: int) -> None:
-        """Keep up to so many videos open, in this process and in copies of this decoder."""
-        self._streams.keep(videos)
-        self._most_videos = videos
+    def keep_open(self, videos: int, *, frames: int = 1) -> None:
+        """Keep up to so many videos open, and so many frames of each, in this process.
 
-    def release(self, row: int) -> None:
-        """Close the videos of a scene that has been read to its end."""
-        self._streams.release(self.scene(row))
-        self._scenes.pop(row, None)
-        for camera in range(CAMERA_COUNT):
-            self._depths.pop((row, camera), None)
+        Copies of this decoder do as well.
+        """
+        self._streams.keep(videos, frames=frames)
+        kinds = {stream.partition("_")[2] for stream in self._needs}
+        self._most_depths = videos // len(kinds | {"depth"}) * frames
+        self._kept_frames = frames
+
+    def release(self, address: Address) -> None:
+        """Close the videos of a run that has been read to its end."""
+        self._streams.release(self.scene(address.row), run=address.run)
+        for key in [key for key in self._depths if key[:2] == (address.row, address.run)]:
+            del self._depths[key]
 
     def close(self) -> None:
         """Close the videos that are open in this process."""
@@ -177,13 +181,14 @@ class SampleDecoder:
             frames=numbers,
             pictures=self._pictures(
                 scene,
+                address.run,
                 self._cameras(address, "rgb"),
                 numbers,
                 shape=(len(numbers), 3, intrinsics.height_px, intrinsics.width_px),
                 out=out,
             ),
             depths={
-                camera: self._depth(scene, address.row, camera, numbers, encodings[camera])
+                camera: self._depth(scene, address, camera, numbers, encodings[camera])
                 for camera in self._cameras(address, "depth")
             },
             intrinsics=intrinsics,
@@ -213,6 +218,7 @@ class SampleDecoder:
     def _pictures(
         self,
         scene: Scene,
+        run: int,
         cameras: list[int],
         frames: tuple[int, ...],
         *,
@@ -226,9 +232,10 @@ class SampleDecoder:
             for camera in cameras:
                 name = rgb_name(camera)
                 if self._frames == "used once" and camera in pictures:
-                    self._streams.write_rgb(scene, name, frame, out=pictures[camera][number])
+                    place = pictures[camera][number]
+                    self._streams.write_rgb(scene, name, frame, out=place, run=run)
                     continue
-                kept = self._streams.rgb(scene, name, frame, size=self._request.size)
+                kept = self._streams.rgb(scene, name, frame, size=self._request.size, run=run)
                 if camera in pictures:
                     pictures[camera][number] = kept
                 else:
@@ -239,33 +246,36 @@ class SampleDecoder:
     def _depth(
         self,
         scene: Scene,
-        row: int,
+        address: Address,
         camera: int,
         frames: tuple[int, ...],
         encoding: DepthEncoding,
     ) -> StoredDepth:
-        """Return a camera's stored depth over frames; that of its last frame is kept."""
+        """Return a camera's stored depth over frames; that of single frames is kept."""
+        stored_at = partial(self._stored, scene, camera, run=address.run, encoding=encoding)
         if len(frames) > 1:
-            parts = [self._stored(scene, camera, frame, encoding=encoding) for frame in frames]
+            parts = [stored_at(frame=frame) for frame in frames]
             return StoredDepth(
                 units=np.concatenate([part.units for part in parts]),
                 measured=np.concatenate([part.measured for part in parts]),
             )
-        key, frame = (row, camera), frames[0]
-        # Taken out and put back: another thread may ask for another frame of this camera.
-        kept = self._depths.pop(key, None)
-        if kept is None or kept[0] != frame:
-            kept = (frame, self._stored(scene, camera, frame, encoding=encoding))
-        self._depths[key] = kept
-        if len(self._depths) > self._most_videos:
+        key = (address.row, address.run, camera, frames[0])
+        # Taken out and put back at the end: another thread may do the same meanwhile.
+        stored = self._depths.pop(key, None)
+        if stored is None:
+            stored = stored_at(frame=frames[0])
+        self._depths[key] = stored
+        if len(self._depths) > self._most_depths:
             self._depths.popitem(last=False)
-        stored = kept[1]
+        if self._kept_frames > 1:
+            # Stored depth is kept for other pairs; what is computed from it would be too much.
+            stored = StoredDepth(stored.units, stored.measured)
         if self._is_changed:
             return StoredDepth(stored.units.copy(), stored.measured.copy())
         return stored
 
     def _stored(
-        self, scene: Scene, camera: int, frame: int, *, encoding: DepthEncoding
+        self, scene: Scene, camera: int, *, frame: int, run: int, encoding: DepthEncoding
     ) -> StoredDepth:
         """Return a camera's stored depth at a frame of its pictures, (1, h, w)."""
         size = self._request.size
@@ -277,7 +287,7 @@ class SampleDecoder:
                 np.zeros((1, height, width), dtype=bool),
             )
         stored = self._streams.read_stored_depth(
-            scene, depth_name(camera), index, encoding=encoding, size=size
+            scene, depth_name(camera), index, encoding=encoding, size=size, run=run
         )
         return StoredDepth(stored.units[None], stored.measured[None])
 

@@ -30,6 +30,9 @@ from stereogenbench_data.sources.ranged_file import MemberFile, RangedFile
 OPEN_STREAMS: Final = 24
 """How many videos a process keeps open: two scenes with all their cameras' colour and depth."""
 
+_Place = tuple[str, int, int]
+"""Path and offset of a video, and which run of it is read."""
+
 _inherited: Final[list[object]] = []
 """Readers that came over a fork. They share file offsets with the parent, so they are neither read
 nor closed here: the operating system takes them back when the process ends."""
@@ -73,8 +76,24 @@ class _PictureMemory:
 class _Stream:
     reader: Any  # a VideoReader or, of depth that blosc2 packed, DepthFrames
     file: Path | MemberFile
-    last: dict[Any, Any] = field(default_factory=dict)
-    memory: _PictureMemory = field(default_factory=_PictureMemory)
+    kept: OrderedDict[Any, Any] = field(default_factory=OrderedDict)
+    memories: list[_PictureMemory] = field(default_factory=list)
+
+    def keep(self, key: Any, make: Callable[[], Any], *, most: int) -> Any:
+        """Return what is kept under a key, made now unless it is there; the oldest makes room."""
+        if key not in self.kept:
+            while len(self.kept) >= most:
+                self.kept.popitem(last=False)
+            self.kept[key] = _read_only(make())
+        return self.kept[key]
+
+    def picture(self, *, height: int, width: int, most: int) -> UInt8[np.ndarray, "3 h w"]:
+        """Return an array to write a picture into, in the memory of one that nobody has."""
+        while len(self.memories) < most:
+            self.memories.append(_PictureMemory())
+        # The memory that was written longest ago comes first.
+        self.memories.append(self.memories.pop(0))
+        return self.memories[-1].picture(height=height, width=width)
 
     def close(self) -> None:
         self.reader.close()
@@ -93,32 +112,41 @@ class Streams:
         """Open videos from a source, and keep at most ``limit`` of them open."""
         self._source = source
         self._limit = limit
-        self._open: OrderedDict[tuple[str, int], _Stream] = OrderedDict()
+        self._kept_frames = 1
+        self._open: OrderedDict[_Place, _Stream] = OrderedDict()
         self._lock = threading.RLock()
         self._process = os.getpid()
 
     def rgb(
-        self, scene: Scene, name: str, index: int, *, size: tuple[int, int] | None
+        self, scene: Scene, name: str, index: int, *, size: tuple[int, int] | None, run: int = 0
     ) -> UInt8[np.ndarray, "3 h w"]:
         """Return one frame of a scene's video as RGB, scaled to (height, width) if it is given.
+
+        Each ``run`` of a video has a decoder of its own, so that several can be read by turns.
 
         Raises:
             StorageError: If the video cannot be read.
             MediaError: If it does not decode to the scene's number of colour pictures.
         """
-        with self._stream(scene, name) as stream:
-            key = (index, size)
-            if key not in stream.last:
-                stream.last = {}
+        most = self._kept_frames
+        with self._stream(scene, name, run) as stream:
+
+            def decoded() -> UInt8[np.ndarray, "3 h w"]:
                 height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
-                out = stream.memory.picture(height=height, width=width)
-                picture = read_rgb(stream.reader, index, size=size, out=out, content="colour")
-                stream.last[key] = _read_only(picture)
-            kept: UInt8[np.ndarray, "3 h w"] = stream.last[key]
+                out = stream.picture(height=height, width=width, most=most)
+                return read_rgb(stream.reader, index, size=size, out=out, content="colour")
+
+            kept: UInt8[np.ndarray, "3 h w"] = stream.keep((index, size), decoded, most=most)
             return kept
 
     def write_rgb(
-        self, scene: Scene, name: str, index: int, *, out: UInt8[np.ndarray, "3 h w"]
+        self,
+        scene: Scene,
+        name: str,
+        index: int,
+        *,
+        out: UInt8[np.ndarray, "3 h w"],
+        run: int = 0,
     ) -> None:
         """Write one frame of a scene's video as RGB, scaled to the array's height and width.
 
@@ -128,7 +156,7 @@ class Streams:
             StorageError: If the video cannot be read.
             MediaError: If it does not decode to the scene's number of colour pictures.
         """
-        with self._stream(scene, name) as stream:
+        with self._stream(scene, name, run) as stream:
             size = (out.shape[-2], out.shape[-1])
             read_rgb(stream.reader, index, size=size, out=out, content="colour")
 
@@ -140,6 +168,7 @@ class Streams:
         *,
         encoding: DepthEncoding,
         size: tuple[int, int] | None = None,
+        run: int = 0,
     ) -> StoredDepth:
         """Return one depth frame of a scene's video, (h, w): stored numbers, where measured.
 
@@ -149,16 +178,16 @@ class Streams:
             index: Which frame of the file; `depth_frame_index` tells which an RGB frame needs.
             encoding: The depth contract.
             size: (height, width) to take the nearest pixels of, None for the stored size.
+            run: As for `rgb`.
 
         Raises:
             StorageError: If the video cannot be read.
             MediaError: If it is not one that the encoding describes or does not decode.
         """
-        with self._stream(scene, name) as stream:
-            if index not in stream.last:
-                units = read_depth_units(stream.reader, index, encoding=encoding)
-                stream.last = {index: _read_only(units)}
-            units = stream.last[index]
+        with self._stream(scene, name, run) as stream:
+            units = stream.keep(
+                index, partial(read_depth_units, stream.reader, index, encoding=encoding), most=1
+            )
             pixel_format = stream.reader.facts.pixel_format
         if size is not None:
             units = resized_nearest(units, size=size)
@@ -170,16 +199,16 @@ class Streams:
         is_own = os.getpid() == self._process
         return StreamStats(len(self._open) if is_own else 0, self._limit)
 
-    def keep(self, limit: int) -> None:
-        """Keep at most so many videos open from now on."""
-        self._limit = limit
+    def keep(self, limit: int, *, frames: int = 1) -> None:
+        """Keep at most so many videos open from now on, and so many pictures of each."""
+        self._limit, self._kept_frames = limit, frames
 
-    def release(self, scene: Scene) -> None:
-        """Close a scene's videos, of which no more is wanted for now."""
+    def release(self, scene: Scene, *, run: int = 0) -> None:
+        """Close the videos of a scene's run, of which no more is wanted for now."""
         self._drop_inherited()
         with self._lock:
             for member in scene.members.values():
-                stream = self._open.pop((member.path, member.offset), None)
+                stream = self._open.pop((member.path, member.offset, run), None)
                 if stream is not None:
                     stream.close()
 
@@ -191,12 +220,12 @@ class Streams:
                 self._open.popitem()[1].close()
 
     @contextmanager
-    def _stream(self, scene: Scene, name: str) -> Iterator[_Stream]:
+    def _stream(self, scene: Scene, name: str, run: int) -> Iterator[_Stream]:
         """Yield an open video; it stays open unless reading it fails."""
         self._drop_inherited()
         with self._lock:
             member, name = scene.member(name), scene.held_name(name)
-            place = (member.path, member.offset)
+            place = (member.path, member.offset, run)
             if place not in self._open:
                 while len(self._open) >= self._limit:
                     self._open.popitem(last=False)[1].close()

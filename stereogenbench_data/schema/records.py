@@ -237,6 +237,8 @@ class Scene:
             packed by blosc2.
         depth_pixel_format: FFmpeg's name of the pixel format of each camera's depth.
         frames: The number of frames in every video and in the trajectory.
+        key_frames: The frames, ascending from 0, at which the decoding of all cameras' pictures
+            can begin.
         members: File name to the place of its bytes. Depth packed by blosc2 has a name of its own,
             which `held_name` returns.
     """
@@ -255,6 +257,7 @@ class Scene:
     depth_pixel_format: tuple[str, ...]
     valid_depth_ratio: float | None
     members: Mapping[str, Member] = field(hash=False)
+    key_frames: tuple[int, ...] = (0,)
 
     def held_name(self, name: str) -> str:
         """Return the name in ``members`` of one of the release's files: depth may be packed."""

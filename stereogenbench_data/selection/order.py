@@ -1,26 +1,35 @@
 """The order of an epoch: which samples make up batch n, as arithmetic on integers.
 
-The order is a pure function of the selection's scenes and samples, the seed, the epoch, the batch
-size, the shuffle groups and the open scenes; ranks and workers are not in it. A permutation of the
-scenes, laid end to end, is cut into shuffle groups of equally many samples; group g gives the
-batches n with n mod groups = g. A group deals its scenes to as many streams as it keeps scenes
-open, and interleaves the streams so that each advances evenly, at a pace of its own, to the group's
-end. Within a scene samples ascend: a process that gets every batch of a group opens each video once
-and reads it forwards once. A cut between groups may part a scene: groups - 1 scenes at the most.
+The order is a pure function of the selection's runs, the seed, the epoch and the rule; ranks and
+workers are not in it. A run is what decodes by itself: the samples from one key frame of a scene to
+the next, so a whole scene where its videos have one key frame. A permutation of the runs, laid end
+to end, is cut into shuffle groups of equally many samples; group g gives the batches n with
+n mod groups = g. A group deals its runs to as many streams as it keeps runs open, and interleaves
+the streams so that each advances evenly, at a pace of its own, to the group's end. A stream starts
+inside its first run, at a moment of its own, and reads what lies before it at its end: else the
+first batches would show first frames alone, and all streams would stay in step.
 
-Random numbers are the raw stream of PCG64, which numpy keeps the same for ever.
+Within a run moments ascend: a process that gets every batch of a group decodes each run once, but
+for what is skipped to reach the moment at which a stream starts. Where several samples show a
+moment (all pairs), so many neighbouring moments are interleaved as the rule has open frames.
+A cut between groups may part a run: groups - 1 runs at the most.
+
+No more than a few thousand samples are ordered at a time, so memory and time until the first batch
+grow with the runs, not with the samples. Random numbers are the raw stream of PCG64, which numpy
+keeps the same for ever.
 """
 
 import heapq
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt64
+from jaxtyping import Bool, Float64, Int64, UInt64
 
 from stereogenbench_data.errors import SelectionError
 
-ORDER_VERSION: Final = 2
+ORDER_VERSION: Final = 3
 """Changes whenever the same arguments give another order; a saved state names it."""
 
 SHUFFLE_GROUPS: Final = 4
@@ -28,16 +37,45 @@ GROUPS_OF_LARGE: Final = 2
 """Where scenes are so large that memory limits how many are open: two workers have one each."""
 
 OPEN_SCENES: Final = 16
-"""Fewer open scenes than this make batches of small size too much alike."""
+"""Fewer open runs than this make batches of small size too much alike."""
 
 DRIFT: Final = 0.1
 """How far a stream's pace may differ from the mean, so that streams do not run in step."""
 
+_CHUNK: Final = 1 << 15
+"""About so many samples of a group are ordered at a time."""
+
+_MANY_RUNS: Final = 32
+"""So many runs a stream are dealt out in their order; fewer so that streams are equally long."""
+
 _TAG: Final = 0x0D3B
+_MIX: Final = np.uint64(0x9E3779B97F4A7C15)
+"""Fibonacci hashing: 2**64 over the golden ratio (Knuth, TAOCP 3, 6.4)."""
 
 OrderKind = Literal["shuffled", "sequential"]
+Start = Literal["anywhere", "beginning"]
 Tail = Literal["drop", "wrap", "uneven"]
 Numbers = Int64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Runs:
+    """The runs of a selection, in the order of its samples.
+
+    Attributes:
+        first_sample: (r + 1,) int64, the number of each run's first sample, and how many there are.
+        pairs: (r,) int64, how many samples show each moment of the run. The samples of a run are
+            numbered moment by moment.
+    """
+
+    first_sample: Int64[np.ndarray, " r1"]
+    pairs: Int64[np.ndarray, " r"]
+
+    @property
+    def lengths(self) -> Numbers:
+        """How many samples each run has."""
+        lengths: Numbers = np.diff(self.first_sample)
+        return lengths
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +85,15 @@ class OrderRule:
     Attributes:
         batch_size: Samples in a batch.
         seed: The seed of the order.
-        shuffle_groups: Into how many groups the scenes are parted; fewer where a group would have
-            fewer scenes than a batch can show.
-        open_scenes: How many scenes a group interleaves. Fewer than `OPEN_SCENES` are never
+        shuffle_groups: Into how many groups the runs are parted; fewer where a group would have
+            fewer runs than a batch can show.
+        open_scenes: How many runs a group interleaves. Fewer than `OPEN_SCENES` are never
             exceeded. From there on there may be more, up to twice as many where a group has fewer
             than twice as many, so that its streams are equally long and batches equally mixed.
+        open_frames: How many neighbouring moments of a run are interleaved, where several samples
+            show a moment.
+        start: Where in its first run each stream starts: "anywhere", at a moment drawn at random,
+            which is reached by decoding what lies before it twice; or at its "beginning".
         kind: "shuffled", or "sequential": by the samples' numbers.
     """
 
@@ -59,23 +101,33 @@ class OrderRule:
     seed: int = 0
     shuffle_groups: int = SHUFFLE_GROUPS
     open_scenes: int = OPEN_SCENES
+    open_frames: int = 1
+    start: Start = "anywhere"
     kind: OrderKind = "shuffled"
 
     def __post_init__(self) -> None:
-        """Require numbers in their ranges and a known kind."""
-        options = {"batch_size": 1, "seed": 0, "shuffle_groups": 1, "open_scenes": 1}
-        for name, least in options.items():
+        """Require numbers in their ranges, and a known kind and start."""
+        least_of = {
+            "batch_size": 1,
+            "seed": 0,
+            "shuffle_groups": 1,
+            "open_scenes": 1,
+            "open_frames": 1,
+        }
+        for name, least in least_of.items():
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise SelectionError(f"{name} must be a whole number from {least}, got {value!r}.")
         if self.kind not in ("shuffled", "sequential"):
             raise SelectionError(f"order must be 'shuffled' or 'sequential', got {self.kind!r}.")
+        if self.start not in ("anywhere", "beginning"):
+            raise SelectionError(f"start must be 'anywhere' or 'beginning', got {self.start!r}.")
 
     def groups_of(self, lengths: Numbers) -> int:
-        """Return into how many groups scenes of so many samples are parted.
+        """Return into how many groups runs of so many samples are parted.
 
-        So few that the longest scene need not come twice in a batch, but two at least, of two
-        scenes each, so that two processes need not decode the same; and a divisor of
+        So few that the longest run need not come twice in a batch, but two at least, of two
+        runs each, so that two processes need not decode the same; and a divisor of
         ``shuffle_groups``, so that processes that share those out share these too.
         """
         if self.kind == "sequential":
@@ -86,38 +138,43 @@ class OrderRule:
         most = min(self.shuffle_groups, max(at_least, as_long_as_the_longest // shown))
         return max(count for count in range(1, most + 1) if self.shuffle_groups % count == 0)
 
-    def in_effect(self, lengths: Numbers) -> "OrderRule":
-        """Return what the order of scenes of so many samples depends on: equal for equal orders.
+    def in_effect(self, runs: Runs) -> "OrderRule":
+        """Return what the order of such runs depends on: equal for equal orders.
 
-        Few scenes have fewer groups and open scenes than requested; a sequential
-        order depends on the batch size alone.
+        Few runs have fewer groups and open runs than requested; a sequential order depends on the
+        batch size alone.
         """
         if self.kind == "sequential":
             return OrderRule(self.batch_size, shuffle_groups=1, open_scenes=1, kind="sequential")
-        most = self._most_scenes(lengths)
+        lengths = runs.lengths
+        shares_moments = bool((runs.pairs > 1).any())
+        has_later_moments = bool((lengths > runs.pairs).any())
+        most = self._most_runs(lengths)
         all_are_open = self.streams_of(most) == most
         return replace(
             self,
             shuffle_groups=self.groups_of(lengths),
             open_scenes=len(lengths) if all_are_open else self.open_scenes,
+            open_frames=self.open_frames if shares_moments and has_later_moments else 1,
+            start=self.start if has_later_moments else "anywhere",
         )
 
-    def streams_of(self, scenes: int) -> int:
-        """Return how many of a group's scenes are open at a time: one in each stream."""
+    def streams_of(self, runs: int) -> int:
+        """Return how many of a group's runs are open at a time: one in each stream."""
         if self.open_scenes < OPEN_SCENES:
-            return min(scenes, self.open_scenes)
-        return -(-scenes // max(1, scenes // self.open_scenes))
+            return min(runs, self.open_scenes)
+        return -(-runs // max(1, runs // self.open_scenes))
 
     def most_open(self, lengths: Numbers) -> int:
-        """Return a bound on the scenes that one group of a selection has open at a time."""
-        most = self._most_scenes(lengths)
+        """Return a bound on the runs that one group of a selection has open at a time."""
+        most = self._most_runs(lengths)
         if self.open_scenes < OPEN_SCENES:
             return self.streams_of(most)
         in_turn = max(1, most // self.open_scenes // 2)
         return min(most, self.open_scenes + self.open_scenes // in_turn)
 
-    def _most_scenes(self, lengths: Numbers) -> int:
-        """Return a bound on the scenes of a group: the shortest ones, and parts of two others."""
+    def _most_runs(self, lengths: Numbers) -> int:
+        """Return a bound on the runs of a group: the shortest ones, and parts of two others."""
         samples = int(lengths.sum())
         batches_of_all = -(-samples // self.batch_size)
         turns = -(-batches_of_all // self.groups_of(lengths))
@@ -127,7 +184,7 @@ class OrderRule:
 
 
 class EpochOrder:
-    """The batches of one epoch by their number; a group is ordered when first asked for.
+    """The batches of one epoch by their number; a group is prepared when first asked for.
 
     Attributes:
         samples: How many samples the epoch has.
@@ -135,15 +192,15 @@ class EpochOrder:
         groups: How many shuffle groups it has.
     """
 
-    def __init__(self, first_sample: Int64[np.ndarray, " s1"], rule: OrderRule, *, epoch: int):
-        """Take the number of each scene's first sample, with that of all samples at the end."""
+    def __init__(self, runs: Runs, rule: OrderRule, *, epoch: int):
+        """Take the runs of a selection."""
         self.rule = rule
         self.epoch = epoch
-        self.samples = int(first_sample[-1])
+        self.runs = runs
+        self.samples = int(runs.first_sample[-1])
         self.batches = -(-self.samples // rule.batch_size)
-        self.groups = rule.groups_of(np.diff(first_sample))
-        self._first_sample = first_sample
-        self._groups: dict[int, Numbers] = {}
+        self.groups = rule.groups_of(runs.lengths)
+        self._groups: dict[int, _Group] = {}
 
     def batch(self, number: int) -> Numbers:
         """Return the samples of a batch, in its order.
@@ -151,13 +208,15 @@ class EpochOrder:
         Raises:
             IndexError: If there is no such batch.
         """
-        if not 0 <= number < self.batches:
-            raise IndexError(f"no batch {number}: the epoch has {self.batches}")
-        size = self.rule.batch_size
-        if self.rule.kind == "sequential":
-            return np.arange(number * size, min(self.samples, (number + 1) * size))
-        turn, group = divmod(number, self.groups)
-        return self.group(group)[turn * size : (turn + 1) * size]
+        return self._batch(number)[0]
+
+    def ends_run(self, number: int) -> Bool[np.ndarray, " n"]:
+        """Return which samples of a batch are the last that its group reads of a run.
+
+        Raises:
+            IndexError: If there is no such batch.
+        """
+        return self._batch(number)[1]
 
     def full_batch(self, number: int) -> Numbers:
         """Return a batch that is never short: after the last sample the epoch starts again."""
@@ -169,47 +228,49 @@ class EpochOrder:
 
     def group(self, group: int) -> Numbers:
         """Return all samples of a shuffle group, in its order."""
+        found = self._group(group)
+        return found.samples(0, found.length)[0]
+
+    def _batch(self, number: int) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
+        if not 0 <= number < self.batches:
+            raise IndexError(f"no batch {number}: the epoch has {self.batches}")
+        size = self.rule.batch_size
+        if self.rule.kind == "sequential":
+            samples = np.arange(number * size, min(self.samples, (number + 1) * size))
+            after = np.searchsorted(self.runs.first_sample, samples + 1)
+            return samples, self.runs.first_sample[after] == samples + 1
+        turn, group = divmod(number, self.groups)
+        found = self._group(group)
+        return found.samples(turn * size, min(found.length, (turn + 1) * size))
+
+    def _group(self, group: int) -> "_Group":
         if group not in self._groups:
-            self._groups[group] = self._ordered(group)
+            self._groups[group] = _Group(self, self._pieces(group), group=group)
         return self._groups[group]
 
-    def scenes_of(self, numbers: Int64[np.ndarray, "*n"]) -> Int64[np.ndarray, "*n"]:
-        """Return the place of each sample's scene in the selection."""
-        scenes: Int64[np.ndarray, "*n"] = (
-            np.searchsorted(self._first_sample, numbers, side="right") - 1
-        )
-        return scenes
+    @cached_property
+    def _permuted(self) -> tuple[Numbers, Numbers]:
+        """The runs in the order of the epoch, and how many samples they and those before have."""
+        raw = self.raw(len(self.runs.pairs), part=0)
+        runs: Numbers = np.argsort(raw, kind="stable")
+        ends: Numbers = np.cumsum(self.runs.lengths[runs])
+        return runs, ends
 
-    def _ordered(self, group: int) -> Numbers:
-        begins, lengths = self._pieces(group)
-        if len(lengths) == 0:
-            return np.empty(0, dtype=np.int64)
-        count = self.rule.streams_of(len(lengths))
-        stream = _assign(lengths, streams=count)
-        draws = _uniform(self._raw(2 * count, part=group + 1))
-        numbers, times = [], []
-        for number, (phase, pace) in enumerate(zip(draws[:count], draws[count:], strict=True)):
-            pieces = np.flatnonzero(stream == number)
-            found = _runs(begins[pieces], lengths[pieces])
-            place = (np.arange(len(found)) + phase) / len(found)
-            numbers.append(found)
-            times.append(place + DRIFT * (2 * pace - 1) * place * (1 - place))
-        merged = np.argsort(np.concatenate(times), kind="stable")
-        ordered: Numbers = np.concatenate(numbers)[merged]
-        return ordered
-
-    def _pieces(self, group: int) -> tuple[Numbers, Numbers]:
-        """Return first sample and length of each scene, or part of one, of a group."""
+    def _pieces(self, group: int) -> "_Pieces":
+        """Return the runs of a group, the first and last of which may be cut."""
         cuts = np.concatenate([[0], np.cumsum(self._group_sizes())])
         low, high = int(cuts[group]), int(cuts[group + 1])
-        scenes = np.argsort(self._raw(len(self._first_sample) - 1, part=0), kind="stable")
-        lengths = np.diff(self._first_sample)[scenes]
-        ends = np.cumsum(lengths)
-        starts = ends - lengths
-        inside = (ends > low) & (starts < high)
-        skipped = np.maximum(low - starts[inside], 0)
-        taken = np.minimum(ends[inside], high) - np.maximum(starts[inside], low)
-        return self._first_sample[scenes[inside]] + skipped, taken
+        if low == high:
+            return _Pieces(*np.empty((3, 0), dtype=np.int64))
+        runs, ends = self._permuted
+        first = int(np.searchsorted(ends, low, side="right"))
+        last = int(np.searchsorted(ends, high, side="left"))
+        inside = runs[first : last + 1]
+        begins = np.zeros(len(inside), dtype=np.int64)
+        stops = self.runs.lengths[inside]
+        stops[-1] -= int(ends[last]) - high
+        begins[0] = low - (int(ends[first - 1]) if first else 0)
+        return _Pieces(inside, begins, stops)
 
     def _group_sizes(self) -> Numbers:
         """Return how many samples each group has: whole batches, but for the epoch's last."""
@@ -219,12 +280,151 @@ class EpochOrder:
         sizes[(self.batches - 1) % self.groups] -= self.batches * size - self.samples
         return sizes
 
-    def _raw(self, count: int, *, part: int) -> UInt64[np.ndarray, " n"]:
+    def raw(self, count: int, *, part: int) -> UInt64[np.ndarray, " n"]:
+        """Return random numbers of a part of the epoch."""
         entropy = (self.rule.seed, self.epoch, _TAG, part + 1)
         raw: UInt64[np.ndarray, " n"] = np.random.PCG64(np.random.SeedSequence(entropy)).random_raw(
             count
         )
         return raw
+
+
+class _Pieces(NamedTuple):
+    """Runs, or parts of them: (p,) int64 each, places from ``begin`` up to ``stop`` of the run."""
+
+    run: Numbers
+    begin: Numbers
+    stop: Numbers
+
+    def take(self, places: Numbers) -> "_Pieces":
+        return _Pieces(self.run[places], self.begin[places], self.stop[places])
+
+
+class _Group:
+    """One shuffle group: streams of pieces, merged by the times of their samples.
+
+    Sample i of a stream of n is due at time t = p + d p (1 - p), p = (i + offset) / n, where offset
+    and d are the stream's own: from 0 to 1, ascending, as |d| < 1. Chunks of equal times are sorted
+    when they are asked for; how many samples of a stream come before a chunk is had by inverting t.
+    """
+
+    def __init__(self, order: EpochOrder, pieces: _Pieces, *, group: int) -> None:
+        self._runs = order.runs
+        self._rule = order.rule
+        self.length = int((pieces.stop - pieces.begin).sum())
+        count = order.rule.streams_of(len(pieces.run))
+        draws = _uniform(order.raw(3 * count, part=group + 1)).reshape(3, count)
+        self._offset, self._drift = draws[0], DRIFT * (2 * draws[1] - 1)
+        self._salt = int(order.raw(1, part=-1)[0])
+        streams = [pieces.take(found) for found in _dealt(pieces, streams=count)]
+        if order.rule.start == "anywhere":
+            # Evenly spread over the streams, so that few streams are apart, too.
+            starts = (np.argsort(draws[2]) + draws[2]) / max(1, count)
+            streams = [
+                self._started(stream, share)
+                for stream, share in zip(streams, starts.tolist(), strict=True)
+            ]
+        self._streams = streams
+        self._ends = [np.cumsum(stream.stop - stream.begin) for stream in streams]
+        self._lengths = np.array([int(ends[-1]) for ends in self._ends], dtype=np.int64)
+        self._before = self._samples_before()
+        self._starts = self._before.sum(axis=1)
+        self._chunks: dict[int, tuple[Numbers, Bool[np.ndarray, " n"]]] = {}
+
+    def samples(self, start: int, stop: int) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
+        """Return samples of the group by their places, and which are the last of a piece."""
+        found, is_last = [np.empty(0, dtype=np.int64)], [np.empty(0, dtype=bool)]
+        chunk = int(np.searchsorted(self._starts, start, side="right")) - 1
+        while start < stop:
+            samples, ends = self._chunk(chunk)
+            begin = start - int(self._starts[chunk])
+            end = min(stop, int(self._starts[chunk + 1])) - int(self._starts[chunk])
+            found.append(samples[begin:end])
+            is_last.append(ends[begin:end])
+            start, chunk = start + end - begin, chunk + 1
+        return np.concatenate(found), np.concatenate(is_last)
+
+    def _chunk(self, number: int) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
+        if number not in self._chunks:
+            if len(self._chunks) > 1:
+                del self._chunks[next(iter(self._chunks))]
+            samples, ends, times = [], [], []
+            for stream, (low, high) in enumerate(
+                zip(self._before[number], self._before[number + 1], strict=True)
+            ):
+                places = np.arange(low, high)
+                times.append(self._times(stream, places))
+                found, is_last = self._samples_of(stream, places)
+                samples.append(found)
+                ends.append(is_last)
+            merged = np.argsort(np.concatenate(times), kind="stable")
+            self._chunks[number] = np.concatenate(samples)[merged], np.concatenate(ends)[merged]
+        return self._chunks[number]
+
+    def _times(
+        self, stream: int | slice, places: Int64[np.ndarray, "*n"]
+    ) -> Float64[np.ndarray, "*n"]:
+        share = (places + self._offset[stream]) / self._lengths[stream]
+        times: Float64[np.ndarray, "*n"] = share + self._drift[stream] * share * (1 - share)
+        return times
+
+    def _samples_before(self) -> Int64[np.ndarray, "c1 s"]:
+        """Return how many samples of each stream are due before each chunk, and in all."""
+        chunks = max(1, round(self.length / _CHUNK))
+        times = (np.arange(1, chunks) / chunks)[:, None]
+        slope = 1 + self._drift
+        share = 2 * times / (slope + np.sqrt(slope**2 - 4 * self._drift * times))
+        before = np.ceil(share * self._lengths - self._offset).astype(np.int64)
+        before = np.clip(before, 0, self._lengths)
+        # The root is exact but for rounding: the times themselves decide.
+        every = slice(None)
+        while (late := (before > 0) & (self._times(every, before - 1) >= times)).any():
+            before -= late
+        while (early := (before < self._lengths) & (self._times(every, before) < times)).any():
+            before += early
+        none = np.zeros((1, len(self._lengths)), dtype=np.int64)
+        return np.concatenate([none, before, self._lengths[None]])
+
+    def _samples_of(self, stream: int, places: Numbers) -> tuple[Numbers, Bool[np.ndarray, " n"]]:
+        """Return the samples at places of a stream, and which are the last of their piece."""
+        pieces, ends = self._streams[stream], self._ends[stream]
+        piece = np.searchsorted(ends, places, side="right")
+        place = pieces.stop[piece] - (ends[piece] - places)
+        run = pieces.run[piece]
+        return self._in_run(run, place), places + 1 == ends[piece]
+
+    def _in_run(self, run: Numbers, place: Numbers) -> Numbers:
+        """Return the sample at a place of a run: blocks of moments, each pair by pair.
+
+        In a block the moments take turns, and each begins with a pair of its own.
+        """
+        first, pairs = self._runs.first_sample[run], self._runs.pairs[run]
+        if (pairs == 1).all():
+            plain: Numbers = first + place
+            return plain
+        moments = (self._runs.first_sample[run + 1] - first) // pairs
+        block, inside = np.divmod(place, pairs * self._rule.open_frames)
+        opened = np.minimum(self._rule.open_frames, moments - block * self._rule.open_frames)
+        turn, within = np.divmod(inside, opened)
+        moment = block * self._rule.open_frames + within
+        mixed = (run.astype(np.uint64) + np.uint64(self._salt)) * _MIX
+        first_pair = (mixed >> np.uint64(40)).astype(np.int64) + moment
+        samples: Numbers = first + moment * pairs + (first_pair + turn) % pairs
+        return samples
+
+    def _started(self, stream: _Pieces, share: float) -> _Pieces:
+        """Return a stream that starts inside its first piece and ends with what lies before."""
+        run, begin, stop = int(stream.run[0]), int(stream.begin[0]), int(stream.stop[0])
+        pairs = int(self._runs.pairs[run])
+        block = pairs * self._rule.open_frames if pairs > 1 else 1
+        start = -(-int(begin + share * (stop - begin)) // block) * block
+        if not begin < start < stop:
+            return stream
+        return _Pieces(
+            np.append(stream.run, run),
+            np.concatenate([[start], stream.begin[1:], [begin]]),
+            np.append(stream.stop, start),
+        )
 
 
 def last_batch(
@@ -259,60 +459,29 @@ def rank_share(start: int, end: int, *, rank: int, world_size: int) -> range:
     return range(start + (rank - start) % world_size, end, world_size)
 
 
-def _assign(lengths: Numbers, *, streams: int) -> Numbers:
-    """Return each piece's stream: the longest piece first, each to the shortest stream."""
-    stream = np.empty(len(lengths), dtype=np.int64)
+def _dealt(pieces: _Pieces, *, streams: int) -> list[Numbers]:
+    """Return the pieces of each stream: about equally many samples in each.
+
+    Many pieces are cut into streams as they come. Of few, the longest goes first, each to the
+    shortest stream.
+    """
+    lengths = pieces.stop - pieces.begin
+    if streams == 0:
+        return []
+    if len(lengths) >= _MANY_RUNS * streams and lengths.max() * streams <= lengths.sum():
+        ends = np.cumsum(lengths)
+        shares = ends[-1] * np.arange(1, streams) // streams
+        return np.split(np.arange(len(lengths)), np.searchsorted(ends, shares) + 1)
+    dealt: list[list[int]] = [[] for _ in range(streams)]
     loads = [(0, number) for number in range(streams)]
     for piece in np.argsort(-lengths, kind="stable").tolist():
         load, number = loads[0]
         heapq.heapreplace(loads, (load + int(lengths[piece]), number))
-        stream[piece] = number
-    return stream
-
-
-def _runs(begins: Numbers, lengths: Numbers) -> Numbers:
-    """Return begin, begin + 1, ... of each run, one run after another."""
-    offsets = np.cumsum(lengths) - lengths
-    runs: Numbers = np.repeat(begins - offsets, lengths)
-    runs += np.arange(len(runs))
-    return runs
+        dealt[number].append(piece)
+    return [np.sort(np.array(own, dtype=np.int64)) for own in dealt]
 
 
 def _uniform(raw: UInt64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     """Return numbers from 0 up to 1 made of the upper 53 bits."""
     uniform: Float64[np.ndarray, " n"] = (raw >> np.uint64(11)) * 2.0**-53
     return uniform
-
-
-class OrderQuality(NamedTuple):
-    """How well an order shuffles.
-
-    Attributes:
-        fewest_scenes: Different scenes in the full batch that has fewest.
-        mean_scenes: Different scenes in a full batch, on average.
-        neighbour_correlation: Pearson's correlation between the numbers of samples that follow one
-            another: 1 for the plan's own order, near 0 for a good shuffle.
-    """
-
-    fewest_scenes: int
-    mean_scenes: float
-    neighbour_correlation: float
-
-
-def order_quality(order: EpochOrder, *, batches: int = 10_000) -> OrderQuality:
-    """Return how well an order shuffles, from the first so many full batches of the epoch.
-
-    >>> from stereogenbench_data.selection.order import EpochOrder, OrderRule
-    >>> scenes = np.arange(65) * 81
-    >>> order_quality(EpochOrder(scenes, OrderRule(16, kind="sequential"), epoch=0)).fewest_scenes
-    1
-    >>> order_quality(EpochOrder(scenes, OrderRule(16), epoch=0)).fewest_scenes
-    14
-    """
-    full = min(batches, order.samples // order.rule.batch_size)
-    numbers = np.array([order.batch(number) for number in range(full)])
-    scenes = np.sort(order.scenes_of(numbers), axis=-1)
-    different = 1 + (np.diff(scenes, axis=-1) != 0).sum(axis=-1)
-    flat = numbers.ravel().astype(np.float64)
-    correlation = np.corrcoef(flat[:-1], flat[1:])[0, 1]
-    return OrderQuality(int(different.min()), float(different.mean()), float(correlation))

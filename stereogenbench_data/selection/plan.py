@@ -8,7 +8,7 @@ import hashlib
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypedDict, Unpack, cast
+from typing import Any, Final, Literal, NamedTuple, TypedDict, Unpack, cast
 
 import numpy as np
 from jaxtyping import Int64
@@ -18,6 +18,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.selection.balance import Balance, balanced
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.selection.order import Runs
 from stereogenbench_data.selection.pairs import (
     BaselineSpec,
     Direction,
@@ -26,7 +27,10 @@ from stereogenbench_data.selection.pairs import (
     baselines_cm,
     choose_pairs,
 )
-from stereogenbench_data.selection.windows import FramesSpec, Windows, parse_frames
+from stereogenbench_data.selection.windows import FramesSpec, Windows, parse_frames, run_starts
+
+LEAST_RUN: Final = 8
+"""So many frames a run has at least: where key frames lie closer, opening would cost too much."""
 
 
 class PairOptions(TypedDict, total=False):
@@ -46,12 +50,16 @@ class Selection(SceneFilters, PairOptions, total=False):
 
 
 class Address(NamedTuple):
-    """Where one sample comes from."""
+    """Where one sample comes from.
+
+    ``run`` numbers what is decoded in one go, where samples are read in the order of an epoch.
+    """
 
     row: int
     source: int
     targets: tuple[int, ...]
     frames: tuple[int, ...]
+    run: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +72,7 @@ class Plan:
         scene_rows: (s,) int64, rows of the scenes, ascending.
         first_pair: (s + 1,) int64, where each scene's pairs begin in ``pairs``.
         first_sample: (s + 1,) int64, the number of each scene's first sample.
+        runs: The runs of samples between key frames, which decode by themselves.
         frame_counts: (s,) int64, the frames of each scene.
         scene_seeds: (s,) int64, a number for each scene that depends on its key alone.
         seed: The seed of what is drawn at random.
@@ -74,6 +83,7 @@ class Plan:
     scene_rows: Int64[np.ndarray, " s"]
     first_pair: Int64[np.ndarray, " s1"]
     first_sample: Int64[np.ndarray, " s1"]
+    runs: Runs
     frame_counts: Int64[np.ndarray, " s"]
     scene_seeds: Int64[np.ndarray, " s"]
     seed: int
@@ -91,6 +101,7 @@ class Plan:
             self.scene_rows,
             self.first_pair,
             self.first_sample,
+            self.runs.first_sample,
             self.frame_counts,
             self.scene_seeds,
         ):
@@ -98,10 +109,17 @@ class Plan:
             digest.update(np.ascontiguousarray(numbers, dtype="<i8").tobytes())
         return digest.hexdigest()
 
-    def is_last_of_scene(self, number: int) -> bool:
-        """Return whether a sample is its scene's last."""
-        place = int(np.searchsorted(self.first_sample, number + 1))
-        return int(self.first_sample[place]) == number + 1
+    def scenes_of(self, numbers: Int64[np.ndarray, "*n"]) -> Int64[np.ndarray, "*n"]:
+        """Return the place of each sample's scene among the scenes of the plan."""
+        scenes: Int64[np.ndarray, "*n"] = (
+            np.searchsorted(self.first_sample, numbers, side="right") - 1
+        )
+        return scenes
+
+    def pairs_of(self, scenes: Int64[np.ndarray, "*n"]) -> Int64[np.ndarray, "*n"]:
+        """Return how many samples show each moment of scenes, by their places in the plan."""
+        pairs: Int64[np.ndarray, "*n"] = self.first_pair[scenes + 1] - self.first_pair[scenes]
+        return pairs
 
     def locate(self, number: int, *, epoch: int) -> Address:
         """Return where a sample comes from; only random frames depend on the epoch.
@@ -125,6 +143,7 @@ class Plan:
             source=int(self.pairs.source[first + pair]),
             targets=tuple(int(target) for target in targets if target >= 0),
             frames=frames,
+            run=int(np.searchsorted(self.runs.first_sample, number, side="right")) - 1,
         )
 
 
@@ -215,21 +234,37 @@ def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) ->
     first_pair = np.append(starts, len(pairs)).astype(np.int64)
     frame_counts = index.column("frames")[scene_rows].astype(np.int64)
     keys = index.column("key")[scene_rows]
+    pairs_of = np.diff(first_pair)
+    kinds, kind_of_row = index.key_frames()
+    kind = kind_of_row[scene_rows]
     per_scene = np.empty(len(scene_rows), dtype=np.int64)
-    for frames in np.unique(frame_counts):
-        same = frame_counts == frames
+    run_counts = np.empty(len(scene_rows), dtype=np.int64)
+    classes: list[tuple[np.ndarray, tuple[int, ...]]] = []
+    for frames, which in sorted(set(zip(frame_counts.tolist(), kind.tolist(), strict=True))):
+        same = (frame_counts == frames) & (kind == which)
         try:
-            per_scene[same] = windows.count(int(frames))
+            per_scene[same] = windows.count(frames)
         except SelectionError as error:
             others = f" and {same.sum() - 1} more" if same.sum() > 1 else ""
             raise SelectionError(f"{keys[same][0]}{others}: {error}") from error
-    samples = np.concatenate([[0], np.cumsum(np.diff(first_pair) * per_scene)])
+        starts_of = run_starts(windows, frames=frames, key_frames=kinds[which], least=LEAST_RUN)
+        run_counts[same] = len(starts_of)
+        classes.append((same, starts_of))
+    first_sample = np.concatenate([[0], np.cumsum(pairs_of * per_scene)]).astype(np.int64)
+    first_run = np.concatenate([[0], np.cumsum(run_counts)])
+    first_of_run = np.empty(first_run[-1] + 1, dtype=np.int64)
+    first_of_run[-1] = first_sample[-1]
+    for same, starts_of in classes:
+        runs = first_run[:-1][same][:, None] + np.arange(len(starts_of))
+        samples = np.array(starts_of) * pairs_of[same][:, None]
+        first_of_run[runs] = first_sample[:-1][same][:, None] + samples
     return Plan(
         pairs=pairs,
         windows=windows,
         scene_rows=scene_rows,
         first_pair=first_pair,
-        first_sample=samples.astype(np.int64),
+        first_sample=first_sample,
+        runs=Runs(first_of_run, np.repeat(pairs_of, run_counts)),
         frame_counts=frame_counts,
         scene_seeds=np.array([zlib.crc32(str(key).encode()) for key in keys], dtype=np.int64),
         seed=seed,

@@ -116,6 +116,28 @@ drawn at random.
 """
 
 
+def run_starts(
+    windows: Windows, *, frames: int, key_frames: Sequence[int], least: int
+) -> tuple[int, ...]:
+    """Return the windows with which runs begin: groups of windows that decode by themselves.
+
+    A run holds the windows whose first frames lie between two key frames, with ``least`` frames or
+    more from the one to the other. Frames drawn at random, of which only the number is known
+    before, are dealt evenly to as many runs.
+    """
+    count = windows.count(frames)
+    cuts = [0]
+    for key in key_frames:
+        if key - cuts[-1] >= least and frames - key >= least:
+            cuts.append(key)
+    if isinstance(windows, Random):
+        runs = min(count, len(cuts))
+        return tuple(count * number // runs for number in range(runs))
+    first = [windows.window(number, frames=frames, draw=(0,))[0] for number in range(count)]
+    run = np.searchsorted(cuts, first, side="right")
+    return tuple(np.flatnonzero(np.diff(run, prepend=-1)).tolist())
+
+
 def parse_frames(spec: Any) -> Windows:
     """Return the windows that a user's ``frames=`` asks for.
 

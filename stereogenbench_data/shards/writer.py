@@ -110,6 +110,8 @@ def row_digest(scene: Scene) -> str:
     """Return a digest of a scene's row in the index, without the places of its files."""
     row = row_of(scene)
     del row["members"], row["valid_depth_ratio"]
+    if row["key_frames"] is None:
+        del row["key_frames"]  # so that shards packed before there were such are kept
     return hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()
 
 

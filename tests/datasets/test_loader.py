@@ -22,7 +22,6 @@ from stereogenbench_data import (
 from stereogenbench_data.datasets.open_videos import (
     OpenVideosWarning,
     RepeatedDecodingWarning,
-    scenes_at_once,
     videos_per_scene,
 )
 from stereogenbench_data.samples import streams
@@ -409,7 +408,12 @@ def test_each_video_is_opened_once_and_each_frame_decoded_once(
     for rank in range(world):
         pairs = StereoPairs(small_index, pairs="all", frames="all")
         loader = pairs.loader(
-            2, shuffle_groups=shuffle_groups, rank=rank, world_size=world, tail="uneven"
+            2,
+            shuffle_groups=shuffle_groups,
+            rank=rank,
+            world_size=world,
+            tail="uneven",
+            start="beginning",
         )
         assert loader.batches.order(0).groups == min(shuffle_groups, 2)
         for _ in loader:
@@ -419,6 +423,22 @@ def test_each_video_is_opened_once_and_each_frame_decoded_once(
     assert len(counts) == 4 * 11
     assert set(counts.values()) == {1}
     assert set(map(tuple, frames.values())) == {tuple(range(7))}
+
+
+def test_a_scene_that_is_started_inside_is_decoded_to_its_end_and_then_its_beginning(
+    small_index, opened
+):
+    counts, frames = opened
+    pairs = StereoPairs(small_index, pairs="all", frames="all")
+    loader = pairs.loader(2, tail="uneven")
+    for _ in loader:
+        pass
+    pairs.close()
+
+    assert max(counts.values()) == 2
+    for found in frames.values():
+        start = found[0]
+        assert found == [*range(start, 7), *range(start)]
 
 
 @pytest.mark.parametrize(("workers", "shuffle_groups"), [(1, 2), (2, 2), (2, 4)])
@@ -441,6 +461,7 @@ def test_workers_among_which_groups_are_dealt_open_each_video_once(
         num_workers=workers,
         multiprocessing_context="fork",
         tail="uneven",
+        start="beginning",
     )
     assert loader.batches.order(0).groups == 2
     batches = list(loader)
@@ -560,7 +581,6 @@ def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
     assert pairs.loader(4).batches.rule.shuffle_groups == shuffle_groups
     assert pairs.loader(4, num_workers=3).batches.rule == pairs.loader(4).batches.rule
     others = StereoPairs(index, **(options | {"fields": ("depth",)}))
-    assert scenes_at_once(index, others.plan) == scenes_at_once(index, pairs.plan)
-    assert pairs.loader(4, open_scenes=7, shuffle_groups=6).batches.rule == OrderRule(
-        4, shuffle_groups=6, open_scenes=7
-    )
+    assert others.loader(4).batches.rule == pairs.loader(4).batches.rule
+    given = pairs.loader(4, open_scenes=7, shuffle_groups=6, open_frames=2).batches.rule
+    assert given == OrderRule(4, shuffle_groups=6, open_scenes=7, open_frames=2)

@@ -2,7 +2,7 @@
 
 import hashlib
 import itertools
-import time
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -13,8 +13,8 @@ from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.selection.order import (
     EpochOrder,
     OrderRule,
+    Runs,
     last_batch,
-    order_quality,
     rank_share,
 )
 
@@ -22,10 +22,21 @@ WORLDS, WORKERS = range(1, 6), range(5)
 KINDS = ("shuffled", "sequential")
 
 
-def order_of(lengths, *, epoch=0, **rule):
-    """Return the order of scenes with so many samples each."""
-    first_sample = np.concatenate([[0], np.cumsum(lengths)])
-    return EpochOrder(first_sample, OrderRule(**({"batch_size": 16} | rule)), epoch=epoch)
+def runs_of(lengths, *, pairs=1):
+    """Return runs with so many moments each, of each of which there are so many pairs."""
+    first_sample = np.concatenate([[0], np.cumsum(np.array(lengths) * pairs)])
+    return Runs(first_sample, np.full(len(lengths), pairs))
+
+
+def order_of(lengths, *, pairs=1, epoch=0, **rule):
+    """Return the order of runs with so many moments each."""
+    rule = OrderRule(**({"batch_size": 16} | rule))
+    return EpochOrder(runs_of(lengths, pairs=pairs), rule, epoch=epoch)
+
+
+def run_of(order, numbers):
+    """Return which run each sample belongs to."""
+    return np.searchsorted(order.runs.first_sample, numbers, side="right") - 1
 
 
 def all_batches(order):
@@ -54,6 +65,9 @@ rules = st.fixed_dictionaries(
         "batch_size": st.integers(1, 20),
         "shuffle_groups": st.integers(1, 6),
         "open_scenes": st.integers(1, 20),
+        "open_frames": st.integers(1, 5),
+        "pairs": st.sampled_from([1, 1, 3, 15]),
+        "start": st.sampled_from(["anywhere", "beginning"]),
         "seed": st.integers(0, 2**70),
         "epoch": st.integers(0, 9),
         "kind": st.sampled_from(KINDS),
@@ -67,53 +81,91 @@ def test_every_sample_is_in_one_batch_and_only_the_last_batch_is_short(lengths, 
     order = order_of(lengths, **rule)
     batches = all_batches(order)
 
-    assert sorted(flat(batches)) == list(range(sum(lengths)))
+    assert sorted(flat(batches)) == list(range(sum(lengths) * rule["pairs"]))
     assert all(len(batch) == rule["batch_size"] for batch in batches[:-1])
     assert 0 < len(batches[-1]) <= rule["batch_size"]
 
 
+def pieces_of(order, group):
+    """Return the places of the group's samples, part by part of its runs, in order."""
+    numbers = order.group(group)
+    runs = run_of(order, numbers)
+    return {run: numbers[runs == run] for run in set(runs.tolist())}
+
+
 @given(lengths=lengths_of_scenes, rule=rules)
 @settings(deadline=None, max_examples=100)
-def test_a_group_reads_each_of_its_scenes_forwards_and_few_are_in_two_groups(lengths, rule):
-    order = order_of(lengths, **(rule | {"kind": "shuffled"}))
-    groups_of_scene = {}
+def test_moments_of_a_run_ascend_but_for_where_a_stream_starts(lengths, rule):
+    order = order_of(lengths, **(rule | {"kind": "shuffled", "open_frames": 1}))
+    parts, goes_back = 0, 0
     for group in range(order.groups):
-        numbers = order.group(group)
-        scenes = order.scenes_of(numbers)
-        for scene in set(scenes.tolist()):
-            own = numbers[scenes == scene]
-            assert (np.diff(own) == 1).all()
-            groups_of_scene.setdefault(scene, []).append(group)
+        for run, numbers in pieces_of(order, group).items():
+            moments = (numbers - order.runs.first_sample[run]) // rule["pairs"]
+            goes_back += int((np.diff(moments) < 0).sum())
+            assert (np.diff(moments) < 0).sum() <= 1
+            parts += 1
 
-    parts = sum(map(len, groups_of_scene.values()))
-    assert len(groups_of_scene) == len(lengths)
+    streams = order.groups * order.rule.most_open(order.runs.lengths)
+    assert goes_back <= (streams if rule["start"] == "anywhere" else 0)
     assert parts - len(lengths) <= order.groups - 1
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
-@settings(deadline=None, max_examples=100)
-def test_no_more_scenes_are_open_in_a_group_than_announced(lengths, rule):
-    order = order_of([7] * len(lengths), **(rule | {"kind": "shuffled"}))
-    most = order.rule.most_open(np.full(len(lengths), 7))
+@settings(deadline=None, max_examples=60)
+def test_a_block_of_moments_is_finished_before_the_next_begins(lengths, rule):
+    rule = rule | {"kind": "shuffled", "start": "beginning"}
+    order = order_of(lengths, **rule)
     for group in range(order.groups):
-        scenes = order.scenes_of(order.group(group)).tolist()
-        first = {scene: scenes.index(scene) for scene in set(scenes)}
-        last = {scene: len(scenes) - scenes[::-1].index(scene) for scene in first}
-        for place in range(len(scenes)):
-            assert sum(first[scene] <= place < last[scene] for scene in first) <= most
+        for run, numbers in pieces_of(order, group).items():
+            moments = (numbers - order.runs.first_sample[run]) // rule["pairs"]
+            if rule["pairs"] > 1:
+                moments = moments // rule["open_frames"]
+
+            assert (np.diff(moments) >= 0).all()
 
 
-@pytest.mark.parametrize("scenes", [3, 10, 13, 64, 2123])
+@given(lengths=lengths_of_scenes, rule=rules)
+@settings(deadline=None, max_examples=60)
+def test_the_last_sample_of_each_part_of_a_run_is_marked(lengths, rule):
+    order = order_of(lengths, **(rule | {"start": "beginning"}))
+    seen, wanted = set(), set()
+    for number in range(order.batches):
+        seen |= set(order.batch(number)[order.ends_run(number)].tolist())
+    if order.rule.kind == "sequential":
+        wanted = set((order.runs.first_sample[1:] - 1).tolist())
+    else:
+        for group in range(order.groups):
+            wanted |= {int(numbers[-1]) for numbers in pieces_of(order, group).values()}
+
+    assert seen == wanted
+
+
+@given(lengths=lengths_of_scenes, rule=rules)
+@settings(deadline=None, max_examples=100)
+def test_no_more_runs_are_open_in_a_group_than_announced(lengths, rule):
+    order = order_of([7] * len(lengths), **(rule | {"kind": "shuffled", "start": "beginning"}))
+    most = order.rule.most_open(order.runs.lengths)
+    for group in range(order.groups):
+        runs = run_of(order, order.group(group)).tolist()
+        first = {run: runs.index(run) for run in set(runs)}
+        last = {run: len(runs) - runs[::-1].index(run) for run in first}
+        for place in range(len(runs)):
+            assert sum(first[run] <= place < last[run] for run in first) <= most
+
+
+@pytest.mark.parametrize("runs", [3, 10, 13, 64, 2123])
 @pytest.mark.parametrize("open_scenes", [1, 2, 4, 5, 15])
-def test_a_small_number_of_open_scenes_is_reached_and_never_exceeded(scenes, open_scenes):
-    order = order_of([7] * scenes, batch_size=1, shuffle_groups=1, open_scenes=open_scenes)
-    found = order.scenes_of(order.group(0))
-    first = np.array([np.flatnonzero(found == scene)[0] for scene in range(scenes)])
-    last = np.array([np.flatnonzero(found == scene)[-1] for scene in range(scenes)])
+def test_a_small_number_of_open_runs_is_reached_and_never_exceeded(runs, open_scenes):
+    order = order_of(
+        [7] * runs, batch_size=1, shuffle_groups=1, open_scenes=open_scenes, start="beginning"
+    )
+    found = run_of(order, order.group(0))
+    first = np.array([np.flatnonzero(found == run)[0] for run in range(runs)])
+    last = np.array([np.flatnonzero(found == run)[-1] for run in range(runs)])
     opened = np.searchsorted(np.sort(first), np.arange(len(found)), side="right")
     closed = np.searchsorted(np.sort(last), np.arange(len(found)))
 
-    assert (opened - closed).max() == min(scenes, open_scenes)
+    assert (opened - closed).max() == min(runs, open_scenes)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -203,7 +255,7 @@ def test_two_seeds_and_two_epochs_differ_from_the_first_epoch_on():
     assert len(set(orders.values())) == 16
 
 
-def test_the_order_of_version_2_never_changes():
+def test_the_order_of_version_3_never_changes():
     """If this fails, orders that users have saved positions in have changed: see ORDER_VERSION."""
     order = order_of(
         [3, 4, 5, 4, 3, 4, 5, 4], batch_size=4, shuffle_groups=2, open_scenes=2, seed=7, epoch=3
@@ -211,21 +263,30 @@ def test_the_order_of_version_2_never_changes():
 
     assert all_batches(order) == PINNED
 
-    long = order_of(np.arange(150) % 11 + 20, seed=2**40, epoch=1)
+    long = order_of(np.arange(150) % 11 + 20, seed=2**40, epoch=1, pairs=3, open_frames=2)
     numbers = np.array(flat(all_batches(long)), dtype="<i8")
     assert hashlib.sha256(numbers.tobytes()).hexdigest() == PINNED_SHA256
 
 
-PINNED_SHA256 = "61ce2c7cdae1609b7d9ed3fd51348f400b52d1f6b56ee0b0c34bf63713661be3"
+@pytest.mark.parametrize("chunk", [1, 7, 100])
+def test_how_much_is_ordered_at_a_time_changes_nothing(monkeypatch, chunk):
+    lengths = np.arange(40) % 7 + 5
+    whole = all_batches(order_of(lengths, pairs=3, batch_size=5, shuffle_groups=2))
+    monkeypatch.setattr("stereogenbench_data.selection.order._CHUNK", chunk)
+
+    assert all_batches(order_of(lengths, pairs=3, batch_size=5, shuffle_groups=2)) == whole
+
+
+PINNED_SHA256 = "b6d3bbf2da555e80c645a27ec93b21628f2ffb543145b082e2254755d4e05edc"
 PINNED = [
-    [0, 28, 1, 29],
-    [16, 20, 17, 21],
-    [2, 30, 3, 31],
-    [18, 22, 7, 23],
-    [4, 12, 5, 13],
-    [8, 24, 9, 25],
-    [6, 14, 19, 15],
-    [10, 26, 11, 27],
+    [2, 28, 3, 29],
+    [16, 22, 17, 23],
+    [4, 30, 5, 31],
+    [18, 24, 7, 25],
+    [6, 12, 19, 13],
+    [8, 26, 9, 27],
+    [0, 14, 1, 15],
+    [10, 20, 11, 21],
 ]
 
 
@@ -233,6 +294,17 @@ def test_a_sequential_order_is_that_of_the_numbers():
     order = order_of([3, 5, 2], batch_size=4, kind="sequential")
 
     assert all_batches(order) == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+
+
+def shown(order, batches, *, pairs=1, frames=81):
+    """Return scenes, moments and frame numbers of batches, (b, n) each, of scenes of such runs."""
+    numbers = np.array([order.batch(number) for number in batches])
+    moments = numbers // pairs
+    return moments // frames, moments, moments % frames
+
+
+def different(values):
+    return np.array([len(set(row)) for row in values.tolist()])
 
 
 @pytest.mark.parametrize("scenes", [64, 65, 71, 79, 90, 127, 128, 150, 400])
@@ -247,23 +319,58 @@ def test_a_batch_of_16_holds_at_least_12_scenes_of_64_or_more(scenes, lengths):
         "some pairs": generator.integers(1, 16, scenes) * 9,
     }[lengths]
     for seed in range(3):
-        assert order_quality(order_of(found, seed=seed, epoch=seed)).fewest_scenes >= 12
+        order = order_of(found, seed=seed, epoch=seed)
+        batches = range(min(1000, order.samples // 16))
+        runs = run_of(order, np.array([order.batch(number) for number in batches]))
+        assert different(runs).min() >= 12
 
 
-def test_neighbours_are_hardly_correlated():
+INDEPENDENT = np.random.default_rng(0).integers(0, 81, (4000, 16)).std(axis=1).mean()
+"""The spread of 16 frame numbers of 81 that are drawn independently, on average."""
+
+
+@pytest.mark.parametrize("scenes", [64, 320, 2000])
+def test_whole_scenes_are_not_in_step(scenes):
+    order = order_of([81] * scenes)
+    _, _, frames = shown(order, range(min(2000, order.samples // 16)))
+    spread = frames.std(axis=1)
+
+    assert spread.mean() > 0.95 * INDEPENDENT
+    assert spread.min() > 0.5 * INDEPENDENT
+    assert spread[0] > 0.8 * INDEPENDENT
+    in_step = order_of([81] * scenes, start="beginning")
+    assert shown(in_step, [0])[2].max() <= 1
+
+
+@pytest.mark.parametrize("scenes", [64, 320])
+@pytest.mark.parametrize("pairs", [1, 15])
+def test_runs_of_8_frames_mix_as_independent_drawing_does(scenes, pairs):
+    order = order_of(([8] * 10 + [1]) * scenes, pairs=pairs)
+    batches = range(min(800, order.samples // 16))
+    found, moments, frames = shown(order, batches, pairs=pairs)
+
+    assert frames.std(axis=1).mean() > 0.9 * INDEPENDENT
+    assert different(moments).mean() > 15
+    assert different(found).mean() > 13
+
+
+def test_moments_of_few_open_scenes_are_interleaved():
+    options = {"pairs": 15, "shuffle_groups": 2, "open_scenes": 3}
+    few = order_of([81] * 64, **options)
+    more = order_of([81] * 64, **options, open_frames=4)
+    moments = [different(shown(each, range(800), pairs=15)[1]).mean() for each in (few, more)]
+
+    assert moments[0] < 5
+    assert moments[1] > 12
+    pairs = [set((more.batch(number) % 15).tolist()) for number in range(100)]
+    assert np.mean([len(each) for each in pairs]) > 7
+
+
+def test_samples_that_follow_one_another_are_hardly_correlated():
     order = order_of([81] * 2000, batch_size=16)
-    quality = order_quality(order)
+    flat_numbers = np.concatenate([order.batch(number) for number in range(5000)]).astype(float)
 
-    assert abs(quality.neighbour_correlation) < 0.03
-    assert quality.mean_scenes > 15.5
-    assert order_quality(order_of([81] * 2000, kind="sequential")).neighbour_correlation > 0.99
-
-
-def test_frames_of_a_batch_come_from_all_over_their_scenes():
-    order = order_of([81] * 2000, batch_size=16)
-    frames = np.array([order.batch(number) % 81 for number in range(2000, 4000)])
-
-    assert frames.std(axis=1).mean() > 0.8 * np.arange(81).std()
+    assert abs(np.corrcoef(flat_numbers[:-1], flat_numbers[1:])[0, 1]) < 0.03
 
 
 @pytest.mark.parametrize(
@@ -273,13 +380,23 @@ def test_small_selections_have_fewer_groups(scenes, groups):
     assert order_of([5] * scenes).groups == groups
 
 
-def test_the_whole_release_is_ordered_within_seconds():
-    order = order_of([81 * 15] * 8493, batch_size=16)
-    began = time.perf_counter()
+def test_the_whole_release_is_ordered():
+    order = order_of([81] * 8493, pairs=15)
     sizes = [len(order.group(group)) for group in range(order.groups)]
 
     assert sum(sizes) == 10_318_995
-    assert time.perf_counter() - began < 10
+
+
+def test_memory_grows_with_the_runs_and_not_with_the_samples():
+    """Half a billion samples, of which a numpy array would take 4 GB."""
+    tracemalloc.start()
+    order = order_of([81] * 424_650, pairs=15)
+    batches = [order.batch(number) for number in (0, 1, 2, 3, order.batches - 1)]
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+
+    assert sum(map(len, batches)) == 4 * 16 + 515_949_750 % 16
+    assert most < 200e6
 
 
 @pytest.mark.parametrize(
@@ -290,6 +407,8 @@ def test_the_whole_release_is_ordered_within_seconds():
         ({"shuffle_groups": True}, "shuffle_groups must be a whole number from 1, got True"),
         ({"open_scenes": 0}, "open_scenes must be a whole number from 1, got 0"),
         ({"seed": -1}, "seed must be a whole number from 0, got -1"),
+        ({"open_frames": 0}, "open_frames must be a whole number from 1, got 0"),
+        ({"start": "middle"}, "start must be 'anywhere' or 'beginning', got 'middle'"),
         ({"kind": "random"}, "order must be 'shuffled' or 'sequential', got 'random'"),
     ],
     ids=str,
@@ -301,20 +420,30 @@ def test_a_rule_that_orders_nothing_is_refused(rule, message):
 
 @given(
     lengths=st.lists(st.integers(1, 12), min_size=1, max_size=40),
+    pairs=st.sampled_from([1, 3]),
     size=st.integers(1, 6),
-    asked=st.lists(st.tuples(st.integers(1, 6), st.integers(1, 24)), min_size=2, max_size=6),
+    asked=st.lists(
+        st.fixed_dictionaries(
+            {
+                "shuffle_groups": st.integers(1, 6),
+                "open_scenes": st.integers(1, 24),
+                "open_frames": st.integers(1, 2),
+                "start": st.sampled_from(["anywhere", "beginning"]),
+            }
+        ),
+        min_size=2,
+        max_size=6,
+    ),
     kind=st.sampled_from(KINDS),
 )
 @settings(deadline=None, max_examples=60)
-def test_rules_that_are_the_same_in_effect_give_the_same_order(lengths, size, asked, kind):
-    found = {}
-    for shuffle_groups, open_scenes in asked:
-        rule = OrderRule(
-            batch_size=size, shuffle_groups=shuffle_groups, open_scenes=open_scenes, kind=kind
-        )
-        batches = all_batches(EpochOrder(np.concatenate([[0], np.cumsum(lengths)]), rule, epoch=0))
+def test_rules_that_are_the_same_in_effect_give_the_same_order(lengths, pairs, size, asked, kind):
+    runs, found = runs_of(lengths, pairs=pairs), {}
+    for options in asked:
+        rule = OrderRule(batch_size=size, kind=kind, **options)
+        batches = all_batches(EpochOrder(runs, rule, epoch=0))
 
-        assert found.setdefault(rule.in_effect(np.array(lengths)), batches) == batches
+        assert found.setdefault(rule.in_effect(runs), batches) == batches
 
 
 @pytest.mark.parametrize("number", [-1, 9])

@@ -95,6 +95,6 @@ def test_views_are_one_sample_a_moment_or_one_a_camera(index):
     each = plan_views(index, cameras="each", **options)
 
     assert len(together) == 2 * 2
-    assert together.locate(1, epoch=0)[1:] == (4, (0, 2), (1,))
+    assert together.locate(1, epoch=0)[1:4] == (4, (0, 2), (1,))
     assert len(each) == 2 * 2 * 6
     assert [each.locate(number, epoch=0)[1:3] for number in (0, 5)] == [(0, ()), (5, ())]

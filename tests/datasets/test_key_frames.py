@@ -1,0 +1,149 @@
+"""Videos with several key frames: what lies between two of them is shuffled by itself."""
+
+import shutil
+from collections import Counter
+from fractions import Fraction
+
+import av
+import pytest
+import torch
+
+from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.samples import streams
+from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
+
+FRAMES = 20
+KEY_FRAMES = (0, 8, 16)
+
+
+def encode_again(path, *, key_every):
+    """Encode a video once more, without loss, with a key frame every so many frames."""
+    with av.open(path) as source:
+        frames = [frame.reformat(format="yuv420p") for frame in source.decode(video=0)]
+    options = {"qp": "0", "x264-params": f"keyint={key_every}:min-keyint={key_every}:scenecut=0"}
+    with av.open(path, "w") as container:
+        stream = container.add_stream("libx264", rate=30, options=options)
+        stream.width, stream.height, stream.pix_fmt = frames[0].width, frames[0].height, "yuv420p"
+        for number, frame in enumerate(frames):
+            frame.pts, frame.time_base = number, Fraction(1, 30)
+            frame.pict_type = 0  # the encoder decides
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    root = tmp_path_factory.mktemp("whole")
+    request = SynthRequest(family="Uniform", scenes=3, size_px=48, frames=FRAMES, seed=5)
+    synthesise(root, request, workers=1)
+    return root
+
+
+@pytest.fixture(scope="module")
+def keyed_release(whole, tmp_path_factory):
+    """The same scenes with a key frame every 8 frames."""
+    root = tmp_path_factory.mktemp("keyed")
+    shutil.copytree(whole, root, dirs_exist_ok=True)
+    for path in sorted(root.rglob("*_rgb.mp4")):
+        encode_again(path, key_every=8)
+    return root
+
+
+def epoch_of(loader):
+    """Return the samples of a pass by key."""
+    return {
+        key: {name: batch[name][place] for name in ("left", "right", "disparity")}
+        for batch in loader
+        for place, key in enumerate(batch["__key__"])
+    }
+
+
+FIELDS = ("left", "right", "disparity", "__key__")
+
+
+def test_the_index_has_the_key_frames_that_all_cameras_share(whole, keyed_release, tmp_path):
+    assert SceneIndex.open(whole).scene(0).key_frames == (0,)
+    assert SceneIndex.open(keyed_release).scene(0).key_frames == KEY_FRAMES
+    copied = shutil.copytree(keyed_release, tmp_path / "copied")
+    encode_again(sorted(copied.rglob("cam_03_rgb.mp4"))[0], key_every=4)
+    encode_again(sorted(copied.rglob("cam_04_rgb.mp4"))[0], key_every=16)
+
+    assert SceneIndex.open(copied).scene(0).key_frames == (0, 16)
+
+
+def test_runs_are_shuffled_by_themselves_and_hold_the_right_frames(whole, keyed_release):
+    loader = StereoPairs(keyed_release, frames="all", fields=FIELDS).loader(4, tail="uneven")
+    expected = StereoPairs(whole, frames="all", fields=FIELDS)
+    found = epoch_of(loader)
+
+    assert len(loader.batches.dataset.plan.runs.pairs) == 9 - 3  # 16 to 19 belongs to the run of 8
+    assert len(found) == 3 * FRAMES
+    for number in range(len(expected)):
+        sample = expected[number]
+        for name in ("left", "right", "disparity"):
+            torch.testing.assert_close(found[sample["__key__"]][name], sample[name], rtol=0, atol=0)
+
+
+def test_a_run_begins_decoding_at_its_key_frame(keyed_release, monkeypatch):
+    first = {}
+
+    class Counting(streams.VideoReader):
+        def frame(self, index):
+            first.setdefault(id(self), (self, index))
+            return super().frame(index)
+
+    monkeypatch.setattr(streams, "VideoReader", Counting)
+    loader = StereoPairs(keyed_release, frames="all", fields=("left",)).loader(
+        4, tail="uneven", start="beginning", shuffle_groups=1
+    )
+    for _ in loader:
+        pass
+
+    assert Counter(index for _, index in first.values()) == {0: 3, 8: 3}
+
+
+@pytest.mark.parametrize("selection", [{}, {"pairs": "all"}, {"frames": ("clips", 3)}], ids=str)
+@pytest.mark.parametrize("workers", [0, 2])
+def test_every_sample_comes_once_and_as_by_number(keyed_release, selection, workers):
+    options = {"frames": "all", "fields": FIELDS} | selection
+    pairs = StereoPairs(keyed_release, **options)
+    loader = pairs.loader(5, num_workers=workers, tail="uneven", open_frames=2)
+    found = epoch_of(loader)
+
+    assert len(found) == len(pairs)
+    for number in range(0, len(pairs), 7):
+        sample = pairs[number]
+        assert torch.equal(found[sample["__key__"]]["right"], sample["right"])
+        assert torch.equal(found[sample["__key__"]]["disparity"], sample["disparity"])
+
+
+def test_frames_drawn_at_random_are_dealt_to_as_many_runs(keyed_release):
+    pairs = StereoPairs(keyed_release, frames=("random", 5), fields=FIELDS)
+
+    assert pairs.plan.runs.lengths.tolist() == [2, 3] * 3
+    assert len(epoch_of(pairs.loader(4, tail="uneven"))) == 15
+
+
+def test_an_index_without_key_frames_opens_with_the_digest_it_had(whole, tmp_path):
+    """As earlier versions wrote it."""
+    import pyarrow.parquet as pq
+
+    index = SceneIndex.open(whole)
+    place = tmp_path / "index.parquet"
+    index.write(place)
+    table = pq.read_table(place)
+    metadata = table.schema.metadata
+    older = table.drop_columns(["key_frames"])
+    pq.write_table(older.replace_schema_metadata(metadata), place)
+    opened = SceneIndex.open(place, root=whole)
+
+    assert opened.digest == index.digest
+    assert opened.scene(0).key_frames == (0,)
+
+
+def test_a_loader_says_in_a_line_what_its_batches_show(keyed_release):
+    loader = StereoPairs(keyed_release, frames="all", pairs="all", fields=FIELDS).loader(4)
+
+    assert "a batch of 4 shows" in loader.stats().shows
+    assert "fully shuffled" in loader.stats().shows

@@ -1,0 +1,49 @@
+"""What batches show, beside a sampler that shuffles everything."""
+
+import numpy as np
+import pytest
+
+from stereogenbench_data import EpochBatches, StereoPairs
+from stereogenbench_data.selection.quality import order_quality
+
+
+@pytest.fixture(scope="module")
+def pairs(small_release):
+    return StereoPairs(small_release, frames="all", pairs="all", fields=("__key__",))
+
+
+def test_scenes_moments_and_frame_numbers_are_counted_as_by_hand(pairs):
+    batches = EpochBatches(pairs, 12)
+    order, plan = batches.order(0), pairs.plan
+    found = order_quality(order, plan)
+    rows = [
+        [plan.locate(number, epoch=0) for number in order.batch(batch)]
+        for batch in range(order.samples // 12)
+    ]
+
+    assert found.found.scenes == np.mean([len({each.row for each in row}) for row in rows])
+    assert found.fewest_scenes == min(len({each.row for each in row}) for row in rows)
+    moments = [len({(each.row, each.frames) for each in row}) for row in rows]
+    assert found.found.moments == np.mean(moments)
+    spreads = [np.std([each.frames[0] for each in row]) for row in rows]
+    assert found.found.frame_spread == pytest.approx(np.mean(spreads), rel=1e-12)
+    assert found.first_frame_spread == pytest.approx(spreads[0], rel=1e-12)
+    assert found.found.scenes_in_1000_batches == 4
+
+
+def test_a_sequential_order_shows_how_little_it_mixes(pairs):
+    shuffled = order_quality(EpochBatches(pairs, 12).order(0), pairs.plan)
+    sequential = order_quality(EpochBatches(pairs, 12, order="sequential").order(0), pairs.plan)
+
+    assert sequential.found.moments < 2.5
+    assert sequential.frame_spread_ratio < 0.5
+    assert shuffled.frame_spread_ratio > 0.7
+    assert sequential.shuffled == shuffled.shuffled
+
+
+def test_one_frame_a_scene_has_no_spread_to_compare(small_release):
+    first = StereoPairs(small_release, fields=("__key__",))
+    found = order_quality(EpochBatches(first, 2).order(0), first.plan)
+
+    assert found.frame_spread_ratio == 1
+    assert "a batch of 2 shows 2.0 scenes and 2.0 moments" in str(found)
