@@ -15,6 +15,7 @@ from stereogenbench_data.cli.browse import browse
 from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
 from stereogenbench_data.cli.evaluate import controls, evaluate, export_inputs
+from stereogenbench_data.cli.export_views import EXPORTS
 from stereogenbench_data.cli.index import index
 from stereogenbench_data.cli.outcome import ErrorsReported
 from stereogenbench_data.cli.pack import pack, unpack, verify
@@ -28,6 +29,7 @@ _START: Final = "Have scenes"
 _LOOK: Final = "Look at them"
 _CHECK: Final = "Check them"
 _PACK: Final = "Pack them"
+_EXPORT: Final = "Take them elsewhere"
 _SCORE: Final = "Score with them"
 
 _DEBUG: Final = "--debug"
@@ -70,13 +72,18 @@ app = typer.Typer(
 )
 
 
+_HELP: Final[Any] = {"context_settings": {"help_option_names": ["-h", "--help"]}}
+
+export = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
+
+
 def _command(function: Any, *, panel: str, example: str) -> None:
     """Register a command, in the panel of the help that it belongs to, with a call that works."""
-    app.command(
-        rich_help_panel=panel,
-        epilog=f"Example: `stereogenbench {example}`",
-        context_settings={"help_option_names": ["-h", "--help"]},
-    )(function)
+    app.command(rich_help_panel=panel, epilog=_example(example), **_HELP)(function)
+
+
+def _example(call: str) -> str:
+    return f"Example: `stereogenbench {call}`"
 
 
 _command(synth, panel=_START, example="synth scenes/ --family Uniform --scenes 4 --size 256")
@@ -93,6 +100,16 @@ _command(unpack, panel=_PACK, example="unpack shards/ scenes/")
 _command(croissant, panel=_PACK, example="croissant shards/ -o croissant/sample.json")
 _command(card, panel=_PACK, example="card shards/ --repo ORG/NAME -o shards/")
 _command(upload, panel=_PACK, example="upload shards/ ORG/NAME")
+app.add_typer(
+    export,
+    name="export",
+    rich_help_panel=_EXPORT,
+    epilog=_example(EXPORTS[0][2]),
+    help="Write scenes in the layouts of other projects.",
+    **_HELP,
+)
+for _name, _function, _call in EXPORTS:
+    export.command(_name, epilog=_example(_call), **_HELP)(_function)
 _command(stats, panel=_CHECK, example="stats shards/ --plots plots/")
 _command(doctor, panel=_CHECK, example="doctor scenes/ -o doctor.png")
 _command(audit, panel=_CHECK, example="audit shards/ --scenes 20 -o audit.md")
