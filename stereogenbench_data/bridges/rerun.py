@@ -14,7 +14,6 @@ pixel centres at 0.5, which Rerun's pictures have; its cloud of depth lies half 
 Source: rerun-io/rerun, docs/snippets, crates/viewer/re_renderer/shader/depth_cloud.wgsl.
 """
 
-import os
 import re
 import sys
 from collections.abc import Iterator
@@ -25,12 +24,7 @@ from typing import Any, Final
 from stereogenbench_data.bridges.posed_images import PosedImage, PosedImageReader, origin_at
 from stereogenbench_data.datasets.mapped import Data, StereoPairs, open_index
 from stereogenbench_data.engine import Progress
-from stereogenbench_data.errors import (
-    ExtraError,
-    SelectionError,
-    StorageError,
-    describe_os_error,
-)
+from stereogenbench_data.errors import ExtraError, SelectionError, StorageError
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import markdown_text
@@ -42,8 +36,8 @@ USUAL_WIDTH_PX: Final = 512
 """How wide pictures are at most, unless a size is asked for."""
 
 _JPEG_QUALITY: Final = 90
-_OS_ERROR: Final = re.compile(r"\(os error (\d+)\)")
-"""How Rerun's errors name the operating system's."""
+_OF_FILE: Final = re.compile(r"os error \d+|File-writer")
+"""What Rerun's errors name if its file cannot be written."""
 _OF_VIEWER: Final = re.compile(r"Viewer|gRPC")
 """What Rerun's errors name if its viewer does not start or does not answer."""
 
@@ -77,12 +71,12 @@ def write_recording(
             recording.save(file.name)
             return log_scene(recording, data, scene, progress=progress, **options)
     except RuntimeError as error:
-        number = _OS_ERROR.search(str(error))
-        if number is None:
+        if not _OF_FILE.search(str(error)):
             raise
-        failed = OSError(int(number[1]), os.strerror(int(number[1])))
-        what = f"{path}: cannot be written"
-        raise StorageError(describe_os_error(what, failed, "Choose another place.")) from error
+        raise StorageError(
+            f"{path}: cannot be written ({error}). Make room if the disk is full, or choose another "
+            "place."
+        ) from error
 
 
 def view_live(
