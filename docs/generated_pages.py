@@ -43,11 +43,17 @@ def commands_page() -> str:
     if group.epilog:
         parts += ["", _plain(group.epilog)]
     for name, command in group.commands.items():
-        parts += ["", f"## stereogenbench {name}", "", _plain(command.help or "")]
-        if command.epilog:
-            parts += ["", _plain(command.epilog)]
-        parts += ["", *_parameters(command)]
+        parts += _described(name, command, level=2)
+        for inner, each in getattr(command, "commands", {}).items():
+            parts += _described(f"{name} {inner}", each, level=3)
     return "\n".join(parts) + "\n"
+
+
+def _described(name: str, command: Any, *, level: int) -> list[str]:
+    parts = ["", f"{'#' * level} stereogenbench {name}", "", _plain(command.help or "")]
+    if command.epilog:
+        parts += ["", _plain(command.epilog)]
+    return parts if hasattr(command, "commands") else [*parts, "", *_parameters(command)]
 
 
 def _parameters(command: Any) -> list[str]:

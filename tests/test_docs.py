@@ -44,7 +44,12 @@ def test_the_strict_build_has_no_warning(built):
 def test_the_page_of_commands_names_every_command_and_option(built):
     page = text_of(built[1], "commands")
 
-    for name, command in typer.main.get_command(app).commands.items():
+    commands = dict(typer.main.get_command(app).commands)
+    for name, group in [*commands.items()]:
+        inner = getattr(group, "commands", {})
+        commands |= {f"{name} {each}": command for each, command in inner.items()}
+    assert "export colmap" in commands
+    for name, command in commands.items():
         assert f"stereogenbench {name}" in page
         for option in (option for parameter in command.params for option in parameter.opts):
             assert option in page or not option.startswith("--"), f"{name} {option}"

@@ -74,8 +74,8 @@ def write_recording(
         if not _OF_FILE.search(str(error)):
             raise
         raise StorageError(
-            f"{path}: cannot be written ({error}). Make room if the disk is full, or choose another "
-            "place."
+            f"{path}: cannot be written ({error}). Make room if the disk is full, or choose "
+            "another place."
         ) from error
 
 
