@@ -144,12 +144,15 @@ class DUSt3RViews(Dataset[list[View]]):
 
 
 class DUSt3RMixin:
-    """What stands in front of DUSt3R's ``BaseStereoViewDataset`` to train on these views.
+    """What stands in front of the base class of DUSt3R, MASt3R or CUT3R to train on these views.
 
     ``class StereoGenBench(DUSt3RMixin, BaseStereoViewDataset)`` is constructed with a
     `DUSt3RViews` and the base's own arguments:
     ``StereoGenBench(DUSt3RViews("shards/", pairs="all"), resolution=(512, 384), aug_crop=16)``.
-    MASt3R's base class takes the same.
+    The bases are DUSt3R's ``BaseStereoViewDataset``, MASt3R's ``MASt3RBaseStereoViewDataset`` and
+    CUT3R's ``BaseMultiViewDataset``, which is told its ``num_views`` and takes so many of a moment.
+
+    Source: the files of these classes in naver/dust3r, naver/mast3r and CUT3R/CUT3R.
     """
 
     def __init__(self, views: DUSt3RViews, **base_options: Any) -> None:
@@ -157,22 +160,35 @@ class DUSt3RMixin:
 
         Args:
             views: The views.
-            **base_options: Passed on: split, resolution, transform, aug_crop, seed.
+            **base_options: Passed on: split, resolution, transform, aug_crop, seed, ...
+
+        Raises:
+            SelectionError: If ``num_views`` is more than there are.
         """
         super().__init__(**base_options)
         self.views = views
-        self.num_views = views.num_views
+        self.num_views = int(base_options.get("num_views", views.num_views))
+        if self.num_views > views.num_views:
+            raise SelectionError(
+                f"num_views={self.num_views}, but the views are lists of {views.num_views}: choose "
+                "more cameras, or fewer views."
+            )
+        self.is_metric_scale = True  # MASt3R's name for depth in metres
 
     def __len__(self) -> int:
         """Return the number of lists of views."""
         return len(self.views)
 
-    def _get_views(self, idx: int, resolution: tuple[int, int], rng: Any) -> list[View]:
+    def _get_views(
+        self, idx: int, resolution: tuple[int, int], rng: Any, num_views: int | None = None
+    ) -> list[View]:
         """Return views cropped and scaled by the base to one of its resolutions."""
-        prepare: Any = self._crop_resize_if_necessary  # type: ignore[attr-defined]
+        base: Any = self
         views = self.views[idx]
+        if num_views is not None:
+            views = [views[place] for place in rng.permutation(len(views))[:num_views]]
         for number, view in enumerate(views):
-            view["img"], view["depthmap"], intrinsics = prepare(
+            view["img"], view["depthmap"], intrinsics = base._crop_resize_if_necessary(
                 view["img"],
                 view["depthmap"],
                 view["camera_intrinsics"],
@@ -181,7 +197,17 @@ class DUSt3RMixin:
                 info=(idx, number),
             )
             view["camera_intrinsics"] = np.asarray(intrinsics, dtype=np.float32)
+            if num_views is not None:
+                shows, maps_rays = base.get_img_and_ray_masks(True, number, rng)  # noqa: FBT003
+                view |= _OF_CUT3R | {"img_mask": shows, "ray_mask": maps_rays}
         return views
+
+
+_OF_CUT3R: Final = {
+    "is_metric": True, "is_video": False, "quantile": np.array(1.0, dtype=np.float32),
+    "camera_only": False, "depth_only": False, "single_view": False, "reset": False,
+}  # fmt: skip
+"""What CUT3R's views say of themselves besides."""
 
 
 Prepare = Callable[..., tuple[Any, ...]]

@@ -219,6 +219,46 @@ def test_more_than_two_views_are_what_the_base_expects(small_release):
     assert len(TrainedOnDUSt3R(views, resolution=(16, 16))[0]) == 6
 
 
+class CUT3RBase(DUSt3RBase):
+    """What the mixin uses of CUT3R's base class besides: the number of views, and masks."""
+
+    def __init__(self, *, num_views=None, **options):
+        super().__init__(**options)
+        self.num_views = num_views
+
+    def __getitem__(self, item):
+        number, count = item
+        return self._get_views(number, self._resolution, np.random.default_rng(number), count)
+
+    def get_img_and_ray_masks(self, is_metric, number, rng):
+        assert is_metric
+        return number == 0, number > 0
+
+
+class TrainedOnCUT3R(DUSt3RMixin, CUT3RBase):
+    pass
+
+
+def test_cut3r_is_given_as_many_views_of_a_moment_as_it_asks_for(small_release):
+    views = DUSt3RViews(small_release, cameras="all", frames="all")
+    dataset = TrainedOnCUT3R(views, num_views=4, resolution=(16, 16))
+    drawn = [dataset[number, 3] for number in range(8)]
+
+    assert dataset.num_views == 4
+    assert len({tuple(view["instance"] for view in views) for views in drawn}) > 1
+    for found in drawn:
+        assert len({view["instance"] for view in found}) == 3
+        assert [view["img_mask"] for view in found] == [True, False, False]
+        assert [view["ray_mask"] for view in found] == [False, True, True]
+        assert all(view["is_metric"] and not view["is_video"] for view in found)
+        assert found[0]["quantile"].dtype == np.float32
+
+
+def test_more_views_than_there_are_cannot_be_asked_for(small_release):
+    with pytest.raises(SelectionError, match=r"num_views=3, but the views are lists of 2"):
+        TrainedOnCUT3R(DUSt3RViews(small_release), num_views=3, resolution=(16, 16))
+
+
 @pytest.mark.parametrize("centre_px", [0.0, 0.5])
 def test_vggt_unprojects_to_the_points_of_the_record(detailed_release, moment, centre_px):
     sample, truth = moment
