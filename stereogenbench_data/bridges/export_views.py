@@ -13,7 +13,7 @@ import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Unpack, get_args
 
@@ -117,6 +117,7 @@ def export_views(
     points = selected.points(layout)
     index = open_index(data)
     filters = training_filters(index, selected.filters)
+    split = filters["split"]
     plan = plan_views(
         index, cameras=selected.cameras, frames=selected.frames, seed=0, filters=filters
     )
@@ -134,12 +135,12 @@ def export_views(
         frames_of.setdefault(address.row, []).append(address.frames[0])
     settings: dict[str, Any] = {
         "layout": layout,
-        "split": filters["split"],
+        "split": sorted([split] if isinstance(split, str) else split or ()),
         "group": selected.group,
         "cameras": list(cameras),
         "size": None if reader.request.size is None else list(reader.request.size),
         "points": points,
-        "depth": None if selected.depth is None else repr(selected.depth),
+        "depth": None if selected.depth is None else _described(selected.depth),
         "data": index.digest,
     }
     if selected.group == "scene":
@@ -253,6 +254,12 @@ def _begin(root: Path, settings: Mapping[str, Any]) -> None:
                 f"{root}: holds an export of other {name}: {found.get(name)!r}, where {wanted!r} "
                 "is asked for. Choose another folder, or remove it."
             )
+
+
+def _described(depth: DepthEncoding) -> dict[str, Any]:
+    """Return a depth contract as JSON holds it."""
+    lists = {"no_depth": list(depth.no_depth), "accept": sorted(depth.accept)}
+    return asdict(depth) | lists
 
 
 def _export_scene(work: _SceneWork, advance: Advance) -> None:

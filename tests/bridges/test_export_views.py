@@ -284,7 +284,7 @@ def read_moge_depth(path):
     return depth
 
 
-def test_mogs_folders_hold_depth_picture_and_normalised_intrinsics(
+def test_moges_folders_hold_depth_picture_and_normalised_intrinsics(
     detailed_release, moment, tmp_path, scene_folder
 ):
     exported(detailed_release, tmp_path, layout="moge")
@@ -304,6 +304,12 @@ def test_mogs_folders_hold_depth_picture_and_normalised_intrinsics(
         meta = json.loads((folder / "meta.json").read_text())
         scaled = np.diag([1 / 160, 1 / 160, 1]) @ moment["intrinsics"].numpy()
         np.testing.assert_allclose(meta["intrinsics"], scaled)
+        rows, columns = np.nonzero(expected > 0)
+        rays = np.stack([(columns + 0.5) / 160, (rows + 0.5) / 160, np.ones(len(rows))], axis=-1)
+        points = rays @ np.linalg.inv(meta["intrinsics"]).T * depth[rows, columns, None]
+        lens = moment["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
+        landed = pixels_of(points, lens)
+        assert np.abs(landed - np.stack([columns + 0.5, rows + 0.5], axis=-1)).max() < CLOSE_PX
         assert (meta["camera"], meta["frame"]) == (camera, 0)
 
 
@@ -316,7 +322,7 @@ def test_mogs_folders_hold_depth_picture_and_normalised_intrinsics(
         pytest.param([0.0, 0.0], 0, id="nothing measured"),
     ],
 )
-def test_mogs_depth_is_read_back_whatever_its_range(tmp_path, values, close):
+def test_moges_depth_is_read_back_whatever_its_range(tmp_path, values, close):
     depth_m = np.array([values], dtype=np.float32)
     picture = np.zeros((1, 2, 3), dtype=np.uint8)
     MogeWriter(tmp_path).add(
@@ -438,7 +444,7 @@ def test_an_export_that_was_killed_goes_on_and_is_whole(small_release, tmp_path)
     assert len(folders) == 21
 
 
-def test_mogs_index_keeps_what_was_exported_before(small_release, tmp_path):
+def test_moges_index_keeps_what_was_exported_before(small_release, tmp_path):
     exported(small_release, tmp_path, layout="moge", family="Uniform")
     exported(small_release, tmp_path, layout="moge", family="IPD_Gaussian", frames=[2])
     names = (tmp_path / ".index.txt").read_text().splitlines()
@@ -457,8 +463,17 @@ def test_evaluation_scenes_are_exported_only_where_the_split_names_them(
 
     assert {folder.relative_to(tmp_path).parts[1] for folder in usual} == {"train"}
     assert {folder.relative_to(tmp_path).parts[1] for folder in asked} == {"eval"}
-    with pytest.raises(StorageError, match=r"other split: 'eval', where 'train' is asked"):
+    with pytest.raises(StorageError, match=r"other split: \['eval'\], where \['train'\] is asked"):
         exported(small_release, tmp_path / "asked", layout=layout, size=(16, 16))
+
+
+def test_both_splits_and_a_contract_go_on_in_their_folder(small_release, tmp_path):
+    contract = DepthEncoding(unit_m=0.05, accept=frozenset({"8-bit", "lossy", "chroma"}))
+    options = {"split": ("train", "eval"), "depth": contract, "size": (16, 16), "layout": "moge"}
+
+    assert len(exported(small_release, tmp_path, **options)) == 4
+    assert len(exported(small_release, tmp_path, **options)) == 4
+    assert json.loads((tmp_path / "export.json").read_text())["split"] == ["eval", "train"]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Views for DUSt3R and VGGT: what their own code makes of them lies on the right points."""
 
 import sys
+from multiprocessing.reduction import ForkingPickler
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -496,6 +497,19 @@ def test_workers_of_a_loader_draw_different_views(small_release):
 
     first, second = (batch.tolist() for batch in loader)
     assert first != second
+
+
+@pytest.mark.parametrize("views_of", [DUSt3RViews, VGGTViews])
+def test_views_travel_to_processes_that_are_started_afresh(small_release, views_of):
+    views = views_of(small_release, frames=[0, 1])
+    travelled = ForkingPickler.loads(ForkingPickler.dumps(views))
+
+    assert len(travelled) == len(views) == 6
+    for each in (travelled, views):
+        picture = (
+            each[1][0]["img"] if views_of is DUSt3RViews else each.get_data(1, ids=[0])["images"][0]
+        )
+        assert np.asarray(picture).shape == (64, 64, 3)
 
 
 def test_the_records_of_the_real_scene_are_those_of_its_views(shared_scenes):
