@@ -11,7 +11,7 @@ killed one leaves nothing that is incomplete. `view_formats` has what is in them
 
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,7 +28,7 @@ from stereogenbench_data.bridges.view_formats import (
 )
 from stereogenbench_data.datasets.mapped import Data, open_index
 from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
-from stereogenbench_data.errors import SelectionError, StorageError, cure_of, describe_os_error
+from stereogenbench_data.errors import SelectionError, StorageError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import check_samples
 from stereogenbench_data.schema.records import DepthEncoding
@@ -74,23 +74,6 @@ class ViewExportOptions(SceneFilters, total=False):
     progress: Progress | None
 
 
-@dataclass(frozen=True, slots=True)
-class _SceneWork:
-    """The folders of one scene that are yet to be written, by name, with the frames of each."""
-
-    index: SceneIndex
-    layout: Layout
-    cameras: tuple[int, ...]
-    frames_of: Mapping[Path, tuple[int, ...]]
-    size: tuple[int, int] | str | None
-    points: int | None
-    depth: DepthEncoding | None
-
-    @property
-    def pictures(self) -> int:
-        return len(self.cameras) * sum(map(len, self.frames_of.values()))
-
-
 def export_views(
     data: Data, out: str | Path, *, layout: Layout, **options: Unpack[ViewExportOptions]
 ) -> list[Path]:
@@ -113,66 +96,30 @@ def export_views(
             something cannot be read or written.
         MediaError: If depth cannot have been stored whole, or a video does not decode.
     """
-    root, selected = Path(out), _Selected(options)
-    points = selected.points(layout)
+    root, selected = Path(out), _Selected(layout, options)
     index = open_index(data)
-    filters = training_filters(index, selected.filters)
-    split = filters["split"]
-    plan = plan_views(
-        index, cameras=selected.cameras, frames=selected.frames, seed=0, filters=filters
-    )
-    if plan.windows.is_clip:
-        raise SelectionError(
-            f"frames={selected.frames!r} are clips: exports take 'all', 'first', ('every', k) or "
-            "numbers of frames; group='scene' puts the chosen frames of a scene together."
-        )
-    reader = PosedImageReader(index, size=selected.size, depth=selected.depth)
-    check_samples(index, plan, reader.request)
-    addresses = [plan.locate(number, epoch=0) for number in range(len(plan))]
-    cameras = (addresses[0].source, *addresses[0].targets)
-    frames_of: dict[int, list[int]] = {}
-    for address in addresses:
-        frames_of.setdefault(address.row, []).append(address.frames[0])
-    settings: dict[str, Any] = {
-        "layout": layout,
-        "split": sorted([split] if isinstance(split, str) else split or ()),
-        "group": selected.group,
-        "cameras": list(cameras),
-        "size": None if reader.request.size is None else list(reader.request.size),
-        "points": points,
-        "depth": None if selected.depth is None else _described(selected.depth),
-        "data": index.digest,
+    frames_of = selected.frames_of(index)
+    _begin(root, selected.description(index, frames_of))
+    folders = {
+        folder: (row, chosen)
+        for row, frames in frames_of.items()
+        for folder, chosen in selected.folders_of(root / index.scene(row).id.key, frames).items()
     }
-    if selected.group == "scene":
-        settings["frames"] = sorted({str(found) for found in frames_of.values()})
-    _begin(root, settings)
-    folders: list[Path] = []
-    works: list[_SceneWork] = []
-    for row, frames in frames_of.items():
-        scene = index.scene(row)
-        place = root / scene.id.key
-        wanted: dict[Path, tuple[int, ...]] = {
-            place / f"frame_{frame:03d}": (frame,) for frame in frames
-        }
-        if selected.group == "scene":
-            wanted = {place: tuple(frames)}
-        folders += wanted
-        missing = {folder: chosen for folder, chosen in wanted.items() if not folder.is_dir()}
-        if missing:
-            alone = SceneIndex.from_scenes(
-                [scene], index.root, shards=index.shards, retry=index.retry
-            )
-            size, depth = reader.request.size, selected.depth
-            works.append(_SceneWork(alone, layout, cameras, missing, size, points, depth))
-    total = len(cameras) * sum(map(len, frames_of.values()))
-    done = total - sum(work.pictures for work in works)
     with try_locked(root / _LOCK) as is_ours:
         if not is_ours:
             raise StorageError(
                 f"{root}: another process exports into this folder. Wait for it, or choose another "
                 "folder."
             )
+        missing: dict[int, dict[Path, tuple[int, ...]]] = {}
+        for folder, (row, chosen) in folders.items():
+            if not folder.is_dir():
+                missing.setdefault(row, {})[folder] = chosen
+        works = [_SceneWork(_alone(index, row), found, selected) for row, found in missing.items()]
+        total = len(selected.cameras) * sum(len(chosen) for _, chosen in folders.values())
+        done = total - sum(work.pictures for work in works)
         advance = advance_of(selected.progress, done=done, total=total)
+        selected.progress = None  # it stays here, the rest goes to other processes
         advance(0)
         with closing(
             LOCAL.map(
@@ -186,44 +133,119 @@ def export_views(
             for _ in exported:
                 advance(0)
         if layout == "moge":
-            _list_pictures(root, folders, cameras)
-    return folders
+            _list_pictures(root, folders, selected.cameras)
+    return [*folders]
 
 
 class _Selected:
-    """The options of an export, with their defaults; the filters are what is left."""
+    """What is exported and how, with the defaults of what was not said.
 
-    def __init__(self, options: Mapping[str, Any]) -> None:
-        rest = dict(options)
-        self.group: Group = rest.pop("group", "moment")
-        self.cameras = rest.pop("cameras", "all")
-        self.frames = rest.pop("frames", "first")
-        self.size = rest.pop("size", None)
-        self.depth: DepthEncoding | None = rest.pop("depth", None)
-        self.workers: int | None = rest.pop("workers", None)
-        self.progress: Progress | None = rest.pop("progress", None)
-        self._points = rest.pop("points", None)
-        self.filters: Any = rest
-        if self.group not in get_args(Group):
-            raise SelectionError(f"group must be 'moment' or 'scene', got {self.group!r}.")
+    Attributes:
+        cameras: Numbers, or "all" until `frames_of` was called.
+        points: How many points are taken from each picture, None for all.
+    """
 
-    def points(self, layout: Layout) -> int | None:
-        """Return how many points are taken from each picture, None for all."""
+    def __init__(self, layout: Layout, options: Mapping[str, Any]) -> None:
         if layout not in get_args(Layout):
             known = ", ".join(map(repr, get_args(Layout)))
             raise SelectionError(f"layout must be one of {known}, got {layout!r}.")
-        if layout == "moge":
-            if self._points is not None or self.group != "moment":
-                raise SelectionError(
-                    "layout='moge' has a folder for each picture: leave out points and group."
-                )
-            return None
-        if self._points == "all":
-            return None
-        points = USUAL_POINTS[layout] if self._points is None else self._points
-        if isinstance(points, bool) or not isinstance(points, int) or points < 1:
-            raise SelectionError(f"points must be a number from 1, or 'all', got {points!r}.")
-        return points
+        rest = dict(options)
+        self.layout: Layout = layout
+        self.group: Group = rest.pop("group", "moment")
+        if self.group not in get_args(Group):
+            raise SelectionError(f"group must be 'moment' or 'scene', got {self.group!r}.")
+        self.points = _points(layout, rest.pop("points", None))
+        if layout == "moge" and self.group != "moment":
+            raise SelectionError(f"layout='moge' has no group={self.group!r}: leave it out.")
+        self.cameras: Any = rest.pop("cameras", "all")
+        self.frames: Any = rest.pop("frames", "first")
+        self.size: Any = rest.pop("size", None)
+        self.depth: DepthEncoding | None = rest.pop("depth", None)
+        self.workers: int | None = rest.pop("workers", None)
+        self.progress: Progress | None = rest.pop("progress", None)
+        self.filters: Any = rest
+
+    def frames_of(self, index: SceneIndex) -> dict[int, tuple[int, ...]]:
+        """Return the frames of each selected row, after checking that they can be exported."""
+        self.filters = training_filters(index, self.filters)
+        plan = plan_views(
+            index, cameras=self.cameras, frames=self.frames, seed=0, filters=self.filters
+        )
+        if plan.windows.is_clip:
+            raise SelectionError(
+                f"frames={self.frames!r} are clips: exports take 'all', 'first', ('every', k) or "
+                "numbers of frames; group='scene' puts the chosen frames of a scene together."
+            )
+        request = PosedImageReader(index, size=self.size, depth=self.depth).request
+        check_samples(index, plan, request)
+        self.size = request.size
+        found: dict[int, tuple[int, ...]] = {}
+        for number in range(len(plan)):
+            address = plan.locate(number, epoch=0)
+            self.cameras = (address.source, *address.targets)
+            found[address.row] = (*found.get(address.row, ()), *address.frames)
+        return found
+
+    def folders_of(self, place: Path, frames: tuple[int, ...]) -> dict[Path, tuple[int, ...]]:
+        """Return the folders of a scene, with the frames of each."""
+        if self.group == "scene":
+            return {place: frames}
+        return {place / f"frame_{frame:03d}": (frame,) for frame in frames}
+
+    def description(
+        self, index: SceneIndex, frames_of: Mapping[int, tuple[int, ...]]
+    ) -> dict[str, Any]:
+        """Return what all of a folder has in common, as JSON holds it."""
+        split, depth = self.filters["split"], None
+        if self.depth is not None:
+            lists = {"no_depth": list(self.depth.no_depth), "accept": sorted(self.depth.accept)}
+            depth = asdict(self.depth) | lists
+        common = {
+            "layout": self.layout,
+            "split": sorted([split] if isinstance(split, str) else split),
+            "group": self.group,
+            "cameras": list(self.cameras),
+            "size": None if self.size is None else list(self.size),
+            "points": self.points,
+            "depth": depth,
+            "data": index.digest,
+        }
+        if self.group == "moment":
+            return common
+        return common | {"frames": sorted(map(list, set(frames_of.values())))}
+
+
+def _points(layout: Layout, points: Any) -> int | None:
+    """Return how many points are taken from each picture, None for all."""
+    if layout == "moge":
+        if points is not None:
+            raise SelectionError(f"layout='moge' has no points={points!r}: leave them out.")
+        return None
+    if points == "all":
+        return None
+    points = USUAL_POINTS[layout] if points is None else points
+    if isinstance(points, bool) or not isinstance(points, int) or points < 1:
+        raise SelectionError(f"points must be a number from 1, or 'all', got {points!r}.")
+    return points
+
+
+@dataclass(frozen=True, slots=True)
+class _SceneWork:
+    """The folders of one scene that are yet to be written, with the frames of each."""
+
+    index: SceneIndex
+    frames_of: Mapping[Path, tuple[int, ...]]
+    selected: _Selected
+
+    @property
+    def pictures(self) -> int:
+        return len(self.selected.cameras) * sum(map(len, self.frames_of.values()))
+
+
+def _alone(index: SceneIndex, row: int) -> SceneIndex:
+    """Return an index of one scene, small enough to be sent to a process with its work."""
+    scene = index.scene(row)
+    return SceneIndex.from_scenes([scene], index.root, shards=index.shards, retry=index.retry)
 
 
 def _begin(root: Path, settings: Mapping[str, Any]) -> None:
@@ -256,52 +278,44 @@ def _begin(root: Path, settings: Mapping[str, Any]) -> None:
             )
 
 
-def _described(depth: DepthEncoding) -> dict[str, Any]:
-    """Return a depth contract as JSON holds it."""
-    lists = {"no_depth": list(depth.no_depth), "accept": sorted(depth.accept)}
-    return asdict(depth) | lists
-
-
 def _export_scene(work: _SceneWork, advance: Advance) -> None:
     """Write the missing folders of one scene, each whole or not at all."""
-    scene = work.index.scene(0)
-    contract = work.depth or DepthEncoding()
-    encodings = dict.fromkeys(work.cameras, contract)
-    for camera in work.cameras:
+    scene, selected = work.index.scene(0), work.selected
+    points, contract = selected.points, selected.depth or DepthEncoding()
+    encodings = dict.fromkeys(selected.cameras, contract)
+    for camera in selected.cameras:
         source = scene.depth_unit_source[camera]
         if source != "unreadable":
             encodings[camera] = contract.with_file_unit(scene.depth_unit_m[camera], source=source)
     writers: dict[Layout, Callable[[Path], ViewWriter]] = {
-        "colmap": lambda folder: ColmapWriter(folder, points=work.points, encodings=encodings),
-        "transforms": lambda folder: TransformsWriter(folder, points=work.points),
-        "ply": lambda folder: PlyWriter(folder, points=work.points),
+        "colmap": lambda folder: ColmapWriter(folder, points=points, encodings=encodings),
+        "transforms": lambda folder: TransformsWriter(folder, points=points),
+        "ply": lambda folder: PlyWriter(folder, points=points),
         "moge": MogeWriter,
     }
-    reader = PosedImageReader(work.index, size=work.size, depth=work.depth)
+    reader = PosedImageReader(work.index, size=selected.size, depth=selected.depth)
     with closing(reader):
         for folder, frames in work.frames_of.items():
             unfinished = folder.with_name(f".{folder.name}.unfinished")
             try:
                 shutil.rmtree(unfinished, ignore_errors=True)
                 unfinished.mkdir(parents=True)
-                writer = writers[work.layout](unfinished)
+                writer = writers[selected.layout](unfinished)
                 for frame in frames:
-                    writer.add([reader.read(0, camera, frame) for camera in work.cameras])
-                    advance(len(work.cameras))
+                    writer.add([reader.read(0, camera, frame) for camera in selected.cameras])
+                    advance(len(selected.cameras))
                 writer.finish()
                 unfinished.replace(folder)
             except OSError as error:
                 if isinstance(error, StorageError):
                     raise
-                raise StorageError(
-                    f"{folder}: cannot be written ({error.strerror or error}). "
-                    + cure_of(error, _ELSEWHERE)
-                ) from error
+                what = f"{folder}: cannot be written"
+                raise StorageError(describe_os_error(what, error, _ELSEWHERE)) from error
             finally:
                 shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _list_pictures(root: Path, folders: Sequence[Path], cameras: Sequence[int]) -> None:
+def _list_pictures(root: Path, folders: Iterable[Path], cameras: Sequence[int]) -> None:
     """Write MoGe's list of folders: those of this export, and those that it named before."""
     path = root / INDEX_TXT
     lines = {

@@ -22,21 +22,6 @@ from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
 
 OutArgument = Annotated[Path, typer.Argument(help="Folder to write into.")]
-GroupOption = Annotated[
-    Literal["moment", "scene"],
-    typer.Option(
-        "--group",
-        help="moment: a folder for each frame, in which nothing moves; scene: one for all the "
-        "frames of a scene, between which characters move.",
-    ),
-]
-
-
-def _points_option(usual: str) -> Any:
-    return typer.Option(
-        "--points",
-        help=f"3D points taken from each picture, or all: every measured pixel [{usual}].",
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,59 +70,75 @@ class ViewOptions(SceneOptions):
         }
 
 
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(ViewOptions):
+    """The same, with what makes a folder and how many points are in it."""
+
+    group: Annotated[
+        Literal["moment", "scene"],
+        typer.Option(
+            "--group",
+            help="moment: a folder for each frame, in which nothing moves; scene: one for all the "
+            "frames of a scene, between which characters move.",
+        ),
+    ] = "moment"
+    points: Annotated[
+        str | None,
+        typer.Option(
+            "--points",
+            help="3D points taken from each picture, or all: every measured pixel [5000; of a "
+            "cloud 100000].",
+        ),
+    ] = None
+
+    def selection(self) -> dict[str, Any]:
+        """Return the options of `export_views` that were given.
+
+        Raises:
+            typer.BadParameter: If a text cannot be parsed.
+        """
+        points: Any = self.points
+        if points not in (None, "all"):
+            if not points.isdecimal():
+                raise typer.BadParameter(
+                    f"{points!r} is not a number or all.", param_hint="--points"
+                )
+            points = int(points)
+        return super().selection() | {"group": self.group, "points": points}
+
+
 @grouped
 @resumable()
-def export_colmap(
-    source: DataOptions,
-    out: OutArgument,
-    *,
-    chosen: ViewOptions,
-    group: GroupOption = "moment",
-    points: Annotated[str | None, _points_option("5000")] = None,
-) -> None:
+def export_colmap(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
     """Write COLMAP's text model with points from depth, for COLMAP, gsplat and 3D Gaussians.
 
     In each folder: images/ and sparse/0/ (cameras.txt, images.txt, points3D.txt), poses and points
     in metres, exact; the world's origin is the first camera. A stopped run goes on if it is run
     again.
     """
-    _export(source, out, chosen, layout="colmap", group=group, points=_points(points))
+    _export(source, out, chosen, layout="colmap")
 
 
 @grouped
 @resumable()
-def export_transforms(
-    source: DataOptions,
-    out: OutArgument,
-    *,
-    chosen: ViewOptions,
-    group: GroupOption = "moment",
-    points: Annotated[str | None, _points_option("5000")] = None,
-) -> None:
+def export_transforms(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
     """Write transforms.json for nerfstudio, with pictures, depth and a point cloud.
 
     Cameras have OpenGL's axes, the world's z points up, depth is in millimetres in .npy files. A
     stopped run goes on if it is run again.
     """
-    _export(source, out, chosen, layout="transforms", group=group, points=_points(points))
+    _export(source, out, chosen, layout="transforms")
 
 
 @grouped
 @resumable()
-def export_ply(
-    source: DataOptions,
-    out: OutArgument,
-    *,
-    chosen: ViewOptions,
-    group: GroupOption = "moment",
-    points: Annotated[str | None, _points_option("100000")] = None,
-) -> None:
+def export_ply(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
     """Write point clouds from depth as PLY: metres, x right, y down, z forward, with colours.
 
     Each folder has points.ply, and stereogenbench.json with the cameras. A stopped run goes on if
     it is run again.
     """
-    _export(source, out, chosen, layout="ply", group=group, points=_points(points))
+    _export(source, out, chosen, layout="ply")
 
 
 @grouped
@@ -160,24 +161,14 @@ EXPORTS: Final[tuple[tuple[str, Callable[..., None], str], ...]] = (
 """Name, function and example of each command of the group ``export``."""
 
 
-def _points(text: str | None) -> Any:
-    if text is None or text == "all":
-        return text
-    if not text.isdecimal():
-        raise typer.BadParameter(f"{text!r} is not a number or all.", param_hint="--points")
-    return int(text)
-
-
-def _export(
-    source: DataOptions, out: Path, chosen: ViewOptions, *, layout: Any, **options: Any
-) -> None:
+def _export(source: DataOptions, out: Path, chosen: ViewOptions, *, layout: Any) -> None:
     from stereogenbench_data.bridges.export_views import export_views
 
     selection = chosen.selection()
     index = source.open()
     for_evaluation = int((index.column("split") != "train").sum())
     with progress_bar("writing", unit="pictures") as progress:
-        folders = export_views(index, out, layout=layout, progress=progress, **options, **selection)
+        folders = export_views(index, out, layout=layout, progress=progress, **selection)
     if chosen.split is None and for_evaluation:
         typer.echo(
             f"{counted(for_evaluation, 'evaluation scene')} left out: --split eval exports them",

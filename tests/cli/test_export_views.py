@@ -68,7 +68,7 @@ def test_filters_cameras_frames_group_and_points_are_taken(small_release, tmp_pa
     assert done.stdout == f"{tmp_path}: 2 folders\n"
     assert settings["cameras"] == [0, 5]
     assert (settings["group"], settings["points"], settings["size"]) == ("scene", None, [16, 16])
-    assert settings["frames"] == ["[0, 3, 6]"]
+    assert settings["frames"] == [[0, 3, 6]]
 
 
 def test_the_same_command_again_finds_all_done(small_release, tmp_path):
