@@ -146,8 +146,8 @@ def export_ply(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -
 def export_moge(source: DataOptions, out: OutArgument, *, chosen: ViewOptions) -> None:
     """Write the training folders of MoGe: image.jpg, depth.png, meta.json, and .index.txt.
 
-    Depth is metric: set "depth_unit": 1.0 for this dataset in MoGe's configuration. A stopped run
-    goes on if it is run again.
+    In MoGe's configuration of this dataset set "depth_unit": 1.0, as depth is metric, and
+    "finite_depth_mask": "only_known". A stopped run goes on if it is run again.
     """
     _export(source, out, chosen, layout="moge")
 
