@@ -163,13 +163,15 @@ EXPORTS: Final[tuple[tuple[str, Callable[..., None], str], ...]] = (
 
 def _export(source: DataOptions, out: Path, chosen: ViewOptions, *, layout: Any) -> None:
     from stereogenbench_data.bridges.export_views import export_views
+    from stereogenbench_data.selection.filters import filter_scenes
 
-    selection = chosen.selection()
+    selection, filters = chosen.selection(), chosen.filters()
     index = source.open()
-    for_evaluation = int((index.column("split") != "train").sum())
     with progress_bar("writing", unit="pictures") as progress:
         folders = export_views(index, out, layout=layout, progress=progress, **selection)
-    if chosen.split is None and for_evaluation:
+    matching = index.column("split")[filter_scenes(index, filters)]  # type: ignore[arg-type]
+    for_evaluation = 0 if chosen.split else int((matching == "eval").sum())
+    if for_evaluation:
         typer.echo(
             f"{counted(for_evaluation, 'evaluation scene')} left out: --split eval exports them",
             err=True,

@@ -66,9 +66,17 @@ def test_filters_cameras_frames_group_and_points_are_taken(small_release, tmp_pa
     settings = json.loads((tmp_path / "export.json").read_text())
 
     assert done.stdout == f"{tmp_path}: 2 folders\n"
+    assert "1 evaluation scene left out" in done.stderr
     assert settings["cameras"] == [0, 5]
     assert (settings["group"], settings["points"], settings["size"]) == ("scene", None, [16, 16])
     assert settings["frames"] == [[0, 3, 6]]
+
+
+def test_evaluation_scenes_that_would_not_match_are_not_counted(small_release, tmp_path):
+    done = run("export", "ply", small_release, tmp_path, *USUAL, "--family", "IPD_Gaussian")
+
+    assert done.stdout == f"{tmp_path}: 1 folder\n"
+    assert "left out" not in done.stderr
 
 
 def test_the_same_command_again_finds_all_done(small_release, tmp_path):
