@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Unpack, get_args
 
-from stereogenbench_data.bridges.posed_images import PosedImageReader, training_filters
+from stereogenbench_data.bridges.posed_images import PosedImageReader, index_of, training_filters
 from stereogenbench_data.bridges.view_formats import (
     INDEX_TXT,
     ColmapWriter,
@@ -26,7 +26,7 @@ from stereogenbench_data.bridges.view_formats import (
     TransformsWriter,
     ViewWriter,
 )
-from stereogenbench_data.datasets.mapped import Data, open_index
+from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.engine import LOCAL, Advance, Progress, advance_of
 from stereogenbench_data.errors import SelectionError, StorageError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
@@ -97,7 +97,7 @@ def export_views(
         MediaError: If depth cannot have been stored whole, or a video does not decode.
     """
     root, selected = Path(out), _Selected(layout, options)
-    index = open_index(data)
+    index = index_of(data)
     frames_of = selected.frames_of(index)
     _begin(root, selected.description(index, frames_of))
     folders = {

@@ -27,11 +27,12 @@ from stereogenbench_data.bridges.posed_images import (
     VIEW_FIELDS,
     PosedImage,
     PosedImageReader,
+    index_of,
     origin_at,
     posed_images,
     training_filters,
 )
-from stereogenbench_data.datasets.mapped import Data, SceneViews, StereoPairs, open_index
+from stereogenbench_data.datasets.mapped import Data, SceneViews, StereoPairs
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.checks import check_samples
 from stereogenbench_data.samples.fields import Sample
@@ -116,7 +117,7 @@ class DUSt3RViews(Dataset[list[View]]):
             StereoGenBenchError: As `StereoPairs` or `SceneViews` does.
         """
         self._dataset = dataset
-        index = open_index(data)
+        index = index_of(data)
         options["split"] = training_filters(index, SceneFilters(split=options.get("split")))[
             "split"
         ]
@@ -260,7 +261,7 @@ class VGGTViews:
         """
         if sequence not in ("moment", "scene"):
             raise SelectionError(f"sequence must be 'moment' or 'scene', got {sequence!r}.")
-        index = open_index(data)
+        index = index_of(data)
         filters = training_filters(index, filters)
         plan = plan_views(index, cameras=cameras, frames=frames, seed=0, filters=filters)
         if plan.windows.is_clip:

@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float32, Float64, Int, UInt8
 
+from stereogenbench_data.datasets.mapped import Data
 from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.geometry.pose import invert_rigid
 from stereogenbench_data.index.table import SceneIndex
@@ -105,6 +106,11 @@ class PosedImage:
         rotation, centre = self.world_from_cam[:3, :3], self.world_from_cam[:3, 3]
         points: Float64[np.ndarray, "*n 3"] = self.points_cam(rows, columns) @ rotation.T + centre
         return points
+
+
+def index_of(data: Data) -> SceneIndex:
+    """Return the index of a folder, an index file, or an index as it is."""
+    return data if isinstance(data, SceneIndex) else SceneIndex.open(data)
 
 
 def training_filters(index: SceneIndex, filters: SceneFilters) -> SceneFilters:

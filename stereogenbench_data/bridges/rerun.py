@@ -21,8 +21,13 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from stereogenbench_data.bridges.posed_images import PosedImage, PosedImageReader, origin_at
-from stereogenbench_data.datasets.mapped import Data, StereoPairs, open_index
+from stereogenbench_data.bridges.posed_images import (
+    PosedImage,
+    PosedImageReader,
+    index_of,
+    origin_at,
+)
+from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import ExtraError, SelectionError, StorageError
 from stereogenbench_data.schema.records import DepthEncoding, Scene
@@ -141,7 +146,7 @@ def log_scene(  # noqa: PLR0913 - each names one thing that a user chooses
         MediaError: If a video does not decode to what the index says.
     """
     rerun = _rerun()
-    index = open_index(data)
+    index = index_of(data)
     row = 0 if scene is None else find_scene(index, scene)
     facts = index.scene(row)
     if size is None:

@@ -5,7 +5,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
 
@@ -421,23 +420,22 @@ def test_an_export_that_was_killed_goes_on_and_is_whole(small_release, tmp_path)
     exported(small_release, expected, **options)
     killed = tmp_path / "killed"
     code = (
-        "import sys; from stereogenbench_data.bridges.export_views import export_views\n"
-        f"export_views(sys.argv[1], sys.argv[2], workers=1, **{options!r})"
+        "import os, signal, sys\n"
+        "from stereogenbench_data.bridges.export_views import export_views\n"
+        "def kill(done, total):\n"
+        "    if done >= int(sys.argv[3]): os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"export_views(sys.argv[1], sys.argv[2], workers=1, progress=kill, **{options!r})"
     )
-    for wanted in (1, 4):
-        process = subprocess.Popen(
-            [sys.executable, "-c", code, str(small_release), str(killed)],
-            cwd=Path(__file__).resolve().parents[2],
-        )
-        until = time.monotonic() + 120
-        while len([*killed.rglob("frame_*")]) <= wanted and time.monotonic() < until:
-            assert process.poll() is None, "it ended before it could be killed"
-            time.sleep(0.005)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+    for pictures, whole in ((6, 0), (50, 7), (126, 20)):
+        ended = subprocess.run(
+            [sys.executable, "-c", code, str(small_release), str(killed), str(pictures)],
+            cwd=Path(__file__).resolve().parents[2], check=False,
+        )  # fmt: skip
+        assert ended.returncode == -signal.SIGKILL
+        assert len([*killed.rglob("frame_*/transforms.json")]) >= whole
+        assert [*killed.rglob(".frame_*.unfinished")]
         for folder in killed.rglob("frame_*"):
-            if not folder.name.startswith("."):
-                assert (folder / "transforms.json").is_file()
+            assert folder.suffix or (folder / "transforms.json").is_file()
 
     folders = exported(small_release, killed, **options)
     assert files_of(killed) == files_of(expected)
