@@ -29,7 +29,7 @@ from stereogenbench_data.bridges.posed_images import (
 )
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.engine import Progress
-from stereogenbench_data.errors import ExtraError, SelectionError, StorageError
+from stereogenbench_data.errors import ExtraError, SelectionError, StorageError, describe_os_error
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import markdown_text
@@ -41,8 +41,6 @@ USUAL_WIDTH_PX: Final = 512
 """How wide pictures are at most, unless a size is asked for."""
 
 _JPEG_QUALITY: Final = 90
-_OF_FILE: Final = re.compile(r"os error \d+|File-writer")
-"""What Rerun's errors name if its file cannot be written."""
 _OF_VIEWER: Final = re.compile(r"Viewer|gRPC")
 """What Rerun's errors name if its viewer does not start or does not answer."""
 
@@ -57,6 +55,9 @@ def write_recording(
 ) -> str:
     """Write a scene as an ``.rrd`` file, whole or not at all; return the scene's key.
 
+    The recording is held in memory until it is written: some 100 MB for a scene of 81 frames at the
+    usual width.
+
     Args:
         path: The file.
         data: What `StereoPairs` takes.
@@ -67,21 +68,22 @@ def write_recording(
     Raises:
         ExtraError: If ``rerun-sdk`` is not installed.
         SelectionError: If there is no such scene, pair or frame.
-        StorageError: If a file is missing or altered, or the disk is full.
+        StorageError: If a file is missing or altered, or the recording cannot be written; a file
+            that was there stays.
         MediaError: If a video does not decode to what the index says.
-        OSError: If the file cannot be written; one that was there stays.
     """
+    # Rerun's own writer of files may wait for ever once a disk is full.
+    with _recording() as recording:
+        stream = recording.binary_stream()
+        key = log_scene(recording, data, scene, progress=progress, **options)
+        content = stream.read() or b""
     try:
-        with open_output(Path(path)) as file, _recording() as recording:
-            recording.save(file.name)
-            return log_scene(recording, data, scene, progress=progress, **options)
-    except RuntimeError as error:
-        if not _OF_FILE.search(str(error)):
-            raise
-        raise StorageError(
-            f"{path}: cannot be written ({error}). Make room if the disk is full, or choose "
-            "another place."
-        ) from error
+        with open_output(Path(path)) as file:
+            file.write(content)
+    except OSError as error:
+        what = f"{path}: cannot be written"
+        raise StorageError(describe_os_error(what, error, "Choose another place.")) from error
+    return key
 
 
 def view_live(

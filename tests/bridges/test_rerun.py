@@ -182,11 +182,18 @@ def test_what_a_scene_does_not_have_is_refused_and_the_file_that_was_there_stays
     assert path.read_bytes() == b"before"
 
 
-def test_a_full_disk_is_named(rerun, small_release, tmp_path):
+def test_a_full_disk_is_named_and_the_file_that_was_there_stays(rerun, small_release, tmp_path):
     with small_disk(tmp_path / "disk", size="100k") as disk:
-        with pytest.raises(StorageError, match=r"a\.rrd: cannot be written.*Make room"):
+        (disk / "a.rrd").write_bytes(b"before")
+        with pytest.raises(StorageError, match=r"a\.rrd: cannot be written .*Make room"):
             bridge.write_recording(disk / "a.rrd", small_release)
-        assert not [*disk.iterdir()]
+        assert [each.name for each in disk.iterdir()] == ["a.rrd"]
+        assert (disk / "a.rrd").read_bytes() == b"before"
+
+
+def test_a_folder_that_is_not_there_is_named(rerun, small_release, tmp_path):
+    with pytest.raises(StorageError, match=r"a\.rrd: cannot be written .*another place"):
+        bridge.write_recording(tmp_path / "none" / "a.rrd", small_release, frames="first")
 
 
 def test_without_rerun_the_extra_is_named(small_release, tmp_path, monkeypatch):
