@@ -10,6 +10,7 @@ from typing import Annotated, Any, Final
 import typer
 from typer.core import TyperGroup
 
+from stereogenbench_data.cli import export_clips, export_views
 from stereogenbench_data.cli.audit import audit
 from stereogenbench_data.cli.bench import bench
 from stereogenbench_data.cli.browse import browse
@@ -17,7 +18,6 @@ from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
 from stereogenbench_data.cli.errors import ErrorsReported
 from stereogenbench_data.cli.evaluate import controls, evaluate, export_inputs
-from stereogenbench_data.cli.export_clips import EXPORTS
 from stereogenbench_data.cli.index import index
 from stereogenbench_data.cli.pack import pack, unpack, verify
 from stereogenbench_data.cli.publish import card, croissant, upload
@@ -112,11 +112,11 @@ app.add_typer(
     export,
     name="export",
     rich_help_panel="Take them elsewhere",
-    epilog=f"Example: `stereogenbench {EXPORTS[0][2]}`",
+    epilog=f"Example: `stereogenbench {export_clips.EXPORTS[0][2]}`",
     help="Write scenes in the layouts of other projects.",
     context_settings=_HELP_OPTIONS,
 )
-for _name, _function, _example in EXPORTS:
+for _name, _function, _example in (*export_clips.EXPORTS, *export_views.EXPORTS):
     export.command(
         _name, epilog=f"Example: `stereogenbench {_example}`", context_settings=_HELP_OPTIONS
     )(_function)

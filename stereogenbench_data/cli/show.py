@@ -1,7 +1,7 @@
-"""``stereogenbench show``: one scene as a picture or a clip."""
+"""``stereogenbench show``: one scene as a picture, a clip or a recording of Rerun."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -16,6 +16,7 @@ from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
 
 _CLIPS = (".mp4", ".gif")
+_RECORDINGS = (".rrd",)
 
 
 @grouped
@@ -32,7 +33,9 @@ def show(  # noqa: PLR0913 - one parameter an option
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", "-o", help="File to write: .png, or .mp4 or .gif for a clip [KEY.png]."
+            "--out",
+            "-o",
+            help="File to write: .png, .mp4 or .gif for a clip, .rrd for Rerun [KEY.png].",
         ),
     ] = None,
     pair: Annotated[
@@ -46,12 +49,23 @@ def show(  # noqa: PLR0913 - one parameter an option
     clip: Annotated[
         bool, typer.Option("--clip", help="Write all frames as a clip, .mp4 or .gif [KEY.mp4].")
     ] = False,
+    rerun: Annotated[
+        bool,
+        typer.Option(
+            "--rerun",
+            help="Write cameras, pictures, depth and disparity over time for Rerun's viewer (extra "
+            "'rerun') [KEY.rrd].",
+        ),
+    ] = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="With --rerun: open the viewer, write no file.")
+    ] = False,
     depth_unit_m: DepthUnitOption = None,
 ) -> None:
     """Draw one scene: its six views, and a pair's disparity, depth, visibility and warp.
 
     The bar of disparity shows pixels and metres, of the stored pictures. A clip shows left, right,
-    disparity and anaglyph over time.
+    disparity and anaglyph over time. A recording for Rerun's viewer has all six cameras over time.
     """
     from stereogenbench_data.audit.pictures import scene_pictures
     from stereogenbench_data.audit.pictures.scene_reader import SceneReader
@@ -66,6 +80,10 @@ def show(  # noqa: PLR0913 - one parameter an option
                 f"{pair!r} is not a pair: write two cameras, such as 0-5.", param_hint="--pair"
             )
         cameras = int(left), int(right)
+    if rerun or live or (out is not None and out.suffix.lower() in _RECORDINGS):
+        shown: dict[str, Any] = {"pair": cameras, "depth": depth_of(depth_unit_m)}
+        _show_in_rerun(source, scene, out, width_px=size, is_live=live, **shown)
+        return
     clip = clip or (out is not None and out.suffix.lower() in _CLIPS)
     if out is not None and out.suffix.lower() not in (_CLIPS if clip else (".png",)):
         wanted = "a clip is .mp4 or .gif" if clip else "a sheet is .png"
@@ -90,3 +108,35 @@ def show(  # noqa: PLR0913 - one parameter an option
             sheet = scene_pictures.scene_sheet(reader, row, pair=cameras, frame=frame, tile_px=size)
             write_png(target, sheet)
     typer.echo(f"{target}: {key}")
+
+
+def _show_in_rerun(
+    source: DataOptions,
+    scene: str | None,
+    out: Path | None,
+    *,
+    width_px: int | None,
+    is_live: bool,
+    **shown: Any,
+) -> None:
+    from stereogenbench_data.bridges.rerun import view_live, write_recording
+    from stereogenbench_data.selection.filters import find_scene
+
+    if out is not None and (is_live or out.suffix.lower() not in _RECORDINGS):
+        wanted = "--live writes no file" if is_live else "a recording is .rrd, by its ending"
+        raise typer.BadParameter(f"{out}: {wanted}.", param_hint="--out")
+    index = source.open()
+    found = index.scene(0 if scene is None else find_scene(index, scene))
+    key, rig = found.id.key, found.rig
+    if width_px is not None:
+        shown["size"] = (
+            max(1, round(rig.image_height_px * width_px / rig.image_width_px)),
+            width_px,
+        )
+    target = out or Path(key.replace("/", "_") + ".rrd")
+    with progress_bar("logging", unit="frames") as progress, writing(target):
+        if is_live:
+            view_live(index, key, progress=progress, **shown)
+        else:
+            write_recording(target, index, key, progress=progress, **shown)
+    typer.echo(f"{'live' if is_live else target}: {key}")

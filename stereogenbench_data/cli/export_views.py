@@ -1,0 +1,179 @@
+"""``stereogenbench export colmap``, ``transforms``, ``ply``, ``moge``: several views, as files."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import typer
+
+from stereogenbench_data.cli.errors import resumable
+from stereogenbench_data.cli.evaluate import frames_option, parse_picture_size
+from stereogenbench_data.cli.options import (
+    DataOptions,
+    DepthUnitOption,
+    SceneOptions,
+    WorkersOption,
+    complete_from,
+    depth_of,
+    grouped,
+)
+from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.schema.text import counted
+
+OutArgument = Annotated[Path, typer.Argument(help="Folder to write into.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewOptions(SceneOptions):
+    """Which views of which scenes are exported."""
+
+    split: Annotated[
+        str | None,
+        typer.Option(
+            "--split",
+            help="train; eval only if you say so [train].",
+            autocompletion=complete_from(("train", "eval")),
+        ),
+    ] = None
+    cameras: Annotated[str, typer.Option("--cameras", help="all, or numbers such as 0,2,5.")] = (
+        "all"
+    )
+    frames: Annotated[
+        str, typer.Option("--frames", help="first, all, every:K, or numbers such as 0,40,80.")
+    ] = "first"
+    size: Annotated[
+        str | None, typer.Option("--size", help="WIDTHxHEIGHT of pictures and depth [as stored].")
+    ] = None
+    depth_unit_m: DepthUnitOption = None
+    workers: WorkersOption = None
+
+    def selection(self) -> dict[str, Any]:
+        """Return the options of `export_views` that were given.
+
+        Raises:
+            typer.BadParameter: If a text cannot be parsed.
+        """
+        cameras: Any = self.cameras
+        if cameras != "all":
+            if not all(map(str.isdecimal, cameras.split(","))):
+                raise typer.BadParameter(
+                    f"{cameras!r} is not all or numbers such as 0,2,5.", param_hint="--cameras"
+                )
+            cameras = tuple(map(int, cameras.split(",")))
+        return self.filters() | {
+            "cameras": cameras,
+            "frames": frames_option(self.frames),
+            "size": None if self.size is None else parse_picture_size(self.size),
+            "depth": depth_of(self.depth_unit_m),
+            "workers": self.workers,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(ViewOptions):
+    """The same, with what makes a folder and how many points are in it."""
+
+    group: Annotated[
+        Literal["moment", "scene"],
+        typer.Option(
+            "--group",
+            help="moment: a folder for each frame, in which nothing moves; scene: one for all the "
+            "frames of a scene, between which characters move.",
+        ),
+    ] = "moment"
+    points: Annotated[
+        str | None,
+        typer.Option(
+            "--points",
+            help="3D points taken from each picture, or all: every measured pixel [5000; of a "
+            "cloud 100000].",
+        ),
+    ] = None
+
+    def selection(self) -> dict[str, Any]:
+        """Return the options of `export_views` that were given.
+
+        Raises:
+            typer.BadParameter: If a text cannot be parsed.
+        """
+        points: Any = self.points
+        if points not in (None, "all"):
+            if not points.isdecimal():
+                raise typer.BadParameter(
+                    f"{points!r} is not a number or all.", param_hint="--points"
+                )
+            points = int(points)
+        return super().selection() | {"group": self.group, "points": points}
+
+
+@grouped
+@resumable()
+def export_colmap(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
+    """Write COLMAP's text model with points from depth, for COLMAP, gsplat and 3D Gaussians.
+
+    In each folder: images/ and sparse/0/ (cameras.txt, images.txt, points3D.txt), poses and points
+    in metres, exact; the world's origin is the first camera. A stopped run goes on if it is run
+    again.
+    """
+    _export(source, out, chosen, layout="colmap")
+
+
+@grouped
+@resumable()
+def export_transforms(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
+    """Write transforms.json for nerfstudio, with pictures, depth and a point cloud.
+
+    Cameras have OpenGL's axes, the world's z points up, depth is in millimetres in .npy files. A
+    stopped run goes on if it is run again.
+    """
+    _export(source, out, chosen, layout="transforms")
+
+
+@grouped
+@resumable()
+def export_ply(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
+    """Write point clouds from depth as PLY: metres, x right, y down, z forward, with colours.
+
+    Each folder has points.ply, and stereogenbench.json with the cameras. A stopped run goes on if
+    it is run again.
+    """
+    _export(source, out, chosen, layout="ply")
+
+
+@grouped
+@resumable()
+def export_moge(source: DataOptions, out: OutArgument, *, chosen: ViewOptions) -> None:
+    """Write the training folders of MoGe: image.jpg, depth.png, meta.json, and .index.txt.
+
+    In MoGe's configuration of this dataset set "depth_unit": 1.0, as depth is metric, and
+    "finite_depth_mask": "only_known". A stopped run goes on if it is run again.
+    """
+    _export(source, out, chosen, layout="moge")
+
+
+EXPORTS: Final[tuple[tuple[str, Callable[..., None], str], ...]] = (
+    ("colmap", export_colmap, "export colmap shards/ colmap/ --frames 0,40"),
+    ("transforms", export_transforms, "export transforms shards/ nerfstudio/ --size 640x640"),
+    ("ply", export_ply, "export ply shards/ clouds/ --points all"),
+    ("moge", export_moge, "export moge shards/ moge/ --frames every:10"),
+)
+"""Name, function and example of each command of the group ``export``."""
+
+
+def _export(source: DataOptions, out: Path, chosen: ViewOptions, *, layout: Any) -> None:
+    from stereogenbench_data.bridges.export_views import export_views
+    from stereogenbench_data.selection.filters import filter_scenes
+
+    selection, filters = chosen.selection(), chosen.filters()
+    index = source.open()
+    with progress_bar("writing", unit="pictures") as progress:
+        folders = export_views(index, out, layout=layout, progress=progress, **selection)
+    matching = index.column("split")[filter_scenes(index, filters)]  # type: ignore[arg-type]
+    for_evaluation = 0 if chosen.split else int((matching == "eval").sum())
+    if for_evaluation:
+        typer.echo(
+            f"{counted(for_evaluation, 'evaluation scene')} left out: --split eval exports them",
+            err=True,
+        )
+    typer.echo(f"{out}: {counted(len(folders), 'folder')}")

@@ -1,0 +1,608 @@
+"""Exports of several views: read as each format says, points lie on the pixels they are of."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from stereogenbench_data import DepthEncoding, SceneViews
+from stereogenbench_data.bridges.export_views import export_views
+from stereogenbench_data.bridges.posed_images import PosedImage
+from stereogenbench_data.bridges.view_formats import MogeWriter, quaternion_wxyz
+from stereogenbench_data.errors import FieldError, SelectionError, StorageError
+from stereogenbench_data.geometry.pose import rotation_from_quaternion_xyzw
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.sources.files import try_locked
+from tests.servers.tools import require_module, small_disk
+
+LAYOUTS = ("colmap", "transforms", "ply", "moge")
+CLOSE_PX = 0.01
+
+exported = partial(export_views, workers=1)
+"""Processes take seconds to start: one test has several."""
+
+
+def files_of(root):
+    """Return every file of an export but its lock, by relative path."""
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file() and path.name != ".lock"
+    }
+
+
+def read_colmap(folder):
+    """Read a text model as COLMAP's documentation describes it."""
+    model = folder / "sparse" / "0"
+
+    def lines(name):
+        text = (model / f"{name}.txt").read_text().splitlines()
+        return [line for line in text if not line.startswith("#")]
+
+    (camera,) = (line.split() for line in lines("cameras"))
+    assert camera[:2] == ["1", "PINHOLE"]
+    size, lens = tuple(map(int, camera[2:4])), tuple(map(float, camera[4:]))
+    images = {}
+    for head, observed in zip(lines("images")[::2], lines("images")[1::2], strict=True):
+        number, w, x, y, z, *step, camera_id, name = head.split()
+        assert camera_id == "1"
+        quaternion = np.array([x, y, z, w], dtype=np.float64)
+        triples = np.array(observed.split(), dtype=np.float64).reshape(-1, 3)
+        images[int(number)] = (
+            name,
+            rotation_from_quaternion_xyzw(quaternion),
+            np.array(step, dtype=np.float64),
+            triples,
+        )
+    points = {}
+    for line in lines("points3D"):
+        number, *rest = line.split()
+        track = np.array(rest[7:], dtype=int).reshape(-1, 2)
+        points[int(number)] = (
+            np.array(rest[:3], dtype=np.float64), tuple(map(int, rest[3:6])), track,
+        )  # fmt: skip
+    return size, lens, images, points
+
+
+def read_ply(path):
+    """Read a binary PLY file of coloured points."""
+    head, _, body = path.read_bytes().partition(b"end_header\n")
+    lines = head.decode("ascii").splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = int(lines[2].removeprefix("element vertex "))
+    kinds = {"float": "<f4", "uchar": "u1"}
+    dtype = np.dtype([(name, kinds[kind]) for _, kind, name in map(str.split, lines[3:])])
+    points = np.frombuffer(body, dtype=dtype)
+    assert len(points) == count
+    world = np.stack([points[name] for name in "xyz"], axis=-1).astype(np.float64)
+    return world, np.stack([points[name] for name in ("red", "green", "blue")], axis=-1)
+
+
+def pixels_of(cam, lens):
+    fx, fy, cx, cy = lens
+    return np.stack([fx * cam[:, 0] / cam[:, 2] + cx, fy * cam[:, 1] / cam[:, 2] + cy], axis=-1)
+
+
+def measured_pixels(depth):
+    """Return the centres of the measured pixels, row by row, and their depths."""
+    rows, columns = np.nonzero(depth > 0)
+    return np.stack([columns + 0.5, rows + 0.5], axis=-1), depth[rows, columns]
+
+
+@pytest.fixture(scope="module")
+def moment(detailed_release):
+    return SceneViews(detailed_release)[0]
+
+
+@pytest.fixture(scope="module")
+def scene_folder():
+    return Path("train", "IPD_Gaussian", "SynthStage", "scene_000000")
+
+
+def test_points_of_a_colmap_model_project_onto_their_observations(
+    detailed_release, moment, tmp_path
+):
+    (folder,) = exported(detailed_release, tmp_path, layout="colmap", points=200)
+    size, lens, images, points = read_colmap(folder)
+
+    assert size == (160, 160)
+    np.testing.assert_array_equal(lens, moment["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]])
+    assert len(points) == 6 * 200
+    for position, colour, track in points.values():
+        for image, place in track:
+            name, rotation, step, observed = images[image]
+            landed = pixels_of((rotation @ position + step)[None], lens)[0]
+            assert np.abs(landed - observed[place, :2]).max() < CLOSE_PX
+        # The first is the pixel that the point is made of.
+        name, rotation, step, observed = images[track[0, 0]]
+        camera = int(name[4:6])
+        u, v = observed[track[0, 1], :2]
+        column, row = int(u), int(v)
+        assert (u, v) == (column + 0.5, row + 0.5)
+        assert tuple(moment["image"][camera, :, row, column].tolist()) == colour
+        depth_m = (rotation @ position + step)[2]
+        assert abs(depth_m - moment["depth"][camera, 0, row, column].item()) < 1e-9
+
+
+def test_other_pictures_observe_a_point_where_their_own_depth_agrees(
+    detailed_release, moment, tmp_path
+):
+    (folder,) = exported(detailed_release, tmp_path, layout="colmap", points=200)
+    _, _, images, points = read_colmap(folder)
+    lengths = []
+    for position, _, track in points.values():
+        lengths.append(len(track))
+        assert len({image for image, _ in track.tolist()}) == len(track)
+        for image, place in track[1:]:
+            name, rotation, step, observed = images[image]
+            u, v = observed[place, :2]
+            there_m = moment["depth"][int(name[4:6]), 0, int(v), int(u)].item()
+            here_m = (rotation @ position + step)[2]
+            assert abs(there_m - here_m) <= 0.02 * here_m + 0.2 + 1e-6
+
+    assert np.mean(lengths) > 3
+
+
+def test_poses_of_a_colmap_model_are_those_of_the_scene_from_its_first_camera(
+    detailed_release, moment, tmp_path
+):
+    (folder,) = exported(detailed_release, tmp_path, layout="colmap", points=1)
+    _, _, images, _ = read_colmap(folder)
+    about = json.loads((folder / "stereogenbench.json").read_text())
+    scene_from_export = np.array(about["scene_from_export"])
+
+    for number, (name, rotation, step, _) in images.items():
+        cam_from_export = np.eye(4)
+        cam_from_export[:3, :3], cam_from_export[:3, 3] = rotation, step
+        scene_from_cam = scene_from_export @ np.linalg.inv(cam_from_export)
+        expected = moment["world_from_cam"][int(name[4:6])].numpy()
+        np.testing.assert_allclose(scene_from_cam, expected, atol=1e-9)
+        stated = np.array(about["pictures"][number - 1]["export_from_cam"])
+        np.testing.assert_allclose(stated @ cam_from_export, np.eye(4), atol=1e-9)
+    assert about["scene"] == "train/IPD_Gaussian/SynthStage/scene_000000"
+
+
+@pytest.mark.skipif(sys.version_info >= (3, 15), reason="pycolmap has no wheel for Python 3.15 yet")
+def test_colmap_reads_the_model(shared_scenes, tmp_path):
+    pycolmap = require_module("pycolmap")
+    (folder,) = exported(
+        shared_scenes, tmp_path, layout="colmap", frames=[0, 40], group="scene", points=300
+    )
+    model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
+
+    assert (len(model.cameras), len(model.images), len(model.points3D)) == (1, 12, 3600)
+    assert model.compute_mean_track_length() > 3
+    for image in model.images.values():
+        assert (folder / "images" / image.name).is_file()
+        for observed in image.points2D:
+            landed = image.project_point(model.points3D[observed.point3D_id].xyz)
+            assert np.abs(landed - observed.xy).max() < CLOSE_PX
+
+
+def test_points_of_transforms_project_onto_the_pixels_they_are_of(
+    detailed_release, moment, tmp_path
+):
+    (folder,) = exported(detailed_release, tmp_path, layout="transforms", points="all")
+    about = json.loads((folder / "transforms.json").read_text())
+    lens = tuple(about[name] for name in ("fl_x", "fl_y", "cx", "cy"))
+    world, colours = read_ply(folder / about["ply_file_path"])
+    first = 0
+    for camera, frame in enumerate(about["frames"]):
+        # OpenGL: x right, y up, z back; so a point ahead has a negative z.
+        gl_from_world = np.linalg.inv(np.array(frame["transform_matrix"]))
+        expected, depth_m = measured_pixels(moment["depth"][camera, 0].numpy())
+        own = slice(first, first + len(expected))
+        first += len(expected)
+        cam = world[own] @ gl_from_world[:3, :3].T + gl_from_world[:3, 3]
+        cam *= (1, -1, -1)
+        assert np.abs(pixels_of(cam, lens) - expected).max() < CLOSE_PX
+        np.testing.assert_allclose(cam[:, 2], depth_m, rtol=1e-5)
+        columns, rows = expected.astype(int).T
+        picture = moment["image"][camera].permute(1, 2, 0).numpy()
+        np.testing.assert_array_equal(colours[own], picture[rows, columns])
+    assert first == len(world)
+
+
+def test_transforms_name_pictures_and_depth_in_millimetres(detailed_release, moment, tmp_path):
+    (folder,) = exported(detailed_release, tmp_path, layout="transforms", points=1)
+    about = json.loads((folder / "transforms.json").read_text())
+
+    assert (about["w"], about["h"], about["camera_model"]) == (160, 160, "OPENCV")
+    for camera, frame in enumerate(about["frames"]):
+        with Image.open(folder / frame["file_path"]) as picture:
+            expected = moment["image"][camera].permute(1, 2, 0)
+            np.testing.assert_array_equal(np.asarray(picture), expected)
+        depth_mm = np.load(folder / frame["depth_file_path"], allow_pickle=False)
+        assert depth_mm.dtype == np.float32
+        np.testing.assert_allclose(depth_mm, moment["depth"][camera, 0] * 1000, rtol=1e-6)
+
+
+def test_the_world_of_transforms_has_its_z_axis_upwards(detailed_release, moment, tmp_path):
+    (folder,) = exported(detailed_release, tmp_path, layout="transforms", points=1)
+    about = json.loads((folder / "transforms.json").read_text())
+    applied = np.array(about["applied_transform"])
+
+    for camera, frame in enumerate(about["frames"]):
+        pose = np.array(frame["transform_matrix"])
+        scene = moment["world_from_cam"][camera].numpy()
+        np.testing.assert_allclose(applied[:, :3] @ scene[:3, :3] * (1, -1, -1), pose[:3, :3])
+        centre = applied[:, :3] @ scene[:3, 3] + applied[:, 3]
+        np.testing.assert_allclose(centre, pose[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(applied[:, :3] @ (0, -1, 0), (0, 0, 1))  # up is -y in the scene
+    assert np.linalg.det(applied[:, :3]) == pytest.approx(1)
+
+
+def test_points_of_a_cloud_project_onto_the_pixels_they_are_of(detailed_release, moment, tmp_path):
+    (folder,) = exported(detailed_release, tmp_path, layout="ply", points="all", cameras=(3, 1))
+    world, _ = read_ply(folder / "points.ply")
+    pictures = json.loads((folder / "stereogenbench.json").read_text())["pictures"]
+    first = 0
+    for picture, camera in zip(pictures, (3, 1), strict=True):
+        intrinsics = np.array(picture["intrinsics"])
+        cam_from_export = np.linalg.inv(np.array(picture["export_from_cam"]))
+        expected, _ = measured_pixels(moment["depth"][camera, 0].numpy())
+        cam = world[first : first + len(expected)] @ cam_from_export[:3, :3].T
+        lens = intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+        landed = pixels_of(cam + cam_from_export[:3, 3], lens)
+        assert (picture["camera"], picture["width"]) == (camera, 160)
+        assert np.abs(landed - expected).max() < CLOSE_PX
+        first += len(expected)
+    assert first == len(world)
+
+
+def test_so_many_points_are_drawn_the_same_each_time(detailed_release, tmp_path):
+    clouds = []
+    for name in "ab":
+        (folder,) = exported(detailed_release, tmp_path / name, layout="ply", points=50)
+        clouds.append(read_ply(folder / "points.ply")[0])
+
+    assert len(clouds[0]) == 300
+    np.testing.assert_array_equal(*clouds)
+    assert len(np.unique(clouds[0], axis=0)) == 300
+
+
+def read_moge_depth(path):
+    """Read depth as MoGe's `read_depth` does."""
+    with Image.open(path) as file:
+        near, far = float(file.info["near"]), float(file.info["far"])
+        numbers = np.array(file)
+    assert numbers.dtype == np.uint16
+    place = (numbers.astype(np.float32) - 1) / 65533
+    depth = near ** (1 - place) * far**place
+    depth[numbers == 0] = np.nan
+    depth[numbers == 65535] = np.inf
+    return depth
+
+
+def test_moges_folders_hold_depth_picture_and_normalised_intrinsics(
+    detailed_release, moment, tmp_path, scene_folder
+):
+    exported(detailed_release, tmp_path, layout="moge")
+    names = (tmp_path / ".index.txt").read_text().splitlines()
+
+    assert names == [str(scene_folder / "frame_000" / f"cam_{camera:02d}") for camera in range(6)]
+    for camera, name in enumerate(names):
+        folder = tmp_path / name
+        depth = read_moge_depth(folder / "depth.png")
+        expected = moment["depth"][camera, 0].numpy()
+        np.testing.assert_array_equal(np.isnan(depth), expected == 0)
+        np.testing.assert_allclose(depth[expected > 0], expected[expected > 0], rtol=1e-4)
+        with Image.open(folder / "image.jpg") as file:
+            picture = np.asarray(file).astype(int)
+        apart = np.abs(picture - moment["image"][camera].permute(1, 2, 0).numpy())
+        assert apart.mean() < 4
+        meta = json.loads((folder / "meta.json").read_text())
+        scaled = np.diag([1 / 160, 1 / 160, 1]) @ moment["intrinsics"].numpy()
+        np.testing.assert_allclose(meta["intrinsics"], scaled)
+        rows, columns = np.nonzero(expected > 0)
+        rays = np.stack([(columns + 0.5) / 160, (rows + 0.5) / 160, np.ones(len(rows))], axis=-1)
+        points = rays @ np.linalg.inv(meta["intrinsics"]).T * depth[rows, columns, None]
+        lens = moment["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
+        landed = pixels_of(points, lens)
+        assert np.abs(landed - np.stack([columns + 0.5, rows + 0.5], axis=-1)).max() < CLOSE_PX
+        assert (meta["camera"], meta["frame"]) == (camera, 0)
+
+
+@pytest.mark.parametrize(
+    ("values", "close"),
+    [
+        pytest.param([0.1, 6553.5], 1e-4, id="the nearest and the farthest that can be stored"),
+        pytest.param([4.0, 4.0], 1e-6, id="a wall"),
+        pytest.param([0.0, 2.5], 1e-6, id="one pixel"),
+        pytest.param([0.0, 0.0], 0, id="nothing measured"),
+    ],
+)
+def test_moges_depth_is_read_back_whatever_its_range(tmp_path, values, close):
+    depth_m = np.array([values], dtype=np.float32)
+    picture = np.zeros((1, 2, 3), dtype=np.uint8)
+    MogeWriter(tmp_path).add(
+        [PosedImage("train/a/b/c", 0, 0, picture, depth_m, np.eye(3), np.eye(4))]
+    )
+
+    found = read_moge_depth(tmp_path / "cam_00" / "depth.png")
+    np.testing.assert_allclose(np.nan_to_num(found, nan=0.0), depth_m, rtol=close)
+
+
+def test_the_size_of_an_export_is_that_of_its_pictures_depth_and_cameras(
+    detailed_release, tmp_path
+):
+    size = (48, 80)
+    (folder,) = exported(
+        detailed_release, tmp_path / "t", layout="transforms", size=size, points="all"
+    )
+    about = json.loads((folder / "transforms.json").read_text())
+    sample = SceneViews(detailed_release, size=size)[0]
+    frame = about["frames"][2]
+
+    assert (about["w"], about["h"]) == (80, 48)
+    assert np.load(folder / frame["depth_file_path"]).shape == size
+    with Image.open(folder / frame["file_path"]) as picture:
+        assert picture.size == (80, 48)
+    lens = (about["fl_x"], about["fl_y"], about["cx"], about["cy"])
+    assert lens == tuple(sample["intrinsics"].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]])
+
+
+def test_a_depth_contract_is_followed(detailed_release, tmp_path):
+    contract = DepthEncoding(unit_m=0.02, kind="ray")
+    (folder,) = exported(
+        detailed_release, tmp_path, layout="ply", depth=contract, points="all", cameras=(0,)
+    )
+    world, _ = read_ply(folder / "points.ply")
+    sample = SceneViews(detailed_release, depth=contract)[0]
+    _, depth_m = measured_pixels(sample["depth"][0, 0].numpy())
+    rotation = sample["world_from_cam"][0, :3, :3].numpy()
+
+    np.testing.assert_allclose((world @ rotation)[:, 2], depth_m, rtol=1e-5)
+
+
+def test_every_moment_has_a_folder_of_its_own_or_a_scene_has_one(small_release, tmp_path):
+    chosen = {"layout": "colmap", "frames": ("every", 3), "family": "Uniform", "points": 5}
+    moments = exported(small_release, tmp_path / "moments", **chosen)
+    scenes = exported(small_release, tmp_path / "scenes", group="scene", **chosen)
+    scene = tmp_path / "moments" / "train" / "Uniform" / "SynthStage" / "scene_000000"
+
+    assert moments[:3] == [scene / f"frame_{frame:03d}" for frame in (0, 3, 6)]
+    assert (len(moments), len(scenes)) == (6, 2)
+    assert scenes[0] == tmp_path / "scenes" / "train" / "Uniform" / "SynthStage" / "scene_000000"
+    for folder, pictures in ((moments[1], 6), (scenes[1], 18)):
+        _, _, images, points = read_colmap(folder)
+        assert (len(images), len(points)) == (pictures, 5 * pictures)
+        names = {name for name, *_ in images.values()}
+        assert names == {path.name for path in (folder / "images").iterdir()}
+        # A track stays in one moment: between moments, characters move.
+        for _, _, track in points.values():
+            assert len({images[image][0][-7:] for image, _ in track.tolist()}) == 1
+
+
+def test_processes_write_the_same_files_as_one(small_release, tmp_path):
+    counts = []
+    for name, workers in (("one", 1), ("two", 2)):
+        export_views(
+            small_release, tmp_path / name, layout="moge", workers=workers,
+            progress=lambda *done: counts.append(done), size=(32, 32),
+        )  # fmt: skip
+        assert counts[-1] == (18, 18)
+
+    assert files_of(tmp_path / "one") == files_of(tmp_path / "two")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_what_was_exported_before_is_kept(small_release, tmp_path, layout):
+    options = {"layout": layout, "frames": [0, 4], "size": (32, 32)}
+    folders = exported(small_release, tmp_path, **options)
+    whole = files_of(tmp_path)
+    kept = {folder: folder.stat().st_mtime_ns for folder in folders[1:]}
+    shutil.rmtree(folders[0])
+    leftover = folders[0].with_name(f".{folders[0].name}.unfinished")
+    leftover.mkdir()
+    (leftover / "half").write_bytes(b"half")
+
+    counts = []
+    again = exported(small_release, tmp_path, progress=lambda *done: counts.append(done), **options)
+    assert again == folders
+    assert files_of(tmp_path) == whole
+    assert {folder: folder.stat().st_mtime_ns for folder in folders[1:]} == kept
+    assert counts[0] == (30, 36)
+
+
+def test_an_export_that_was_killed_goes_on_and_is_whole(small_release, tmp_path):
+    options = {"layout": "transforms", "frames": "all", "points": 2000}
+    expected = tmp_path / "expected"
+    exported(small_release, expected, **options)
+    killed = tmp_path / "killed"
+    code = (
+        "import os, signal, sys\n"
+        "from stereogenbench_data.bridges.export_views import export_views\n"
+        "def kill(done, total):\n"
+        "    if done >= int(sys.argv[3]): os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"export_views(sys.argv[1], sys.argv[2], workers=1, progress=kill, **{options!r})"
+    )
+    for pictures, whole in ((6, 0), (50, 7), (126, 20)):
+        ended = subprocess.run(
+            [sys.executable, "-c", code, str(small_release), str(killed), str(pictures)],
+            cwd=Path(__file__).resolve().parents[2], check=False,
+        )  # fmt: skip
+        assert ended.returncode == -signal.SIGKILL
+        assert len([*killed.rglob("frame_*/transforms.json")]) >= whole
+        assert [*killed.rglob(".frame_*.unfinished")]
+        for folder in killed.rglob("frame_*"):
+            assert folder.suffix or (folder / "transforms.json").is_file()
+
+    folders = exported(small_release, killed, **options)
+    assert files_of(killed) == files_of(expected)
+    assert len(folders) == 21
+
+
+def test_moges_index_keeps_what_was_exported_before(small_release, tmp_path):
+    exported(small_release, tmp_path, layout="moge", family="Uniform")
+    exported(small_release, tmp_path, layout="moge", family="IPD_Gaussian", frames=[2])
+    names = (tmp_path / ".index.txt").read_text().splitlines()
+
+    assert names == sorted(names)
+    assert len(names) == 18
+    assert all((tmp_path / name / "meta.json").is_file() for name in names)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_evaluation_scenes_are_exported_only_where_the_split_names_them(
+    small_release, tmp_path, layout
+):
+    usual = exported(small_release, tmp_path / "usual", layout=layout, size=(16, 16))
+    asked = exported(small_release, tmp_path / "asked", layout=layout, size=(16, 16), split="eval")
+
+    assert {folder.relative_to(tmp_path).parts[1] for folder in usual} == {"train"}
+    assert {folder.relative_to(tmp_path).parts[1] for folder in asked} == {"eval"}
+    with pytest.raises(StorageError, match=r"other split: \['eval'\], where \['train'\] is asked"):
+        exported(small_release, tmp_path / "asked", layout=layout, size=(16, 16))
+
+
+def test_both_splits_and_a_contract_go_on_in_their_folder(small_release, tmp_path):
+    contract = DepthEncoding(unit_m=0.05, accept=frozenset({"8-bit", "lossy", "chroma"}))
+    options = {"split": ("train", "eval"), "depth": contract, "size": (16, 16), "layout": "moge"}
+
+    assert len(exported(small_release, tmp_path, **options)) == 4
+    assert len(exported(small_release, tmp_path, **options)) == 4
+    assert json.loads((tmp_path / "export.json").read_text())["split"] == ["eval", "train"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "name"),
+    [
+        ({"layout": "ply"}, "layout"),
+        ({"size": (20, 20)}, "size"),
+        ({"points": 7}, "points"),
+        ({"cameras": (0, 1)}, "cameras"),
+        ({"group": "scene"}, "group"),
+        ({"depth": DepthEncoding(unit_m=0.5)}, "depth"),
+    ],
+)
+def test_a_folder_holds_one_kind_of_export(small_release, tmp_path, changed, name):
+    options = {"layout": "colmap", "size": (16, 16), "points": 5}
+    exported(small_release, tmp_path, **options)
+
+    with pytest.raises(StorageError, match=rf"an export of other {name}: .*another folder"):
+        exported(small_release, tmp_path, **(options | changed))
+
+
+def test_scenes_as_one_hold_the_same_frames(small_release, tmp_path):
+    options = {"layout": "ply", "size": (16, 16), "group": "scene"}
+    exported(small_release, tmp_path, frames=[0], **options)
+
+    with pytest.raises(StorageError, match=r"other frames: .*another folder"):
+        exported(small_release, tmp_path, frames=[0, 1], **options)
+
+
+def test_other_data_go_elsewhere(small_release, detailed_release, tmp_path):
+    exported(small_release, tmp_path, layout="ply", size=(16, 16))
+
+    with pytest.raises(StorageError, match=r"other data: .*another folder"):
+        exported(detailed_release, tmp_path, layout="ply", size=(16, 16))
+
+
+def test_a_folder_of_something_else_is_left_alone(small_release, tmp_path):
+    (tmp_path / "thesis.tex").write_text("mine")
+
+    with pytest.raises(StorageError, match=r"not empty and holds no export\.json.*a new folder"):
+        exported(small_release, tmp_path, layout="ply")
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_description_that_is_none_is_named(small_release, tmp_path):
+    (tmp_path / "export.json").write_text("{")
+
+    with pytest.raises(StorageError, match=r"export\.json: is not the description of an export"):
+        exported(small_release, tmp_path, layout="ply")
+
+
+def test_two_processes_do_not_export_into_one_folder(small_release, tmp_path):
+    exported(small_release, tmp_path, layout="ply", size=(16, 16), family="Uniform")
+
+    with try_locked(tmp_path / ".lock") as is_ours:
+        assert is_ours
+        with pytest.raises(StorageError, match=r"another process exports into this folder"):
+            exported(small_release, tmp_path, layout="ply", size=(16, 16))
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"layout": "colmap", "frames": ("clips", 3)}, SelectionError, r"are clips: exports take"),
+        ({"layout": "nerf"}, SelectionError, r"layout must be one of 'colmap'.*got 'nerf'"),
+        ({"layout": "ply", "group": "clip"}, SelectionError, r"'moment' or 'scene', got 'clip'"),
+        ({"layout": "ply", "points": 0}, SelectionError, r"points must be .* 'all', got 0"),
+        ({"layout": "ply", "points": True}, SelectionError, r"points must be .*got True"),
+        ({"layout": "moge", "points": 5}, SelectionError, r"'moge' has no points=5: leave"),
+        ({"layout": "moge", "group": "scene"}, SelectionError, r"has no group='scene': leave"),
+        ({"layout": "ply", "family": "none"}, SelectionError, r"family='none' matches none"),
+        ({"layout": "ply", "colour": "red"}, SelectionError, r"there is no filter 'colour'"),
+        ({"layout": "ply", "cameras": (0, 6)}, SelectionError, r"cameras must be"),
+        ({"layout": "ply", "size": (0, 5)}, FieldError, r"size must be"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_before_anything_is_written(
+    small_release, tmp_path, options, error, message
+):
+    with pytest.raises(error, match=message):
+        exported(small_release, tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_video_is_named_and_nothing_half_is_left(small_release, tmp_path):
+    release = tmp_path / "release"
+    shutil.copytree(small_release, release)
+    scene = release / "train" / "Uniform" / "SynthStage" / "scene_000001"
+    index = SceneIndex.open(release)
+    (scene / "cam_04_rgb.mp4").unlink()
+
+    with pytest.raises(StorageError, match=r"scene_000001.*cam_04_rgb"):
+        exported(index, tmp_path / "out", layout="ply", size=(16, 16))
+    assert not [*(tmp_path / "out").rglob("*.unfinished")]
+
+
+def test_a_full_disk_is_named_and_nothing_half_is_left(small_release, tmp_path):
+    with small_disk(tmp_path / "disk", size="200k") as disk:
+        with pytest.raises(StorageError, match=r"frame_000.*No space left.*Make room"):
+            exported(small_release, disk / "out", layout="transforms", frames="all")
+        folders = [*(disk / "out").rglob("frame_*")]
+        assert all((folder / "transforms.json").is_file() for folder in folders)
+
+
+def test_the_same_comes_out_of_shards_and_folders(small_release, small_shards, tmp_path):
+    found = []
+    for name, data in (("folders", small_release), ("shards", small_shards)):
+        exported(data, tmp_path / name, layout="transforms", size=(32, 32))
+        found.append(files_of(tmp_path / name))
+        found[-1].pop("export.json")
+
+    assert found[0] == found[1]
+
+
+rotations = st.tuples(*[st.floats(-1, 1) for _ in range(4)]).filter(
+    lambda numbers: np.linalg.norm(numbers) > 0.1
+)
+
+
+@given(rotations)
+def test_a_quaternion_gives_its_rotation_back(numbers):
+    rotation = rotation_from_quaternion_xyzw(np.array(numbers))
+    w, x, y, z = quaternion_wxyz(rotation)
+
+    assert w >= 0
+    back = rotation_from_quaternion_xyzw(np.array([x, y, z, w]))
+    np.testing.assert_allclose(back, rotation, atol=1e-14)
+
+
+@pytest.mark.parametrize("axis", np.eye(3), ids="xyz")
+def test_half_a_turn_has_a_quaternion(axis):
+    quaternion = np.abs(quaternion_wxyz(2 * np.outer(axis, axis) - np.eye(3)))
+
+    np.testing.assert_allclose(quaternion, [0, *axis], atol=1e-15)

@@ -1,0 +1,131 @@
+"""``stereogenbench export`` of several views, and ``show --rerun``, as a user calls them."""
+
+import json
+import shlex
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.commands import app
+from tests.servers.tools import require_module
+
+EXPORT = typer.main.get_command(app).commands["export"]  # type: ignore[attr-defined]
+VIEWS = ("colmap", "transforms", "ply", "moge")
+USUAL = ("--size", "16x16", "--workers", "1")
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_every_layout_has_an_example_that_parses_and_says_what_its_options_are(name):
+    command = EXPORT.commands[name]
+    words = shlex.split(command.epilog.partition("`stereogenbench ")[2].rstrip("`"))
+
+    assert words[:2] == ["export", name]
+    command.make_context(name, words[2:], resilient_parsing=False)
+    for parameter in command.params:
+        assert getattr(parameter, "help", ""), f"{name} {parameter.name}"
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("colmap", "sparse/0/points3D.txt"),
+        ("transforms", "transforms.json"),
+        ("ply", "points.ply"),
+        ("moge", "cam_00/depth.png"),
+    ],
+)
+def test_training_scenes_are_exported_and_those_left_out_are_counted(
+    small_release, tmp_path, name, file
+):
+    done = run("export", name, small_release, tmp_path, *USUAL)
+
+    assert done.exit_code == 0, done.output
+    assert done.stdout == f"{tmp_path}: 3 folders\n"
+    assert "1 evaluation scene left out: --split eval exports them" in done.stderr
+    folder = tmp_path / "train" / "Uniform" / "SynthStage" / "scene_000001" / "frame_000"
+    assert (folder / file).is_file()
+
+
+def test_evaluation_scenes_are_exported_if_the_split_names_them(small_release, tmp_path):
+    done = run("export", "ply", small_release, tmp_path, *USUAL, "--split", "eval")
+
+    assert done.stdout == f"{tmp_path}: 1 folder\n"
+    assert "left out" not in done.stderr
+
+
+def test_filters_cameras_frames_group_and_points_are_taken(small_release, tmp_path):
+    done = run(
+        "export", "ply", small_release, tmp_path, *USUAL, "--family", "Uniform", "--cameras", "0,5",
+        "--frames", "every:3", "--group", "scene", "--points", "all",
+    )  # fmt: skip
+    settings = json.loads((tmp_path / "export.json").read_text())
+
+    assert done.stdout == f"{tmp_path}: 2 folders\n"
+    assert "1 evaluation scene left out" in done.stderr
+    assert settings["cameras"] == [0, 5]
+    assert (settings["group"], settings["points"], settings["size"]) == ("scene", None, [16, 16])
+    assert settings["frames"] == [[0, 3, 6]]
+
+
+def test_evaluation_scenes_that_would_not_match_are_not_counted(small_release, tmp_path):
+    done = run("export", "ply", small_release, tmp_path, *USUAL, "--family", "IPD_Gaussian")
+
+    assert done.stdout == f"{tmp_path}: 1 folder\n"
+    assert "left out" not in done.stderr
+
+
+def test_the_same_command_again_finds_all_done(small_release, tmp_path):
+    first = run("export", "colmap", small_release, tmp_path, *USUAL, "--points", "5")
+    again = run("export", "colmap", small_release, tmp_path, *USUAL, "--points", "5")
+
+    assert first.stdout == again.stdout == f"{tmp_path}: 3 folders\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--cameras", "a,b"], "'a,b' is not all or numbers"),
+        (["--points", "many"], "'many' is not a number or all"),
+        (["--frames", "some"], "'some' is not all, first"),
+        (["--size", "big"], "size must be WIDTHxHEIGHT"),
+    ],
+)
+def test_a_text_that_is_not_understood_is_named(small_release, tmp_path, options, message):
+    done = run("export", "ply", small_release, tmp_path / "out", *options)
+
+    assert done.exit_code == 2
+    assert message in " ".join(done.output.replace("│", " ").split())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "options", [["--rerun"], ["-o", "scene_000001.rrd"]], ids=["by its key", "by its ending"]
+)
+def test_a_recording_is_written(small_release, tmp_path, monkeypatch, options):
+    require_module("rerun")
+    monkeypatch.chdir(tmp_path)
+    key = "train/Uniform/SynthStage/scene_000001"
+    name = options[1] if "-o" in options else f"{key.replace('/', '_')}.rrd"
+    done = run("show", small_release, "scene_000001", "--size", "16", "--pair", "0-2", *options)
+
+    assert (done.exit_code, done.stdout) == (0, f"{name}: {key}\n"), done.output
+    assert (tmp_path / name).read_bytes().startswith(b"RRF")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--rerun", "-o", "a.png"], "a.png: a recording is .rrd, by its ending"),
+        (["--rerun", "--live", "-o", "a.rrd"], "a.rrd: --live writes no file"),
+    ],
+)
+def test_a_file_that_is_no_recording_is_refused(small_release, options, message):
+    done = run("show", small_release, *options)
+
+    assert done.exit_code == 2
+    assert message in " ".join(done.output.replace("│", " ").split())
