@@ -12,7 +12,6 @@ not what it gains from frame to frame.
 import argparse
 import io
 import json
-import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +21,6 @@ from typing import Any, Final
 
 import av
 import cv2
-import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
@@ -309,10 +307,8 @@ def depth_rows(data: Path, *, size: tuple[int, int], rounds: int) -> list[dict[s
     scene = index.scene(0)
     name = "cam_00_depth.mkv"
     path = Path(index.root, scene.members[name].path)
-    from stereogenbench_data.media.depth import open_depth
-    from stereogenbench_data.samples.views import resized_nearest
+    from stereogenbench_data.media.depth import open_depth, read_depth_units, resized_nearest
     from stereogenbench_data.schema.records import DepthEncoding
-    from stereogenbench_data.media.depth import read_depth_units
 
     count = min(FRAMES, scene.frames)
 
