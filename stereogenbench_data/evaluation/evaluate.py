@@ -162,6 +162,7 @@ def select_workload(
         SelectionError: If nothing matches.
         MediaError: If depth that a metric needs cannot have been stored whole.
         EvaluationError: If the samples are clips, random frames, sweeps or right to left.
+        StorageError: If the data were derived for training, whose pictures have an error.
     """
     selection: dict[str, Any] = {
         key: value for key, value in options.items() if key not in RunOptions.__optional_keys__
@@ -175,6 +176,7 @@ def select_workload(
         **selection,
     )
     plan, index = dataset.plan, dataset.index
+    index.require_released("The evaluation")
     chosen, windows = plan.pairs, plan.windows
     if windows.is_clip or isinstance(windows, Random):
         raise EvaluationError(

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from stereogenbench_data.errors import MediaError, SchemaError, StorageError, explain_os_errors
-from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import (
     baseline_deviation_cm,
@@ -34,6 +34,7 @@ from stereogenbench_data.media.depth import (
     require_depth_stream,
     resolve_encoding,
 )
+from stereogenbench_data.media.depth_frames import CODEC_NAME
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.document import parse_text, require_text_size
 from stereogenbench_data.schema.parse import (
@@ -59,11 +60,13 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     METADATA_FILES,
     PACKED_DEPTH_NAMES,
+    TRAINING_JSON,
     TRAJECTORY_JSON,
     VIDEO_FILES,
     depth_name,
     rgb_name,
 )
+from stereogenbench_data.schema.training import TrainingDocument, parse_training
 from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.sources.location import is_remote, joined
 from stereogenbench_data.sources.members import read_text_file
@@ -81,7 +84,9 @@ _DEVIATION_SHARE: Final = 0.001
 _LEAST_BESIDE: Final = 0.9
 """How much of a baseline must lie along camera 0's x axis; in a lateral rig the cameras turn by at
 most 25 degrees from the line on which they stand."""
-_FILES: Final = frozenset({*METADATA_FILES, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
+_FILES: Final = frozenset(
+    {*METADATA_FILES, TRAINING_JSON, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()}
+)
 """Files of a release; others in a scene's folder are ignored."""
 
 Difference = tuple[str, str]
@@ -194,7 +199,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     poses = CameraPoses.from_trajectory(trajectory)
     _require_recorded_baselines(key, rig, poses)
     lateral_m = lateral_offsets_m(poses)
-    residual_px = rectification_residual_px(poses, rig_intrinsics(rig))
+    residual_px = rectification_residual_px(poses, recorded_intrinsics(rig))
     _require_lateral_rig(key, rig, lateral_m, residual_px=residual_px)
     units = [_depth_unit(facts[name], name=f"{key}/{name}") for name in depth_names]
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
@@ -386,6 +391,28 @@ def _valid_ratio(folder: SceneFolder, key: str, frames: int) -> float:
     return float(np.mean(shares))
 
 
+def derived_scene(scene: Scene, document: TrainingDocument) -> Scene:
+    """Return the row of a scene of training shards, from its released row or its own.
+
+    The rig keeps what ``baseline.json`` records, and knows the size of the derived pictures. The
+    places of the files are not changed.
+    """
+    names = [*document.files]
+    is_packed = not set(names).isdisjoint(PACKED_DEPTH_NAMES.values())
+    return replace(
+        scene,
+        rig=replace(
+            scene.rig,
+            image_width_px=document.size_px[0],
+            image_height_px=document.size_px[1],
+            recorded_size_px=document.source_size_px,
+        ),
+        depth_codec=(CODEC_NAME,) * CAMERA_COUNT if is_packed else scene.depth_codec,
+        key_frames=document.key_frames,
+        training=document.facts,
+    )
+
+
 def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Difference]:
     """Return where a scene's metadata files differ from its row of an index.
 
@@ -400,6 +427,7 @@ def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Diffe
     for names, compare in (
         ((BASELINE_JSON,), _differing_rig),
         ((BASELINE_JSON, COMPLETE_JSON), _differing_labels),
+        ((TRAINING_JSON,), _differing_training),
         ((TRAJECTORY_JSON,), _differing_poses),
         ((), _differing_caption),
     ):
@@ -437,10 +465,16 @@ def _differing_place(scene: Scene) -> Iterator[Difference]:
 
 def _differing_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
     rig, _ = parse_rig(texts[BASELINE_JSON], where=f"{scene.id.key}/{BASELINE_JSON}")
+    recorded = scene.rig
+    if recorded.recorded_size_px is not None:
+        width_px, height_px = recorded.recorded_size_px
+        recorded = replace(
+            recorded, image_width_px=width_px, image_height_px=height_px, recorded_size_px=None
+        )
     for each in fields(Rig):
         if each.name.startswith("image_") and rig.image_size_source == "default":
             continue
-        found, indexed = getattr(rig, each.name), getattr(scene.rig, each.name)
+        found, indexed = getattr(rig, each.name), getattr(recorded, each.name)
         if not _same(found, indexed):
             yield _difference(BASELINE_JSON, each.name, found, indexed)
 
@@ -459,6 +493,37 @@ def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diff
             )
 
 
+def _differing_training(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
+    where = f"{scene.id.key}/{TRAINING_JSON}"
+    document = parse_training(texts[TRAINING_JSON], where=where)
+    derived = derived_scene(scene, document)
+    for what, found, indexed in (
+        ("the key", document.key, scene.id.key),
+        ("the picture size", document.size_px, _size_px(scene.rig)),
+        ("the recorded size", document.source_size_px, scene.rig.recorded_size_px),
+        ("the key frames", document.key_frames, scene.key_frames),
+        ("the source", derived.training, scene.training),
+    ):
+        if not _same_text(found, indexed):
+            yield _difference(TRAINING_JSON, what, found, indexed)
+    for name, file in document.files.items():
+        member = scene.members.get(name)
+        if member is not None and (member.size, member.crc32) not in (
+            (file.size, file.crc32), (file.size, None),
+        ):  # fmt: skip
+            found = (file.size, file.crc32)
+            yield _difference(TRAINING_JSON, name, found, (member.size, member.crc32))
+
+
+def _size_px(rig: Rig) -> tuple[int, int]:
+    return rig.image_width_px, rig.image_height_px
+
+
+def _same_text(found: object, indexed: object) -> bool:
+    """Return whether two values are equal; nan equals nan."""
+    return repr(found) == repr(indexed)
+
+
 def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
     where = f"{scene.id.key}/{TRAJECTORY_JSON}"
     trajectory = parse_trajectory(texts[TRAJECTORY_JSON], where=where)
@@ -470,7 +535,7 @@ def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diffe
     if not np.allclose(lateral_m, scene.lateral_m, rtol=0, atol=_SAME_M):
         places_m = tuple(map(float, lateral_m))
         yield _difference(TRAJECTORY_JSON, "lateral_m", places_m, scene.lateral_m)
-    residual_px = rectification_residual_px(poses, rig_intrinsics(scene.rig))
+    residual_px = rectification_residual_px(poses, recorded_intrinsics(scene.rig))
     if not math.isclose(residual_px, scene.rig_residual_px, rel_tol=_SAME_PX, abs_tol=_SAME_PX):
         yield _difference(TRAJECTORY_JSON, "rig_residual_px", residual_px, scene.rig_residual_px)
 

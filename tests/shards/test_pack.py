@@ -759,7 +759,7 @@ def test_the_command_packs_and_reports_what_there_is(small_release, tmp_path, pa
     assert (first.exit_code, second.exit_code) == (0, 0)
     assert first.stdout == (
         f"{tmp_path}: 2 shards packed, 0 were finished before\n"
-        f"2 shards of the plan yet to be packed, the first is {NAMES[1]}: the part that packs "
+        f"2 shards of the plan to be packed yet, from {NAMES[1]} on: the part that packs "
         f"the last one writes the index\n"
     )
     assert second.stdout == (
