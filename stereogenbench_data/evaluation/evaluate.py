@@ -168,6 +168,8 @@ def select_workload(
         key: value for key, value in options.items() if key not in RunOptions.__optional_keys__
     }
     selection.setdefault("frames", "all")
+    data = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
+    data.require_released("The evaluation")
     dataset = StereoPairs(
         data,
         fields=tuple(dict.fromkeys((*fields_of(protocol), *inputs))),
@@ -176,7 +178,6 @@ def select_workload(
         **selection,
     )
     plan, index = dataset.plan, dataset.index
-    index.require_released("The evaluation")
     chosen, windows = plan.pairs, plan.windows
     if windows.is_clip or isinstance(windows, Random):
         raise EvaluationError(

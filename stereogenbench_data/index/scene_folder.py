@@ -50,6 +50,7 @@ from stereogenbench_data.schema.records import (
     Rig,
     Scene,
     SceneLabels,
+    TrainingFacts,
 )
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
@@ -64,7 +65,6 @@ from stereogenbench_data.schema.release import (
     TRAJECTORY_JSON,
     VIDEO_FILES,
     depth_name,
-    rgb_name,
 )
 from stereogenbench_data.schema.training import TrainingDocument, parse_training
 from stereogenbench_data.schema.trajectory import parse_trajectory
@@ -78,7 +78,9 @@ _T = TypeVar("_T")
 ValidDepth = Literal["skip", "sample"]
 
 _DESCRIPTIONS: Final = (DESCRIPTION_JSON, DESCRIPTION_TXT)
-_NEEDED: Final = (COMPLETE_JSON, BASELINE_JSON, TRAJECTORY_JSON, *VIDEO_FILES)
+_NEEDED: Final = (COMPLETE_JSON, BASELINE_JSON, TRAJECTORY_JSON)
+_NO_DEPTH: Final = StreamFacts(CODEC_NAME, "gray16le", 0, 0, 0, 0.0, {})
+"""What the index says of depth of a scene of training shards that has none."""
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
 _LEAST_BESIDE: Final = 0.9
@@ -183,43 +185,76 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     """
     folder = SceneFolder(root, key)
     files = folder.stamps()
-    _require_finished(key, files)
+    document = None
+    if TRAINING_JSON in files:
+        document = parse_training(folder.read(TRAINING_JSON), where=f"{key}/{TRAINING_JSON}")
+    videos = _videos_of(document)
+    _require_finished(key, files, videos=videos)
     rig, labels = parse_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
     marked = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
     trajectory = parse_trajectory(folder.read(TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}")
     texts: dict[str, bytes] = {name: folder.read(name) for name in _DESCRIPTIONS if name in files}
     caption = _caption(texts, key=key)
-    depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
-    facts = {name: _probed(folder, key, _held(files, name)) for name in VIDEO_FILES}
+    facts = {name: _probed(folder, key, _held(files, name)) for name in videos}
     counts = {name: fact.frames for name, fact in facts.items()}
     counts[TRAJECTORY_JSON] = trajectory.frame_count
     frames = _common(key, counts, what="number of frames", unit="frames")
-    rig = _sized_as_videos(key, rig, facts)
+    rig = _sized_as_videos(key, rig, facts, document=document)
     _require_kinds(key, rig, facts)
     poses = CameraPoses.from_trajectory(trajectory)
     _require_recorded_baselines(key, rig, poses)
     lateral_m = lateral_offsets_m(poses)
     residual_px = rectification_residual_px(poses, recorded_intrinsics(rig))
     _require_lateral_rig(key, rig, lateral_m, residual_px=residual_px)
-    units = [_depth_unit(facts[name], name=f"{key}/{name}") for name in depth_names]
+    depths = _of_each_camera({name: facts[name] for name in videos if name.endswith("_depth.mkv")})
+    units = [_depth_unit(facts, name=f"{key}/{name}") for name, facts in depths]
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
-    return Scene(
+    scene = Scene(
         id=parse_scene_key(key),
         labels=_merged_labels(labels, marked),
         caption=caption,
         rig=rig,
         frames=frames,
-        frame_rate_hz=facts[rgb_name(0)].frame_rate_hz,
+        frame_rate_hz=next(iter(facts.values())).frame_rate_hz,
         lateral_m=tuple(map(float, lateral_m)),
         rig_residual_px=residual_px,
         depth_unit_m=tuple(unit_m for unit_m, _ in units),
         depth_unit_source=tuple(source for _, source in units),
-        depth_codec=tuple(facts[name].codec for name in depth_names),
-        depth_pixel_format=tuple(facts[name].pixel_format for name in depth_names),
+        depth_codec=tuple(facts.codec for _, facts in depths),
+        depth_pixel_format=tuple(facts.pixel_format for _, facts in depths),
         valid_depth_ratio=ratio,
         key_frames=_common_key_frames(facts, frames=frames),
         members={name: Member(f"{key}/{name}", 0, size) for name, (size, _) in files.items()},
     )
+    if document is None:
+        return scene
+    derived = replace(derived_scene(scene, document), depth_codec=scene.depth_codec)
+    for what, found, said in (
+        ("key", key, document.key),
+        ("key frames", scene.key_frames, document.key_frames),
+    ):
+        if found != said:
+            raise StorageError(
+                f"{key}: {TRAINING_JSON} tells {what} {_brief(said)}, and the scene has "
+                f"{_brief(found)}. A file is of another scene: fetch the scene again."
+            )
+    return derived
+
+
+def _videos_of(document: TrainingDocument | None) -> tuple[str, ...]:
+    """Return the names of the videos that a scene must have: all, unless it was derived."""
+    if document is None:
+        return VIDEO_FILES
+    return tuple(
+        name for name in VIDEO_FILES if PACKED_DEPTH_NAMES.get(name, name) in document.files
+    )
+
+
+def _of_each_camera(depths: Mapping[str, StreamFacts]) -> list[tuple[str, StreamFacts]]:
+    """Return name and facts of each camera's depth; a camera without depth has another's."""
+    names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
+    some = next(iter(depths.items()), (names[0], _NO_DEPTH))
+    return [(name, depths[name]) if name in depths else some for name in names]
 
 
 def _held(files: Mapping[str, object], name: str) -> str:
@@ -240,14 +275,14 @@ def _probed(folder: SceneFolder, key: str, name: str) -> StreamFacts:
             video.close()
 
 
-def _require_finished(key: str, files: Mapping[str, object]) -> None:
+def _require_finished(key: str, files: Mapping[str, object], *, videos: tuple[str, ...]) -> None:
     if not files:
         raise IncompleteScene(f"{key}: the folder is empty")
     if COMPLETE_JSON not in files:
         raise IncompleteScene(f"{key}: has no {COMPLETE_JSON}, so it was never finished")
-    if not any(name in files for name in VIDEO_FILES):
-        raise IncompleteScene(f"{key}: has metadata only, and none of its 12 videos")
-    missing = [name for name in _NEEDED if _held(files, name) not in files]
+    if not any(_held(files, name) in files for name in videos):
+        raise IncompleteScene(f"{key}: has metadata only, and none of its {len(videos)} videos")
+    missing = [name for name in (*_NEEDED, *videos) if _held(files, name) not in files]
     if missing:
         raise StorageError(
             f"{key}: is marked as complete and has no {', '.join(missing)} "
@@ -292,20 +327,38 @@ def _common(key: str, found: Mapping[str, _T], *, what: str, unit: str) -> _T:
     return common
 
 
-def _sized_as_videos(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> Rig:
-    """Return the rig for pictures of the videos' size, where baseline.json records no size."""
+def _sized_as_videos(
+    key: str, rig: Rig, facts: Mapping[str, StreamFacts], *, document: TrainingDocument | None
+) -> Rig:
+    """Return the rig for pictures of the videos' size.
+
+    This differs from the recorded one where baseline.json records no size, and where the videos
+    were derived.
+    """
     sizes = {name: f"{fact.width_px}x{fact.height_px}" for name, fact in facts.items()}
     common = _common(key, sizes, what="picture size", unit="pixels")
-    width_px, height_px = facts[rgb_name(0)].width_px, facts[rgb_name(0)].height_px
-    if (width_px, height_px) == (rig.image_width_px, rig.image_height_px):
-        return rig
-    if rig.image_size_source == "recorded" or rig.principal_point_px is not None:
+    first = next(iter(facts.values()))
+    size_px = (first.width_px, first.height_px)
+    recorded_px = size_px if document is None else document.source_size_px
+    if document is not None and size_px != document.size_px:
+        raise StorageError(
+            f"{key}: {TRAINING_JSON} is for pictures of {document.size_px[0]}x"
+            f"{document.size_px[1]} pixels, and all videos have {common}. Fetch the scene again."
+        )
+    is_fixed = rig.image_size_source == "recorded" or rig.principal_point_px is not None
+    if recorded_px != (rig.image_width_px, rig.image_height_px) and is_fixed:
         raise StorageError(
             f"{key}: {BASELINE_JSON} is for pictures of {rig.image_width_px}x"
             f"{rig.image_height_px} pixels, and all videos have {common}. Correct image_width "
             f"and image_height, or fetch the videos again."
         )
-    return replace(rig, image_width_px=width_px, image_height_px=height_px)
+    width_px, height_px = size_px
+    return replace(
+        rig,
+        image_width_px=width_px,
+        image_height_px=height_px,
+        recorded_size_px=None if document is None else document.source_size_px,
+    )
 
 
 def _require_kinds(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> None:
@@ -383,12 +436,14 @@ def _valid_ratio(folder: SceneFolder, key: str, frames: int) -> float:
     encoding = DepthEncoding()
     files = folder.stamps()
     for name in (_held(files, depth_name(camera)) for camera in range(CAMERA_COUNT)):
+        if name not in files:
+            continue
         with open_depth(folder.video(name), name=f"{key}/{name}", frames=frames) as reader:
             for frame in sorted({0, frames // 2, frames - 1}):
                 units = read_depth_units(reader, frame, encoding=encoding)
                 known = measured(units, encoding=encoding, pixel_format=reader.facts.pixel_format)
                 shares.append(float(np.mean(known)))
-    return float(np.mean(shares))
+    return float(np.mean(shares)) if shares else 0.0
 
 
 def derived_scene(scene: Scene, document: TrainingDocument) -> Scene:
@@ -502,7 +557,10 @@ def _differing_training(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Di
         ("the picture size", document.size_px, _size_px(scene.rig)),
         ("the recorded size", document.source_size_px, scene.rig.recorded_size_px),
         ("the key frames", document.key_frames, scene.key_frames),
-        ("the source", derived.training, scene.training),
+        *(
+            (name, getattr(derived.training, name), getattr(scene.training, name, None))
+            for name in (each.name for each in fields(TrainingFacts))
+        ),
     ):
         if not _same_text(found, indexed):
             yield _difference(TRAINING_JSON, what, found, indexed)
