@@ -41,8 +41,8 @@ def pack(  # noqa: PLR0913 - one parameter an option
     shard_size: Annotated[
         str,
         typer.Option(
-            help="Largest size of a shard, such as 500MB or 2GiB. A scene is never divided: a "
-            "larger one has a larger shard to itself."
+            help="Largest size of a shard, such as 500MB or 2GiB (training shards: about). A scene "
+            "is never divided: a larger one has a larger shard to itself."
         ),
     ] = "2GB",
     part: Annotated[
@@ -241,7 +241,7 @@ def verify(
         if comparison is not None:
             decoded += f", {report.videos_compared} compared with {comparison}"
         if report.derived:
-            typer.echo(f"{report.root}: {report.derived}")
+            typer.echo(plain_line(f"{report.root}: {report.derived}"))
         typer.echo(
             f"{report.root}: {counted(report.shards, 'shard')}, {counted(report.scenes, 'scene')}, "
             f"{counted(report.members, 'member')}, {report.bytes / 1e6:.1f} MB{decoded}; "

@@ -36,6 +36,7 @@ _FORMAT: Final = 1
 _LARGEST_SIDE_PX: Final = 2**16
 _LARGEST_INT: Final = 2**53
 _DIGEST: Final = re.compile(r"[0-9a-f]{64}")
+_WORD: Final = re.compile(r"[A-Za-z0-9_.+-]{1,40}")
 _CRC32: Final = re.compile(r"[0-9a-f]{8}")
 
 
@@ -143,7 +144,9 @@ def parse_training(text: bytes, *, where: str) -> TrainingDocument:
     source.require_keys("key", "index_digest", "width_px", "height_px")
     derived.require_keys("width_px", "height_px", "quality", "key_frames")
     pictures.require_keys("codec", "pixel_format", "options", "key_frame_distance")
-    pictures.text("codec"), pictures.text("pixel_format")
+    for place, name in ((pictures, "codec"), (pictures, "pixel_format"), (derived, "quality")):
+        if not _WORD.fullmatch(place.text(name)):
+            raise place.wrong(name, "must be a name of letters, digits and _ . + -")
     pictures.integer("key_frame_distance", least=1)
     for each in (pictures.object("options"), root.object("versions")):
         for name in each.value:

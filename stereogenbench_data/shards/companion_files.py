@@ -70,8 +70,8 @@ def derivation_facts(index: SceneIndex) -> dict[str, Any]:
     mean_db = [each for _, training in known for each in training.psnr_db if each == each]
     worst_db = [each for _, training in known for each in training.worst_psnr_db if each == each]
     facts["psnr_db"] = {
-        "mean": round(sum(mean_db) / len(mean_db), 3),
-        "worst_frame": min(worst_db),
+        "mean": round(sum(mean_db) / max(len(mean_db), 1), 3),
+        "worst_frame": min(worst_db, default=0.0),
     }
     return facts
 

@@ -5,6 +5,7 @@ share nothing but the plan, which is a function of the release and the target si
 """
 
 import json
+import shutil
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -255,6 +256,7 @@ def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
         return report
     for task, manifest in zip(job.tasks, shards, strict=True):
         _require_same_rows(task, manifest)
+        shutil.rmtree(task.derived, ignore_errors=True)  # of a run killed after its last shard
     index = SceneIndex.from_scenes(
         [
             scene

@@ -25,6 +25,7 @@ from stereogenbench_data import (
     export_inputs,
     score_controls,
 )
+from stereogenbench_data.audit.contract.doctor import diagnose
 from stereogenbench_data.audit.geometry_audit import AuditRequest, audit
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import MediaError, SchemaError, ShardError, StorageError
@@ -37,6 +38,7 @@ from stereogenbench_data.media.picture_encoding import (
 from stereogenbench_data.media.video import probe
 from stereogenbench_data.schema.release import TRAINING_JSON
 from stereogenbench_data.schema.training import parse_training
+from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
 from stereogenbench_data.shards.unpack import unpack
@@ -223,6 +225,9 @@ def test_the_same_input_gives_the_same_bytes_whatever_the_workers_and_parts(
 
 
 def test_a_finished_pack_is_kept_and_leaves_no_files_of_scenes(shards, release):
+    left = shards / ".parts" / "train-Uniform-000000.derived" / KEY
+    left.mkdir(parents=True)
+    (left / TRAINING_JSON).write_bytes(b"{}")
     report = pack(release, shards, training=SETTINGS, workers=1)
 
     assert report.packed == ()
@@ -429,9 +434,10 @@ def test_a_smaller_size_works_on_top_and_a_larger_one_warns(packed):
         lambda data, out: export_inputs(data, out, tier="G1"),
         lambda data, out: score_controls(data),
         lambda data, out: audit(data),
+        lambda data, out: diagnose(data),
         lambda data, out: pack(data, out, training=TrainingSettings((12, 16)), workers=1),
     ],
-    ids=["evaluate", "export-inputs", "controls", "audit", "pack"],
+    ids=["evaluate", "export-inputs", "controls", "audit", "doctor", "pack"],
 )
 def test_what_needs_released_pictures_refuses_derived_ones(packed, tmp_path, work):
     (tmp_path / "out").mkdir()
@@ -461,6 +467,19 @@ def test_unpacked_training_shards_are_a_folder_of_derived_scenes(packed, tmp_pat
         StereoPairs(folder, fields=("disparity",))[1]["disparity"],
         StereoPairs(packed, fields=("disparity",))[1]["disparity"],
     )
+
+
+def test_a_download_of_a_part_is_a_folder_of_derived_scenes(packed, tmp_path):
+    index = SceneIndex.open(packed)
+    part = plan_download(index, [0], cameras=[0, 1], streams=["rgb", "depth"])
+    download(index, part, tmp_path, workers=1)
+
+    assert repr(SceneIndex.open(tmp_path).scene(0).training) == repr(index.scene(0).training)
+    folder = StereoPairs(tmp_path)
+    one, other = folder[0], StereoPairs(packed)[0]
+    folder.close()
+    assert torch.equal(one["left"], other["left"])
+    assert torch.equal(one["disparity"], other["disparity"])
 
 
 # Damage and alteration.
@@ -512,6 +531,26 @@ def test_an_altered_psnr_contradicts_the_shard(shards):
     ]
     assert problem.scene == scenes[0].id.key
     assert "60.0" in problem.found
+
+
+@pytest.mark.parametrize(
+    ("facts", "found"),
+    [
+        ({"quality": "[small](http://x)"}, "training_quality"),
+        ({"source_digest": "none"}, "training_source"),
+        ({"settings": "[" * 9999}, "training_settings"),
+        ({"settings": "{"}, "training_settings"),
+        ({"psnr_db": (400.0,) * 6}, "psnr_db"),
+        ({"psnr_db": (40.0,) * 5}, "psnr_db"),
+        ({"worst_psnr_db": (-math.inf,) * 6}, "worst_psnr_db"),
+    ],
+)
+def test_an_index_cannot_say_other_things_of_training_shards(packed, facts, found):
+    scene = SceneIndex.open(packed).scene(0)
+    altered = replace(scene, training=replace(scene.training, **facts))
+
+    with pytest.raises(StorageError, match=rf"{found} is .*altered"):
+        SceneIndex.from_scenes([altered], packed)
 
 
 @pytest.mark.parametrize(
