@@ -81,8 +81,8 @@ def _h264(rate_factor: int, *, bits_a_pixel: float) -> PictureCodec:
 
 
 QUALITIES: Final[dict[Quality, PictureCodec]] = {
-    "small": _h264(18, bits_a_pixel=0.75),
-    "balanced": _h264(10, bits_a_pixel=1.75),
+    "small": _h264(18, bits_a_pixel=0.8),
+    "balanced": _h264(10, bits_a_pixel=2.0),
     "high": PictureCodec(
         "mjpeg", "yuvj444p", {"quality": "95", "subsampling": "4:4:4"}, 1, bits_a_pixel=5.0
     ),

@@ -15,7 +15,7 @@ because it is stored without loss.
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -25,7 +25,6 @@ from stereogenbench_data.schema.records import TrainingFacts
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     PACKED_DEPTH_NAMES,
-    depth_name,
     rgb_name,
 )
 
@@ -249,16 +248,3 @@ class _Object:
             self.integer(name, least=1, most=_LARGEST_SIDE_PX) for name in ("width_px", "height_px")
         )
         return width_px, height_px
-
-
-def training_cameras(names: Sequence[str]) -> list[int]:
-    """Return the cameras of which the names of a scene's files hold pictures or depth."""
-    return [
-        camera
-        for camera in range(CAMERA_COUNT)
-        if not {
-            rgb_name(camera),
-            depth_name(camera),
-            PACKED_DEPTH_NAMES[depth_name(camera)],
-        }.isdisjoint(names)
-    ]

@@ -205,7 +205,7 @@ def prepare(  # noqa: PLR0913 - what `pack` takes
         for task in tasks:
             manifest = read_manifest(task)
             if manifest is not None and task.target.is_file():
-                if task.derivation is None:
+                if task.derivation is None:  # else the plan holds the digest of the source's index
                     _require_same_sources(task, manifest)
                 _require_same_rows(task, manifest)
     except OSError as error:

@@ -58,7 +58,7 @@ SAMPLED_SCENES: Final = 3
 _LARGEST_DENOMINATOR: Final = 100_000
 _PICTURE_STEPS: Final = 3
 """A picture is decoded, encoded, and decoded again."""
-_DEPTH_BITS_A_PIXEL: Final = 3.0
+_DEPTH_BITS_A_PIXEL: Final = 1.5
 _FIXED_BYTES: Final = 8192
 
 
