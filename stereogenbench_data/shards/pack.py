@@ -5,6 +5,7 @@ share nothing but the plan, which is a function of the release and the target si
 """
 
 import json
+import os
 import shutil
 import warnings
 from collections.abc import Iterator, Sequence
@@ -38,6 +39,7 @@ from stereogenbench_data.shards.writer import (
     ShardManifest,
     ShardTask,
     SourceStamp,
+    derive_task,
     find_packed,
     find_touched,
     not_of_plan,
@@ -150,12 +152,24 @@ def pack(  # noqa: PLR0913 - each is an option of the command
     left = sum(task.shard.source_bytes for task in tasks)
     advance = advance_of(progress, done=total - left, total=total)
     advance(0)
+    is_counted = False
+    if training is not None and len(tasks) < (workers or os.cpu_count() or 1):
+        # Fewer shards than processes: these share the scenes, and the shards are packed after.
+        scenes = [(task, scene) for task in tasks for scene in task.shard.scenes]
+        for _ in engine.map(
+            derive_task,
+            scenes,
+            name=lambda work: f"{work[0].target}: {work[1].id.key}",
+            workers=workers,
+            advance=advance,
+        ):
+            is_counted = True
     outcomes = engine.map(
         pack_task,
         tasks,
         name=lambda task: str(task.target),
         workers=workers,
-        advance=advance,
+        advance=(lambda count: advance(0)) if is_counted else advance,
     )
     return _finish(job, packed={shard.name for shard, work in outcomes if work == "packed"})
 

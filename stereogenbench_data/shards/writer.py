@@ -206,18 +206,35 @@ def pack_task(
     done = find_packed(task)
     if done is not None:
         return done, "kept"
+    with _named_errors(task), _open_exclusive(task.unfinished) as file:
+        done = find_packed(task) or find_touched(task, after_bytes)
+        if done is not None:
+            return done, "kept"
+        if task.derivation is None:
+            return _pack(task, file, after_bytes)
+        derived = _with_derived_files(task, task.derivation, after_bytes)
+        # What is copied from now on was counted when it was derived.
+        packed = _pack(derived, file, lambda count: after_bytes(0))
+        shutil.rmtree(task.derived, ignore_errors=True)
+        return packed
+
+
+def derive_task(work: tuple[ShardTask, Scene], after_bytes: Advance) -> None:
+    """Derive the files of one scene of a shard, unless they are there; a worker calls this.
+
+    Raises:
+        ShardError: As `pack_task` says.
+    """
+    task, scene = work
+    with _named_errors(task):
+        _derive(task, scene, after_bytes)
+
+
+@contextmanager
+def _named_errors(task: ShardTask) -> Iterator[None]:
+    """Turn errors of the system about a shard into a ShardError that names it."""
     try:
-        with _open_exclusive(task.unfinished) as file:
-            done = find_packed(task) or find_touched(task, after_bytes)
-            if done is not None:
-                return done, "kept"
-            if task.derivation is None:
-                return _pack(task, file, after_bytes)
-            derived = _with_derived_files(task, task.derivation, after_bytes)
-            # What is copied from now on was counted when it was derived.
-            packed = _pack(derived, file, lambda count: after_bytes(0))
-            shutil.rmtree(task.derived, ignore_errors=True)
-            return packed
+        yield
     except OSError as error:
         if isinstance(error, ShardError):
             raise
@@ -256,12 +273,27 @@ def _open_exclusive(path: Path) -> Iterator[FileIO]:
             path.unlink(missing_ok=True)
 
 
+def _derive(task: ShardTask, scene: Scene, after_bytes: Advance) -> None:
+    """Derive the files of a scene, in this process alone."""
+    if task.derivation is None:
+        return
+    folder = task.derived / scene.id.key
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with try_locked(folder.with_name(f".{folder.name}.lock")) as is_ours:
+        if not is_ours:
+            raise ShardError(
+                f"{folder}: another process is deriving this scene. Give each process a part of "
+                f"its own (--part I/N), or wait for that one."
+            )
+        derive_scene(task.derivation, scene, folder, advance=after_bytes)
+
+
 def _with_derived_files(task: ShardTask, derivation: Derivation, after_bytes: Advance) -> ShardTask:
     """Derive the files of a shard's scenes; return the task that packs them as they are."""
     members = []
     for scene in task.shard.scenes:
         key = scene.id.key
-        derive_scene(derivation, scene, task.derived / key, advance=after_bytes)
+        _derive(task, scene, after_bytes)
         members += [
             PlannedMember(
                 f"{key}.{name}", f"{key}/{name}", (task.derived / key / name).stat().st_size

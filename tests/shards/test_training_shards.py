@@ -43,6 +43,7 @@ from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
 from stereogenbench_data.shards.unpack import unpack
 from stereogenbench_data.shards.verify import verify
+from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.synthesis import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.servers.tools import require_module
@@ -222,6 +223,36 @@ def test_the_same_input_gives_the_same_bytes_whatever_the_workers_and_parts(
     assert (first.index, len(first.missing)) == (None, 1)
     assert second.missing == ()
     assert bytes_of(tmp_path / "two") == bytes_of(tmp_path / "parts") == bytes_of(packed)
+
+
+def test_more_processes_than_shards_share_the_scenes(packed, release, tmp_path):
+    seen = []
+    report = pack(
+        release,
+        tmp_path,
+        training=SETTINGS,
+        rows=[1, 2],
+        workers=2,
+        progress=lambda done, total: seen.append((done, total)),
+    )
+
+    shard = "train-Uniform-000000.tar"
+    assert report.packed == (shard,)
+    assert (tmp_path / shard).read_bytes() == (packed / shard).read_bytes()
+    assert seen == sorted(seen)
+    assert seen[-1][0] == seen[-1][1]
+    assert not list((tmp_path / ".parts").glob("*.derived"))
+
+
+def test_a_scene_that_another_process_derives_is_left_to_it(release, tmp_path):
+    folder = tmp_path / ".parts" / "train-Uniform-000000.derived" / KEY
+    folder.parent.mkdir(parents=True)
+
+    with (
+        try_locked(folder.with_name(f".{folder.name}.lock")),
+        pytest.raises(ShardError, match=r"scene_000001: another process .*--part I/N"),
+    ):
+        pack(release, tmp_path, training=SETTINGS, rows=[2], workers=1)
 
 
 def test_a_finished_pack_is_kept_and_leaves_no_files_of_scenes(shards, release):
