@@ -28,7 +28,7 @@ from stereogenbench_data.media.depth import (
     resolve_encoding,
 )
 from stereogenbench_data.media.depth_frames import DepthFrames
-from stereogenbench_data.media.picture_encoding import QUALITIES, measured_error
+from stereogenbench_data.media.picture_encoding import measured_error
 from stereogenbench_data.media.video import VideoReader, probe, require_pixel_aspect
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
@@ -476,8 +476,7 @@ def _comparisons(
         row = rows.get(scene.id.key)
         released = None if row is None else source.scene(row)
         size = (scene.rig.image_height_px, scene.rig.image_width_px)
-        quality = "balanced" if scene.training is None else scene.training.quality
-        settings = TrainingSettings(size, "high" if quality not in QUALITIES else quality)
+        settings = TrainingSettings(size, "high")  # nothing is encoded, and it stores any size
         derivation = Derivation.of_index(source, settings, [] if released is None else [released])
         names = tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound)
         tasks.append(ComparisonTask(index.root, scene, released, derivation, names))
