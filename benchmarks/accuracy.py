@@ -31,7 +31,7 @@ from benchmarks.ways import (
 )
 from stereogenbench_data.geometry.disparity import disparity_error_px
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.samples.views import resized_nearest
+from stereogenbench_data.media.depth import resized_nearest
 
 CASES: Final = 240
 PIXELS: Final = (8, 256)

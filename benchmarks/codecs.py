@@ -22,7 +22,6 @@ from typing import Any, Final
 
 import av
 import cv2
-import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
@@ -30,11 +29,10 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from benchmarks.results import machine
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.media.depth import open_depth, read_depth_units
+from stereogenbench_data.media.depth import open_depth, read_depth_units, resized_nearest
 from stereogenbench_data.media.depth_frames import blosc2_module
 from stereogenbench_data.media.video import VideoReader, read_rgb
 from stereogenbench_data.samples.size import parse_size
-from stereogenbench_data.samples.views import resized_nearest
 from stereogenbench_data.schema.records import DepthEncoding
 
 FRAMES: Final = 48

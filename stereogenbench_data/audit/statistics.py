@@ -100,6 +100,7 @@ class Statistics:
         families: Figures of each (split, subset, family) of the data.
         branches: Figures of each (split, family), the subsets of eval together.
         short_pairs: The short baselines of Pairwise_Uniform.
+        derived: What training shards were derived from, and how; empty for released data.
     """
 
     root: str
@@ -107,6 +108,7 @@ class Statistics:
     families: tuple[FamilyStatistics, ...]
     branches: tuple[FamilyStatistics, ...]
     short_pairs: ShortPairs
+    derived: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the statistics as values for `json.dumps`."""
@@ -148,6 +150,7 @@ def statistics(index: SceneIndex, **filters: Unpack[SceneFilters]) -> Statistics
         families=tuple(families),
         branches=tuple(branches),
         short_pairs=ShortPairs(int(short.sum()), len(concerned), tuple(maps)),
+        derived=index.derivation if index.is_derived else "",
     )
 
 

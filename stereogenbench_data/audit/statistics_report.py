@@ -174,6 +174,7 @@ def statistics_markdown(found: Statistics, lines: Sequence[Line] = ()) -> str:
     """Return statistics as Markdown, with the comparison with the paper if given."""
     text = [
         f"# Statistics of {markdown_text(str(found.root))}",
+        *([] if not found.derived else ["", f"These are {found.derived}."]),
         *_section("Scenes", _count_rows(found)),
         *_section("Adjacent baselines (cm)", _spread_rows(found.branches, "adjacent")),
         *_section("Baselines of all 15 pairs (cm)", _spread_rows(found.branches, "all pairs")),

@@ -21,8 +21,10 @@ from stereogenbench_data.schema.release import (
     CAMERA_PAIRS,
     DESCRIPTION_TXT,
     METADATA_FILES,
+    TRAINING_JSON,
 )
 from stereogenbench_data.schema.text import counted, markdown_text
+from stereogenbench_data.shards.companion_files import derivation_facts
 from stereogenbench_data.sources.files import write_atomic
 
 CARD_NAME: Final = "README.md"
@@ -103,7 +105,9 @@ def _head(index: SceneIndex, configs: _Configs) -> list[str]:
 
 def _features(index: SceneIndex) -> dict[str, str]:
     kinds = {name: "string" if name == DESCRIPTION_TXT else "json" for name in METADATA_FILES}
-    videos = sorted(name for name in index.scene(0).members if name.startswith("cam_"))
+    members = index.scene(0).members
+    videos = sorted(name for name in members if name.startswith("cam_"))
+    kinds |= {TRAINING_JSON: "json"} if TRAINING_JSON in members else {}
     return kinds | dict.fromkeys(videos, "binary") | {"__key__": "string", "__url__": "string"}
 
 
@@ -142,12 +146,14 @@ def _body(index: SceneIndex, configs: _Configs, repository: str) -> list[str]:
     config = next(name for name in configs if name != "all")
     split = next(iter(configs[config]))
     rules: dict[str, Any] = dataset_facts.RESPONSIBLE_USE
+    size = "" if index.is_derived else ", size=(480, 832)"
     sections = ("dataUseCases", "dataLimitations", "dataBiases", "personalSensitiveInformation")
     return [
         f"# {dataset_facts.TITLE}",
         "",
         dataset_facts.DESCRIPTION,
         "",
+        *_derivation(index),
         "## How to load",
         "",
         "With stereogenbench-data (`pip install 'stereogenbench-data[hub]'`), which reads only the",
@@ -157,7 +163,7 @@ def _body(index: SceneIndex, configs: _Configs, repository: str) -> list[str]:
         "from stereogenbench_data import StereoPairs",
         "",
         f'pairs = StereoPairs("hf://datasets/{repository}", split="{split.partition("_")[0]}",',
-        f'                    family="{config}", pairs="all", frames="all", size=(480, 832))',
+        f'                    family="{config}", pairs="all", frames="all"{size})',
         "loader = pairs.loader(batch_size=8, num_workers=2, seed=0)",
         "```",
         "",
@@ -195,6 +201,26 @@ def _body(index: SceneIndex, configs: _Configs, repository: str) -> list[str]:
         "```bibtex",
         dataset_facts.CITATION,
         "```",
+    ]
+
+
+def _derivation(index: SceneIndex) -> list[str]:
+    if not index.is_derived:
+        return []
+    facts = derivation_facts(index)
+    psnr_db = facts["psnr_db"]
+    return [
+        "## Derived for training",
+        "",
+        f"{dataset_facts.DERIVED}",
+        "",
+        f"- size {facts['size']}, quality {facts['quality']}, pictures by {facts['codec']}, depth "
+        f"by blosc2 without loss",
+        f"- PSNR of pictures: {psnr_db['mean']:.2f} dB on average, {psnr_db['worst_frame']:.2f} "
+        f"in the worst frame",
+        f"- source: the release with index {facts['source_digest']}",
+        f"- settings: `{json.dumps(facts['settings'], sort_keys=True)}`",
+        "",
     ]
 
 

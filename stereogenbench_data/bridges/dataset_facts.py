@@ -22,6 +22,11 @@ DESCRIPTION: Final = (
     "for training alone (Pairwise_Uniform); eval scenes on maps that training has seen and on "
     "maps that it has not."
 )
+DERIVED: Final = (
+    "These shards were derived from the release for training, and do not replace it: pictures are "
+    "smaller and were encoded again, with an error; depth has the nearest pixels of the released "
+    "depth, without loss. Scores of the benchmark need the released pictures."
+)
 LICENCE_NOTE: Final = (
     "The rendered RGB and depth, the scene manifests and the authored metadata are CC-BY-4.0; the "
     "authors' code is MIT. Third-party Unreal Engine maps, character meshes, animations, textures "

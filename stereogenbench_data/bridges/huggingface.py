@@ -11,6 +11,7 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     METADATA_FILES,
     PACKED_DEPTH_NAMES,
+    TRAINING_JSON,
     VIDEO_FILES,
 )
 
@@ -61,7 +62,8 @@ def features(*, depth_suffix: str = "mkv") -> "Features":
 
     Args:
         depth_suffix: The suffix of depth members: "mkv" as released, "b2frame" in shards packed
-            with ``--depth-codec blosc2``.
+            with ``--depth-codec blosc2`` and in training shards; a row then also has
+            ``training.json``, None in the former.
 
     Raises:
         SelectionError: If ``depth_suffix`` is neither.
@@ -79,6 +81,8 @@ def features(*, depth_suffix: str = "mkv") -> "Features":
     kinds: dict[str, Any] = {
         name: Value("string") if name == DESCRIPTION_TXT else Json() for name in METADATA_FILES
     }
+    if names:
+        kinds[TRAINING_JSON] = Json()
     for name in VIDEO_FILES:
         kinds[names.get(name, name)] = Value("binary")
     return Features(kinds | {"__key__": Value("string"), "__url__": Value("string")})
@@ -125,7 +129,7 @@ class _RowDecoder:
 
     def _samples(self, row: dict[str, Any]) -> list[Sample]:
         absent = [name for name in VIDEO_FILES if name in row and row[name] is None]
-        if absent:
+        if absent and row.get(TRAINING_JSON) is None:
             raise StorageError(
                 f"{row['__key__']}: the shard has no {', '.join(absent)}. If it was packed with "
                 '--depth-codec blosc2, read it with features(depth_suffix="b2frame").'

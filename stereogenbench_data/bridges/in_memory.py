@@ -18,12 +18,17 @@ from stereogenbench_data.index.scene_folder import describe_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.schema.parse import parse_scene_key
-from stereogenbench_data.schema.release import METADATA_FILES, PACKED_DEPTH_NAMES, VIDEO_FILES
+from stereogenbench_data.schema.release import (
+    METADATA_FILES,
+    PACKED_DEPTH_NAMES,
+    TRAINING_JSON,
+    VIDEO_FILES,
+)
 from stereogenbench_data.selection.pairs import PairsSpec
 from stereogenbench_data.selection.windows import FramesSpec
 
 _VIDEOS: Final = (*VIDEO_FILES, *PACKED_DEPTH_NAMES.values())
-_FILES: Final = (*METADATA_FILES, *_VIDEOS)
+_FILES: Final = (*METADATA_FILES, TRAINING_JSON, *_VIDEOS)
 
 
 class SampleOptions(TypedDict, total=False):

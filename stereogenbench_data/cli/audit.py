@@ -69,6 +69,10 @@ def audit(  # noqa: PLR0913 - one parameter an option
             autocompletion=_complete_limit,
         ),
     ] = None,
+    derived: Annotated[
+        Literal["refuse", "ok"],
+        typer.Option(help="Whether to audit training shards, whose pictures have an error."),
+    ] = "refuse",
     out: OutOption = None,
     journal: Annotated[
         Path | None,
@@ -110,6 +114,7 @@ def audit(  # noqa: PLR0913 - one parameter an option
         seed=seed,
         depth=None if contract == DepthEncoding() else contract,
         limits=AuditLimits.parse(limit or []),
+        derived=derived,
     )
     options: Any = chosen.filters() | work.options()
     with progress_bar("reading the index", unit="scenes") as progress:

@@ -36,6 +36,8 @@ def browse(
     service = Service(Catalogue(index, shown_data=shown_data, depth=depth), reader)
     with PageServer(service, port=port) as server:
         typer.echo(f"{server.url}: {counted(len(index), 'scene')} of {shown_data}; Ctrl-C ends it")
+        if index.is_derived:
+            typer.echo(f"{shown_data}: {index.derivation}")
         if open_page:
             webbrowser.open(server.url)
         try:

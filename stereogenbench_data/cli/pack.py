@@ -1,9 +1,10 @@
 """``stereogenbench pack``, ``verify``, ``unpack``: released trees into tar shards, and back."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -12,6 +13,7 @@ from stereogenbench_data.cli.errors import FINDINGS, resumable
 from stereogenbench_data.cli.options import (
     JsonOption,
     RootOption,
+    SceneOptions,
     ShardsOptions,
     WorkOptions,
     grouped,
@@ -19,25 +21,61 @@ from stereogenbench_data.cli.options import (
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted, plain_line
 
+if TYPE_CHECKING:
+    from stereogenbench_data.index.table import SceneIndex
+    from stereogenbench_data.shards.training import TrainingSettings
+
 
 @grouped
 @resumable()
 def pack(  # noqa: PLR0913 - one parameter an option
-    root: Annotated[str, typer.Argument(help="Released tree, or its index file.")],
+    root: Annotated[
+        str,
+        typer.Argument(
+            help="Released tree, or its index file; with --size also shards, or the URL of either."
+        ),
+    ],
     out: Annotated[Path, typer.Argument(help="Folder for the shards and their index.")],
     *,
     data_root: RootOption = None,
     shard_size: Annotated[
         str,
         typer.Option(
-            help="Largest size of a shard, such as 500MB or 2GiB. A scene is never divided: a "
-            "larger one has a larger shard to itself."
+            help="Largest size of a shard, such as 500MB or 2GiB (training shards: about). A scene "
+            "is never divided: a larger one has a larger shard to itself."
         ),
     ] = "2GB",
     part: Annotated[
         str,
         typer.Option(help="I/N packs every N-th shard from the I-th on: one part per machine."),
     ] = "1/1",
+    size: Annotated[
+        str | None,
+        typer.Option(
+            help="WIDTHxHEIGHT, such as 832x480: make training shards, with pictures encoded at "
+            "this size for fast decoding in any order, and depth at this size without loss."
+        ),
+    ] = None,
+    quality: Annotated[
+        Literal["small", "balanced", "high"] | None,
+        typer.Option(
+            help="Of training shards [balanced]; small: fewest bytes (H.264); balanced: less error "
+            "(H.264); high: least error, and any frame at once (JPEG)."
+        ),
+    ] = None,
+    cameras: Annotated[
+        str | None,
+        typer.Option(help="Cameras of training shards, such as 0,1 [all that a scene has]."),
+    ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run",
+            help="Derive a sample of the training shards, print the bytes and core-hours that all "
+            "would take, and write nothing.",
+        ),
+    ] = False,
+    chosen: SceneOptions,
     work: WorkOptions,
     depth_codec: Annotated[
         Literal["released", "blosc2"],
@@ -53,7 +91,12 @@ def pack(  # noqa: PLR0913 - one parameter an option
     To continue a stopped run, run it again: it keeps finished shards by their sizes, times of
     change and metadata. `stereogenbench verify` reads every byte. With --part, run the same command
     once for each I; the last one to finish writes the index.
+
+    With --size the shards are derived for training: smaller pictures, a key frame every few frames,
+    depth bit for bit as `size=` gives it. Each video is decoded again, and its error is in the
+    index. Evaluation and audit refuse such data.
     """
+    from stereogenbench_data.selection.filters import filter_scenes
     from stereogenbench_data.shards.pack import pack as packed_by
     from stereogenbench_data.shards.plan import parse_bytes
 
@@ -63,13 +106,24 @@ def pack(  # noqa: PLR0913 - one parameter an option
             f"{part!r} is not a part: write I/N, such as 1/4.", param_hint="--part"
         )
     target_bytes = parse_bytes(shard_size)
+    training = _training(size, quality=quality, cameras=cameras, depth_codec=depth_codec)
+    if dry_run and training is None:
+        raise typer.BadParameter("estimates training shards: give --size.", param_hint="--dry-run")
     index = open_index(root, root=data_root)
+    filters: Any = chosen.filters()
+    rows = filter_scenes(index, filters).tolist() if filters else None
+    scenes = len(index) if rows is None else len(rows)
+    if dry_run and training is not None:
+        _print_estimate(index, rows or range(scenes), training, as_json=as_json)
+        return
     with progress_bar("packing", unit="MB") as progress:
         report = packed_by(
             index,
             out,
             target_bytes=target_bytes,
             depth_codec=depth_codec,
+            training=training,
+            rows=rows,
             part=(int(number), int(count)),
             **work.options(),
             progress=progress,
@@ -80,7 +134,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
             "packed": report.packed,
             "part": report.part,
             "missing": report.missing,
-            "scenes": len(index),
+            "scenes": scenes,
         }
         typer.echo(json.dumps(document, indent=2))
         return
@@ -95,7 +149,53 @@ def pack(  # noqa: PLR0913 - one parameter an option
             f"{report.missing[0]} on: the part that packs the last one writes the index"
         )
     else:
-        typer.echo(f"{report.index}: {counted(len(index), 'scene')}")
+        typer.echo(f"{report.index}: {counted(scenes, 'scene')}")
+
+
+def _training(
+    size: str | None, *, quality: Any, cameras: str | None, depth_codec: str
+) -> "TrainingSettings | None":
+    """Return the settings of training shards; None without a size."""
+    if size is None:
+        for option, value in (("--quality", quality), ("--cameras", cameras)):
+            if value is not None:
+                raise typer.BadParameter("is of training shards: give --size.", param_hint=option)
+        return None
+    from stereogenbench_data.cli.evaluate import parse_picture_size
+    from stereogenbench_data.shards.training import TrainingSettings
+
+    if depth_codec != "released":
+        raise typer.BadParameter(
+            "training shards have depth of their own: leave it out.", param_hint="--depth-codec"
+        )
+    numbers = None
+    if cameras is not None:
+        parts = [part.strip() for part in cameras.split(",")]
+        if not all(part in set("012345") for part in parts):
+            raise typer.BadParameter(
+                f"{cameras!r}: write numbers from 0 to 5, such as 0,1", param_hint="--cameras"
+            )
+        numbers = tuple(sorted({int(part) for part in parts}))
+    return TrainingSettings(parse_picture_size(size), quality or "balanced", numbers)
+
+
+def _print_estimate(
+    index: "SceneIndex", rows: Sequence[int], training: "TrainingSettings", *, as_json: bool
+) -> None:
+    from tempfile import TemporaryDirectory
+
+    from stereogenbench_data.shards.training import estimate
+
+    with TemporaryDirectory() as folder:
+        found = estimate(index, rows, training, folder=Path(folder))
+    if as_json:
+        typer.echo(json.dumps(asdict(found), indent=2))
+        return
+    typer.echo(
+        f"{counted(found.scenes, 'scene')}, {counted(found.videos, 'video')}: about "
+        f"{found.bytes / 1e6:,.1f} MB from {found.source_bytes / 1e6:,.1f} MB, in about "
+        f"{found.core_hours:,.2g} core-hours (by one camera of {len(found.sampled)} scenes)"
+    )
 
 
 @grouped
@@ -105,6 +205,13 @@ def verify(
     deep: Annotated[
         bool, typer.Option("--deep", help="Decode every video too, and count its frames.")
     ] = False,
+    comparison: Annotated[
+        str | None,
+        typer.Option(
+            "--source",
+            help="With --deep: the released data of training shards, to compare every frame with.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
     work: WorkOptions,
 ) -> None:
@@ -114,11 +221,14 @@ def verify(
     """
     from stereogenbench_data.shards.verify import verify as verified
 
+    if comparison is not None and not deep:
+        raise typer.BadParameter("compares frames: add --deep.", param_hint="--source")
     with progress_bar("verifying", unit="MB") as progress:
         report = verified(
             source.shards,
             root=source.data_root,
             mode="decode" if deep else "bytes",
+            source=None if comparison is None else open_index(comparison),
             **work.options(),
             progress=progress,
         )
@@ -128,6 +238,10 @@ def verify(
         for problem in report.problems:
             typer.echo(plain_line(str(problem)))
         decoded = f", {counted(report.videos_decoded, 'video')} decoded" if deep else ""
+        if comparison is not None:
+            decoded += f", {report.videos_compared} compared with {comparison}"
+        if report.derived:
+            typer.echo(plain_line(f"{report.root}: {report.derived}"))
         typer.echo(
             f"{report.root}: {counted(report.shards, 'shard')}, {counted(report.scenes, 'scene')}, "
             f"{counted(report.members, 'member')}, {report.bytes / 1e6:.1f} MB{decoded}; "

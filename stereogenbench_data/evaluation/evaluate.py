@@ -164,11 +164,14 @@ def select_workload(
         SelectionError: If nothing matches.
         MediaError: If depth that a metric needs cannot have been stored whole.
         EvaluationError: If the samples are clips, random frames, sweeps or right to left.
+        StorageError: If the data were derived for training, whose pictures have an error.
     """
     selection: dict[str, Any] = {
         key: value for key, value in options.items() if key not in RunOptions.__optional_keys__
     }
     selection.setdefault("frames", "all")
+    data = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
+    data.require_released("The evaluation")
     dataset = StereoPairs(
         data,
         fields=tuple(dict.fromkeys((*fields_of(protocol), *inputs))),

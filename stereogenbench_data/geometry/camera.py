@@ -130,11 +130,23 @@ class Intrinsics:
 
 
 def rig_intrinsics(rig: Rig) -> Intrinsics:
+    """Return the intrinsics of all six cameras of a rig, for its stored pictures.
+
+    Where these have another size than the recorded one, the numbers equal those of `resized`, bit
+    for bit.
+    """
+    recorded = recorded_intrinsics(rig)
+    if rig.recorded_size_px is None:
+        return recorded
+    return recorded.resized(width_px=rig.image_width_px, height_px=rig.image_height_px)
+
+
+def recorded_intrinsics(rig: Rig) -> Intrinsics:
     """Return the intrinsics of all six cameras of a rig, at the recorded image size."""
     return Intrinsics.from_mm(
         focal_mm=rig.focal_mm,
         sensor_mm=(rig.sensor_width_mm, rig.sensor_height_mm),
-        size_px=(rig.image_width_px, rig.image_height_px),
+        size_px=rig.recorded_size_px or (rig.image_width_px, rig.image_height_px),
         principal_point_px=rig.principal_point_px,
     )
 

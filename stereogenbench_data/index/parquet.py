@@ -22,9 +22,10 @@ import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import StorageError, cure_of, describe_os_error, explain_os_errors
 from stereogenbench_data.index.arrow import as_numpy, one_array
-from stereogenbench_data.index.rows import ADDED, SCHEMA, row_of
+from stereogenbench_data.index.rows import ADDED, SCHEMA, TRAINING_COLUMNS, row_of
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.training import MOST_PSNR_DB
 from stereogenbench_data.sources.files import open_atomic
 from stereogenbench_data.sources.location import is_remote, local_path, shown
 from stereogenbench_data.sources.members import UNSAFE_PATH
@@ -251,6 +252,18 @@ def _require_texts(table: pa.Table, *, where: str) -> None:
         if odd:
             options = ", ".join(str(each) for each in known)
             raise _odd(where, name, odd[0], f"none of {options}")
+    for name, form in _FORMS.items():
+        texts = table.column(name)
+        odd = texts.filter(pc.invert(pc.match_substring_regex(texts, form)))
+        if len(odd):
+            raise _odd(where, name, odd[0].as_py(), "not what training shards say")
+    for text in pc.unique(table.column("training_settings")).drop_null().to_pylist():
+        try:
+            is_object = isinstance(json.loads(text), dict)
+        except (ValueError, RecursionError):
+            is_object = False
+        if not is_object:
+            raise _odd(where, "training_settings", text[:_SHOWN], "not a JSON object")
     for name in ("family", "map_name"):
         texts = table.column(name)
         odd = texts.filter(pc.match_substring_regex(texts, r"^$|[/\\\x00-\x1f]"))
@@ -273,9 +286,20 @@ def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
     if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
         raise StorageError(f"{where}: a primary pair has a camera twice. {made_again(where)}")
     _require_key_frames(table, where=where)
-    halves = [pc.is_null(table.column(f"principal_{axis}_px")) for axis in "xy"]
-    if pc.any(pc.not_equal(*halves)).as_py():
-        raise StorageError(f"{where}: a principal point has one number only. {made_again(where)}")
+    for what, names in (
+        ("a principal point has one number only", ("principal_x_px", "principal_y_px")),
+        ("a recorded size has one number only", ("recorded_width_px", "recorded_height_px")),
+        ("what training shards say of a scene is there in part only", TRAINING_COLUMNS),
+    ):
+        unknown = [pc.is_null(table.column(name)) for name in names]
+        if any(pc.any(pc.not_equal(unknown[0], other)).as_py() for other in unknown[1:]):
+            raise StorageError(f"{where}: {what}. {made_again(where)}")
+    for name in ("psnr_db", "worst_psnr_db"):
+        lists = one_array(table.column(name)).drop_null()
+        flat = as_numpy(lists.flatten())
+        odd = flat[~(np.isnan(flat) | ((flat >= 0) & (flat <= MOST_PSNR_DB)))].tolist()
+        if odd or (as_numpy(pc.list_value_length(lists)) != CAMERA_COUNT).any():
+            raise _odd(where, name, odd[:1], f"not one of 0 to {MOST_PSNR_DB:g} dB for each camera")
 
 
 def _require_key_frames(table: pa.Table, *, where: str) -> None:
@@ -297,6 +321,13 @@ def _odd(where: str, name: str, found: Any, why: str) -> StorageError:
     )
 
 
+_SHOWN: Final = 60
+_FORMS: Final = {
+    "training_source": r"^[0-9a-f]{64}$",
+    "training_quality": r"^[A-Za-z0-9_.+-]{1,40}$",
+    "training_codec": r"^[A-Za-z0-9_.+-]{1,40}$",
+}
+"""What texts about training shards look like: they are shown."""
 _PLAIN_TEXTS: Final = ("split", "subset", "image_size_source")
 _KNOWN: Final = {
     "split": ("train", "eval"),
@@ -313,6 +344,8 @@ _BOUNDS: Final = {
     "sensor_height_mm": _ABOVE,
     "image_width_px": (1, 2**16),
     "image_height_px": (1, 2**16),
+    "recorded_width_px": (1, 2**16),
+    "recorded_height_px": (1, 2**16),
     "baselines_cm": _ABOVE,
     "primary_left": (0, CAMERA_COUNT - 1),
     "primary_right": (0, CAMERA_COUNT - 1),

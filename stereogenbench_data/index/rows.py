@@ -9,7 +9,14 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from stereogenbench_data.schema.records import Member, Rig, Scene, SceneId, SceneLabels
+from stereogenbench_data.schema.records import (
+    Member,
+    Rig,
+    Scene,
+    SceneId,
+    SceneLabels,
+    TrainingFacts,
+)
 from stereogenbench_data.schema.release import CAMERA_COUNT, CAMERA_PAIRS
 
 _MEMBER: Final = pa.struct(
@@ -70,11 +77,24 @@ _COLUMNS: Final[dict[str, tuple[pa.DataType, bool, tuple[str | int, ...]]]] = {
     "depth_pixel_format": (_TEXTS, _REQUIRED, ("depth_pixel_format",)),
     "valid_depth_ratio": (_NUMBER, _NULLABLE, ("valid_depth_ratio",)),
     "key_frames": (_list(pa.int32()), _NULLABLE, ("key_frames",)),
+    "recorded_width_px": (_INTEGER, _NULLABLE, ("rig", "recorded_size_px", 0)),
+    "recorded_height_px": (_INTEGER, _NULLABLE, ("rig", "recorded_size_px", 1)),
+    "training_source": (_TEXT, _NULLABLE, ("training", "source_digest")),
+    "training_quality": (_TEXT, _NULLABLE, ("training", "quality")),
+    "training_codec": (_TEXT, _NULLABLE, ("training", "codec")),
+    "training_settings": (_TEXT, _NULLABLE, ("training", "settings")),
+    "psnr_db": (_list(_NUMBER), _NULLABLE, ("training", "psnr_db")),
+    "worst_psnr_db": (_list(_NUMBER), _NULLABLE, ("training", "worst_psnr_db")),
     "members": (_list(_MEMBER), _REQUIRED, ("members",)),
 }
 """Name of a column to its type, whether it may be null, and where `Scene` holds its value."""
 
-ADDED: Final = ("key_frames",)
+TRAINING_COLUMNS: Final = tuple(
+    name for name, (_, _, place) in _COLUMNS.items() if place[0] == "training"
+)
+"""Columns of what training shards say; all are null for released scenes."""
+
+ADDED: Final = ("key_frames", "recorded_width_px", "recorded_height_px", *TRAINING_COLUMNS)
 """Columns that indexes of earlier versions lack: null means what these knew."""
 
 SCHEMA: Final = pa.schema(
@@ -92,10 +112,8 @@ def row_of(scene: Scene) -> dict[str, Any]:
     for name, (_, _, place) in _COLUMNS.items():
         value: Any = scene
         for part in place:
-            if isinstance(part, str):
-                value = getattr(value, part)
-            elif value is not None:
-                value = value[part]
+            if value is not None:
+                value = getattr(value, part) if isinstance(part, str) else value[part]
         row[name] = list(value) if isinstance(value, tuple) else value
     if scene.key_frames == (0,):
         row["key_frames"] = None
@@ -107,7 +125,7 @@ def row_of(scene: Scene) -> dict[str, Any]:
 
 _FIELDS: Final[dict[tuple[str, ...], dict[str, str]]] = {
     owner: {str(place[-1]): name for name, (_, _, place) in _COLUMNS.items() if place[:-1] == owner}
-    for owner in [(), ("id",), ("labels",), ("rig",)]
+    for owner in [(), ("id",), ("labels",), ("rig",), ("training",)]
 }
 """A part of `Scene` to its fields and their columns."""
 
@@ -119,7 +137,9 @@ def scene_of(row: Mapping[str, Any]) -> Scene:
         found = ((field, row[name]) for field, name in _FIELDS[owner].items())
         return {field: tuple(value) if type(value) is list else value for field, value in found}
 
-    x_px, y_px = row["principal_x_px"], row["principal_y_px"]
+    def pair(first: str, second: str) -> Any:
+        return None if row[first] is None else (row[first], row[second])
+
     scene = values()
     scene["key_frames"] = scene["key_frames"] or (0,)
     scene["members"] = {
@@ -130,9 +150,11 @@ def scene_of(row: Mapping[str, Any]) -> Scene:
         id=SceneId(**values("id")),
         labels=SceneLabels(**values("labels")),
         rig=Rig(
-            principal_point_px=None if x_px is None else (x_px, y_px),
+            principal_point_px=pair("principal_x_px", "principal_y_px"),
+            recorded_size_px=pair("recorded_width_px", "recorded_height_px"),
             primary_pair=(row["primary_left"], row["primary_right"]),
             **values("rig"),
         ),
+        training=None if row["training_quality"] is None else TrainingFacts(**values("training")),
         **scene,
     )

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from stereogenbench_data.errors import MediaError, SchemaError, StorageError, explain_os_errors
-from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.geometry.camera import recorded_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.geometry.rig import (
     baseline_deviation_cm,
@@ -34,6 +34,7 @@ from stereogenbench_data.media.depth import (
     require_depth_stream,
     resolve_encoding,
 )
+from stereogenbench_data.media.depth_frames import CODEC_NAME
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.document import parse_text, require_text_size
 from stereogenbench_data.schema.parse import (
@@ -49,6 +50,7 @@ from stereogenbench_data.schema.records import (
     Rig,
     Scene,
     SceneLabels,
+    TrainingFacts,
 )
 from stereogenbench_data.schema.release import (
     BASELINE_JSON,
@@ -59,11 +61,12 @@ from stereogenbench_data.schema.release import (
     DESCRIPTION_TXT,
     METADATA_FILES,
     PACKED_DEPTH_NAMES,
+    TRAINING_JSON,
     TRAJECTORY_JSON,
     VIDEO_FILES,
     depth_name,
-    rgb_name,
 )
+from stereogenbench_data.schema.training import TrainingDocument, parse_training
 from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.sources.location import is_remote, joined
 from stereogenbench_data.sources.members import read_text_file
@@ -75,13 +78,17 @@ _T = TypeVar("_T")
 ValidDepth = Literal["skip", "sample"]
 
 _DESCRIPTIONS: Final = (DESCRIPTION_JSON, DESCRIPTION_TXT)
-_NEEDED: Final = (COMPLETE_JSON, BASELINE_JSON, TRAJECTORY_JSON, *VIDEO_FILES)
+_NEEDED: Final = (COMPLETE_JSON, BASELINE_JSON, TRAJECTORY_JSON)
+_NO_DEPTH: Final = StreamFacts(CODEC_NAME, "gray16le", 0, 0, 0, 0.0, {})
+"""What the index says of depth of a scene of training shards that has none."""
 _DEVIATION_CM: Final = 0.1
 _DEVIATION_SHARE: Final = 0.001
 _LEAST_BESIDE: Final = 0.9
 """How much of a baseline must lie along camera 0's x axis; in a lateral rig the cameras turn by at
 most 25 degrees from the line on which they stand."""
-_FILES: Final = frozenset({*METADATA_FILES, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
+_FILES: Final = frozenset(
+    {*METADATA_FILES, TRAINING_JSON, *VIDEO_FILES, *PACKED_DEPTH_NAMES.values()}
+)
 """Files of a release; others in a scene's folder are ignored."""
 
 Difference = tuple[str, str]
@@ -178,43 +185,76 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     """
     folder = SceneFolder(root, key)
     files = folder.stamps()
-    _require_finished(key, files)
+    document = None
+    if TRAINING_JSON in files:
+        document = parse_training(folder.read(TRAINING_JSON), where=f"{key}/{TRAINING_JSON}")
+    videos = _videos_of(document)
+    _require_finished(key, files, videos=videos)
     rig, labels = parse_rig(folder.read(BASELINE_JSON), where=f"{key}/{BASELINE_JSON}")
     marked = parse_complete(folder.read(COMPLETE_JSON), where=f"{key}/{COMPLETE_JSON}")
     trajectory = parse_trajectory(folder.read(TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}")
     texts: dict[str, bytes] = {name: folder.read(name) for name in _DESCRIPTIONS if name in files}
     caption = _caption(texts, key=key)
-    depth_names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
-    facts = {name: _probed(folder, key, _held(files, name)) for name in VIDEO_FILES}
+    facts = {name: _probed(folder, key, _held(files, name)) for name in videos}
     counts = {name: fact.frames for name, fact in facts.items()}
     counts[TRAJECTORY_JSON] = trajectory.frame_count
     frames = _common(key, counts, what="number of frames", unit="frames")
-    rig = _sized_as_videos(key, rig, facts)
+    rig = _sized_as_videos(key, rig, facts, document=document)
     _require_kinds(key, rig, facts)
     poses = CameraPoses.from_trajectory(trajectory)
     _require_recorded_baselines(key, rig, poses)
     lateral_m = lateral_offsets_m(poses)
-    residual_px = rectification_residual_px(poses, rig_intrinsics(rig))
+    residual_px = rectification_residual_px(poses, recorded_intrinsics(rig))
     _require_lateral_rig(key, rig, lateral_m, residual_px=residual_px)
-    units = [_depth_unit(facts[name], name=f"{key}/{name}") for name in depth_names]
+    depths = _of_each_camera({name: facts[name] for name in videos if name.endswith("_depth.mkv")})
+    units = [_depth_unit(facts, name=f"{key}/{name}") for name, facts in depths]
     ratio = None if valid_depth == "skip" else _valid_ratio(folder, key, frames)
-    return Scene(
+    scene = Scene(
         id=parse_scene_key(key),
         labels=_merged_labels(labels, marked),
         caption=caption,
         rig=rig,
         frames=frames,
-        frame_rate_hz=facts[rgb_name(0)].frame_rate_hz,
+        frame_rate_hz=next(iter(facts.values())).frame_rate_hz,
         lateral_m=tuple(map(float, lateral_m)),
         rig_residual_px=residual_px,
         depth_unit_m=tuple(unit_m for unit_m, _ in units),
         depth_unit_source=tuple(source for _, source in units),
-        depth_codec=tuple(facts[name].codec for name in depth_names),
-        depth_pixel_format=tuple(facts[name].pixel_format for name in depth_names),
+        depth_codec=tuple(facts.codec for _, facts in depths),
+        depth_pixel_format=tuple(facts.pixel_format for _, facts in depths),
         valid_depth_ratio=ratio,
         key_frames=_common_key_frames(facts, frames=frames),
         members={name: Member(f"{key}/{name}", 0, size) for name, (size, _) in files.items()},
     )
+    if document is None:
+        return scene
+    derived = replace(derived_scene(scene, document), depth_codec=scene.depth_codec)
+    for what, found, said in (
+        ("key", key, document.key),
+        ("key frames", scene.key_frames, document.key_frames),
+    ):
+        if found != said:
+            raise StorageError(
+                f"{key}: {TRAINING_JSON} tells {what} {_brief(said)}, and the scene has "
+                f"{_brief(found)}. A file is of another scene: fetch the scene again."
+            )
+    return derived
+
+
+def _videos_of(document: TrainingDocument | None) -> tuple[str, ...]:
+    """Return the names of the videos that a scene must have: all, unless it was derived."""
+    if document is None:
+        return VIDEO_FILES
+    return tuple(
+        name for name in VIDEO_FILES if PACKED_DEPTH_NAMES.get(name, name) in document.files
+    )
+
+
+def _of_each_camera(depths: Mapping[str, StreamFacts]) -> list[tuple[str, StreamFacts]]:
+    """Return name and facts of each camera's depth; a camera without depth has another's."""
+    names = [depth_name(camera) for camera in range(CAMERA_COUNT)]
+    some = next(iter(depths.items()), (names[0], _NO_DEPTH))
+    return [(name, depths[name]) if name in depths else some for name in names]
 
 
 def _held(files: Mapping[str, object], name: str) -> str:
@@ -235,14 +275,14 @@ def _probed(folder: SceneFolder, key: str, name: str) -> StreamFacts:
             video.close()
 
 
-def _require_finished(key: str, files: Mapping[str, object]) -> None:
+def _require_finished(key: str, files: Mapping[str, object], *, videos: tuple[str, ...]) -> None:
     if not files:
         raise IncompleteScene(f"{key}: the folder is empty")
     if COMPLETE_JSON not in files:
         raise IncompleteScene(f"{key}: has no {COMPLETE_JSON}, so it was never finished")
-    if not any(name in files for name in VIDEO_FILES):
-        raise IncompleteScene(f"{key}: has metadata only, and none of its 12 videos")
-    missing = [name for name in _NEEDED if _held(files, name) not in files]
+    if not any(_held(files, name) in files for name in videos):
+        raise IncompleteScene(f"{key}: has metadata only, and none of its {len(videos)} videos")
+    missing = [name for name in (*_NEEDED, *videos) if _held(files, name) not in files]
     if missing:
         raise StorageError(
             f"{key}: is marked as complete and has no {', '.join(missing)} "
@@ -287,20 +327,38 @@ def _common(key: str, found: Mapping[str, _T], *, what: str, unit: str) -> _T:
     return common
 
 
-def _sized_as_videos(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> Rig:
-    """Return the rig for pictures of the videos' size, where baseline.json records no size."""
+def _sized_as_videos(
+    key: str, rig: Rig, facts: Mapping[str, StreamFacts], *, document: TrainingDocument | None
+) -> Rig:
+    """Return the rig for pictures of the videos' size.
+
+    This differs from the recorded one where baseline.json records no size, and where the videos
+    were derived.
+    """
     sizes = {name: f"{fact.width_px}x{fact.height_px}" for name, fact in facts.items()}
     common = _common(key, sizes, what="picture size", unit="pixels")
-    width_px, height_px = facts[rgb_name(0)].width_px, facts[rgb_name(0)].height_px
-    if (width_px, height_px) == (rig.image_width_px, rig.image_height_px):
-        return rig
-    if rig.image_size_source == "recorded" or rig.principal_point_px is not None:
+    first = next(iter(facts.values()))
+    size_px = (first.width_px, first.height_px)
+    recorded_px = size_px if document is None else document.source_size_px
+    if document is not None and size_px != document.size_px:
+        raise StorageError(
+            f"{key}: {TRAINING_JSON} is for pictures of {document.size_px[0]}x"
+            f"{document.size_px[1]} pixels, and all videos have {common}. Fetch the scene again."
+        )
+    is_fixed = rig.image_size_source == "recorded" or rig.principal_point_px is not None
+    if recorded_px != (rig.image_width_px, rig.image_height_px) and is_fixed:
         raise StorageError(
             f"{key}: {BASELINE_JSON} is for pictures of {rig.image_width_px}x"
             f"{rig.image_height_px} pixels, and all videos have {common}. Correct image_width "
             f"and image_height, or fetch the videos again."
         )
-    return replace(rig, image_width_px=width_px, image_height_px=height_px)
+    width_px, height_px = size_px
+    return replace(
+        rig,
+        image_width_px=width_px,
+        image_height_px=height_px,
+        recorded_size_px=None if document is None else document.source_size_px,
+    )
 
 
 def _require_kinds(key: str, rig: Rig, facts: Mapping[str, StreamFacts]) -> None:
@@ -378,12 +436,36 @@ def _valid_ratio(folder: SceneFolder, key: str, frames: int) -> float:
     encoding = DepthEncoding()
     files = folder.stamps()
     for name in (_held(files, depth_name(camera)) for camera in range(CAMERA_COUNT)):
+        if name not in files:
+            continue
         with open_depth(folder.video(name), name=f"{key}/{name}", frames=frames) as reader:
             for frame in sorted({0, frames // 2, frames - 1}):
                 units = read_depth_units(reader, frame, encoding=encoding)
                 known = measured(units, encoding=encoding, pixel_format=reader.facts.pixel_format)
                 shares.append(float(np.mean(known)))
-    return float(np.mean(shares))
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def derived_scene(scene: Scene, document: TrainingDocument) -> Scene:
+    """Return the row of a scene of training shards, from its released row or its own.
+
+    The rig keeps what ``baseline.json`` records, and knows the size of the derived pictures. The
+    places of the files are not changed.
+    """
+    names = [*document.files]
+    is_packed = not set(names).isdisjoint(PACKED_DEPTH_NAMES.values())
+    return replace(
+        scene,
+        rig=replace(
+            scene.rig,
+            image_width_px=document.size_px[0],
+            image_height_px=document.size_px[1],
+            recorded_size_px=document.source_size_px,
+        ),
+        depth_codec=(CODEC_NAME,) * CAMERA_COUNT if is_packed else scene.depth_codec,
+        key_frames=document.key_frames,
+        training=document.facts,
+    )
 
 
 def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Difference]:
@@ -400,6 +482,7 @@ def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Diffe
     for names, compare in (
         ((BASELINE_JSON,), _differing_rig),
         ((BASELINE_JSON, COMPLETE_JSON), _differing_labels),
+        ((TRAINING_JSON,), _differing_training),
         ((TRAJECTORY_JSON,), _differing_poses),
         ((), _differing_caption),
     ):
@@ -437,10 +520,16 @@ def _differing_place(scene: Scene) -> Iterator[Difference]:
 
 def _differing_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
     rig, _ = parse_rig(texts[BASELINE_JSON], where=f"{scene.id.key}/{BASELINE_JSON}")
+    recorded = scene.rig
+    if recorded.recorded_size_px is not None:
+        width_px, height_px = recorded.recorded_size_px
+        recorded = replace(
+            recorded, image_width_px=width_px, image_height_px=height_px, recorded_size_px=None
+        )
     for each in fields(Rig):
         if each.name.startswith("image_") and rig.image_size_source == "default":
             continue
-        found, indexed = getattr(rig, each.name), getattr(scene.rig, each.name)
+        found, indexed = getattr(rig, each.name), getattr(recorded, each.name)
         if not _same(found, indexed):
             yield _difference(BASELINE_JSON, each.name, found, indexed)
 
@@ -459,6 +548,40 @@ def _differing_labels(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diff
             )
 
 
+def _differing_training(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
+    where = f"{scene.id.key}/{TRAINING_JSON}"
+    document = parse_training(texts[TRAINING_JSON], where=where)
+    derived = derived_scene(scene, document)
+    for what, found, indexed in (
+        ("the key", document.key, scene.id.key),
+        ("the picture size", document.size_px, _size_px(scene.rig)),
+        ("the recorded size", document.source_size_px, scene.rig.recorded_size_px),
+        ("the key frames", document.key_frames, scene.key_frames),
+        *(
+            (name, getattr(derived.training, name), getattr(scene.training, name, None))
+            for name in (each.name for each in fields(TrainingFacts))
+        ),
+    ):
+        if not _same_text(found, indexed):
+            yield _difference(TRAINING_JSON, what, found, indexed)
+    for name, file in document.files.items():
+        member = scene.members.get(name)
+        if member is not None and (member.size, member.crc32) not in (
+            (file.size, file.crc32), (file.size, None),
+        ):  # fmt: skip
+            found = (file.size, file.crc32)
+            yield _difference(TRAINING_JSON, name, found, (member.size, member.crc32))
+
+
+def _size_px(rig: Rig) -> tuple[int, int]:
+    return rig.image_width_px, rig.image_height_px
+
+
+def _same_text(found: object, indexed: object) -> bool:
+    """Return whether two values are equal; nan equals nan."""
+    return repr(found) == repr(indexed)
+
+
 def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:
     where = f"{scene.id.key}/{TRAJECTORY_JSON}"
     trajectory = parse_trajectory(texts[TRAJECTORY_JSON], where=where)
@@ -470,7 +593,7 @@ def _differing_poses(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Diffe
     if not np.allclose(lateral_m, scene.lateral_m, rtol=0, atol=_SAME_M):
         places_m = tuple(map(float, lateral_m))
         yield _difference(TRAJECTORY_JSON, "lateral_m", places_m, scene.lateral_m)
-    residual_px = rectification_residual_px(poses, rig_intrinsics(scene.rig))
+    residual_px = rectification_residual_px(poses, recorded_intrinsics(scene.rig))
     if not math.isclose(residual_px, scene.rig_residual_px, rel_tol=_SAME_PX, abs_tol=_SAME_PX):
         yield _difference(TRAJECTORY_JSON, "rig_residual_px", residual_px, scene.rig_residual_px)
 

@@ -6,7 +6,7 @@ data's root and never lead out of it.
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +21,8 @@ from stereogenbench_data.index.rows import SCHEMA, scene_of
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.retry import RetryPolicy
+
+_LISTS: Final = ("members", "key_frames", "psnr_db", "worst_psnr_db")
 
 
 class SceneIndex:
@@ -166,7 +168,7 @@ class SceneIndex:
     def column(self, name: str) -> np.ndarray:
         """Return a column as a read-only array; `rows.SCHEMA` names them.
 
-        ``members`` and ``key_frames`` are not among them: see `scene` and `key_frames`.
+        ``members``, ``key_frames`` and the PSNRs are not among them: see `scene`, `key_frames`.
 
         Returns:
             (n,) numbers (nan where unknown) or, for texts, objects (None where unknown); (n, 15)
@@ -176,7 +178,7 @@ class SceneIndex:
             StorageError: If there is no such column.
         """
         if name not in self._columns:
-            columns = [each for each in SCHEMA.names if each not in ("members", "key_frames")]
+            columns = [each for each in SCHEMA.names if each not in _LISTS]
             if name not in columns:
                 known = ", ".join(columns)
                 raise StorageError(f"the index has no column {name!r}; it has {known}.")
@@ -212,6 +214,41 @@ class SceneIndex:
         is_video = as_numpy(pc.starts_with(names, "cam_"))
         rows = as_numpy(pc.list_parent_indices(lists))
         return np.bincount(rows[is_video], minlength=len(self))
+
+    @property
+    def is_derived(self) -> bool:
+        """Whether scenes of it were derived for training, with an error; released ones were not."""
+        released: int = self._table.column("training_quality").null_count
+        return released < len(self)
+
+    @property
+    def derivation(self) -> str:
+        """What derived data are, for messages: of training shards, their size and quality."""
+        for row in np.flatnonzero(self.column("training_quality").astype(bool))[:1].tolist():
+            scene = self.scene(row)
+            if scene.training is not None:
+                return (
+                    f"training shards, derived at {scene.rig.image_width_px}x"
+                    f"{scene.rig.image_height_px} (quality {scene.training.quality}, "
+                    f"{scene.training.codec}) from the index {scene.training.source_digest[:12]}"
+                )
+        return "released data"
+
+    def require_released(self, doing: str, *, cure: str = "") -> None:
+        """Refuse derived data where released data are needed.
+
+        Args:
+            doing: What needs them, such as "An evaluation".
+            cure: What else to do than to pass the released data.
+
+        Raises:
+            StorageError: If scenes were derived for training.
+        """
+        if self.is_derived:
+            raise StorageError(
+                f"{self.where}: holds {self.derivation}. {doing} needs the released pictures, and "
+                f"these have an error. Pass the released data{cure}."
+            )
 
     @property
     def digest(self) -> str:

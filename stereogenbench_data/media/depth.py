@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Final, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt16
+from jaxtyping import Bool, Float32, Shaped, UInt16
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.geometry.camera import Intrinsics
@@ -233,3 +233,18 @@ def depth_frame_index(index: int, *, encoding: DepthEncoding, frames: int) -> in
     """Return which depth frame belongs to an RGB frame, None where the video has no such frame."""
     lagged = index + encoding.frame_lag
     return lagged if 0 <= lagged < frames else None
+
+
+def resized_nearest(
+    maps: Shaped[np.ndarray, "*batch h w"], *, size: tuple[int, int]
+) -> Shaped[np.ndarray, "*batch h2 w2"]:
+    """Return maps at another size by the nearest pixel centre, never averaged across an edge.
+
+    Pixel i of n takes the source pixel that holds the centre (i + 0.5) * source / n: what torch
+    calls nearest-exact.
+    """
+    rows, columns = (
+        np.minimum((np.arange(wanted) + 0.5) * found / wanted, found - 1).astype(np.intp)
+        for wanted, found in zip(size, maps.shape[-2:], strict=True)
+    )
+    return np.ascontiguousarray(maps[..., rows[:, None], columns])

@@ -5,6 +5,7 @@ Only FFV1 of one grey plane is packed: of such a video the stored numbers are al
 
 import io
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Final, cast
@@ -15,9 +16,22 @@ from av.video.stream import VideoStream
 from jaxtyping import UInt16
 
 from stereogenbench_data.errors import MediaError
-from stereogenbench_data.media.container import VideoFile, exact, open_container, text_tags
-from stereogenbench_data.media.depth import ANY_DEPTH, read_depth_units, require_depth_stream
+from stereogenbench_data.media.container import (
+    StreamFacts,
+    VideoFile,
+    exact,
+    open_container,
+    text_tags,
+)
+from stereogenbench_data.media.depth import (
+    ANY_DEPTH,
+    open_depth,
+    read_depth_units,
+    require_depth_stream,
+    resized_nearest,
+)
 from stereogenbench_data.media.depth_frames import (
+    CODEC_NAME,
     DepthFrames,
     StoredClip,
     blosc2_module,
@@ -37,14 +51,21 @@ AfterFrame = Callable[[], None]
 
 
 def packed_depth(
-    video: VideoFile, *, name: str, frames: int, after_frame: AfterFrame = lambda: None
+    video: VideoFile,
+    *,
+    name: str,
+    frames: int,
+    size: tuple[int, int] | None = None,
+    after_frame: AfterFrame = lambda: None,
 ) -> bytes:
     """Return a depth video as a file of blosc2's frames.
 
     Args:
         video: A path, or a seekable binary file; the latter stays the caller's to close.
-        name: What messages call it.
+        name: What messages call it. With a size, it may name depth that is packed already.
         frames: How many frames it must have.
+        size: (height, width) to take the nearest pixels of, as `resized_nearest` does; None for
+            the stored size.
         after_frame: Called after each frame.
 
     Raises:
@@ -53,9 +74,9 @@ def packed_depth(
             packed does not read back as it was.
     """
     chunks, pts = [], []
-    with VideoReader(video, name=name, frames=frames) as reader:
+    with open_depth(video, name=name, frames=frames) as reader:
         facts = reader.facts
-        if facts.codec != "ffv1":
+        if facts.codec not in ("ffv1", CODEC_NAME):
             raise MediaError(
                 f"{name}: its depth is stored by codec {facts.codec}, and blosc2 packs only FFV1. "
                 f"Pack with --depth-codec released."
@@ -66,41 +87,53 @@ def packed_depth(
         time_base = Fraction(1)
         for index in range(frames):
             units = read_depth_units(reader, index, encoding=_ANY_BITS)
+            if size is not None:
+                units = resized_nearest(units, size=size)
             chunk = compressed_chunk(units.tobytes())
-            frame = reader.frame(index)
-            if frame.pts is None:
-                raise MediaError(
-                    f"{name}: a frame has no time, so the video could not be written again. Pack "
-                    f"with --depth-codec released."
-                )
-            pts.append(frame.pts)
-            time_base = exact(frame.time_base) or time_base
+            if isinstance(reader, VideoReader):
+                frame = reader.frame(index)
+                if frame.pts is None:
+                    raise MediaError(
+                        f"{name}: a frame has no time, so the video could not be written again. "
+                        f"Pack with --depth-codec released."
+                    )
+                pts.append(frame.pts)
+                time_base = exact(frame.time_base) or time_base
             chunks.append(chunk)
             found = np.empty_like(units)
             blosc2_module().decompress2(chunk, dst=found, nthreads=1)
             if not np.array_equal(found, units):
                 raise _not_whole(name, index)
             after_frame()
-    with open_container(video, name=name) as container:
-        stream = container.streams.video[0]
-        rate = exact(stream.average_rate) or 1 / (time_base * max(pts[-1], 1))
-        clip = StoredClip(
-            width_px=facts.width_px,
-            height_px=facts.height_px,
-            codec=facts.codec,
-            pixel_format=facts.pixel_format,
-            rate=(rate.numerator, rate.denominator),
-            time_base=(time_base.numerator, time_base.denominator),
-            pts=tuple(pts),
-            tags=text_tags(container.metadata),
-            stream_tags=text_tags(stream.metadata),
-        )
+        packed_before = reader.clip if isinstance(reader, DepthFrames) else None
+    clip = packed_before or _clip_of(video, facts, name=name, pts=tuple(pts), time_base=time_base)
+    if size is not None:
+        clip = replace(clip, width_px=size[1], height_px=size[0])
     content = frame_file(clip, chunks)
     with DepthFrames(io.BytesIO(content), name=name, frames=frames) as packed:
         for index, chunk in enumerate(chunks):
             if packed.chunk(index) != (b"" if is_zeros(chunk) else chunk):
                 raise _not_whole(name, index)
     return content
+
+
+def _clip_of(
+    video: VideoFile, facts: StreamFacts, *, name: str, pts: tuple[int, ...], time_base: Fraction
+) -> StoredClip:
+    with open_container(video, name=name) as container:
+        stream = container.streams.video[0]
+        rate = exact(stream.average_rate) or 1 / (time_base * max(pts[-1], 1))
+        return StoredClip(
+            width_px=facts.width_px,
+            height_px=facts.height_px,
+            codec=facts.codec,
+            pixel_format=facts.pixel_format,
+            rate=(rate.numerator, rate.denominator),
+            time_base=(time_base.numerator, time_base.denominator),
+            pts=pts,
+            tags=text_tags(container.metadata),
+            stream_tags=text_tags(stream.metadata),
+        )
 
 
 def _not_whole(name: str, index: int) -> MediaError:

@@ -10,7 +10,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import require_depth_stream
 from stereogenbench_data.samples.derive import RECTIFIED_PX
 from stereogenbench_data.samples.request import Request
-from stereogenbench_data.samples.size import warn_if_swapped
+from stereogenbench_data.samples.size import EnlargedSizeWarning, warn_if_swapped
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name
 from stereogenbench_data.selection.plan import Plan
@@ -24,7 +24,8 @@ def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
     """Check, by the index alone, that the samples of a plan can be made as requested.
 
     Warns with `OddSceneWarning` where rigs are not rectified, or where a scene's cameras state
-    several units of depth, and with `SwappedSizeWarning` where height and width look exchanged.
+    several units of depth, with `SwappedSizeWarning` where height and width look exchanged, and
+    with `EnlargedSizeWarning` where a size is larger than training shards store.
 
     Raises:
         StorageError: If the index lacks a video that a sample needs; it names the first scene and
@@ -38,7 +39,16 @@ def check_samples(index: SceneIndex, plan: Plan, request: Request) -> None:
     _warn_of_odd_scenes(index, plan, request)
     if request.size is not None and len(plan.scene_rows):
         rig = index.scene(int(plan.scene_rows[0])).rig
-        warn_if_swapped(request.size, stored=(rig.image_height_px, rig.image_width_px))
+        stored = (rig.image_height_px, rig.image_width_px)
+        warn_if_swapped(request.size, stored=stored)
+        if index.is_derived and (request.size[0] > stored[0] or request.size[1] > stored[1]):
+            warnings.warn(
+                f"{index.where}: holds {index.derivation}, and size={request.size!r} (height, "
+                f"width) is larger: pictures and depth are enlarged. Leave size out, or pass "
+                f"released data.",
+                EnlargedSizeWarning,
+                stacklevel=5,
+            )
 
 
 def _require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:

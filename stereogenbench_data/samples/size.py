@@ -16,6 +16,10 @@ class SwappedSizeWarning(UserWarning):
     """A size looks like (width, height), but (height, width) is expected."""
 
 
+class EnlargedSizeWarning(UserWarning):
+    """A size is larger than training shards store: pictures are enlarged, not sharpened."""
+
+
 def parse_size(text: str) -> tuple[int, int]:
     """Return the (height, width) in pixels of a text WIDTHxHEIGHT.
 

@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from stereogenbench_data.errors import MediaError, StorageError
-from stereogenbench_data.media.depth import measured, open_depth, read_depth_units
+from stereogenbench_data.media.depth import measured, open_depth, read_depth_units, resized_nearest
 from stereogenbench_data.media.video import VideoReader, read_rgb, require_pixel_aspect
-from stereogenbench_data.samples.views import StoredDepth, resized_nearest
+from stereogenbench_data.samples.views import StoredDepth
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES
 from stereogenbench_data.sources.members import MemberSource

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 
 from stereogenbench_data.errors import FieldError
+from stereogenbench_data.media.depth import resized_nearest
 from stereogenbench_data.samples.request import Transform
-from stereogenbench_data.samples.views import StoredDepth, Views, resized_nearest
+from stereogenbench_data.samples.views import StoredDepth, Views
 
 Generator = np.random.Generator
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Shaped, UInt8, UInt16
+from jaxtyping import Bool, UInt8, UInt16
 
 from stereogenbench_data.errors import FieldError
 from stereogenbench_data.geometry.camera import Intrinsics
@@ -77,18 +77,3 @@ class Views:
         """Return where a picture does not show what its camera saw, None for nowhere."""
         maps = [pixels for pixels in (self.padded, self.erased.get(camera)) if pixels is not None]
         return np.logical_or.reduce(maps) if maps else None
-
-
-def resized_nearest(
-    maps: Shaped[np.ndarray, "*batch h w"], *, size: tuple[int, int]
-) -> Shaped[np.ndarray, "*batch h2 w2"]:
-    """Return maps at another size by the nearest pixel centre, never averaged across an edge.
-
-    Pixel i of n takes the source pixel that holds the centre (i + 0.5) * source / n: what torch
-    calls nearest-exact.
-    """
-    rows, columns = (
-        np.minimum((np.arange(wanted) + 0.5) * found / wanted, found - 1).astype(np.intp)
-        for wanted, found in zip(size, maps.shape[-2:], strict=True)
-    )
-    return np.ascontiguousarray(maps[..., rows[:, None], columns])

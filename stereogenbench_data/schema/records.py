@@ -49,7 +49,9 @@ class Rig:
 
     ``principal_point_px`` is (x, y) in pixels of the recorded image, None for the image centre.
     ``baselines_cm`` has one entry per pair of `CAMERA_PAIRS`, in that order.
-    ``image_size_source`` is "default" if the file records no image size.
+    ``image_size_source`` is "default" if the file records no image size. ``recorded_size_px`` is
+    the (width, height) that the file is for, where the pictures are stored at another size:
+    ``image_width_px`` and ``image_height_px`` are then those of the stored pictures.
     """
 
     focal_mm: float
@@ -61,6 +63,7 @@ class Rig:
     baselines_cm: tuple[float, ...]
     primary_pair: tuple[int, int]
     image_size_source: Literal["recorded", "default"] = "recorded"
+    recorded_size_px: tuple[int, int] | None = None
 
     def baseline_cm(self, camera_a: int, camera_b: int) -> float:
         """Return the recorded distance in cm between two cameras, in either order."""
@@ -222,6 +225,28 @@ class ShardFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class TrainingFacts:
+    """What training shards say of a scene: derived from what, how, and with what error.
+
+    Attributes:
+        source_digest: The digest of the index of the released data.
+        quality: The name of the settings, such as "balanced".
+        codec: FFmpeg's name of the codec of the pictures.
+        settings: The encoder's settings, as JSON.
+        psnr_db: Of each camera's pictures, the mean over frames of the PSNR against those that
+            ``size=`` gives of the released video; nan for cameras that are not there.
+        worst_psnr_db: The same of the worst frame.
+    """
+
+    source_digest: str
+    quality: str
+    codec: str
+    settings: str
+    psnr_db: tuple[float, ...]
+    worst_psnr_db: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """One row of the index: everything that is needed before a video is opened.
 
@@ -239,6 +264,7 @@ class Scene:
         frames: The number of frames in every video and in the trajectory.
         key_frames: The frames, ascending from 0, at which the decoding of all cameras' pictures
             can begin.
+        training: What is known of a scene of training shards; None for released scenes.
         members: File name to the place of its bytes. Depth packed by blosc2 has a name of its own,
             which `held_name` returns.
     """
@@ -258,6 +284,7 @@ class Scene:
     valid_depth_ratio: float | None
     members: Mapping[str, Member] = field(hash=False)
     key_frames: tuple[int, ...] = (0,)
+    training: TrainingFacts | None = None
 
     def held_name(self, name: str) -> str:
         """Return the name in ``members`` of one of the release's files: depth may be packed."""

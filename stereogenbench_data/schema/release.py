@@ -32,6 +32,8 @@ TRAJECTORY_JSON: Final = "trajectory.json"
 COMPLETE_JSON: Final = "_scene_complete.json"
 DESCRIPTION_JSON: Final = "scene_description_qwen_dataset_level.json"
 DESCRIPTION_TXT: Final = "scene_description_qwen_dataset_level.txt"
+TRAINING_JSON: Final = "training.json"
+"""What this package adds to the metadata of scenes that it derives for training."""
 METADATA_FILES: Final = (
     BASELINE_JSON,
     TRAJECTORY_JSON,

@@ -19,7 +19,7 @@ from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.index.tree import ListedTree
 from stereogenbench_data.schema.records import Member, Scene
-from stereogenbench_data.schema.release import METADATA_FILES
+from stereogenbench_data.shards.plan import SCENE_TEXTS
 from stereogenbench_data.shards.tar import read_chunks
 from stereogenbench_data.sources.files import copy_with_crc32, open_atomic
 from stereogenbench_data.sources.location import is_remote, joined, local_path
@@ -89,7 +89,7 @@ def plan_download(
                 f"{scene.id.key}: the index has no {', '.join(missing)}: it is of a partial "
                 f"download. Download from the whole release."
             )
-        names = [name for name in METADATA_FILES if name in scene.members]
+        names = [name for name in SCENE_TEXTS if name in scene.members]
         names += [videos[stem] for stem in stems]
         scenes.append(replace(scene, members={name: scene.members[name] for name in names}))
     return Download(tuple(scenes))
@@ -168,7 +168,7 @@ def _is_whole(wanted: WantedFile, dest: Path) -> bool:
     path, member = dest / wanted.key / wanted.name, wanted.member
     if not path.is_file() or path.stat().st_size != member.size:
         return False
-    if member.crc32 is None or wanted.name not in METADATA_FILES:
+    if member.crc32 is None or wanted.name not in SCENE_TEXTS:
         return True
     return zlib.crc32(path.read_bytes()) == member.crc32
 

@@ -5,30 +5,41 @@ share nothing but the plan, which is a function of the release and the target si
 """
 
 import json
+import os
+import shutil
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from stereogenbench_data.engine import LOCAL, Engine, Progress, advance_of, no_advance
 from stereogenbench_data.errors import ShardError, describe_os_error
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.scene_folder import derived_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frames import CODEC_NAME, blosc2_module
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
-from stereogenbench_data.schema.release import CAMERA_COUNT, METADATA_FILES, PACKED_DEPTH_NAMES
+from stereogenbench_data.schema.release import (
+    CAMERA_COUNT,
+    METADATA_FILES,
+    PACKED_DEPTH_NAMES,
+    TRAINING_JSON,
+)
+from stereogenbench_data.schema.training import parse_training
 from stereogenbench_data.shards.companion_files import write_companion_files
 from stereogenbench_data.shards.plan import DEFAULT_SHARD_BYTES, DepthCodec, ShardPlan, plan_shards
 from stereogenbench_data.shards.tar import CHUNK_BYTES, read_members
+from stereogenbench_data.shards.training import Derivation, TrainingSettings
 from stereogenbench_data.shards.writer import (
     PARTS,
     TEMPORARY_SUFFIX,
     ShardManifest,
     ShardTask,
     SourceStamp,
+    derive_task,
     find_packed,
     find_touched,
     not_of_plan,
@@ -39,6 +50,7 @@ from stereogenbench_data.shards.writer import (
     row_digest,
 )
 from stereogenbench_data.sources.files import copy_with_crc32, write_atomic
+from stereogenbench_data.sources.location import is_remote
 from stereogenbench_data.sources.members import require_own_files
 
 _PLAN_FILE: Final = "plan.json"
@@ -90,6 +102,8 @@ def pack(  # noqa: PLR0913 - each is an option of the command
     *,
     target_bytes: int = DEFAULT_SHARD_BYTES,
     depth_codec: DepthCodec = "released",
+    training: TrainingSettings | None = None,
+    rows: Sequence[int] | None = None,
     part: tuple[int, int] = (1, 1),
     workers: int | None = None,
     engine: Engine = LOCAL,
@@ -107,6 +121,9 @@ def pack(  # noqa: PLR0913 - each is an option of the command
             counts with its released size.
         depth_codec: "released" keeps depth as it is. "blosc2" packs it losslessly, so that each
             frame decodes by itself and faster (extra ``blosc2``).
+        training: Derive training shards with these settings (extra ``blosc2``) instead; the data
+            may then be shards or a URL, too.
+        rows: The rows of the scenes to pack; None is all.
         part: (I, N): pack every N-th shard, starting at the I-th; I is 1 to N.
         workers: The number of processes; None is one a core.
         engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster` whose nodes all find the
@@ -121,29 +138,51 @@ def pack(  # noqa: PLR0913 - each is an option of the command
         ShardError: If a shard cannot be packed; or the folder is in the release, or holds another
             plan, other shards, or shards that were packed from other files.
     """
-    job = prepare(data, out, target_bytes=target_bytes, depth_codec=depth_codec, part=part)
+    job = prepare(
+        data,
+        out,
+        target_bytes=target_bytes,
+        depth_codec=depth_codec,
+        training=training,
+        rows=rows,
+        part=part,
+    )
     tasks = job.remaining()
     total = sum(task.shard.source_bytes for task in job.part)
     left = sum(task.shard.source_bytes for task in tasks)
     advance = advance_of(progress, done=total - left, total=total)
     advance(0)
+    is_counted = False
+    if training is not None and len(tasks) < (workers or os.cpu_count() or 1):
+        # Fewer shards than processes: these share the scenes, and the shards are packed after.
+        scenes = [(task, scene) for task in tasks for scene in task.shard.scenes]
+        for _ in engine.map(
+            derive_task,
+            scenes,
+            name=lambda work: f"{work[0].target}: {work[1].id.key}",
+            workers=workers,
+            advance=advance,
+        ):
+            is_counted = True
     outcomes = engine.map(
         pack_task,
         tasks,
         name=lambda task: str(task.target),
         workers=workers,
-        advance=advance,
+        advance=(lambda count: advance(0)) if is_counted else advance,
     )
     return _finish(job, packed={shard.name for shard, work in outcomes if work == "packed"})
 
 
-def prepare(
+def prepare(  # noqa: PLR0913 - what `pack` takes
     data: SceneIndex | str | Path,
     out: str | Path,
     *,
     target_bytes: int,
     part: tuple[int, int],
     depth_codec: DepthCodec = "released",
+    training: TrainingSettings | None = None,
+    rows: Sequence[int] | None = None,
 ) -> PackJob:
     """Make the plan and claim the folder for it.
 
@@ -157,21 +196,31 @@ def prepare(
     if not 1 <= number <= count:
         raise ShardError(f"part {number}/{count}: a part is I/N with I from 1 to N, such as 1/4.")
     index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
-    if depth_codec == "blosc2":
+    if depth_codec == "blosc2" or training is not None:
         blosc2_module()
-    plan = plan_shards(index, target_bytes, depth_codec=depth_codec)
-    require_own_files(
-        plan.root, (member.source for shard in plan.shards for member in shard.members)
-    )
+    plan = plan_shards(index, target_bytes, depth_codec=depth_codec, training=training, rows=rows)
+    if not is_remote(plan.root):
+        sources = {member.source for shard in plan.shards for member in shard.members} - {""}
+        require_own_files(plan.root, sorted(sources))
     _require_fitting(plan)
     out = Path(out)
-    tasks = tuple(ShardTask(shard, plan.root, str(out), plan.digest) for shard in plan.shards)
+    tasks = tuple(
+        ShardTask(
+            shard,
+            plan.root,
+            str(out),
+            plan.digest,
+            None if training is None else Derivation.of_index(index, training, shard.scenes),
+        )
+        for shard in plan.shards
+    )
     try:
         _claim_folder(plan, out)
         for task in tasks:
             manifest = read_manifest(task)
             if manifest is not None and task.target.is_file():
-                _require_same_sources(task, manifest)
+                if task.derivation is None:  # else the plan holds the digest of the source's index
+                    _require_same_sources(task, manifest)
                 _require_same_rows(task, manifest)
     except OSError as error:
         if isinstance(error, ShardError):
@@ -221,11 +270,12 @@ def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
         return report
     for task, manifest in zip(job.tasks, shards, strict=True):
         _require_same_rows(task, manifest)
+        shutil.rmtree(task.derived, ignore_errors=True)  # of a run killed after its last shard
     index = SceneIndex.from_scenes(
         [
             scene
             for task, manifest in zip(job.tasks, shards, strict=True)
-            for scene in _scenes_in(task.shard.scenes, manifest)
+            for scene in _scenes_in(task, manifest)
         ],
         job.out,
         shards={
@@ -240,14 +290,22 @@ def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
     return replace(report, index=job.out / INDEX_NAME)
 
 
-def _scenes_in(scenes: tuple[Scene, ...], shard: ShardManifest) -> Iterator[Scene]:
-    """Yield scenes of the release with the places of their files in a shard."""
-    places: dict[str, dict[str, Member]] = {scene.id.key: {} for scene in scenes}
+def _scenes_in(task: ShardTask, shard: ShardManifest) -> Iterator[Scene]:
+    """Yield scenes of the release with the places of their files in a shard, as they are there."""
+    places: dict[str, dict[str, Member]] = {scene.id.key: {} for scene in task.shard.scenes}
     for member, crc32 in zip(shard.tar_members, shard.crc32s, strict=True):
         key, _, name = member.name.partition(".")
         places[key][name] = Member(shard.name, member.offset, member.size, crc32)
-    for scene in scenes:
+    for scene in task.shard.scenes:
         members = places[scene.id.key]
+        if task.derivation is not None:
+            place = members[TRAINING_JSON]
+            with task.target.open("rb") as file:
+                file.seek(place.offset)
+                text = file.read(place.size)
+            where = f"{task.target}: {scene.id.key}.{TRAINING_JSON}"
+            yield replace(derived_scene(scene, parse_training(text, where=where)), members=members)
+            continue
         is_packed = not members.keys().isdisjoint(PACKED_DEPTH_NAMES.values())
         codec = (CODEC_NAME,) * CAMERA_COUNT if is_packed else scene.depth_codec
         yield replace(scene, members=members, depth_codec=codec)
@@ -264,11 +322,13 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
         OSError: If it cannot be written to.
     """
     place = out / PARTS / _PLAN_FILE
-    expected = {
+    expected: dict[str, Any] = {
         "plan": plan.digest,
         "target_bytes": plan.target_bytes,
         "shards": len(plan.shards),
     } | ({} if plan.depth_codec == "released" else {"depth": plan.depth_codec})
+    if plan.training is not None:
+        expected["training"] = plan.training.describe()
     _require_outside_release(plan, out)
     if not place.exists():
         _require_own_shards(plan, out)
@@ -281,7 +341,8 @@ def _claim_folder(plan: ShardPlan, out: Path) -> None:
     if found != expected:
         raise ShardError(
             f"{place}: this folder is for another plan ({_brief(found)}, and this one is "
-            f"{_brief(expected)}): the release, the size of the shards or the depth codec differs. "
+            f"{_brief(expected)}): the release, the size of the shards, the depth codec or the "
+            f"training settings differ. "
             f"Pack into an empty folder, or remove what is in {out}."
         )
     _require_no_others(plan, out)
@@ -292,10 +353,15 @@ def _brief(content: object) -> str:
         return "unreadable"
     digest, size = str(content.get("plan"))[:12], content.get("target_bytes")
     depth = content.get("depth", "released")
+    training = content.get("training")
+    if isinstance(training, dict):
+        depth = f"{depth}, for training at {training.get('size')}, {training.get('quality')}"
     return f"{content.get('shards')} shards of {size} bytes, depth {depth}, {digest}"
 
 
 def _require_outside_release(plan: ShardPlan, out: Path) -> None:
+    if is_remote(plan.root):
+        return
     root, place = Path(plan.root).resolve(), out.resolve()
     if place == root:
         raise ShardError(f"{out}: is the release itself. Pack into another folder.")

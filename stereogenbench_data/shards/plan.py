@@ -7,10 +7,10 @@ release and target size always give the same plan.
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.index.table import SceneIndex
@@ -19,18 +19,29 @@ from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     METADATA_FILES,
     PACKED_DEPTH_NAMES,
+    TRAINING_JSON,
     depth_name,
     rgb_name,
 )
 from stereogenbench_data.shards.tar import BLOCK_BYTES, END_OF_ARCHIVE, member_header, padded
+from stereogenbench_data.shards.training import (
+    TrainingSettings,
+    derived_names,
+    expected_bytes,
+    released_name,
+    source_bytes,
+)
 
 DepthCodec = Literal["released", "blosc2"]
 """How shards store depth: as the released videos, or as blosc2 frames, which decode faster."""
 
 DEFAULT_SHARD_BYTES: Final = 2_000_000_000
 
+SCENE_TEXTS: Final = (*METADATA_FILES, TRAINING_JSON)
+"""The metadata files that a scene in shards may have."""
+
 MEMBER_ORDER: Final = (
-    *METADATA_FILES,
+    *SCENE_TEXTS,
     *(name(camera) for camera in range(CAMERA_COUNT) for name in (rgb_name, depth_name)),
 )
 """The order of a scene's files in a shard: metadata first, then camera by camera."""
@@ -45,7 +56,7 @@ class PlannedMember:
     """A file of a scene: its name in the shard, and the released file that it is made from.
 
     ``source`` is relative to the release's root. ``size`` is that of the source, which is also the
-    member's unless depth is packed.
+    member's unless depth is packed; of derived files, about what they will have.
     """
 
     name: str
@@ -62,6 +73,7 @@ class PlannedShard:
     size: int
     scenes: tuple[Scene, ...]
     members: tuple[PlannedMember, ...]
+    training: TrainingSettings | None = None
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -71,6 +83,10 @@ class PlannedShard:
     @property
     def source_bytes(self) -> int:
         """The size of all files that it is made from."""
+        if self.training is not None:
+            return sum(
+                source_bytes(scene, derived_names(scene, self.training)) for scene in self.scenes
+            )
         return sum(member.size for member in self.members)
 
 
@@ -81,9 +97,10 @@ class ShardPlan:
     Attributes:
         root: The release's folder.
         target_bytes: The largest size of a shard, unless one scene alone exceeds it; packed depth
-            counts with its released size.
-        digest: sha256 of the target size and of all names and sizes. It does not depend on the
-            root.
+            counts with its released size, derived files with an estimate.
+        digest: sha256 of the target size and of all names and sizes; of training shards, also of
+            their settings and of the source's index. It does not depend on the root.
+        training: What training shards hold; None for a release.
     """
 
     root: str
@@ -91,6 +108,7 @@ class ShardPlan:
     shards: tuple[PlannedShard, ...]
     digest: str
     depth_codec: DepthCodec = "released"
+    training: TrainingSettings | None = None
 
 
 def plan_shards(
@@ -98,23 +116,42 @@ def plan_shards(
     target_bytes: int = DEFAULT_SHARD_BYTES,
     *,
     depth_codec: DepthCodec = "released",
+    training: TrainingSettings | None = None,
+    rows: Sequence[int] | None = None,
 ) -> ShardPlan:
     """Return the plan that packs the scenes of an index.
 
+    Args:
+        index: The data; a released folder, unless training shards are made.
+        target_bytes: The largest size of a shard.
+        depth_codec: How depth is stored; training shards have blosc2's frames.
+        training: What training shards hold; None packs released files as they are.
+        rows: The scenes to pack; None is all.
+
     Raises:
-        ShardError: If the data are packed already or remote, scenes were left out of the index as
-            broken, the target is below 1, or two shards would have the same name.
+        ShardError: If the data are packed already or remote (training shards may be made of such),
+            or derived already; scenes were left out of the index as broken; no scene is selected;
+            the target is below 1; or two shards would have the same name.
     """
-    _require_released(index)
+    _require_released(index, training=training)
+    if rows is not None and not len(rows):
+        raise ShardError(f"{index.where}: no scene is selected. Check the filters.")
     if target_bytes < 1:
         raise ShardError(f"the size of a shard must be at least 1 byte, got {target_bytes}.")
     scenes = sorted(
-        map(index.scene, range(len(index))), key=lambda scene: (_group_of(scene), scene.id.key)
+        map(index.scene, range(len(index)) if rows is None else map(int, rows)),
+        key=lambda scene: (_group_of(scene), scene.id.key),
     )
+
+    def planned(scene: Scene) -> list[PlannedMember]:
+        return _members_of(scene, depth_codec) if training is None else _derived(scene, training)
+
     shards = tuple(
         shard
         for group, members in groupby(scenes, key=_group_of)
-        for shard in _filled(group, members, target_bytes=target_bytes, depth_codec=depth_codec)
+        for shard in _filled(
+            group, members, target_bytes=target_bytes, planned=planned, training=training
+        )
     )
     names: dict[str, str] = {}
     for shard in shards:
@@ -128,9 +165,12 @@ def plan_shards(
         [shard.name, shard.size, [[member.name, member.size] for member in shard.members]]
         for shard in shards
     ]
-    content_text = json.dumps([target_bytes, content], separators=(",", ":"))
+    whole: list[Any] = [target_bytes, content]
+    if training is not None:
+        whole += [training.describe(), index.digest]
+    content_text = json.dumps(whole, separators=(",", ":"))
     digest = hashlib.sha256(content_text.encode()).hexdigest()
-    return ShardPlan(index.root, target_bytes, shards, digest, depth_codec)
+    return ShardPlan(index.root, target_bytes, shards, digest, depth_codec, training)
 
 
 def parse_bytes(text: str) -> int:
@@ -150,13 +190,18 @@ def parse_bytes(text: str) -> int:
     return size
 
 
-def _require_released(index: SceneIndex) -> None:
-    if index.shards:
+def _require_released(index: SceneIndex, *, training: TrainingSettings | None) -> None:
+    if index.is_derived:
+        raise ShardError(
+            f"{index.where}: holds {index.derivation}. Pack the released data instead: what is "
+            f"derived twice has both errors."
+        )
+    if index.shards and training is None:
         raise ShardError(
             f"{index.where}: already holds shards. To pack again, run `stereogenbench unpack`, and "
             f"pass the folder that it made."
         )
-    if "://" in index.root:
+    if "://" in index.root and training is None:
         raise ShardError(f"{index.where}: is remote. Download the release, and pass its folder.")
     if index.broken:
         names = ", ".join(sorted(index.broken)[:3])
@@ -174,22 +219,47 @@ def _group_of(scene: Scene) -> str:
 
 
 def _filled(
-    group: str, scenes: Iterable[Scene], *, target_bytes: int, depth_codec: DepthCodec
+    group: str,
+    scenes: Iterable[Scene],
+    *,
+    target_bytes: int,
+    planned: Callable[[Scene], list[PlannedMember]],
+    training: TrainingSettings | None,
 ) -> Iterator[PlannedShard]:
     """Yield the shards of one group, each as full as the order of scenes allows."""
     number, size = 0, len(END_OF_ARCHIVE)
     held: list[Scene] = []
     members: list[PlannedMember] = []
+
+    def finished() -> PlannedShard:
+        name = f"{group}-{number:06d}.tar"
+        return PlannedShard(name, size, tuple(held), tuple(members), training)
+
     for scene in scenes:
-        added = _members_of(scene, depth_codec)
+        added = planned(scene)
         added_bytes = sum(BLOCK_BYTES + padded(member.size) for member in added)
         if held and size + added_bytes > target_bytes:
-            yield PlannedShard(f"{group}-{number:06d}.tar", size, tuple(held), tuple(members))
+            yield finished()
             held, members, size, number = [], [], len(END_OF_ARCHIVE), number + 1
         held.append(scene)
         members += added
         size += added_bytes
-    yield PlannedShard(f"{group}-{number:06d}.tar", size, tuple(held), tuple(members))
+    yield finished()
+
+
+def _derived(scene: Scene, training: TrainingSettings) -> list[PlannedMember]:
+    """Return the planned files of a scene of training shards, with about the sizes they will have.
+
+    Their source is that of the released file; ``training.json`` has none.
+    """
+    planned = []
+    for name in derived_names(scene, training):
+        source = "" if name == TRAINING_JSON else scene.held_name(released_name(name))
+        path = scene.members[source].path if source else ""
+        size = expected_bytes(scene, name, training)
+        planned.append(PlannedMember(f"{scene.id.key}.{name}", path, size))
+        member_header(planned[-1].name, size)  # refuses what a tar cannot hold
+    return planned
 
 
 def _members_of(scene: Scene, depth_codec: DepthCodec) -> list[PlannedMember]:

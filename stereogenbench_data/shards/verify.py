@@ -6,10 +6,12 @@ A damaged shard does not stop the others: all problems are listed, each with its
 import io
 import warnings
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
+
+import numpy as np
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import MediaError, ShardError, cure_of
@@ -17,26 +19,45 @@ from stereogenbench_data.index.scene_folder import metadata_differences
 from stereogenbench_data.index.stale import StaleIndexWarning
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.container import StreamFacts
-from stereogenbench_data.media.depth import require_depth_stream, resolve_encoding
+from stereogenbench_data.media.depth import (
+    ANY_DEPTH,
+    open_depth,
+    read_depth_units,
+    require_depth_stream,
+    resized_nearest,
+    resolve_encoding,
+)
 from stereogenbench_data.media.depth_frames import DepthFrames
+from stereogenbench_data.media.picture_encoding import measured_error
 from stereogenbench_data.media.video import VideoReader, probe, require_pixel_aspect
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.schema.release import (
     CAMERA_COUNT,
     METADATA_FILES,
     PACKED_DEPTH_NAMES,
+    TRAINING_JSON,
     depth_name,
 )
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.shards.companion_files import companion_files
 from stereogenbench_data.shards.open import open_shards
+from stereogenbench_data.shards.plan import SCENE_TEXTS
 from stereogenbench_data.shards.tar import FETCH_AGAIN, TarMember, read_checksums, read_members
+from stereogenbench_data.shards.training import (
+    Derivation,
+    TrainingSettings,
+    open_source,
+    released_name,
+    source_pictures,
+)
 from stereogenbench_data.shards.writer import TEMPORARY_SUFFIX
 
 _WRONG_INDEX: Final = "Put the index beside the shards that it was packed with."
 _FETCH_BOTH: Final = "Fetch the shard and its index again, or pack them again."
 _WRITE_AGAIN: Final = "Fetch it again, or run `stereogenbench pack` again to write it."
 _SHOWN: Final = 3
+_SAME_DB: Final = 0.01
+"""How far a PSNR may be off that of another machine, in dB."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -82,7 +103,10 @@ class _DecodeTask:
 
 @dataclass(frozen=True, slots=True)
 class VerifyReport:
-    """What was checked, and what is wrong in the order of shards, scenes and members."""
+    """What was checked, and what is wrong in the order of shards, scenes and members.
+
+    ``derived`` says what training shards were derived from, and is empty for others.
+    """
 
     root: str
     shards: int
@@ -91,13 +115,16 @@ class VerifyReport:
     bytes: int
     videos_decoded: int
     problems: tuple[Problem, ...]
+    derived: str = ""
+    videos_compared: int = 0
 
 
-def verify(
+def verify(  # noqa: PLR0913 - each is an option of the command
     data: str | Path,
     *,
     root: str | Path | None = None,
     mode: Literal["bytes", "decode"] = "bytes",
+    source: SceneIndex | None = None,
     workers: int | None = None,
     engine: Engine = LOCAL,
     progress: Progress | None = None,
@@ -110,24 +137,30 @@ def verify(
         data: The folder of the shards, or its index file.
         root: The folder of the shards, if the index file is elsewhere.
         mode: "bytes" reads all bytes; "decode" then also decodes all frames of all videos.
+        source: The released data that training shards were derived from: with "decode", metadata
+            and depth must be equal and pictures have the PSNR that the index says.
         workers: The number of processes; None is one a core.
         engine: Where they run: `engine.LOCAL`, or an `engine.RayCluster`.
         progress: Called repeatedly with the bytes done, and all of them; with "decode" those of
-            videos count twice.
+            videos count twice, with a source three times.
 
     Raises:
-        StorageError: If there is no index of shards, or a worker died.
+        StorageError: If there is no index of shards, a source is given for shards that were not
+            derived, or a worker died.
     """
     with warnings.catch_warnings():
         # A stale index is a problem, reported with the others.
         warnings.simplefilter("ignore", StaleIndexWarning)
         index = open_shards(data, root)
+    if source is not None:
+        _require_comparable(index, source)
     expected = _expected_of(index)
     problems = list(_folder_problems(index, expected))
     checks = [each for each in expected.values() if each.path.is_file()]
     scenes = [index.scene(row) for row in range(len(index))] if mode == "decode" else []
     video_bytes = sum(scene.members[name].size for scene in scenes for name in scene.held_videos)
-    total = sum(each.facts.size for each in checks) + video_bytes
+    compared = scenes if source is not None else []
+    total = sum(each.facts.size for each in checks) + video_bytes * (2 if compared else 1)
     advance = advance_of(progress, total=total)
     sound: set[str] = set()
     for wrong, right in engine.map(
@@ -148,6 +181,15 @@ def verify(
         advance=advance,
     ):
         problems += found
+    comparisons = _comparisons(index, source, compared, sound) if source is not None else []
+    for found in engine.map(
+        compare_scene,
+        comparisons,
+        name=lambda task: task.scene.id.key,
+        workers=workers,
+        advance=advance,
+    ):
+        problems += found
     return VerifyReport(
         root=index.where,
         shards=len(expected),
@@ -156,6 +198,8 @@ def verify(
         bytes=sum(each.facts.size for each in expected.values()),
         videos_decoded=sum(len(task.names) for task in tasks),
         problems=tuple(sorted(problems)),
+        derived=index.derivation if index.is_derived else "",
+        videos_compared=sum(len(task.names) for task in comparisons),
     )
 
 
@@ -274,7 +318,7 @@ def _misindexed(expected: _ExpectedShard, file: io.FileIO, sound: set[str]) -> I
     """Yield where the index contradicts the metadata in the shard."""
     for scene in expected.scenes:
         texts = {}
-        for name in METADATA_FILES:
+        for name in SCENE_TEXTS:
             member = scene.members.get(name)
             if member is not None and f"{scene.id.key}.{name}" in sound:
                 file.seek(member.offset)
@@ -360,9 +404,7 @@ def _decode_scene(task: _DecodeTask, after_bytes: Advance) -> list[Problem]:
 def _decode(task: _DecodeTask, name: str) -> None:
     """Decode all frames of a video in a shard, and compare its header with the index."""
     scene, member = task.scene, task.scene.members[name]
-    with Path(task.root, member.path).open("rb") as shard:
-        shard.seek(member.offset)
-        file = io.BytesIO(shard.read(member.size))
+    file = io.BytesIO(_content(task.root, member))
     if name in PACKED_DEPTH_NAMES.values():
         with DepthFrames(file, name=name, frames=scene.frames) as depth:
             _require_indexed(scene, name, depth.facts)
@@ -400,3 +442,109 @@ def _require_indexed(scene: Scene, name: str, facts: StreamFacts) -> None:
     require_depth_stream(
         codec=facts.codec, pixel_format=facts.pixel_format, encoding=encoding, name=name
     )
+
+
+# Training shards and what they were derived from: every frame is compared.
+
+
+@dataclass(frozen=True, slots=True)
+class ComparisonTask:
+    """A scene of training shards, and the same scene of the source; None if that has no such."""
+
+    root: str
+    scene: Scene
+    released: Scene | None
+    derivation: Derivation
+    names: tuple[str, ...]
+
+
+def _require_comparable(index: SceneIndex, source: SceneIndex) -> None:
+    if not index.is_derived:
+        raise ShardError(
+            f"{index.where}: holds released data, which have no source to compare with. Leave the "
+            f"source out."
+        )
+    source.require_released("A comparison")
+
+
+def _comparisons(
+    index: SceneIndex, source: SceneIndex, scenes: Sequence[Scene], sound: Collection[str]
+) -> list[ComparisonTask]:
+    rows = {str(key): row for row, key in enumerate(source.column("key"))}
+    tasks = []
+    for scene in scenes:
+        row = rows.get(scene.id.key)
+        released = None if row is None else source.scene(row)
+        size = (scene.rig.image_height_px, scene.rig.image_width_px)
+        settings = TrainingSettings(size, "high")  # nothing is encoded, and it stores any size
+        derivation = Derivation.of_index(source, settings, [] if released is None else [released])
+        names = tuple(name for name in scene.held_videos if f"{scene.id.key}.{name}" in sound)
+        tasks.append(ComparisonTask(index.root, scene, released, derivation, names))
+    return tasks
+
+
+def compare_scene(task: ComparisonTask, after_bytes: Advance) -> list[Problem]:
+    """Compare a scene of training shards with its source; a worker process calls this."""
+    scene, problems = task.scene, []
+    cure = "Derive the scene again, or pass the data that it was derived from."
+    released = task.released
+    for name, member in scene.members.items() if released is not None else ():
+        try:
+            found = ""
+            if name != TRAINING_JSON and released is not None:
+                found = _difference(task, released, name)
+        except (MediaError, OSError) as error:
+            found = f"cannot be compared: {str(error).rstrip('.')}"
+        if found:
+            problems.append(Problem(member.path, scene.id.key, name, found, cure))
+        after_bytes(member.size if name in task.names else 0)
+    if released is None:
+        path = next(iter(scene.members.values())).path
+        problems.append(Problem(path, scene.id.key, "", "is not in the source", cure))
+        after_bytes(sum(scene.members[name].size for name in task.names))
+    return problems
+
+
+def _difference(task: ComparisonTask, released: Scene, name: str) -> str:
+    """Return how a file differs from what deriving it gives, "" if it does not."""
+    scene, source = task.scene, task.derivation.source()
+    content = _content(task.root, scene.members[name])
+    if name in METADATA_FILES:
+        is_same = name in released.members and source.read(released, name) == content
+        return "" if is_same else "differs from the source's"
+    if name not in task.names:
+        return ""
+    original = released_name(name)
+    if released.held_name(original) not in released.members:
+        return "is not in the source"
+    label = source.label(released, original)
+    video = open_source(source, released, original)
+    if name.endswith("_rgb.mp4"):
+        pictures = source_pictures(video, released, task.derivation.settings, name=label)
+        error = measured_error(pictures, io.BytesIO(content), name=name)
+        camera = int(name[4:6])
+        facts = scene.training
+        said = (0.0, 0.0) if facts is None else (facts.psnr_db[camera], facts.worst_psnr_db[camera])
+        measured = (error.psnr_db, error.worst_psnr_db)
+        if all(abs(one - two) <= _SAME_DB for one, two in zip(measured, said, strict=True)):
+            return ""
+        return (
+            f"has a PSNR of {measured[0]:.3f} dB (worst frame {measured[1]:.3f}) against the "
+            f"source, and the index says {said[0]:.3f} ({said[1]:.3f})"
+        )
+    size = task.derivation.settings.size
+    with (
+        open_depth(video, name=label, frames=scene.frames) as reader,
+        DepthFrames(io.BytesIO(content), name=name, frames=scene.frames) as derived,
+    ):
+        for index in range(scene.frames):
+            units = resized_nearest(read_depth_units(reader, index, encoding=ANY_DEPTH), size=size)
+            if not np.array_equal(units, derived.units(index)):
+                return f"frame {index} has other depth than the source's nearest pixels"
+    return ""
+
+
+def _content(root: str, member: Member) -> bytes:
+    with Path(root, member.path).open("rb") as shard:
+        shard.seek(member.offset)
+        return shard.read(member.size)

@@ -9,6 +9,7 @@ import hashlib
 import io
 import json
 import os
+import shutil
 import stat
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,22 +22,25 @@ from typing import Final, Literal, NamedTuple
 
 from stereogenbench_data.engine import Advance, no_advance
 from stereogenbench_data.errors import DISK_FULL, MediaError, ShardError, describe_os_error
-from stereogenbench_data.index.rows import row_of
-from stereogenbench_data.index.scene_folder import metadata_differences
+from stereogenbench_data.index.rows import ADDED, row_of
+from stereogenbench_data.index.scene_folder import derived_scene, metadata_differences
 from stereogenbench_data.media.depth_packing import packed_depth
 from stereogenbench_data.schema.records import Scene
-from stereogenbench_data.schema.release import METADATA_FILES
-from stereogenbench_data.shards.plan import PlannedMember, PlannedShard
+from stereogenbench_data.schema.release import TRAINING_JSON
+from stereogenbench_data.schema.training import parse_training
+from stereogenbench_data.shards.plan import SCENE_TEXTS, PlannedMember, PlannedShard
 from stereogenbench_data.shards.tar import (
     BLOCK_BYTES,
     END_OF_ARCHIVE,
     Checksums,
     TarMember,
     member_header,
+    padded,
     read_checksums,
     read_chunks,
     read_members,
 )
+from stereogenbench_data.shards.training import Derivation, derive_scene, derived_names
 from stereogenbench_data.sources.files import copy_with_crc32, try_locked, write_atomic
 
 TEMPORARY_SUFFIX: Final = ".tmp"
@@ -53,6 +57,12 @@ class ShardTask:
     root: str
     out: str
     plan_digest: str
+    derivation: Derivation | None = None
+
+    @property
+    def derived(self) -> Path:
+        """The folder of its derived files until it is finished."""
+        return self.target.parent / PARTS / f"{self.target.stem}.derived"
 
     @property
     def target(self) -> Path:
@@ -110,8 +120,9 @@ def row_digest(scene: Scene) -> str:
     """Return a digest of a scene's row in the index, without the places of its files."""
     row = row_of(scene)
     del row["members"], row["valid_depth_ratio"]
-    if row["key_frames"] is None:
-        del row["key_frames"]  # so that shards packed before there were such are kept
+    for name in ADDED:
+        if row[name] is None:
+            del row[name]  # so that shards packed before there were such are kept
     return hashlib.sha256(json.dumps(row, sort_keys=True).encode()).hexdigest()
 
 
@@ -195,10 +206,35 @@ def pack_task(
     done = find_packed(task)
     if done is not None:
         return done, "kept"
+    with _named_errors(task), _open_exclusive(task.temporary) as file:
+        done = find_packed(task) or find_touched(task, after_bytes)
+        if done is not None:
+            return done, "kept"
+        if task.derivation is None:
+            return _pack(task, file, after_bytes)
+        derived = _with_derived_files(task, task.derivation, after_bytes)
+        # What is copied from now on was counted when it was derived.
+        packed = _pack(derived, file, lambda count: after_bytes(0))
+        shutil.rmtree(task.derived, ignore_errors=True)
+        return packed
+
+
+def derive_task(work: tuple[ShardTask, Scene], after_bytes: Advance) -> None:
+    """Derive the files of one scene of a shard, unless they are there; a worker calls this.
+
+    Raises:
+        ShardError: As `pack_task` says.
+    """
+    task, scene = work
+    with _named_errors(task):
+        _derive(task, scene, after_bytes)
+
+
+@contextmanager
+def _named_errors(task: ShardTask) -> Iterator[None]:
+    """Turn errors of the system about a shard into a ShardError that names it."""
     try:
-        with _open_exclusive(task.temporary) as file:
-            done = find_packed(task) or find_touched(task, after_bytes)
-            return (done, "kept") if done is not None else _pack(task, file, after_bytes)
+        yield
     except OSError as error:
         if isinstance(error, ShardError):
             raise
@@ -235,6 +271,38 @@ def _open_exclusive(path: Path) -> Iterator[FileIO]:
                 yield file
         finally:
             path.unlink(missing_ok=True)
+
+
+def _derive(task: ShardTask, scene: Scene, after_bytes: Advance) -> None:
+    """Derive the files of a scene, in this process alone."""
+    if task.derivation is None:
+        return
+    folder = task.derived / scene.id.key
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with try_locked(folder.with_name(f".{folder.name}.lock")) as is_ours:
+        if not is_ours:
+            raise ShardError(
+                f"{folder}: another process is deriving this scene. Give each process a part of "
+                f"its own (--part I/N), or wait for that one."
+            )
+        derive_scene(task.derivation, scene, folder, advance=after_bytes)
+
+
+def _with_derived_files(task: ShardTask, derivation: Derivation, after_bytes: Advance) -> ShardTask:
+    """Derive the files of a shard's scenes; return the task that packs them as they are."""
+    members = []
+    for scene in task.shard.scenes:
+        key = scene.id.key
+        _derive(task, scene, after_bytes)
+        members += [
+            PlannedMember(
+                f"{key}.{name}", f"{key}/{name}", (task.derived / key / name).stat().st_size
+            )
+            for name in derived_names(scene, derivation.settings)
+        ]
+    size = len(END_OF_ARCHIVE) + sum(BLOCK_BYTES + padded(member.size) for member in members)
+    shard = replace(task.shard, size=size, members=tuple(members))
+    return replace(task, shard=shard, root=str(task.derived))
 
 
 def _pack(
@@ -333,12 +401,16 @@ def _write_scene(
     videos = []
     for member in members:
         name = member.name.partition(".")[2]
-        if name not in METADATA_FILES:
+        if name not in SCENE_TEXTS:
             videos.append(member)
             continue
         texts[name], stamp = _read_whole(Path(task.root, member.source), member.size, after_bytes)
         output.write_member(member.name, texts[name], stamp)
     if scene is not None and texts:
+        if task.derivation is not None:
+            where = f"{scene.id.key}/{TRAINING_JSON}"
+            document = parse_training(texts[TRAINING_JSON], where=where)
+            scene = replace(derived_scene(scene, document), members={})
         require_indexed_metadata(scene, texts, root=task.root)
     for member in videos:
         source = Path(task.root, member.source)

@@ -9,6 +9,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from jaxtyping import Int64
 
+from stereogenbench_data.audit.pictures.scene_pictures import derived_text
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.index.table import SceneIndex
@@ -304,4 +305,5 @@ def _facts(scene: Scene, *, depth: DepthEncoding | None) -> dict[str, Any]:
         "depth_unit_m": unit_m if math.isfinite(unit_m) else None,
         "depth_unit_source": scene.depth_unit_source[0] if depth is None else "as asked",
         "rig_residual_px": scene.rig_residual_px,
+        "derived": derived_text(scene),
     }

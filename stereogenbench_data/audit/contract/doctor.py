@@ -104,6 +104,7 @@ def diagnose(  # noqa: PLR0913 - each names one thing that a user chooses
             f"scenes and frames must be at least 1, got {scenes} and {frames}: ask for more."
         )
     index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
+    index.require_released("The doctor")
     encoding = depth or DepthEncoding()
     rows = filter_scenes(index, filters or {})
     residual_px = index.column("rig_residual_px")[rows]

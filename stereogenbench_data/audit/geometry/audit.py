@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final, Unpack
+from typing import Any, Final, Literal, Unpack
 
 import numpy as np
 from jaxtyping import Int64
@@ -54,6 +54,7 @@ class AuditRequest:
         seed: Seed of the random draw.
         depth: A depth contract that overrides what the files state, or None.
         limits: Values beyond which a scene is a finding.
+        derived: "ok" audits training shards, too, whose pictures have an error.
 
     Raises:
         SelectionError: If a number is too small.
@@ -64,6 +65,7 @@ class AuditRequest:
     seed: int = 0
     depth: DepthEncoding | None = None
     limits: AuditLimits = field(default_factory=AuditLimits)
+    derived: Literal["refuse", "ok"] = "refuse"
 
     def __post_init__(self) -> None:
         """Refuse numbers that are too small."""
@@ -151,7 +153,8 @@ def audit(
         **filters: Which scenes, see `SceneFilters`.
 
     Raises:
-        StorageError: If there are no such data, or a worker process died.
+        StorageError: If there are no such data, they were derived for training and the request
+            does not accept that, or a worker process died.
         SelectionError: If no scene passes the filters.
 
     Source: the StereoGenBench paper, section on geometry conventions and sanity checks, and on
@@ -162,6 +165,8 @@ def audit(
         index = data
     else:
         index = open_for_audit(data, workers=workers, engine=engine, **filters)
+    if request.derived == "refuse":
+        index.require_released("The audit", cure=", or accept derived data (--derived ok)")
     is_wanted = _KeyFilter(filters)
     broken = {key: text for key, text in index.broken.items() if is_wanted(key)}
     incomplete = {key: text for key, text in index.incomplete.items() if is_wanted(key)}

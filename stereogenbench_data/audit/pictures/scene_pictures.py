@@ -1,5 +1,6 @@
 """Pictures of a scene: all views and maps on one page, or a clip of one pair over time."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -143,8 +144,20 @@ def _title(scene: Scene, sample: Sample, *, pair: tuple[int, int], frame: int) -
         f"{rig.image_height_px} px; focal length {rig.focal_mm:.4g} mm, fx {camera.fx_px:.1f} px; "
         f"depth unit {unit_m:g} m ({source}); rig residual {scene.rig_residual_px:.2g} px"
     )
-    caption = [scene.caption] if scene.caption else []
-    return [scene.id.key, facts, *caption]
+    texts = [text for text in (derived_text(scene), scene.caption) if text]
+    return [scene.id.key, facts, *texts]
+
+
+def derived_text(scene: Scene) -> str:
+    """Return what a scene of training shards is, in a few words; empty for a released scene."""
+    facts, recorded = scene.training, scene.rig.recorded_size_px
+    if facts is None or recorded is None:
+        return ""
+    held = [each for each in facts.psnr_db if not math.isnan(each)]
+    return (
+        f"training shard, derived from {recorded[0]} x {recorded[1]} px: quality "
+        f"{facts.quality} ({facts.codec}), PSNR {min(held):.1f} dB or more"
+    )
 
 
 def _view_tiles(scene: Scene, views: Any, pair: tuple[int, int]) -> list[_Tile]:

@@ -20,6 +20,7 @@ from stereogenbench_data.bridges.croissant.nodes import CONTEXT, CROISSANT, RAI,
 from stereogenbench_data.bridges.croissant.shards import packed_nodes, write_tables
 from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.shards.companion_files import derivation_facts
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import shown
 
@@ -87,6 +88,8 @@ def write_descriptor(
         data_url = publication.data_url or dataset_facts.HOME
         files, records = folder_nodes(index, repository_url=data_url)
     descriptor = _head(publication, url=data_url) | {"distribution": files, "recordSet": records}
+    if index is not None and index.is_derived:
+        descriptor |= _derived(index)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         text = json.dumps(descriptor, indent=1, ensure_ascii=False) + "\n"
@@ -98,6 +101,33 @@ def write_descriptor(
             )
         ) from error
     return descriptor
+
+
+def _derived(index: SceneIndex) -> Node:
+    """Return what the descriptor of training shards says instead: from what, how, what error."""
+    facts = derivation_facts(index)
+    psnr_db = facts["psnr_db"]
+    encoding = {
+        "@type": "prov:Activity",
+        "prov:type": {"@id": "https://www.wikidata.org/wiki/Q1172378"},
+        "prov:label": "Derivation for training",
+        "description": (
+            f"Pictures scaled to {facts['size']} and encoded by {facts['codec']} (quality "
+            f"{facts['quality']}, settings {json.dumps(facts['settings'], sort_keys=True)}), PSNR "
+            f"{psnr_db['mean']:.2f} dB on average and {psnr_db['worst_frame']:.2f} dB in the worst "
+            f"frame; depth of the nearest pixels, by blosc2 without loss."
+        ),
+    }
+    source = {
+        "@type": "prov:Entity",
+        "prov:label": dataset_facts.TITLE,
+        "description": f"The release, with the index {facts['source_digest']}.",
+    }
+    return {
+        "description": f"{dataset_facts.DESCRIPTION} {dataset_facts.DERIVED}",
+        "prov:wasGeneratedBy": [*dataset_facts.PROVENANCE["prov:wasGeneratedBy"], encoding],
+        "prov:wasDerivedFrom": [*dataset_facts.PROVENANCE["prov:wasDerivedFrom"], source],
+    }
 
 
 def _relative(root: str, *, to: Path) -> str:

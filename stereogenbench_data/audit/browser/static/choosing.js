@@ -163,6 +163,7 @@ export async function selectScene(key, { keep = false, pair = null, frame = 0 } 
     `${scene.frames} frames at ${scene.frame_rate_hz} Hz`,
     `focal length ${Number(scene.focal_mm.toFixed(2))} mm, fx ${scene.fx_px.toFixed(1)} px`,
     `depth unit ${scene.depth_unit_m ?? "?"} m (${scene.depth_unit_source})`,
+    ...(scene.derived ? [scene.derived] : []),
     ...(scene.rig_residual_px > 0.05 ? [`not rectified, by ${scene.rig_residual_px.toPrecision(2)} px`] : []),
   ].join("; ");
   $("frame").max = scene.frames - 1;

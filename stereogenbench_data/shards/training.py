@@ -1,0 +1,480 @@
+"""Scenes derived for training: pictures and depth at one size, decoded fast, their error measured.
+
+A derived scene has the released metadata, pictures encoded at training size with short runs between
+key frames, depth of the nearest pixels without loss, and ``training.json``, which says all that. It
+needs no source any more. The files of a scene are made in a folder beside the shards; its
+``training.json`` is written last, so a killed run continues after the last whole scene.
+"""
+
+import importlib.metadata
+import io
+import time
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Final
+
+import av
+import numpy as np
+from PIL import features
+
+from stereogenbench_data.engine import Advance, no_advance
+from stereogenbench_data.errors import MediaError, SchemaError, ShardError, StorageError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.container import VideoFile
+from stereogenbench_data.media.depth_frames import blosc2_module
+from stereogenbench_data.media.depth_packing import packed_depth
+from stereogenbench_data.media.picture_encoding import (
+    QUALITIES,
+    PictureError,
+    Quality,
+    key_frames_of,
+    measured_error,
+    require_encodable,
+    write_pictures,
+)
+from stereogenbench_data.media.video import VideoReader, read_rgb, require_pixel_aspect
+from stereogenbench_data.schema.records import Scene, ShardFacts
+from stereogenbench_data.schema.release import (
+    CAMERA_COUNT,
+    FRAME_RATE_HZ,
+    METADATA_FILES,
+    PACKED_DEPTH_NAMES,
+    TRAINING_JSON,
+    depth_name,
+    rgb_name,
+)
+from stereogenbench_data.schema.training import DerivedFile, TrainingDocument, parse_training
+from stereogenbench_data.sources.files import write_atomic
+from stereogenbench_data.sources.members import MemberSource
+from stereogenbench_data.sources.ranged_file import require_crc32
+from stereogenbench_data.sources.retry import RetryPolicy
+
+SAMPLED_SCENES: Final = 3
+"""Of how many scenes one camera is derived to estimate the whole."""
+
+_LARGEST_DENOMINATOR: Final = 100_000
+_PICTURE_STEPS: Final = 3
+"""A picture is decoded, encoded, and decoded again."""
+_DEPTH_BITS_A_PIXEL: Final = 1.5
+_FIXED_BYTES: Final = 8192
+
+
+@dataclass(frozen=True, slots=True)
+class TrainingSettings:
+    """What training shards hold.
+
+    Attributes:
+        size: (height, width) of pictures and depth in pixels.
+        quality: How pictures are encoded, a name of `QUALITIES`.
+        cameras: The cameras to keep; None keeps those that each scene has.
+    """
+
+    size: tuple[int, int]
+    quality: Quality = "balanced"
+    cameras: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be stored.
+
+        Raises:
+            MediaError: If the quality cannot store the size.
+            ShardError: If quality or cameras are unknown.
+        """
+        if self.quality not in QUALITIES:
+            raise ShardError(f"quality {self.quality!r}: must be one of {', '.join(QUALITIES)}.")
+        cameras = self.cameras
+        if cameras is not None and (
+            not cameras or sorted(set(cameras)) != list(cameras)
+            or not set(cameras) <= set(range(CAMERA_COUNT))
+        ):  # fmt: skip
+            raise ShardError(
+                f"cameras {cameras!r}: must be ascending numbers of 0 to {CAMERA_COUNT - 1}."
+            )
+        require_encodable(self.size, self.quality)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the settings as JSON, for the plan."""
+        cameras = None if self.cameras is None else list(self.cameras)
+        return {
+            "size": f"{self.size[1]}x{self.size[0]}",
+            "quality": self.quality,
+            "cameras": cameras,
+            "pictures": QUALITIES[self.quality].description(),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Derivation:
+    """All that a worker needs to derive scenes: the settings, and how the source is read."""
+
+    settings: TrainingSettings
+    root: str
+    digest: str
+    shards: Mapping[str, ShardFacts] = field(default_factory=dict)
+    retry: RetryPolicy | None = None
+
+    @classmethod
+    def of_index(
+        cls, index: SceneIndex, settings: TrainingSettings, scenes: Sequence[Scene]
+    ) -> "Derivation":
+        """Return the derivation of some scenes of an index."""
+        used = {member.path for scene in scenes for member in scene.members.values()}
+        shards = {path: facts for path, facts in index.shards.items() if path in used}
+        return cls(settings, index.root, index.digest, shards, index.retry)
+
+    def source(self) -> MemberSource:
+        """Return the reader of the source's files."""
+        return MemberSource(self.root, shards=self.shards, revision=self.digest, retry=self.retry)
+
+
+def derived_names(scene: Scene, settings: TrainingSettings) -> list[str]:
+    """Return the names of a scene's derived files, in the order of shards.
+
+    Raises:
+        ShardError: If the scene is derived already, lacks a wanted camera, has none at all, or is
+            smaller than the wanted size.
+    """
+    key, rig = scene.id.key, scene.rig
+    if scene.training is not None:
+        raise ShardError(
+            f"{key}: is a scene of training shards already, derived at {rig.image_width_px}x"
+            f"{rig.image_height_px}. Derive from the released data, so that errors do not add up."
+        )
+    height, width = settings.size
+    if height > rig.image_height_px or width > rig.image_width_px:
+        raise ShardError(
+            f"{key}: its pictures have {rig.image_width_px}x{rig.image_height_px} pixels, and "
+            f"{width}x{height} are asked for. Choose a size that is not larger."
+        )
+    names = [name for name in METADATA_FILES if name in scene.members]
+    names.append(TRAINING_JSON)
+    wanted = range(CAMERA_COUNT) if settings.cameras is None else settings.cameras
+    videos = []
+    for camera in wanted:
+        videos += [name for name in (rgb_name(camera), depth_name(camera)) if _has(scene, name)]
+        if settings.cameras is not None and not _has(scene, rgb_name(camera)):
+            raise ShardError(
+                f"{key}: has no {rgb_name(camera)}. Choose other --cameras, or fetch it."
+            )
+    if not any(name.endswith("_rgb.mp4") for name in videos):
+        raise ShardError(f"{key}: has no video of pictures. Fetch some, or leave the scene out.")
+    return [*names, *(PACKED_DEPTH_NAMES.get(name, name) for name in videos)]
+
+
+def _has(scene: Scene, name: str) -> bool:
+    return scene.held_name(name) in scene.members
+
+
+def released_name(name: str) -> str:
+    """Return the released name of a derived file."""
+    return next((each for each, packed in PACKED_DEPTH_NAMES.items() if packed == name), name)
+
+
+def source_bytes(scene: Scene, names: Sequence[str]) -> int:
+    """Return the size of the source files that some derived files are made from."""
+    held = [scene.held_name(released_name(name)) for name in names]
+    return sum(scene.members[name].size for name in held if name in scene.members)
+
+
+def expected_bytes(scene: Scene, name: str, settings: TrainingSettings) -> int:
+    """Return about how many bytes a derived file has: plans are made by it."""
+    pixels = settings.size[0] * settings.size[1] * scene.frames
+    if name == TRAINING_JSON:
+        return _FIXED_BYTES
+    if name in METADATA_FILES:
+        return scene.members[name].size
+    picture = QUALITIES[settings.quality].bits_a_pixel
+    bits = picture if name.endswith("_rgb.mp4") else _DEPTH_BITS_A_PIXEL
+    return _FIXED_BYTES + round(pixels * bits / 8)
+
+
+def derive_scene(
+    derivation: Derivation, scene: Scene, folder: Path, *, advance: Advance = no_advance
+) -> TrainingDocument:
+    """Make the derived files of a scene in a folder, unless they are there and whole.
+
+    Args:
+        derivation: What to make of which source.
+        scene: The scene's row of the source's index.
+        folder: Where to write; created if it does not exist.
+        advance: Called with how many bytes of the source were done since the last call.
+
+    Returns:
+        What ``training.json`` says, which is the last of the files.
+
+    Raises:
+        ShardError: If a source file is missing, damaged or cannot be derived from, or what was
+            written does not read back as it must.
+        OSError: If a file cannot be written.
+    """
+    settings = derivation.settings
+    names = derived_names(scene, settings)
+    found = _finished(derivation, scene, folder, names)
+    if found is not None:
+        advance(source_bytes(scene, names))
+        return found
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / TRAINING_JSON).unlink(missing_ok=True)
+    source = derivation.source()
+    files: dict[str, DerivedFile] = {}
+    key_frames: set[int] | None = None
+    try:
+        for name in names:
+            if name in METADATA_FILES:
+                write_atomic(folder / name, source.read(scene, name))
+                advance(scene.members[name].size)
+                continue
+            if name == TRAINING_JSON:
+                continue
+            is_picture = name.endswith("_rgb.mp4")
+            steps = scene.frames * (_PICTURE_STEPS if is_picture else 1)
+            step = _steps(source_bytes(scene, [name]), steps, advance)
+            content = open_source(source, scene, released_name(name))
+            where = source.label(scene, released_name(name))
+            target, error = folder / name, None
+            if is_picture:
+                pictures = source_pictures(content, scene, settings, name=where, after_frame=step)
+                error = _write_checked(pictures, target, scene, settings, after_frame=step)
+                found_keys = key_frames_of(target, name=str(target))
+                key_frames = set(found_keys) & (key_frames or set(found_keys))
+            else:
+                target.write_bytes(
+                    packed_depth(
+                        content,
+                        name=where,
+                        frames=scene.frames,
+                        size=settings.size,
+                        after_frame=step,
+                    )
+                )
+            files[name] = _derived_file(target, error)
+    except (MediaError, SchemaError) as error:
+        raise ShardError(f"{scene.id.key}: {error}") from error
+    except StorageError as error:
+        if isinstance(error, ShardError):
+            raise
+        raise ShardError(f"{scene.id.key}: {error}") from error
+    document = _document(derivation, scene, files, tuple(sorted(key_frames or {0})))
+    write_atomic(folder / TRAINING_JSON, document.text())
+    return document
+
+
+def _steps(size: int, total: int, advance: Advance) -> Callable[[], None]:
+    """Return a function to call after each of some steps: all calls add up to the size."""
+    done = 0
+
+    def step() -> None:
+        nonlocal done
+        done += 1
+        advance(size * done // total - size * (done - 1) // total)
+
+    return step
+
+
+def open_source(source: MemberSource, scene: Scene, name: str) -> VideoFile:
+    """Return a source video: its path, or its bytes in memory where it is part of a shard."""
+    opened = source.open(scene, name)
+    if isinstance(opened, Path):
+        return opened
+    with opened:
+        content = opened.read()
+    member = scene.member(name)
+    require_crc32(zlib.crc32(content), expected=member.crc32, name=source.label(scene, name))
+    return io.BytesIO(content)
+
+
+def source_pictures(
+    video: VideoFile,
+    scene: Scene,
+    settings: TrainingSettings,
+    *,
+    name: str,
+    after_frame: Callable[[], None] = lambda: None,
+) -> np.ndarray:
+    """Return what ``size=`` gives of a video on the fly, (t, 3, h, w) uint8."""
+    with VideoReader(video, name=name, frames=scene.frames) as reader:
+        size = reader.size_px if all(reader.size_px) else None
+        found = size or (reader.facts.width_px, reader.facts.height_px)
+        indexed = (scene.rig.image_width_px, scene.rig.image_height_px)
+        if found != indexed:
+            raise MediaError(
+                f"{name}: holds pictures of {found[0]}x{found[1]} pixels where the index says "
+                f"{indexed[0]}x{indexed[1]}. Fetch them again, or run `stereogenbench index` again."
+            )
+        require_pixel_aspect(reader.pixel_aspect, scene.rig, name=name)
+        pictures = np.empty((scene.frames, 3, *settings.size), dtype=np.uint8)
+        for index in range(scene.frames):
+            read_rgb(reader, index, size=settings.size, out=pictures[index], content="colour")
+            after_frame()
+    return pictures
+
+
+def _write_checked(
+    pictures: np.ndarray,
+    target: Path,
+    scene: Scene,
+    settings: TrainingSettings,
+    *,
+    after_frame: Callable[[], None] = lambda: None,
+) -> PictureError:
+    """Write pictures, decode them again and return their error."""
+    rate = Fraction(scene.frame_rate_hz or FRAME_RATE_HZ).limit_denominator(_LARGEST_DENOMINATOR)
+    write_pictures(
+        pictures, target, quality=settings.quality, rate_hz=rate, after_frame=after_frame
+    )
+    return measured_error(pictures, target, name=str(target), after_frame=after_frame)
+
+
+def _derived_file(path: Path, error: PictureError | None) -> DerivedFile:
+    content = path.read_bytes()
+    if error is None:
+        return DerivedFile(len(content), zlib.crc32(content))
+    return DerivedFile(
+        len(content),
+        zlib.crc32(content),
+        error.psnr_db,
+        error.worst_psnr_db,
+        error.worst_frame,
+    )
+
+
+def _document(
+    derivation: Derivation,
+    scene: Scene,
+    files: Mapping[str, DerivedFile],
+    key_frames: tuple[int, ...],
+) -> TrainingDocument:
+    settings = derivation.settings
+    return TrainingDocument(
+        key=scene.id.key,
+        source_digest=derivation.digest,
+        source_size_px=(scene.rig.image_width_px, scene.rig.image_height_px),
+        size_px=(settings.size[1], settings.size[0]),
+        quality=settings.quality,
+        key_frames=key_frames,
+        pictures=QUALITIES[settings.quality].description(),
+        versions=_versions(settings.quality),
+        files=dict(files),
+    )
+
+
+def _versions(quality: Quality) -> dict[str, str]:
+    """Return the versions that the derived bytes depend on."""
+    versions = {
+        "stereogenbench-data": importlib.metadata.version("stereogenbench-data"),
+        "av": av.__version__,
+        "libavcodec": ".".join(map(str, av.library_versions["libavcodec"])),
+        "libswscale": ".".join(map(str, av.library_versions["libswscale"])),
+        "blosc2": str(blosc2_module().__version__),
+    }
+    if QUALITIES[quality].codec == "mjpeg":
+        versions["pillow"] = importlib.metadata.version("pillow")
+        versions["libjpeg"] = str(features.version("libjpeg_turbo") or features.version("jpg"))
+    return versions
+
+
+def _finished(
+    derivation: Derivation, scene: Scene, folder: Path, names: Sequence[str]
+) -> TrainingDocument | None:
+    """Return what an earlier run made, None unless it is whole and as this run would make it."""
+    try:
+        text = (folder / TRAINING_JSON).read_bytes()
+        document = parse_training(text, where=str(folder / TRAINING_JSON))
+    except (OSError, SchemaError):
+        return None
+    expected = _document(derivation, scene, document.files, document.key_frames)
+    videos = {name for name in names if name not in (*METADATA_FILES, TRAINING_JSON)}
+    if document.text() != expected.text() or set(document.files) != videos:
+        return None
+    try:
+        for name, file in document.files.items():
+            content = (folder / name).read_bytes()
+            if (len(content), zlib.crc32(content)) != (file.size, file.crc32):
+                return None
+        source = derivation.source()
+        for name in names:
+            is_text = name in METADATA_FILES
+            if is_text and (folder / name).read_bytes() != source.read(scene, name):
+                return None
+    except OSError:
+        return None
+    return document
+
+
+# How much there is to do.
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What packing would take, by a timed sample.
+
+    Attributes:
+        scenes: How many scenes.
+        videos: How many videos of pictures and of depth.
+        bytes: Of all derived files, about.
+        source_bytes: Of all files that are read.
+        core_hours: Processor time, about, in hours.
+        sampled: Keys of the scenes of which one camera was derived.
+    """
+
+    scenes: int
+    videos: int
+    bytes: int
+    source_bytes: int
+    core_hours: float
+    sampled: tuple[str, ...]
+
+
+def estimate(
+    index: SceneIndex, rows: Sequence[int], settings: TrainingSettings, *, folder: Path
+) -> Estimate:
+    """Return what deriving some scenes takes: one camera of some of them is derived and timed.
+
+    Args:
+        index: The source.
+        rows: The scenes.
+        settings: What to derive.
+        folder: Where the sample is written; the caller removes it.
+
+    Raises:
+        ShardError: As `derive_scene`; or if there are no scenes.
+    """
+    if not len(rows):
+        raise ShardError(f"{index.where}: no scene is selected. Check the filters.")
+    scenes = [index.scene(int(row)) for row in rows]
+    names = [derived_names(scene, settings) for scene in scenes]
+    places = sorted({round(each) for each in np.linspace(0, len(scenes) - 1, SAMPLED_SCENES)})
+    spent_s, made, frames = 0.0, {"rgb": 0, "depth": 0}, {"rgb": 0, "depth": 0}
+    for place in places:
+        scene = scenes[place]
+        camera = next(int(name[4:6]) for name in names[place] if name.endswith("_rgb.mp4"))
+        one = TrainingSettings(settings.size, settings.quality, (camera,))
+        derivation = Derivation.of_index(index, one, [scene])
+        began_s = time.process_time()
+        document = derive_scene(derivation, scene, folder / str(place))
+        spent_s += time.process_time() - began_s
+        for name, file in document.files.items():
+            kind = "rgb" if name.endswith("_rgb.mp4") else "depth"
+            made[kind] += file.size
+            frames[kind] += scene.frames
+    wanted = {"rgb": 0, "depth": 0}
+    videos = texts = 0
+    for scene, each in zip(scenes, names, strict=True):
+        for name in each:
+            if name.startswith("cam_"):
+                wanted["rgb" if name.endswith("_rgb.mp4") else "depth"] += scene.frames
+                videos += 1
+            elif name in scene.members:
+                texts += scene.members[name].size
+    size = texts + sum(made[kind] * wanted[kind] / max(frames[kind], 1) for kind in made)
+    return Estimate(
+        scenes=len(scenes),
+        videos=videos,
+        bytes=round(size),
+        source_bytes=sum(map(source_bytes, scenes, names)),
+        core_hours=spent_s / sum(frames.values()) * sum(wanted.values()) / 3600,
+        sampled=tuple(scenes[place].id.key for place in places),
+    )

@@ -1,0 +1,725 @@
+"""Training shards: what `size=` gives on the fly, decoded fast, with an error that is known."""
+
+import json
+import math
+import shutil
+import subprocess
+import sys
+import tarfile
+from dataclasses import replace
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from stereogenbench_data.audit.geometry_audit import AuditRequest, audit
+from typer.testing import CliRunner
+
+from stereogenbench_data import (
+    PAIR_FIELDS,
+    EnlargedSizeWarning,
+    StereoPairs,
+    evaluate,
+    export_inputs,
+    score_controls,
+)
+from stereogenbench_data.audit.contract.doctor import diagnose
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.errors import MediaError, SchemaError, ShardError, StorageError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.media.picture_encoding import (
+    QUALITIES,
+    measured_error,
+    write_pictures,
+)
+from stereogenbench_data.media.video import probe
+from stereogenbench_data.schema.release import TRAINING_JSON
+from stereogenbench_data.schema.training import parse_training
+from stereogenbench_data.shards.download import download, plan_download
+from stereogenbench_data.shards.pack import pack
+from stereogenbench_data.shards.training import TrainingSettings
+from stereogenbench_data.shards.unpack import unpack
+from stereogenbench_data.shards.verify import verify
+from stereogenbench_data.sources.files import try_locked
+from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
+from tests.servers.tools import require_module
+from tests.shards.shard_files import bytes_of, flip_byte
+
+SIZE = (24, 32)
+SETTINGS = TrainingSettings(SIZE)
+PICTURES = ("left", "right", "warped_right")
+FIELDS = tuple(name for name in PAIR_FIELDS if name not in ("__url__", *PICTURES))
+KEY = "train/Uniform/SynthStage/scene_000001"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def blosc2():
+    require_module("blosc2")
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory):
+    """Three scenes of 18 frames, more than two runs between key frames."""
+    root = tmp_path_factory.mktemp("training") / "release"
+    for family, scenes in (("IPD_Gaussian", 1), ("Uniform", 2)):
+        synthesise(
+            root, SynthRequest(family=family, scenes=scenes, size_px=48, frames=18), workers=1
+        )
+    SceneIndex.open(root).write(root / "index.parquet")
+    return root
+
+
+@pytest.fixture(scope="module")
+def packed(release, tmp_path_factory):
+    """Its training shards by the default settings; not to be changed."""
+    out = tmp_path_factory.mktemp("training_shards") / "shards"
+    pack(release, out, training=SETTINGS, workers=1)
+    return out
+
+
+@pytest.fixture
+def shards(packed, tmp_path):
+    """A copy that a test may change."""
+    return shutil.copytree(packed, tmp_path / "shards")
+
+
+def picture(sample, name):
+    return sample[name].numpy().astype(float)
+
+
+def psnr_db(one, other):
+    return 10 * math.log10(255**2 / np.square(one - other).mean())
+
+
+def document_of(folder, key):
+    index = SceneIndex.open(folder)
+    row = list(index.column("key")).index(key)
+    member = index.scene(row).members[TRAINING_JSON]
+    with (folder / member.path).open("rb") as file:
+        file.seek(member.offset)
+        return parse_training(file.read(member.size), where="test")
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_all_but_pictures_is_bit_for_bit_what_size_gives(release, tmp_path, quality):
+    pack(release, tmp_path, training=TrainingSettings(SIZE, quality), workers=1)
+
+    derived = StereoPairs(tmp_path, pairs="all", frames="all", fields=FIELDS)
+    on_the_fly = StereoPairs(release, pairs="all", frames="all", fields=FIELDS, size=SIZE)
+
+    assert len(derived) == len(on_the_fly) == 3 * 15 * 18
+    for number in range(0, len(derived), 53):
+        one, other = derived[number], on_the_fly[number]
+        for name in FIELDS:
+            if isinstance(one[name], torch.Tensor):
+                assert torch.equal(one[name], other[name]), name
+            else:
+                assert one[name] == other[name], name
+
+
+def test_pictures_have_the_psnr_that_the_index_states(release, packed):
+    index = SceneIndex.open(packed)
+    derived = StereoPairs(packed, pairs=[(1, 4)], frames="all", fields=("left", "scene"))
+    on_the_fly = StereoPairs(release, pairs=[(1, 4)], frames="all", fields=("left",), size=SIZE)
+    found = {}
+    for number in range(len(derived)):
+        one = derived[number]
+        found.setdefault(one["scene"], []).append(
+            psnr_db(picture(one, "left"), picture(on_the_fly[number], "left"))
+        )
+
+    for scene in map(index.scene, range(len(index))):
+        decibels = found[scene.id.key]
+        assert scene.training.psnr_db[1] == pytest.approx(np.mean(decibels), abs=0.0011)
+        assert scene.training.worst_psnr_db[1] == pytest.approx(min(decibels), abs=0.0011)
+        assert scene.training.psnr_db[1] <= np.mean(decibels)
+        assert scene.training.worst_psnr_db[1] <= min(decibels)
+
+
+def test_better_qualities_cost_bytes_and_save_error(release, tmp_path):
+    found = []
+    for quality in QUALITIES:
+        out = tmp_path / quality
+        pack(release, out, training=TrainingSettings(SIZE, quality), workers=1)
+        index = SceneIndex.open(out)
+        scenes = list(map(index.scene, range(len(index))))
+        found.append(
+            (
+                sum(scene.members["cam_00_rgb.mp4"].size for scene in scenes),
+                min(min(scene.training.psnr_db) for scene in scenes),
+            )
+        )
+
+    assert list(QUALITIES) == ["small", "balanced", "high"]
+    assert all(one < other for one, other in pairwise(found))
+    assert all(one[1] < other[1] for one, other in pairwise(found))
+
+
+def test_the_index_says_from_what_and_how_scenes_were_derived(release, packed):
+    source, index = SceneIndex.open(release), SceneIndex.open(packed)
+
+    assert index.is_derived
+    assert not source.is_derived
+    assert "32x24" in index.derivation
+    assert source.digest[:12] in index.derivation
+    for row in range(len(index)):
+        scene, released = index.scene(row), source.scene(row)
+        rig = scene.rig
+        assert (rig.image_width_px, rig.image_height_px) == (32, 24)
+        assert rig.recorded_size_px == (48, 48)
+        assert scene.training.source_digest == source.digest
+        assert (scene.training.quality, scene.training.codec) == ("balanced", "h264")
+        assert json.loads(scene.training.settings)["options"]["crf"] == "10"
+        assert scene.key_frames == (0, 8, 16)
+        assert scene.depth_codec == ("blosc2",) * 6
+        assert replace(
+            scene, rig=released.rig, members={}, key_frames=(0,), training=None, depth_codec=()
+        ) == replace(released, members={}, depth_codec=())
+
+
+def test_a_scene_says_so_itself_and_keeps_the_released_metadata(release, packed):
+    document = document_of(packed, KEY)
+    with tarfile.open(packed / "train-Uniform-000000.tar") as tar:
+        texts = {
+            name.partition(".")[2]: tar.extractfile(name).read()
+            for name in tar.getnames()
+            if name.startswith(KEY) and "cam_" not in name
+        }
+        videos = {name: tar.extractfile(f"{KEY}.{name}").read() for name in document.files}
+
+    assert texts.pop(TRAINING_JSON) == document.text()
+    assert texts == {name: (release / KEY / name).read_bytes() for name in texts}
+    assert len(texts) == 5
+    assert (document.key, document.size_px, document.source_size_px) == (KEY, (32, 24), (48, 48))
+    assert {"av", "blosc2", "stereogenbench-data"} <= set(document.versions)
+    assert {name: len(content) for name, content in videos.items()} == {
+        name: file.size for name, file in document.files.items()
+    }
+
+
+def test_files_beside_the_shards_say_that_data_are_derived(packed, release, tmp_path):
+    pack(release, tmp_path, workers=1)
+    derived, released = (
+        json.loads((folder / "shards.json").read_bytes()) for folder in (packed, tmp_path)
+    )
+
+    assert derived["derived"]["size"] == "32x24"
+    assert derived["derived"]["source_digest"] == SceneIndex.open(release).digest
+    assert derived["derived"]["psnr_db"]["worst_frame"] < derived["derived"]["psnr_db"]["mean"]
+    assert "derived" not in released
+
+
+def test_the_same_input_gives_the_same_bytes_whatever_the_workers_and_parts(
+    packed, release, tmp_path
+):
+    pack(release, tmp_path / "two", training=SETTINGS, workers=2)
+    first = pack(release, tmp_path / "parts", training=SETTINGS, part=(1, 2), workers=1)
+    second = pack(release, tmp_path / "parts", training=SETTINGS, part=(2, 2), workers=1)
+
+    assert (first.index, len(first.missing)) == (None, 1)
+    assert second.missing == ()
+    assert bytes_of(tmp_path / "two") == bytes_of(tmp_path / "parts") == bytes_of(packed)
+
+
+def test_more_processes_than_shards_share_the_scenes(packed, release, tmp_path):
+    seen = []
+    report = pack(
+        release,
+        tmp_path,
+        training=SETTINGS,
+        rows=[1, 2],
+        workers=2,
+        progress=lambda done, total: seen.append((done, total)),
+    )
+
+    shard = "train-Uniform-000000.tar"
+    assert report.packed == (shard,)
+    assert (tmp_path / shard).read_bytes() == (packed / shard).read_bytes()
+    assert seen == sorted(seen)
+    assert seen[-1][0] == seen[-1][1]
+    assert not list((tmp_path / ".parts").glob("*.derived"))
+
+
+def test_a_scene_that_another_process_derives_is_left_to_it(release, tmp_path):
+    folder = tmp_path / ".parts" / "train-Uniform-000000.derived" / KEY
+    folder.parent.mkdir(parents=True)
+
+    with (
+        try_locked(folder.with_name(f".{folder.name}.lock")),
+        pytest.raises(ShardError, match=r"scene_000001: another process .*--part I/N"),
+    ):
+        pack(release, tmp_path, training=SETTINGS, rows=[2], workers=1)
+
+
+def test_a_finished_pack_is_kept_and_leaves_no_files_of_scenes(shards, release):
+    left = shards / ".parts" / "train-Uniform-000000.derived" / KEY
+    left.mkdir(parents=True)
+    (left / TRAINING_JSON).write_bytes(b"{}")
+    report = pack(release, shards, training=SETTINGS, workers=1)
+
+    assert report.packed == ()
+    assert report.index is not None
+    assert not list((shards / ".parts").glob("*.derived"))
+
+
+class Killed(Exception):
+    """The process ends here."""
+
+
+def test_a_killed_run_loses_at_most_one_scene(packed, release, tmp_path):
+    index = SceneIndex.open(release)
+    rows = [row for row in range(len(index)) if "Uniform" in index.column("key")[row]]
+
+    def killed(done, total):
+        if done > 0.75 * total:
+            raise Killed
+
+    with pytest.raises(Killed):
+        pack(release, tmp_path, training=SETTINGS, rows=rows, workers=1, progress=killed)
+    whole = list(tmp_path.glob(f".parts/*.derived/**/{TRAINING_JSON}"))
+    before = {path: path.stat().st_mtime_ns for path in whole[0].parent.iterdir()}
+    seen = []
+
+    def watching(done, total):
+        if not seen:
+            seen.append({path: path.stat().st_mtime_ns for path in before})
+
+    pack(release, tmp_path, training=SETTINGS, rows=rows, workers=1, progress=watching)
+
+    assert len(whole) == 1
+    assert not list(tmp_path.glob("*.tmp"))
+    assert seen == [before]
+    shard = "train-Uniform-000000.tar"
+    assert (tmp_path / shard).read_bytes() == (packed / shard).read_bytes()
+
+
+def test_derived_files_that_were_damaged_before_the_shard_are_made_again(packed, release, tmp_path):
+    def killed(done, total):
+        if done > 0.75 * total:
+            raise Killed
+
+    with pytest.raises(Killed):
+        pack(release, tmp_path, training=SETTINGS, workers=1, progress=killed)
+    for name in ("cam_03_rgb.mp4", "baseline.json"):
+        flip_byte(next(tmp_path.glob(f".parts/*.derived/**/{name}")))
+    pack(release, tmp_path, training=SETTINGS, workers=1)
+
+    assert bytes_of(tmp_path) == bytes_of(packed)
+
+
+def test_a_process_that_is_killed_goes_on_where_it_was(packed, release, tmp_path):
+    script = (
+        "import os, sys\n"
+        "from stereogenbench_data.shards.pack import pack\n"
+        "from stereogenbench_data.shards.training import TrainingSettings\n"
+        "def progress(done, total):\n"
+        "    if done > total / 2: os.kill(os.getpid(), 9)\n"
+        "pack(sys.argv[1], sys.argv[2], training=TrainingSettings((24, 32)), workers=1,\n"
+        "     progress=progress)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", script, str(release), str(tmp_path)], check=False)
+    pack(release, tmp_path, training=SETTINGS, workers=1)
+
+    assert run.returncode == -9
+    assert bytes_of(tmp_path) == bytes_of(packed)
+
+
+def test_other_settings_or_another_source_are_another_plan(shards, release, tmp_path):
+    with pytest.raises(ShardError, match=r"32x24, balanced.*32x24, small"):
+        pack(release, shards, training=TrainingSettings(SIZE, "small"), workers=1)
+    with pytest.raises(ShardError, match="another plan"):
+        pack(release, shards, training=SETTINGS, rows=[0], workers=1)
+    with pytest.raises(ShardError, match="another plan"):
+        pack(release, shards, workers=1)
+
+
+@pytest.mark.parametrize("form", ["shards", "packed depth"])
+def test_shards_are_a_source_as_their_release_is(packed, release, tmp_path, form):
+    codec = "blosc2" if form == "packed depth" else "released"
+    pack(release, tmp_path / "source", depth_codec=codec, workers=1)
+    pack(tmp_path / "source", tmp_path / "out", training=SETTINGS, workers=1)
+
+    one, other = document_of(tmp_path / "out", KEY), document_of(packed, KEY)
+    assert one.files == other.files
+    assert one.source_digest != other.source_digest
+
+
+def test_a_url_is_a_source_as_its_folder_is(packed, release, tmp_path, web):
+    shutil.copytree(release, tmp_path / "web", dirs_exist_ok=True)
+
+    pack(web.url, tmp_path / "out", training=SETTINGS, rows=[0], workers=1)
+
+    key = SceneIndex.open(release).scene(0).id.key
+    assert document_of(tmp_path / "out", key).files == document_of(packed, key).files
+
+
+def test_some_cameras_and_scenes_are_kept(release, tmp_path):
+    settings = TrainingSettings(SIZE, cameras=(0, 3))
+    pack(release, tmp_path, training=settings, rows=[1], workers=1)
+
+    (scene,) = [SceneIndex.open(tmp_path).scene(0)]
+    assert scene.held_videos == (
+        "cam_00_rgb.mp4", "cam_03_rgb.mp4", "cam_00_depth.b2frame", "cam_03_depth.b2frame",
+    )  # fmt: skip
+    assert [math.isnan(each) for each in scene.training.psnr_db] == [
+        camera not in (0, 3) for camera in range(6)
+    ]
+    assert StereoPairs(tmp_path, pairs=[(0, 3)])[0]["left"].shape == (3, *SIZE)
+    with pytest.raises(StorageError, match="cam_01"):
+        StereoPairs(tmp_path)
+    assert verify(tmp_path, mode="decode", workers=1).problems == ()
+
+
+def test_a_scene_that_lacks_a_camera_is_derived_without_it(release, tmp_path):
+    source = SceneIndex.open(release)
+    scene = source.scene(1)
+    held = {name: member for name, member in scene.members.items() if "cam_02" not in name}
+    index = SceneIndex.from_scenes([replace(scene, members=held)], release)
+
+    pack(index, tmp_path, training=SETTINGS, workers=1)
+    with pytest.raises(ShardError, match=rf"{scene.id.key}: has no cam_02_rgb\.mp4"):
+        pack(index, tmp_path / "not", training=TrainingSettings(SIZE, cameras=(1, 2)), workers=1)
+
+    assert len(SceneIndex.open(tmp_path).scene(0).held_videos) == 10
+
+
+@pytest.mark.parametrize(
+    ("request_", "size", "key_frames"),
+    [
+        (SynthRequest(family="Uniform", scenes=1, size_px=40, frames=1), (17, 23), (0,)),
+        (SynthRequest(family="Uniform", scenes=1, size_px=40, frames=8), (40, 40), (0,)),
+        (SynthRequest(family="Uniform", scenes=1, size_px=36, frames=24), (18, 34), (0, 8, 16)),
+    ],
+)
+def test_scenes_of_other_lengths_and_sizes(tmp_path, request_, size, key_frames):
+    synthesise(tmp_path / "release", request_, workers=1)
+    is_odd = size[0] % 2 == 1
+    settings = TrainingSettings(size, "high" if is_odd else "small")
+    pack(tmp_path / "release", tmp_path / "out", training=settings, workers=1)
+
+    derived = StereoPairs(tmp_path / "out", frames="all", fields=("left", "disparity", "valid"))
+    on_the_fly = StereoPairs(
+        tmp_path / "release", frames="all", fields=("left", "disparity", "valid"), size=size
+    )
+    last = derived[len(derived) - 1], on_the_fly[len(derived) - 1]
+    assert torch.equal(last[0]["disparity"], last[1]["disparity"])
+    assert psnr_db(picture(last[0], "left"), picture(last[1], "left")) > 25
+    assert SceneIndex.open(tmp_path / "out").scene(0).key_frames == key_frames
+    report = verify(
+        tmp_path / "out", mode="decode", source=SceneIndex.open(tmp_path / "release"), workers=1
+    )
+    assert (report.problems, report.videos_compared) == ((), 12)
+
+
+@pytest.mark.parametrize("size", [(24, 31), (23, 32)])
+def test_h264_refuses_odd_sides_by_name(size):
+    with pytest.raises(MediaError, match=rf"{size[1]}x{size[0]}.*even.*quality 'high'"):
+        TrainingSettings(size, "balanced")
+
+
+def test_larger_pictures_than_released_are_refused(release, tmp_path):
+    with pytest.raises(ShardError, match=r"scene_000000: .*48x48 .*64x24 are asked for"):
+        pack(release, tmp_path, training=TrainingSettings((24, 64)), workers=1)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("settings", "found"),
+    [
+        ({"cameras": ()}, r"cameras \(\)"),
+        ({"cameras": (3, 1)}, r"cameras \(3, 1\).*ascending"),
+        ({"cameras": (6,)}, r"cameras \(6,\).*0 to 5"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(settings, found):
+    with pytest.raises(ShardError, match=found):
+        TrainingSettings(SIZE, **settings)
+
+
+def test_no_scene_is_refused(release, tmp_path):
+    with pytest.raises(ShardError, match="no scene is selected"):
+        pack(release, tmp_path, training=SETTINGS, rows=[], workers=1)
+
+
+# What reads them, and what refuses them.
+
+
+def test_a_smaller_size_works_on_top_and_a_larger_one_warns(packed):
+    smaller = StereoPairs(packed, size=(12, 16), fields=("left", "disparity", "intrinsics"))[0]
+    with pytest.warns(EnlargedSizeWarning, match=r"32x24.*\(48, 48\)"):
+        StereoPairs(packed, size=(48, 48))
+
+    plain = StereoPairs(packed, fields=("intrinsics",))[0]
+    assert smaller["left"].shape == (3, 12, 16)
+    assert torch.allclose(smaller["intrinsics"][0] * 2, plain["intrinsics"][0])
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda data, out: evaluate(data, out, tier="G1"),
+        lambda data, out: export_inputs(data, out, tier="G1"),
+        lambda data, out: score_controls(data),
+        lambda data, out: audit(data),
+        lambda data, out: diagnose(data),
+        lambda data, out: pack(data, out, training=TrainingSettings((12, 16)), workers=1),
+    ],
+    ids=["evaluate", "export-inputs", "controls", "audit", "doctor", "pack"],
+)
+def test_what_needs_released_pictures_refuses_derived_ones(packed, tmp_path, work):
+    (tmp_path / "out").mkdir()
+    with pytest.raises(StorageError, match=r"training shards, derived at 32x24.*released data"):
+        work(packed, tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_an_explicit_word_lets_the_audit_run(packed):
+    report = audit(packed, AuditRequest(sample=1, frames=1, derived="ok"), workers=1)
+
+    assert len(report.scenes) == 1
+
+
+def test_unpacked_training_shards_are_a_folder_of_derived_scenes(packed, tmp_path):
+    unpack(packed, tmp_path, workers=1)
+    (tmp_path / "index.parquet").unlink(missing_ok=True)
+    folder, index = SceneIndex.open(tmp_path), SceneIndex.open(packed)
+
+    for row in range(len(index)):
+        one, other = folder.scene(row), index.scene(row)
+        assert repr(one.training) == repr(other.training)
+        assert (one.rig, one.key_frames, one.rig_residual_px) == (
+            other.rig, other.key_frames, other.rig_residual_px,
+        )  # fmt: skip
+    assert torch.equal(
+        StereoPairs(folder, fields=("disparity",))[1]["disparity"],
+        StereoPairs(packed, fields=("disparity",))[1]["disparity"],
+    )
+
+
+def test_a_download_of_a_part_is_a_folder_of_derived_scenes(packed, tmp_path):
+    index = SceneIndex.open(packed)
+    part = plan_download(index, [0], cameras=[0, 1], streams=["rgb", "depth"])
+    download(index, part, tmp_path, workers=1)
+
+    assert repr(SceneIndex.open(tmp_path).scene(0).training) == repr(index.scene(0).training)
+    folder = StereoPairs(tmp_path)
+    one, other = folder[0], StereoPairs(packed)[0]
+    folder.close()
+    assert torch.equal(one["left"], other["left"])
+    assert torch.equal(one["disparity"], other["disparity"])
+
+
+# Damage and alteration.
+
+
+def test_every_frame_is_compared_with_the_source(packed, release):
+    report = verify(packed, mode="decode", source=SceneIndex.open(release), workers=1)
+
+    assert report.problems == ()
+    assert (report.videos_decoded, report.videos_compared) == (36, 36)
+    assert "32x24" in report.derived
+
+
+def test_another_source_is_found_out(packed, release, tmp_path):
+    other = tmp_path / "other"
+    synthesise(
+        other, SynthRequest(family="Uniform", scenes=2, size_px=48, frames=18, seed=9), workers=1
+    )
+
+    report = verify(packed, mode="decode", source=SceneIndex.open(other), workers=1)
+
+    found = {(each.scene.rpartition("/")[2], each.member) for each in report.problems}
+    assert ("scene_000001", "cam_04_rgb.mp4") in found
+    assert ("scene_000001", "cam_04_depth.b2frame") in found
+    assert ("scene_000001", "trajectory.json") in found
+    assert any("is not in the source" in each.found for each in report.problems)
+    pack(release, tmp_path / "released", workers=1)
+    with pytest.raises(ShardError, match="no source to compare with"):
+        verify(tmp_path / "released", mode="decode", source=SceneIndex.open(release))
+
+
+def test_a_flipped_byte_is_found(shards):
+    flip_byte(shards / "train-Uniform-000000.tar")
+
+    assert verify(shards, workers=1).problems
+
+
+def test_an_altered_psnr_contradicts_the_shard(shards):
+    index = SceneIndex.open(shards)
+    scenes = [index.scene(row) for row in range(len(index))]
+    better = replace(scenes[0].training, psnr_db=(60.0,) * 6)
+    altered = SceneIndex.from_scenes(
+        [replace(scenes[0], training=better), *scenes[1:]], shards, shards=index.shards
+    )
+    altered.write(shards / "index.parquet")
+
+    (problem, *_) = [
+        each for each in verify(shards, workers=1).problems if each.member == TRAINING_JSON
+    ]
+    assert problem.scene == scenes[0].id.key
+    assert "60.0" in problem.found
+
+
+@pytest.mark.parametrize(
+    ("facts", "found"),
+    [
+        ({"quality": "[small](http://x)"}, "training_quality"),
+        ({"source_digest": "none"}, "training_source"),
+        ({"settings": "[" * 9999}, "training_settings"),
+        ({"settings": "{"}, "training_settings"),
+        ({"psnr_db": (400.0,) * 6}, "psnr_db"),
+        ({"psnr_db": (40.0,) * 5}, "psnr_db"),
+        ({"worst_psnr_db": (-math.inf,) * 6}, "worst_psnr_db"),
+    ],
+)
+def test_an_index_cannot_say_other_things_of_training_shards(packed, facts, found):
+    scene = SceneIndex.open(packed).scene(0)
+    altered = replace(scene, training=replace(scene.training, **facts))
+
+    with pytest.raises(StorageError, match=rf"{found} is .*altered"):
+        SceneIndex.from_scenes([altered], packed)
+
+
+@pytest.mark.parametrize(
+    ("alter", "found"),
+    [
+        (lambda text: text[:-40], "not valid JSON"),
+        (lambda text: text.replace(b'"format": 1', b'"format": 2'), r"\$\.format must be 1"),
+        (lambda text: text.replace(b'"psnr_db": ', b'"psnr_db": 1'), r"psnr_db must be 0 to 100"),
+        (lambda text: text.replace(b"cam_00_rgb.mp4", b"../../etc"), r"\$\.files must name"),
+        (lambda text: text.replace(b"[0, 8, 16]", b"[0, 16, 8]"), "key_frames must be frames"),
+        (lambda text: text.replace(b'"width_px": 32', b'"width_px": -1'), "width_px must be"),
+        (lambda text: text.replace(b'"versions"', b'"version"'), r"\$\.version must be there"),
+        (lambda text: text.replace(b'"bytes": ', b'"bytes": -'), "bytes must be a whole number"),
+        (lambda text: text.replace(b'"crc32": "', b'"crc32": "x'), "crc32 must be 8 hex digits"),
+    ],
+)
+def test_an_altered_description_is_refused_with_its_place(packed, alter, found):
+    text = alter(document_of(packed, KEY).text())
+
+    with pytest.raises(SchemaError, match=rf"shard/training\.json: .*{found}"):
+        parse_training(text, where="shard/training.json")
+
+
+def test_a_source_that_is_not_the_one_of_its_index_is_refused(release, tmp_path):
+    source = shutil.copytree(release, tmp_path / "source")
+    index = SceneIndex.open(source)
+    place = source / KEY / "cam_02_rgb.mp4"
+    place.write_bytes(place.read_bytes()[:-50])
+
+    with pytest.raises(ShardError, match=rf"{KEY}.*cam_02_rgb\.mp4"):
+        pack(index, tmp_path / "out", training=SETTINGS, workers=1)
+    assert not list((tmp_path / "out").glob("train-Uniform*.tar"))
+
+
+def moving(count, *, size=(32, 48)):
+    """Pictures of a smooth texture that moves by three pixels a frame."""
+    coarse = np.random.default_rng(0).integers(0, 256, (6, 20, 3), dtype=np.uint8)
+    wide = np.asarray(Image.fromarray(coarse).resize((160, 48), Image.Resampling.BICUBIC))
+    return np.stack(
+        [
+            wide[: size[0], 3 * place : 3 * place + size[1]].transpose(2, 0, 1)
+            for place in range(count)
+        ]
+    )
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("rate_hz", [Fraction(15), Fraction(24), Fraction(30000, 1001)])
+def test_a_video_is_written_the_same_each_time_and_read_back(tmp_path, quality, rate_hz):
+    pictures = moving(19)
+    one, other = tmp_path / "one.mp4", tmp_path / "other.mp4"
+    for path in (one, other):
+        write_pictures(pictures, path, quality=quality, rate_hz=rate_hz)
+    error = measured_error(pictures, one, name="one")
+    facts = probe(one, name="one.mp4")
+
+    assert one.read_bytes() == other.read_bytes()
+    assert 20 < error.worst_psnr_db <= error.psnr_db < 100
+    assert facts.frames == 19
+    assert facts.frame_rate_hz == pytest.approx(float(rate_hz), rel=1e-4)
+    distance = QUALITIES[quality].key_frame_distance
+    assert facts.key_frames == tuple(range(0, 19, distance))
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("shift", [-1, 1])
+def test_a_neighbouring_frame_in_the_place_of_one_is_found(tmp_path, quality, shift):
+    pictures = moving(10)
+    write_pictures(pictures, tmp_path / "a.mp4", quality=quality, rate_hz=Fraction(15))
+
+    with pytest.raises(MediaError, match=r"video: frame \d shows frame \d of its source"):
+        measured_error(np.roll(pictures, shift, axis=0), tmp_path / "a.mp4", name="video")
+
+
+def test_frames_that_do_not_differ_are_not_taken_for_each_other(tmp_path):
+    still = np.repeat(moving(1), 12, axis=0)
+    write_pictures(still, tmp_path / "a.mp4", quality="small", rate_hz=Fraction(15))
+
+    assert measured_error(still, tmp_path / "a.mp4", name="a").psnr_db > 20
+
+
+def test_a_lost_frame_is_found(tmp_path):
+    write_pictures(moving(10), tmp_path / "a.mp4", quality="small", rate_hz=Fraction(15))
+
+    with pytest.raises(MediaError, match="holds 10 frames where 11 are expected"):
+        measured_error(moving(11), tmp_path / "a.mp4", name="a")
+
+
+# The command.
+
+
+def command(*words):
+    return CliRunner().invoke(app, list(map(str, words)))
+
+
+def test_the_command_derives_and_verifies(release, tmp_path):
+    out = tmp_path / "train"
+    packed = command(
+        "pack", release, out, "--size", "32x24", "--quality", "small", "--cameras", "0,1",
+        "--family", "Uniform", "--workers", 1,
+    )  # fmt: skip
+    verified = command("verify", out, "--deep", "--source", release, "--workers", 1)
+
+    assert (packed.exit_code, verified.exit_code) == (0, 0)
+    assert "2 scenes" in packed.stdout
+    assert "derived at 32x24 (quality small, h264)" in verified.stdout
+    assert f"8 compared with {release}; 0 problems" in verified.stdout
+
+
+def test_a_dry_run_tells_bytes_and_core_hours_and_writes_nothing(release, packed, tmp_path):
+    said = command("pack", release, tmp_path / "out", "--size", "32x24", "--dry-run")
+    told = command("pack", release, tmp_path / "out", "--size", "32x24", "--dry-run", "--json")
+
+    index = SceneIndex.open(packed)
+    size = sum(each.size for row in range(3) for each in index.scene(row).members.values())
+    estimate = json.loads(told.stdout)
+    assert said.exit_code == told.exit_code == 0
+    assert "3 scenes, 36 videos" in said.stdout
+    assert "core-hours" in said.stdout
+    assert estimate["bytes"] == pytest.approx(size, rel=0.2)
+    assert 0 < estimate["core_hours"] < 0.1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        (["--quality", "small"], "--size"),
+        (["--cameras", "0"], "--size"),
+        (["--dry-run"], "--size"),
+        (["--size", "32x24", "--cameras", "0,7"], "0 to 5"),
+        (["--size", "32", "--dry-run"], "WIDTHxHEIGHT"),
+        (["--size", "32x24", "--depth-codec", "blosc2"], "--depth-codec"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(release, tmp_path, options, found):
+    run = command("pack", release, tmp_path / "out", *options)
+
+    assert run.exit_code == 2
+    assert found in run.output
+    assert not Path(tmp_path / "out").exists()
