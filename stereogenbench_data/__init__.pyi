@@ -11,6 +11,7 @@ from stereogenbench_data.datasets.mapped import SceneViews as SceneViews
 from stereogenbench_data.datasets.mapped import StereoPairs as StereoPairs
 from stereogenbench_data.datasets.streamed import StereoPairStream as StereoPairStream
 from stereogenbench_data.datasets.tensors import collate as collate
+from stereogenbench_data.datasets.tensors import to_device as to_device
 from stereogenbench_data.errors import DescriptorError as DescriptorError
 from stereogenbench_data.errors import EvaluationError as EvaluationError
 from stereogenbench_data.errors import ExtraError as ExtraError

@@ -118,7 +118,7 @@ def derive(
             if isinstance(batch[name], torch.Tensor)
         }
         made: dict[str, torch.Tensor] = {}
-        for contract, rows in _contracts(batch).items():
+        for contract, rows in _contracts(batch):
             if len(rows) == len(depth):
                 made = _derived(_Moments.of(moved, contract), names, places)
                 break
@@ -163,24 +163,25 @@ class _Contract(NamedTuple):
     """What decides which formulas hold for a scene.
 
     Attributes:
-        is_rectified: Whether disparity is the closed form; else points go through the poses.
+        rig: "rectified" if disparity is the closed form, "posed" if points go through the poses.
         kind: "planar" or "ray" depth.
         form: Whether a stored number is proportional to "depth" or to its "inverse".
     """
 
-    is_rectified: bool
+    rig: str
     kind: str
     form: str
 
 
-def _contracts(batch: Mapping[str, Any]) -> dict[_Contract, list[int]]:
-    """Return which moments of a batch have which contract: texts, so no device is asked."""
-    rows: dict[_Contract, list[int]] = {}
-    for row, (rig, kind, form) in enumerate(
-        zip(batch["rig"], batch["depth_kind"], batch["depth_form"], strict=True)
-    ):
-        rows.setdefault(_Contract(rig == "rectified", kind, form), []).append(row)
-    return rows
+def _contracts(batch: Mapping[str, Any]) -> list[tuple[_Contract, list[int]]]:
+    """Return the contracts of a batch's moments, and which have each. Texts: no device is asked."""
+    names = ("rig", "depth_kind", "depth_form")
+    texts = list(zip(*(batch[name] for name in names), strict=True))
+    apart = [each for row, each in enumerate(texts) if each not in texts[:row]]
+    return [
+        (_Contract(*each), [row for row, other in enumerate(texts) if other == each])
+        for each in apart
+    ]
 
 
 def _require_pairs(pairs: PairPlaces, *, views: int) -> list[tuple[int, int]]:
@@ -353,7 +354,7 @@ class _Direction:
     @_once
     def disparity(self) -> torch.Tensor:
         """Disparity in pixels, 0 where depth was not measured."""
-        if not self._contract.is_rectified:
+        if self._contract.rig != "rectified":
             width_px = self.measured.shape[-1]
             u_px = torch.arange(width_px, dtype=torch.float64, device=self.measured.device) + 0.5
             moved = torch.where(self.measured, u_px - self.projection.u_px, 0.0)
@@ -371,7 +372,7 @@ class _Direction:
     @_once
     def projection(self) -> Projection:
         """Where each source pixel lands in the target."""
-        if self._contract.is_rectified:
+        if self._contract.rig == "rectified":
             return project_rectified(self.depth_m, self.disparity)
         target_from_source = torch.stack(
             [self._moments.cams_from_cam[:, source, :, target] for source, target in self._places],

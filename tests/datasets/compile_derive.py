@@ -20,7 +20,7 @@ def main() -> None:
         expected = derive(batch, fields=DERIVED_FIELDS)
         for name, values in made.items():
             assert torch.equal(values.nan_to_num(), expected[name].nan_to_num()), (rig, name)
-        print(f"{rig} {contract}: {len(made)} fields are equal")
+        sys.stdout.write(f"{rig} {contract}: {len(made)} fields are equal\n")
 
 
 if __name__ == "__main__":
