@@ -26,9 +26,10 @@ from stereogenbench_data.geometry.arrays import (
 from stereogenbench_data.geometry.camera import Intrinsics, require_positive, require_size
 from stereogenbench_data.schema.records import DepthForm
 
-_EXACT_FACTORS: Final = np.arange(128.0, 256.0)
-"""Whole numbers whose product with a 16-bit number is exact in the 24 bits of float32. Smaller ones
-are these divided by a power of two, and round in the same way."""
+_EXACT_FACTORS: Final = (128.0, 256.0)
+"""From the first to below the second: whole numbers whose product with a 16-bit number is exact in
+the 24 bits of float32. Smaller ones are these divided by a power of two, and round in the same way.
+"""
 
 _NEARLY_EXACT: Final = 2.0**-29
 """A relative error that is at most 1/32 ulp of a float32."""
@@ -220,12 +221,13 @@ def _exact_quotients(
 ) -> tuple[Float64[Any, "*rigs"], Float64[Any, "*rigs"], Bool[Any, "*rigs"]]:
     """Return the float32 product and the factor of `_exact_quotient`, and whether they will do."""
     xp = array_namespace(shift_units)
-    factors = xp.asarray(_EXACT_FACTORS, device=device(shift_units))
+    # Made where they are used: a copy to a GPU would wait for all that is queued there.
+    factors = xp.arange(*_EXACT_FACTORS, dtype=xp.float64, device=device(shift_units))
     products = shift_units[..., None] * factors
     rounded = as_float64(xp.astype(products, xp.float32))
     misses = xp.abs(rounded / products - 1.0)
     best = xp.argmin(misses, axis=-1)
-    chosen = xp.arange(len(_EXACT_FACTORS), device=device(shift_units)) == best[..., None]
+    chosen = factors - _EXACT_FACTORS[0] == best[..., None]
     product, factor, miss = (
         xp.sum(xp.where(chosen, values, 0.0), axis=-1) for values in (rounded, factors, misses)
     )

@@ -148,6 +148,29 @@ def test_every_field_is_that_of_stereo_pairs(contract, rig):
         assert 0.001 < made[name].float().mean() < 0.999, name
 
 
+@pytest.mark.parametrize("cx_px", [20.0, 20.3])
+def test_points_on_the_edge_between_two_pixels_land_on_the_same_one(cx_px):
+    """Here alone rounding could decide: through poses that are not turned, by half pixels."""
+    views, known = scene(CONTRACTS["planar depth"], rig="posed")
+    centres = np.zeros((len(FRAMES), 6, 3))
+    centres[:, :, 1] = 100 * np.asarray(known.scene.lateral_m)
+    poses = CameraPoses.from_trajectory(
+        Trajectory(centres, 0.01, np.zeros((len(FRAMES), 6, 3)), "rotator_deg")
+    )
+    known = replace(known, poses=poses, encodings=dict.fromkeys(range(6), DepthEncoding(0.1)))
+    halves_px = np.random.default_rng(0).choice([0.5, 1.5, 3.5, 4.5], (6, len(FRAMES), *SIZE))
+    units = np.rint(63.0 * 0.2 / halves_px * 10).astype(np.uint16)
+    depths = {camera: StoredDepth(units[camera], units[camera] > 0) for camera in range(6)}
+    camera = Intrinsics(63.0, 63.0, cx_px, 6.0, SIZE[1], SIZE[0])
+    scenes = [(replace(views, depths=depths, intrinsics=camera), known)]
+
+    made, expected = derive(batch_of(scenes), fields=DERIVED_FIELDS), expected_of(scenes)
+
+    differing = {name: int((made[name] != expected[name]).sum()) for name in MASKS}
+    assert differing == dict.fromkeys(MASKS, 0)
+    assert_equal(made, expected)
+
+
 def test_stills_have_no_axis_of_time():
     batch = batch_of([scene(CONTRACTS["planar depth"])])
     still = {
