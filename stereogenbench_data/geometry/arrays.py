@@ -22,7 +22,10 @@ BLOCK_PIXELS: Final = 64 * 1280
 
 def is_torch_array(values: Array) -> bool:
     """Return whether an array is a torch tensor; torch is not imported."""
-    return not isinstance(values, np.ndarray) and type(values).__module__.startswith("torch")
+    if isinstance(values, np.ndarray):
+        return False
+    is_torchs_own = type(values).__module__.startswith("torch")
+    return is_torchs_own or bool(array_api_compat.is_torch_array(values))
 
 
 def is_numpy_array(values: Array) -> bool:
@@ -31,8 +34,12 @@ def is_numpy_array(values: Array) -> bool:
 
 
 def array_namespace(*arrays: Array) -> Any:
-    """Return the functions of the array API standard for the library of these arrays."""
-    if is_torch_array(arrays[0]):
+    """Return the functions of the array API standard for the library of these arrays.
+
+    Raises:
+        TypeError: If they are of several libraries.
+    """
+    if all(map(is_torch_array, arrays)):
         from array_api_compat import torch as functions
 
         return functions
