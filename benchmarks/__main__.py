@@ -12,6 +12,7 @@ from typing import Final
 
 from benchmarks.accuracy import CASES, measure_accuracy
 from benchmarks.clock import MeasurementError, in_a_fork
+from benchmarks.derive import measure_derive
 from benchmarks.equality import differences
 from benchmarks.evaluation import measure_evaluation
 from benchmarks.ffmpeg_links import link_libraries
@@ -26,7 +27,7 @@ from benchmarks.tried import measure_tried
 from benchmarks.workloads import RATES, WORKLOADS, Workload
 
 ROOT: Final = Path(__file__).parents[1]
-OTHERS: Final = ("accuracy", "profile", "start", "memory", "tried", "evaluation")
+OTHERS: Final = ("accuracy", "profile", "start", "memory", "tried", "evaluation", "derive")
 """Measurements beside the races; `--only` takes these names too."""
 
 QUICK: Final = ("first", "all-frames", "random", "accuracy", "profile")
@@ -116,6 +117,7 @@ def measure_others(
         "start": lambda: measure_start(material, rounds=rounds, report=report),
         "memory": lambda: measure_memory(material, batches=options.batches, report=report),
         "tried": lambda: measure_tried(material, rounds=min(rounds, 3), report=report),
+        "derive": lambda: measure_derive(material, rounds=min(rounds, 3), report=report),
         "evaluation": lambda: measure_evaluation(rounds=min(rounds, 3), report=report),
     }
     failed = []
@@ -124,7 +126,8 @@ def measure_others(
             continue
         began = time.perf_counter()
         try:
-            results.put(name, in_a_fork(work[name]))
+            # "derive" forks by itself: a GPU is of no use in a fork.
+            results.put(name, work[name]() if name == "derive" else in_a_fork(work[name]))
         except MeasurementError as error:
             failed.append(f"{name}: {error}")
             report(f"{name} failed: {error}")

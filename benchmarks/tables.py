@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
+from benchmarks.derive import MARK
 from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, NO_DEPTH, OURS, title
 from benchmarks.material import DRAWN_CRF, OTHER_CRFS
 from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios, sent_mb, shares
@@ -23,7 +24,7 @@ def tables(sections: dict[str, Any]) -> str:
             parts.append(by_rate(sections))
     for name, make in (
         ("start", _start), ("memory", _memory), ("accuracy", _accuracy), ("profile", _profile),
-        ("tried", _tried), ("evaluation", _evaluation),
+        ("tried", _tried), ("evaluation", _evaluation), ("derive", _derive),
     ):  # fmt: skip
         if name in sections:
             parts.append(make(sections[name]))
@@ -250,6 +251,34 @@ def _profile(profile: dict[str, Any]) -> str:
     rows.append(["all", *(f"{sum(profile[n]['ms_a_sample'].values()):.2f}" for n in names)])
     head = ("ms a sample, one worker", *names)
     return "## Where the time goes\n\n" + table(head, rows)
+
+
+def _derive(found: dict[str, Any]) -> str:
+    parts = ["## Pairs made on the device\n"]
+    rows = []
+    for size, measured in found.items():
+        ways = measured["ways"]
+        decoding_s = ways["decoding alone"]["cpu_s"]
+        for name, way in ways.items():
+            ratio = way["cpu_s"] / decoding_s
+            mark = at_most(ratio, MARK) if name == "views and stored depth" else ""
+            rows.append(
+                [f"{name}, {size}", f"{way['cpu_s'] * 1e3:.1f}", f"{ratio:.2f}", mark,
+                 f"{way['bytes'] / 1e6:.1f}"]
+            )  # fmt: skip
+    head = ("a moment of six cameras", "processor ms", "to decoding", "target", "MB")
+    parts.append(table(head, rows))
+    rows = [
+        [f"{size}, {way}", f"{gpu[way]:.0f}", f"{gpu[way] / gpu['limit']:.2f}", gpu["device"]]
+        for size, measured in found.items()
+        if (gpu := measured["gpu"]) is not None
+        for way in ("limit", "eager", "compiled")
+        if way in gpu
+    ]
+    if not rows:
+        return "\n".join([*parts, "No GPU was at hand: rates on one were not measured.\n"])
+    head = ("15 pairs with all maps", "moments/s", "to the memory's limit", "device")
+    return "\n".join([*parts, table(head, rows)])
 
 
 def headlines(races: dict[str, Any]) -> str:

@@ -3,6 +3,9 @@
 from stereogenbench_data.datasets.adapters import to_raft_stereo as to_raft_stereo
 from stereogenbench_data.datasets.adapters import to_torchvision as to_torchvision
 from stereogenbench_data.datasets.batches import EpochBatches as EpochBatches
+from stereogenbench_data.datasets.derive import DERIVE_FIELDS as DERIVE_FIELDS
+from stereogenbench_data.datasets.derive import DERIVED_FIELDS as DERIVED_FIELDS
+from stereogenbench_data.datasets.derive import derive as derive
 from stereogenbench_data.datasets.loader import PairsLoader as PairsLoader
 from stereogenbench_data.datasets.mapped import SceneViews as SceneViews
 from stereogenbench_data.datasets.mapped import StereoPairs as StereoPairs
@@ -12,6 +15,7 @@ from stereogenbench_data.datasets.open_videos import (
 )
 from stereogenbench_data.datasets.streamed import StereoPairStream as StereoPairStream
 from stereogenbench_data.datasets.tensors import collate as collate
+from stereogenbench_data.datasets.tensors import to_device as to_device
 from stereogenbench_data.errors import DescriptorError as DescriptorError
 from stereogenbench_data.errors import EvaluationError as EvaluationError
 from stereogenbench_data.errors import ExtraError as ExtraError

@@ -92,7 +92,10 @@ def _head(index: SceneIndex, configs: _Configs) -> list[str]:
         "configs:",
     ]
     for config, splits in configs.items():
-        lines += [f"- config_name: {config}", "  data_files:"]
+        lines.append(f"- config_name: {config}")
+        if config == "all":
+            lines.append("  default: true")
+        lines.append("  data_files:")
         for split, paths in splits.items():
             lines += [f"  - split: {split}", f"    path: {json.dumps(paths)}"]
     lines.append("dataset_info:")

@@ -1,10 +1,10 @@
 """The classes behind `huggingface.iterable`; this module imports Hugging Face ``datasets``."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from datasets import IterableDataset
+from datasets import DatasetInfo, Features, IterableDataset
 from datasets.iterable_dataset import ExamplesIterable
 from torch.utils.data import get_worker_info
 
@@ -25,15 +25,15 @@ class SampleIterable(IterableDataset):  # type: ignore[misc]  # datasets ships n
     pairs: StereoPairs
 
     @classmethod
-    def of(cls, pairs: StereoPairs) -> "SampleIterable":
-        """Return the samples of a map-style dataset."""
+    def of(cls, pairs: StereoPairs, features: Features | None) -> "SampleIterable":
+        """Return the samples of a map-style dataset, with these features or without any."""
         scenes = list(range(len(pairs.plan.scene_rows)))
         made = IterableDataset.from_generator(
             _samples, gen_kwargs={"pairs": pairs, "scenes": scenes}
         )
         plain = made._ex_iterable
-        scenes_of_epoch = _ScenesOfEpoch(plain.generate_examples_fn, plain.kwargs)
-        samples = cls(scenes_of_epoch, info=made.info, split=made.split)
+        scenes_of_epoch = _ScenesOfEpoch.of(plain, features)
+        samples = cls(scenes_of_epoch, info=DatasetInfo(features=features), split=made.split)
         samples.pairs = pairs
         return samples
 
@@ -43,34 +43,56 @@ class SampleIterable(IterableDataset):  # type: ignore[misc]  # datasets ships n
         self.pairs.set_epoch(epoch)
 
 
-class _ScenesOfEpoch(ExamplesIterable):  # type: ignore[misc]  # datasets ships no types
+class _Scenes(ExamplesIterable):  # type: ignore[misc]  # datasets ships no types
+    """Scenes whose samples are as their features say.
+
+    ``datasets`` passes on what has types as it is. Otherwise it would encode each sample, and turn
+    arrays of one axis into lists.
+
+    Attributes:
+        features: The features; None where samples differ in size.
+    """
+
+    features: Features | None = None
+
+    @classmethod
+    def of(cls, scenes: ExamplesIterable, features: Features | None, **options: Any) -> Self:
+        """Return the same scenes with features."""
+        typed = cls(scenes.generate_examples_fn, scenes.kwargs | options)
+        typed.features = features
+        return typed
+
+    @property
+    def is_typed(self) -> bool:
+        """Whether samples have features."""
+        return self.features is not None
+
+
+class _ScenesOfEpoch(_Scenes):
     """The scenes; ``datasets`` passes them the epoch of any dataset derived from them.
 
     At the start of an iteration, ``datasets`` calls ``shift_rngs`` with the epoch, unless it is 0.
     A worker calls it a second time with the worker's number, on its share of the scenes. That
-    share is a plain `ExamplesIterable`, so the second call does not change the epoch.
+    share is `_Scenes`, so the second call does not change the epoch.
     """
 
     def shift_rngs(self, value: int) -> "_ScenesOfEpoch":
         """Return the same scenes for an epoch."""
-        return _ScenesOfEpoch(self.generate_examples_fn, self.kwargs | {"epoch": value})
+        return _ScenesOfEpoch.of(self, self.features, epoch=value)
 
     def shuffle_data_sources(self, generator: np.random.Generator) -> "_ScenesOfEpoch":
         """Return the scenes in another order."""
-        plain = super().shuffle_data_sources(generator)
-        return _ScenesOfEpoch(plain.generate_examples_fn, plain.kwargs)
+        return _ScenesOfEpoch.of(super().shuffle_data_sources(generator), self.features)
 
     def shard_data_sources(
         self,
         num_shards: int,
         index: int,
         contiguous: bool = True,  # noqa: FBT001, FBT002 - as datasets calls it
-    ) -> ExamplesIterable:
+    ) -> _Scenes:
         """Return a share of the scenes."""
-        plain = super().shard_data_sources(num_shards, index, contiguous)
-        if get_worker_info() is not None:
-            return plain
-        return _ScenesOfEpoch(plain.generate_examples_fn, plain.kwargs)
+        kind = _ScenesOfEpoch if get_worker_info() is None else _Scenes
+        return kind.of(super().shard_data_sources(num_shards, index, contiguous), self.features)
 
 
 def _samples(pairs: StereoPairs, scenes: list[int], epoch: int | None = None) -> Iterator[Sample]:

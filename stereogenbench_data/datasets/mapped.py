@@ -62,6 +62,7 @@ class _MappedScenes(Dataset[Sample]):
         check_samples(index, plan, request)
         self.index = index
         self.plan = plan
+        self.request = request
         opened = _opens_checked(check, plan)
         self._loader = SampleLoader(
             index,

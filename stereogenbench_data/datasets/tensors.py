@@ -1,6 +1,6 @@
-"""From arrays to tensors, and from samples to a batch."""
+"""From arrays to tensors, from samples to a batch, and from batches to a device."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,47 @@ def collate(samples: Sequence[Sample]) -> dict[str, Any]:
                     "size=(height, width), or batch sweeps one by one."
                 )
     return {name: _stacked([sample[name] for sample in samples]) for name in first}
+
+
+def to_device(
+    batches: Iterable[Mapping[str, Any]], device: torch.device | str | int
+) -> Iterator[dict[str, Any]]:
+    """Yield the batches of one pass on a device; on CUDA, copied while it computes.
+
+    There each batch is copied on a stream of its own as soon as the loop asks for it, beside what
+    the loop has queued so far; what the loop queues next waits for the copy. So copies overlap
+    with computing where the loop runs ahead of the device: read losses now and then, not at every
+    step. Give the loader ``pin_memory=True``: copies of other memory make the loop wait. No batch
+    is taken before it is asked for, so the loader's ``state_dict`` counts what the loop has seen.
+
+    Args:
+        batches: A loader, or what else yields flat batches.
+        device: Where tensors go; what is no tensor stays as it is. On the processor, tensors that
+            are there already are given as they are.
+    """
+    target = torch.device(device)
+    if target.type != "cuda":
+        for batch in batches:
+            yield _sent(batch, target)
+        return
+    copies = torch.cuda.Stream(target)
+    for batch in batches:
+        with torch.cuda.stream(copies):
+            moved = _sent(batch, target)
+        consumer = torch.cuda.current_stream(target)
+        consumer.wait_stream(copies)
+        for value in moved.values():
+            if isinstance(value, torch.Tensor):
+                # Its memory is the copies' stream's, which may reuse it only after the consumer.
+                value.record_stream(consumer)
+        yield moved
+
+
+def _sent(batch: Mapping[str, Any], device: torch.device) -> dict[str, Any]:
+    return {
+        name: value.to(device, non_blocking=True) if isinstance(value, torch.Tensor) else value
+        for name, value in batch.items()
+    }
 
 
 def _stacked(values: list[Any]) -> Any:

@@ -2,19 +2,53 @@
 
 All functions take and return arrays of either library. The rest of the layer is written once,
 against the array API standard. The arrays of one call must be of one library and on one device.
+
+Torch tensors are recognised by their type before array_api_compat is asked: torch.compile cannot
+trace its cached checks without warnings.
 """
 
 import math
 from typing import Any, Final
 
+import array_api_compat
 import numpy as np
-from array_api_compat import array_namespace, device, is_numpy_array, is_torch_array
 
 Array = Any
 """A numpy array or a torch tensor; jaxtyping checks its shape and dtype under test."""
 
 BLOCK_PIXELS: Final = 64 * 1280
 """How many pixels of float maps stay in a processor's cache from one step to the next."""
+
+
+def is_torch_array(values: Array) -> bool:
+    """Return whether an array is a torch tensor; torch is not imported."""
+    if isinstance(values, np.ndarray):
+        return False
+    is_torchs_own = type(values).__module__.startswith("torch")
+    return is_torchs_own or bool(array_api_compat.is_torch_array(values))
+
+
+def is_numpy_array(values: Array) -> bool:
+    """Return whether an array is one of numpy's."""
+    return isinstance(values, (np.ndarray, np.generic))
+
+
+def array_namespace(*arrays: Array) -> Any:
+    """Return the functions of the array API standard for the library of these arrays.
+
+    Raises:
+        TypeError: If they are of several libraries.
+    """
+    if all(map(is_torch_array, arrays)):
+        from array_api_compat import torch as functions
+
+        return functions
+    return array_api_compat.array_namespace(*arrays)
+
+
+def device(values: Array) -> Any:
+    """Return the device on which an array is."""
+    return values.device if is_torch_array(values) else array_api_compat.device(values)
 
 
 def pixel_centres(like: Array, *, dtype: Any) -> tuple[Array, Array]:
@@ -31,7 +65,7 @@ def as_float64(values: Array) -> Array:
     return xp.astype(values, xp.float64, copy=False)
 
 
-def quotient(number: float, divisor: Array) -> Array:
+def quotient(number: float | Array, divisor: Array) -> Array:
     """Return number / divisor, rounded once; torch would multiply by the rounded reciprocal."""
     xp = array_namespace(divisor)
     return xp.asarray(number, dtype=divisor.dtype, device=device(divisor)) / divisor

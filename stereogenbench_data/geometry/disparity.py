@@ -11,22 +11,25 @@ import math
 from typing import Any, Final, Literal
 
 import numpy as np
-from array_api_compat import array_namespace, is_numpy_array
-from jaxtyping import Bool, Float, Float32, Integer
+from jaxtyping import Bool, Float, Float32, Float64, Integer
 
 from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.arrays import (
     BLOCK_PIXELS,
+    array_namespace,
     as_float64,
+    device,
+    is_numpy_array,
     pixel_centres,
     quotient,
 )
 from stereogenbench_data.geometry.camera import Intrinsics, require_picture_size, require_positive
 from stereogenbench_data.schema.records import DepthForm
 
-_EXACT_FACTORS: Final = np.arange(128.0, 256.0)
-"""Whole numbers whose product with a 16-bit number is exact in the 24 bits of float32. Smaller ones
-are these divided by a power of two, and round in the same way."""
+_EXACT_FACTORS: Final = (128.0, 256.0)
+"""From the first to below the second: whole numbers whose product with a 16-bit number is exact in
+the 24 bits of float32. Smaller ones are these divided by a power of two, and round in the same way.
+"""
 
 _NEARLY_EXACT: Final = 2.0**-29
 """A relative error that is at most 1/32 ulp of a float32."""
@@ -132,6 +135,37 @@ def disparity_from_units(
     return xp.astype(quotient(product, divisor), xp.float32, copy=False)
 
 
+def disparity_from_shifts(
+    units: Integer[Any, "*batch h w"],
+    shift_units: Float64[Any, "*rigs"],
+    *,
+    form: DepthForm = "depth",
+) -> Float32[Any, "*batch h w"]:
+    """Return the disparity in pixels of stored depth of several rigs, bit for bit as for each one.
+
+    Each map is what `disparity_from_units` gives. The quotient is computed in float64, which has
+    digits enough that rounding it to float32 is rounding the exact quotient.
+
+    Args:
+        units: Stored numbers below 2 ** 16, as decoded.
+        shift_units: Focal length in pixels times signed baseline, divided by metres in a stored
+            unit. Its shape is broadcast to the maps'.
+        form: Whether a stored number is proportional to depth or to its inverse.
+
+    Returns:
+        Disparity in pixels, 0 where the stored number is 0.
+    """
+    xp = array_namespace(units)
+    stored = as_float64(units)
+    if form == "inverse":
+        return xp.astype(stored * shift_units, xp.float32)
+    product, factor, is_exact = _exact_quotients(shift_units)
+    product, factor = xp.where(is_exact, product, shift_units), xp.where(is_exact, factor, 1.0)
+    divisor = stored * factor
+    divisor = xp.where(divisor == 0, math.inf, divisor)
+    return xp.astype(product / divisor, xp.float32)
+
+
 def write_disparity(
     out: Float32[np.ndarray, "*batch h w"],
     units: Integer[np.ndarray, "*batch h w"],
@@ -176,12 +210,28 @@ def write_disparity(
 
 def _exact_quotient(shift_units: float) -> tuple[float, float, Literal["float32", "float64"]]:
     """Return product, factor and dtype with shift / units = product / (units * factor)."""
-    products = shift_units * _EXACT_FACTORS
-    misses = np.abs(products.astype(np.float32) / products - 1.0)
-    best = misses.argmin()
-    if misses[best] > _NEARLY_EXACT:
-        return shift_units, 1.0, "float64"
-    return float(products[best]), float(_EXACT_FACTORS[best]), "float32"
+    product, factor, is_exact = _exact_quotients(np.array(shift_units))
+    if is_exact:
+        return float(product), float(factor), "float32"
+    return shift_units, 1.0, "float64"
+
+
+def _exact_quotients(
+    shift_units: Float64[Any, "*rigs"],
+) -> tuple[Float64[Any, "*rigs"], Float64[Any, "*rigs"], Bool[Any, "*rigs"]]:
+    """Return the float32 product and the factor of `_exact_quotient`, and whether they will do."""
+    xp = array_namespace(shift_units)
+    # Made where they are used: a copy to a GPU would wait for all that is queued there.
+    factors = xp.arange(*_EXACT_FACTORS, dtype=xp.float64, device=device(shift_units))
+    products = shift_units[..., None] * factors
+    rounded = as_float64(xp.astype(products, xp.float32))
+    misses = xp.abs(rounded / products - 1.0)
+    best = xp.argmin(misses, axis=-1)
+    chosen = factors - _EXACT_FACTORS[0] == best[..., None]
+    product, factor, miss = (
+        xp.sum(xp.where(chosen, values, 0.0), axis=-1) for values in (rounded, factors, misses)
+    )
+    return product, factor, miss <= _NEARLY_EXACT
 
 
 def disparity_error_px(
@@ -218,13 +268,31 @@ def disparity_error_px(
             f"quantum_m must be a finite number of metres, 0 or more, got {quantum_m!r}: "
             "give the depth encoding's unit."
         )
+    return error_bound_px(depth_m, shift_px_m=focal_px * abs(baseline_m), half_step_m=quantum_m / 2)
+
+
+def error_bound_px(
+    depth_m: Float[Any, "*batch h w"],
+    *,
+    shift_px_m: float | Float[Any, "*#batch h1 w1"],
+    half_step_m: float | Float[Any, "*#batch h1 w1"],
+) -> Float[Any, "*batch h w"]:
+    """Return the bound of `disparity_error_px`; its numbers are not checked.
+
+    Args:
+        depth_m: Stored depth along the optical axis, in metres.
+        shift_px_m: Focal length in pixels times baseline in metres, not negative. Several are of
+            the depth's dtype.
+        half_step_m: Half the step between neighbouring depths in metres. Several are of the depth's
+            dtype.
+    """
     xp = array_namespace(depth_m)
     eps = float(xp.finfo(depth_m.dtype).eps)
     stored_m = _inf_where_not_positive(depth_m)
-    nearest_m = stored_m * (1.0 - 2.0 * eps) - quantum_m / 2
-    relative = quotient(quantum_m / 2, stored_m) + 2.0 * eps
+    nearest_m = stored_m * (1.0 - 2.0 * eps) - half_step_m
+    relative = quotient(half_step_m, stored_m) + 2.0 * eps
     bounded = nearest_m > 0
-    bound_px = focal_px * abs(baseline_m) * relative / xp.where(bounded, nearest_m, 1.0)
+    bound_px = shift_px_m * relative / xp.where(bounded, nearest_m, 1.0)
     return xp.where(bounded, bound_px, math.inf)
 
 
@@ -253,12 +321,28 @@ def ray_from_planar(
 
 
 def _ray_per_planar(like: Float[Any, "*batch h w"], intrinsics: Intrinsics) -> Float[Any, "h w"]:
-    """Return |(x, y, 1)| of the ray through each pixel's centre, in the dtype of ``like``."""
     require_picture_size(like.shape, intrinsics, name="the depth map")
+    return ray_per_planar(
+        like,
+        focal_px=(intrinsics.fx_px, intrinsics.fy_px),
+        centre_px=(intrinsics.cx_px, intrinsics.cy_px),
+    )
+
+
+def ray_per_planar(
+    like: Float[Any, "*batch h w"], *, focal_px: tuple[Any, Any], centre_px: tuple[Any, Any]
+) -> Float[Any, "..."]:
+    """Return |(x, y, 1)| of the ray through each pixel's centre, in the dtype of ``like``.
+
+    Args:
+        like: Maps of that size.
+        focal_px: fx and fy in pixels; float64 arrays, to be broadcast to the maps, or floats.
+        centre_px: cx and cy, likewise.
+    """
     xp = array_namespace(like)
     u_px, v_px = pixel_centres(like, dtype=xp.float64)
-    x = (u_px - intrinsics.cx_px) / intrinsics.fx_px
-    y = (v_px - intrinsics.cy_px) / intrinsics.fy_px
+    x = (u_px - centre_px[0]) / focal_px[0]
+    y = (v_px - centre_px[1]) / focal_px[1]
     return xp.astype(xp.sqrt(x * x + (y * y + 1.0)), like.dtype, copy=False)
 
 

@@ -9,13 +9,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace, is_numpy_array
 from jaxtyping import Bool, Float, Float64, Int64
 
 from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.arrays import (
     BLOCK_PIXELS,
+    array_namespace,
     as_float64,
+    device,
+    is_numpy_array,
     leading_offsets,
     pixel_centres,
     whole_where,
@@ -90,16 +92,40 @@ def project_through_poses(
     """
     require_picture_size(depth_m.shape, intrinsics, name="the depth map")
     xp = array_namespace(depth_m)
-    dtype = depth_m.dtype
     camera_matrix = target_intrinsics.matrix()
     homography = camera_matrix @ target_from_source[:3, :3] @ np.linalg.inv(intrinsics.matrix())
     step = camera_matrix @ target_from_source[:3, 3]
+    place = device(depth_m)
+    return project_by_homography(
+        depth_m, xp.asarray(homography, device=place), xp.asarray(step, device=place)
+    )
 
+
+def project_by_homography(
+    depth_m: Float[Any, "*batch h w"],
+    homography: Float64[Any, "*rigs 3 3"],
+    step_px_m: Float64[Any, "*rigs 3"],
+) -> Projection:
+    """Return the projection homography (u, v, 1) z + step, as `project_through_poses` does.
+
+    Args:
+        depth_m: Source depth along the optical axis, in metres.
+        homography: K_t R K_s^-1, of one rig or of several: their shape is broadcast to the maps'.
+        step_px_m: K_t t, likewise.
+    """
+    xp = array_namespace(depth_m)
+    dtype = depth_m.dtype
     u_px, v_px = pixel_centres(depth_m, dtype=xp.float64)
     source_m = as_float64(depth_m)
+    rows, shifts = homography[..., None, None], step_px_m[..., None, None]
     x, y, z = (
-        source_m * (float(row[0]) * u_px + (float(row[1]) * v_px + float(row[2]))) + float(shift)
-        for row, shift in zip(homography, step, strict=True)
+        source_m
+        * (
+            rows[..., axis, 0, :, :] * u_px
+            + (rows[..., axis, 1, :, :] * v_px + rows[..., axis, 2, :, :])
+        )
+        + shifts[..., axis, :, :]
+        for axis in range(3)
     )
     in_front = xp.where((z > 0) & xp.isfinite(z), z, xp.nan)
     return Projection(

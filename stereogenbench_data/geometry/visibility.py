@@ -21,7 +21,7 @@ def visible_in_target(
     measured: Bool[Any, "*batch h w"],
     target_depth_m: Float[Any, "*batch target_h target_w"],
     target_measured: Bool[Any, "*batch target_h target_w"],
-    quantum_m: float | Float[Any, "*batch h w"],
+    quantum_m: float | Float[Any, "*#batch #h #w"],
     tolerance: float = 0.02,
 ) -> Bool[Any, "*batch h w"]:
     """Return the source pixels that the target camera sees, decided by the target's depth.
@@ -74,7 +74,7 @@ def visible_from_source(
     projection: Projection,
     *,
     measured: Bool[Any, "*batch h w"],
-    quantum_m: float | Float[Any, "*batch h w"],
+    quantum_m: float | Float[Any, "*#batch #h #w"],
     tolerance: float = 0.02,
 ) -> Bool[Any, "*batch h w"]:
     """Return the source pixels that nothing in the source view occludes from the target.

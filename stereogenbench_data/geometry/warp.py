@@ -8,10 +8,15 @@ import math
 from typing import Any, Final
 
 import numpy as np
-from array_api_compat import array_namespace
 from jaxtyping import Bool, Float, Int64, Shaped
 
-from stereogenbench_data.geometry.arrays import Array, leading_offsets, scatter_max, take_pixels
+from stereogenbench_data.geometry.arrays import (
+    Array,
+    array_namespace,
+    leading_offsets,
+    scatter_max,
+    take_pixels,
+)
 from stereogenbench_data.geometry.projection import (
     Projection,
     image_starts,

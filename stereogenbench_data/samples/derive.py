@@ -5,9 +5,9 @@ from functools import cached_property
 from typing import Any, Final, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, UInt16
 
-from stereogenbench_data.errors import GeometryError
+from stereogenbench_data.errors import FieldError, GeometryError
 from stereogenbench_data.geometry.arrays import take_flat
 from stereogenbench_data.geometry.disparity import (
     disparity_error_px,
@@ -72,6 +72,9 @@ class PairGeometry:
     """Geometry from a source camera's depth to a target camera.
 
     Maps are (t, h, w). Disparity is u_source - u_target in pixels.
+
+    Attributes:
+        encoding: The depth contract of the source.
     """
 
     def __init__(self, views: Views, facts: SceneFacts, *, source: int, target: int) -> None:
@@ -80,16 +83,52 @@ class PairGeometry:
         self._facts = facts
         self._source = source
         self._target = target
-        self._encoding = facts.encodings[source]
+        self.encoding = facts.encodings[source]
 
     @property
     def stored(self) -> StoredDepth:
         """The source camera's depth as it is stored."""
         return self._views.depths[self._source]
 
+    @property
+    def no_depth(self) -> int:
+        """The number that stands for "not measured" in `stored_numbers`; -1 where there is none."""
+        numbers = self.encoding.no_depth
+        # No pixel format has a measured 65535 where its largest number means "not measured".
+        known = [number for number in numbers if number != "max" and 0 <= number < 2**16]
+        if 0 in known:
+            return 0
+        return 2**16 - 1 if "max" in numbers else min(known, default=-1)
+
+    @property
+    def stored_numbers(self) -> UInt16[np.ndarray, "t h w"]:
+        """The source's depth as it is stored, with one number for all that was not measured.
+
+        Raises:
+            FieldError: If a transform padded or painted over the pictures, which these numbers
+                cannot say; or if pixels were not measured and the contract has no number for it.
+        """
+        camera = self.stored
+        if self._views.padded is not None or self._views.erased:
+            raise FieldError(
+                f"{self._facts.scene.id.key}: stored_depth does not tell which pixels are padding "
+                "or were erased: leave out Letterbox and Eraser, or ask StereoPairs for fields."
+            )
+        if camera.measured.all():
+            return camera.units
+        if self.no_depth < 0:
+            raise FieldError(
+                f"{self._facts.scene.id.key}: depth of camera {self._source} is not measured "
+                f"everywhere, and the contract has no number for that, no_depth="
+                f"{self.encoding.no_depth!r}: name one that is not in use."
+            )
+        return np.where(camera.measured, camera.units, np.uint16(self.no_depth))
+
     @cached_property
     def baseline_m(self) -> float:
-        """The recorded baseline, negative where the target stands to the left."""
+        """The recorded baseline, negative where the target stands to the left; 0 for itself."""
+        if self._target == self._source:
+            return 0.0
         lateral_m = self._facts.scene.lateral_m
         to_the_right = lateral_m[self._target] > lateral_m[self._source]
         if self._views.world == "mirrored":
@@ -105,7 +144,7 @@ class PairGeometry:
             derived[key] = depth_m_from_units(
                 self.stored.units,
                 measured=self.stored.measured,
-                encoding=self._encoding,
+                encoding=self.encoding,
                 intrinsics=self._views.intrinsics,
             )
         depth_m: MapF32 = derived[key]
@@ -126,21 +165,21 @@ class PairGeometry:
             u_px = np.arange(self.depth_m.shape[-1]) + 0.5
             moved = np.where(self.stored.measured, u_px - self.projection.u_px, 0)
             np.multiply(moved, sign, out=out, casting="same_kind")
-        elif self._encoding.kind == "ray":
+        elif self.encoding.kind == "ray":
             rig = {"focal_px": self._views.intrinsics.fx_px, "baseline_m": self.baseline_m}
             np.multiply(disparity_from_depth(self.depth_m, **rig), np.float32(sign), out=out)
         else:
             shift_m = self._views.intrinsics.fx_px * self.baseline_m
             measured = self.stored.measured
-            if 0 not in self._encoding.no_depth and self._encoding.form == "depth":
+            if 0 not in self.encoding.no_depth and self.encoding.form == "depth":
                 # By this contract a stored 0 was measured; its disparity is 0.
                 measured = measured & (self.stored.units != 0)
             write_disparity(
                 out,
                 self.stored.units,
                 measured=measured,
-                shift_units=sign * shift_m / self._encoding.known_unit_m,
-                form=self._encoding.form,
+                shift_units=sign * shift_m / self.encoding.known_unit_m,
+                form=self.encoding.form,
             )
 
     @cached_property
@@ -175,25 +214,34 @@ class PairGeometry:
         )
         return _as_seen(transforms, self._views)
 
+    @property
+    def assumed_motion(self) -> Motions:
+        """`target_from_source`; of a rectified rig what its closed form assumes, without poses."""
+        if not self._facts.is_rectified:
+            return self.target_from_source
+        motions: Motions = np.tile(np.eye(4), (len(self._views.frames), 1, 1))
+        motions[:, 0, 3] = -self.baseline_m
+        return motions
+
     def quantum_m(self, target: DepthEncoding) -> float | MapF32:
         """Return the coarser step between depths that the two cameras can store."""
-        if self._encoding.form == "depth":
-            return max(self._encoding.known_unit_m, target.known_unit_m)
-        return self.depth_m**2 / np.float32(self._encoding.known_unit_m)
+        if self.encoding.form == "depth":
+            return max(self.encoding.known_unit_m, target.known_unit_m)
+        return self.depth_m**2 / np.float32(self.encoding.known_unit_m)
 
     @cached_property
     def disparity_error(self) -> MapF32:
         """How far quantised depth can put disparity off, in pixels; 0 where not measured."""
         focal_px = self._views.intrinsics.fx_px
-        if self._encoding.form == "inverse":
-            half_step_px = focal_px * abs(self.baseline_m) / self._encoding.known_unit_m / 2
+        if self.encoding.form == "inverse":
+            half_step_px = focal_px * abs(self.baseline_m) / self.encoding.known_unit_m / 2
             flat: MapF32 = self.stored.measured * np.float32(half_step_px)
             return flat
         bound: MapF32 = disparity_error_px(
             self.depth_m,
             focal_px=focal_px,
             baseline_m=self.baseline_m,
-            quantum_m=self._encoding.known_unit_m,
+            quantum_m=self.encoding.known_unit_m,
         )
         return bound
 
@@ -203,7 +251,7 @@ class PairGeometry:
         visible: MapBool = visible_from_source(
             self.projection,
             measured=self.stored.measured,
-            quantum_m=self.quantum_m(self._encoding),
+            quantum_m=self.quantum_m(self.encoding),
         )
         return self._shown_in_both(visible)
 
@@ -271,6 +319,14 @@ class PairSample:
     def backward(self) -> PairGeometry:
         """From the target to the source."""
         return PairGeometry(self.views, self.facts, source=self.target, target=self.views.source)
+
+    @property
+    def to_each_view(self) -> list[PairGeometry]:
+        """From the target to every view of the sample, the target itself too."""
+        return [
+            PairGeometry(self.views, self.facts, source=self.target, target=camera)
+            for camera in (self.views.source, *self.views.targets)
+        ]
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -236,6 +236,45 @@ VIEW_FIELDS: Final[dict[str, Field]] = _table(
         needs_poses="always", per_target=True,
     ),
     Field(
+        "stored_depth", "uint16", "(1,H,W)",
+        "depth as the file stores it, for `derive`; `no_depth` where not valid",
+        make=lambda s: s.backward.stored_numbers[:, None],
+        streams=SOURCE_DEPTH | TARGET_DEPTH, per_target=True,
+    ),
+    Field(
+        "no_depth", "int64", "()", "the number in stored_depth that means not valid; -1 if none",
+        make=lambda s: np.int64(s.backward.no_depth), per_target=True, per_frame=False,
+    ),
+    Field(
+        "depth_unit_m", "float64", "()",
+        "m in a stored unit of depth; of inverse depth, the depth of the number 1",
+        make=lambda s: np.float64(s.backward.encoding.known_unit_m), per_target=True, per_frame=False,
+    ),
+    Field(
+        "depth_kind", "str", "", "planar or ray: what stored depth measures",
+        make=lambda s: s.forward.encoding.kind, per_frame=False,
+    ),
+    Field(
+        "depth_form", "str", "", "depth or inverse: what a stored number is proportional to",
+        make=lambda s: s.forward.encoding.form, per_frame=False,
+    ),
+    Field(
+        "rig", "str", "", "rectified, or posed where disparity needs the poses",
+        make=lambda s: "rectified" if s.facts.is_rectified else "posed", per_frame=False,
+    ),
+    Field(
+        "baselines_m", "float64", "(V,)",
+        "m from this camera to each view's; negative if that stands to the left",
+        make=lambda s: np.array([way.baseline_m for way in s.to_each_view]),
+        per_target=True, per_frame=False,
+    ),
+    Field(
+        "cams_from_cam", "float64", "(V,4,4)",
+        "camera's coordinates to each view's camera's, m; of a rectified rig, a pure shift",
+        make=lambda s: np.stack([way.assumed_motion for way in s.to_each_view], axis=1),
+        needs_poses="unless rectified", per_target=True,
+    ),
+    Field(
         "camera", "int64", "()", "number of the camera",
         make=lambda s: np.int64(s.target), per_target=True, per_frame=False,
     ),

@@ -41,7 +41,7 @@ class Compose:
         if odd or any(isinstance(step, type) for step in self.transforms):
             raise FieldError(f"Compose takes transforms, got {(odd or self.transforms)[0]!r}.")
         erased = False
-        for transform in self._steps():
+        for transform in self.steps():
             if erased and transform.swaps_views:
                 raise FieldError(
                     f"Eraser stands before {transform!r}, which would carry its patches into the "
@@ -49,11 +49,11 @@ class Compose:
                 )
             erased = erased or isinstance(transform, Eraser)
 
-    def _steps(self) -> Iterator[Transform]:
+    def steps(self) -> Iterator[Transform]:
         """Walk through the transforms, also through those of a Compose within."""
         for transform in self.transforms:
             if isinstance(transform, Compose):
-                yield from transform._steps()
+                yield from transform.steps()
             else:
                 yield transform
 

@@ -8,8 +8,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from benchmarks import __main__, accuracy, clock, evaluation, profile, race, start, tables, tried
+from benchmarks import (
+    __main__,
+    accuracy,
+    clock,
+    derive,
+    evaluation,
+    profile,
+    race,
+    start,
+    tables,
+    tried,
+)
 from benchmarks.__main__ import chosen, parse
 from benchmarks.material import facts
 from benchmarks.plots import plot_all
@@ -112,6 +124,27 @@ def test_the_parts_of_a_profile_add_up_to_the_whole(material):
     assert found["ms"]["decoding depth"] > 0
     assert found["ms"]["decoding colour"] > 0
     assert found["ms"]["queueing"] > 0
+
+
+def test_pairs_in_the_loader_are_compared_with_views_that_become_pairs(material):
+    found = derive.measure_derive(material, rounds=1, report=str)
+
+    text = tables.tables({"derive": found})
+    for size in ("as stored", "832x480"):
+        ways = found[size]["ways"]
+        pixels = 64 * 64 if size == "as stored" else 832 * 480
+        # Six pictures and six maps of two bytes, and numbers of cameras beside them.
+        assert ways["views and stored depth"]["bytes"] == pytest.approx(30 * pixels, abs=6000)
+        assert ways["15 pairs in the loader"]["bytes"] == 15 * (2 * 3 + 2 * 4 + 5 + 3) * pixels
+        assert all(way["cpu_s"] > 0 for way in ways.values())
+        assert f"views and stored depth, {size}" in text
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU with CUDA")
+def test_the_rate_on_a_gpu_stands_beside_its_memorys(material):
+    gpu = derive.measure_derive(material, rounds=1, report=str)["832x480"]["gpu"]
+
+    assert 0 < gpu["eager"] < gpu["limit"]
 
 
 def test_starting_and_memory_are_measured(material):

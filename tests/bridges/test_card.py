@@ -72,7 +72,7 @@ def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_pa
     require_module("datasets")
     folder = shutil.copytree(SAMPLE, tmp_path / "hub")
     write_card_over(folder)
-    wanted = [["Uniform", "train"], ["IPD_Gaussian", "eval_unseen_map"]]
+    wanted = [["Uniform", "train"], ["IPD_Gaussian", "eval_unseen_map"], [None, "train"]]
     code = LOAD if torchcodec == "present" else WITHOUT_TORCHCODEC + LOAD
 
     with serving(folder, handler=HubHandler) as server:
@@ -84,6 +84,7 @@ def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_pa
 
     assert done.returncode == 0, done.stderr[-3000:]
     found = json.loads(done.stdout)
+    assert len(found["None train"]) == 4, "without a config: all families"
     index = SceneIndex.open(SAMPLE)
     scenes = {index.scene(row).id.key: index.scene(row) for row in range(len(index))}
     assert [row[0] for row in found["Uniform train"]] == [

@@ -5,15 +5,17 @@ import sys
 
 import datasets
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from datasets.distributed import split_dataset_by_node
 from torch.utils.data import DataLoader
 from torchdata.stateful_dataloader import StatefulDataLoader
 
-from stereogenbench_data import StereoPairs
+from stereogenbench_data import PAIR_FIELDS, Compose, HorizontalFlip, RandomCrop, StereoPairs
 from stereogenbench_data.bridges import huggingface
-from stereogenbench_data.errors import SelectionError, StorageError
+from stereogenbench_data.errors import FieldError, SelectionError, StorageError
 from stereogenbench_data.shards.pack import pack
 from tests.servers.tools import require_module
 
@@ -125,6 +127,74 @@ def test_running_workers_follow_the_epoch(small_shards):
 
     assert drawn(0) != drawn(1)
     assert drawn(0) == drawn(0)
+
+
+EVERY_FIELD = tuple(name for name in PAIR_FIELDS if name not in ("__key__", "__url__"))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"size": (24, 40)},
+        {"frames": ("clips", 3)},
+        {"pairs": "sweep", "frames": ("clips", 3)},
+        {"transform": Compose([HorizontalFlip(), RandomCrop(16, 24)])},
+    ],
+    ids=str,
+)
+def test_samples_are_as_their_features_say(small_shards, options):
+    pairs = StereoPairs(small_shards, fields=EVERY_FIELD, **options)
+
+    features = huggingface.sample_features(pairs)
+
+    assert list(features) == list(EVERY_FIELD)
+    for name, value in pairs[0].items():
+        feature = features[name]
+        if isinstance(value, str):
+            assert feature == datasets.Value("string")
+        elif value.ndim < 2:
+            one = feature.feature if value.ndim else feature
+            assert f"torch.{one.dtype}" == str(value.dtype), name
+            assert value.ndim == 0 or feature.length == len(value), name
+        else:
+            assert (f"torch.{feature.dtype}", feature.shape) == (str(value.dtype), value.shape)
+
+
+def test_features_that_differ_are_refused_by_name(small_shards):
+    odd = StereoPairs(small_shards, transform=Compose([Odd()]))
+
+    with pytest.raises(FieldError, match=r"shards.*Give size="):
+        huggingface.sample_features(odd)
+    assert huggingface.iterable(small_shards, transform=Odd()).features is None
+
+
+class Odd:
+    """A transform of somebody else, of which nothing is known."""
+
+    swaps_views = False
+
+    def __call__(self, views, generator):
+        return views
+
+
+def test_datasets_of_ours_are_interleaved_cast_and_written_with_their_dtypes(stream, tmp_path):
+    cast = stream.cast_column("pair", datasets.List(datasets.Value("int32"), length=2))
+    mixed = datasets.interleave_datasets([stream, stream])
+    joined = datasets.concatenate_datasets([stream, stream])
+
+    cast.to_parquet(tmp_path / "samples.parquet")
+
+    for each in (cast, mixed, joined):
+        sample = next(iter(each))
+        assert sample["left"].dtype == np.uint8
+        assert sample["pair"].shape == (2,)
+        assert each.features["left"] == datasets.Array3D(shape=(3, 64, 64), dtype="uint8")
+    rows = pq.read_table(tmp_path / "samples.parquet")
+    assert rows.schema.field("pair").type.value_type == pa.int32()
+    assert rows["__key__"].to_pylist() == keys(stream)
+    left = np.array(rows["left"][0].as_py(), dtype=np.uint8)
+    assert np.array_equal(left, next(iter(stream))["left"])
 
 
 def raw(urls, **options):

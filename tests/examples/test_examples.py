@@ -52,6 +52,14 @@ def test_two_ranks_train_and_a_second_run_goes_on(tmp_path):
     assert sorted(re.findall(r"rank (\d): epoch (\d)", second)) == [("0", "1"), ("1", "1")]
 
 
+def test_pairs_are_made_on_the_device(tmp_path):
+    said = run(tmp_path, EXAMPLES / "derive_on_device.py")
+
+    errors = re.findall(r"epoch \d: 300 pairs of 20 moments, error ([\d.]+) px", said)
+    assert len(errors) == 2
+    assert float(errors[1]) < float(errors[0])
+
+
 def test_lightning_trains_and_validates(tmp_path):
     assert re.search(r"error [\d.]+ px", run(tmp_path, EXAMPLES / "lightning_module.py"))
 

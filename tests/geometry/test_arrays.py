@@ -90,6 +90,11 @@ def test_results_stay_on_the_device_of_the_input(inputs):
     assert {str(values.device) for values in made.values()} == {"meta"}
 
 
+def test_arrays_of_two_libraries_are_refused():
+    with pytest.raises(TypeError, match="Multiple namespaces"):
+        take_flat(torch.zeros(3), np.zeros(2, dtype=np.int64))
+
+
 def test_values_outside_the_mask_may_be_anything(library):
     values = np.array([[2.9, -2.9, 0.0, np.nan, np.inf, -1e30]], dtype=np.float32)
     mask = np.array([[True, True, True, False, False, False]])

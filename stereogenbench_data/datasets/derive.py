@@ -1,0 +1,477 @@
+"""Pairs made where training runs: from six pictures and stored depths to every pair's maps.
+
+A moment of six cameras is 30 bytes a pixel; its 15 pairs with disparity and masks are over 165.
+`SceneViews` with the fields `DERIVE_FIELDS` gives the first, `derive` makes the second of it on any
+device of torch. Numbers are those of `StereoPairs`: the formulas are the same functions of
+`geometry`, in the same order, with cameras in float64.
+
+Maps are (b, p, t, h, w) inside: moments, pairs, frames, rows, columns.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, NamedTuple, Protocol, TypeVar, cast
+
+import torch
+
+from stereogenbench_data.errors import FieldError, SelectionError
+from stereogenbench_data.geometry.arrays import take_pixels
+from stereogenbench_data.geometry.disparity import (
+    disparity_from_shifts,
+    error_bound_px,
+    ray_per_planar,
+)
+from stereogenbench_data.geometry.projection import (
+    Projection,
+    project_by_homography,
+    project_rectified,
+)
+from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
+from stereogenbench_data.geometry.warp import front_pixels
+
+DERIVE_FIELDS: Final = (
+    "image", "stored_depth", "depth_unit_m", "no_depth", "depth_kind", "depth_form", "rig",
+    "intrinsics", "baselines_m", "cams_from_cam", "camera",
+)  # fmt: skip
+"""The fields of `SceneViews` that `derive` takes; ``image`` only for fields that show pictures."""
+
+DERIVED_FIELDS: Final = (
+    "left", "right", "disparity", "valid", "visible", "visible_from_left", "disparity_error",
+    "depth", "depth_right", "disparity_right", "valid_right", "visible_right", "warped_right",
+    "hole", "intrinsics", "baseline_m", "pair",
+)  # fmt: skip
+"""The fields of `PAIR_FIELDS` that `derive` makes."""
+
+PairPlaces = Literal["all"] | Sequence[tuple[int, int]]
+"""The pairs to make: (first view, second view), as places on the axis of views."""
+
+_CHUNK_PIXELS: Final = 2**22
+"""How many pixels of pairs are made at a time: what lies between steps takes up to 80 bytes each.
+"""
+
+_PICTURES: Final = frozenset({"left", "right", "warped_right"})
+
+
+def derive(
+    batch: Mapping[str, Any],
+    *,
+    fields: Iterable[str] = ("left", "right", "disparity", "valid", "baseline_m", "pair"),
+    pairs: PairPlaces = "all",
+    device: torch.device | str | None = None,
+) -> dict[str, torch.Tensor]:
+    """Return fields of stereo pairs, made of a batch of views with stored depth.
+
+    Disparity is the float32 that `StereoPairs` gives or a neighbour of it, and masks are the same:
+    a pixel may differ only where a rig goes through its poses and a point lies on the edge of a
+    pixel, or two depths are just as far apart as is tolerated, to within the last bits of float64.
+    Results do not depend on the device, nor from run to run: where points compete for a pixel, the
+    largest of whole numbers wins. Nothing waits for the device. Autocast has no effect here, and
+    torch.compile takes the function as a single graph; a batch of scenes of other contracts, or of
+    posed among rectified rigs, is compiled anew.
+
+    Args:
+        batch: A batch of `SceneViews` with the fields `DERIVE_FIELDS`, of stills or clips.
+        fields: Names of the fields to make, of `DERIVED_FIELDS`; they mean what they do in
+            `PAIR_FIELDS`.
+        pairs: "all" makes each pair of views once, the view that comes first as the left one; or
+            (left, right) places on the batch's axis of views. With ``cameras="all"`` these are the
+            numbers of the cameras.
+        device: Where to move what is needed of the batch, and derive; None derives where it is.
+
+    Returns:
+        The fields by name, (B, P, ...) and in clips (B, P, T, ...), where P counts the pairs;
+        ``intrinsics``, which all views share, (B, 3, 3).
+
+    Raises:
+        FieldError: If the batch lacks a field that is needed, or one that is asked for cannot be
+            made.
+        SelectionError: If a pair is not two different views of the batch.
+    """
+    names = (fields,) if isinstance(fields, str) else tuple(fields)
+    unknown = [name for name in names if name not in DERIVED_FIELDS]
+    if unknown or not names:
+        raise FieldError(
+            f"derive cannot make {unknown[0] if unknown else 'no field'!r}; it makes "
+            f"{', '.join(DERIVED_FIELDS)}."
+        )
+    needed = [name for name in DERIVE_FIELDS if name != "image" or not _PICTURES.isdisjoint(names)]
+    missing = [name for name in needed if name not in batch]
+    if missing:
+        raise FieldError(
+            f"the batch has no {', '.join(missing)}: load it with "
+            "SceneViews(..., fields=DERIVE_FIELDS)."
+        )
+    depth = batch["stored_depth"]
+    if depth.dtype != torch.uint16 or depth.ndim not in (5, 6):
+        raise FieldError(
+            f"stored_depth is {depth.dtype} {tuple(depth.shape)}, not uint16 (B, V, 1, H, W) or, "
+            "of clips, (B, V, T, 1, H, W): give derive a batch of stacked views."
+        )
+    places = _require_pairs(pairs, views=depth.shape[1])
+    where = depth.device if device is None else torch.device(device)
+    # The meta device has no autocast to switch off.
+    casts_on = "cpu" if where.type == "meta" else where.type
+    with torch.no_grad(), torch.autocast(device_type=casts_on, enabled=False):
+        moved = {
+            name: batch[name].to(where, non_blocking=True)
+            for name in needed
+            if isinstance(batch[name], torch.Tensor)
+        }
+        made: dict[str, torch.Tensor] = {}
+        for contract, rows in _contracts(batch):
+            if len(rows) == len(depth):
+                made = _derived(_Moments.of(moved, contract), names, places)
+                break
+            chosen = {name: torch.stack([v[row] for row in rows]) for name, v in moved.items()}
+            part = _derived(_Moments.of(chosen, contract), names, places)
+            for name, values in part.items():
+                if name not in made:
+                    made[name] = values.new_empty((len(depth), *values.shape[1:]))
+                for place, row in enumerate(rows):
+                    made[name][row] = values[place]
+        if depth.ndim == 5:
+            made = {name: v.squeeze(2) if v.ndim > 4 else v for name, v in made.items()}
+        return made
+
+
+def _derived(
+    moments: "_Moments", names: tuple[str, ...], places: list[tuple[int, int]]
+) -> dict[str, torch.Tensor]:
+    """Return fields of moments that have one contract, some pairs at a time."""
+    count, _, frames, height_px, width_px = moments.units.shape
+    step = max(1, _CHUNK_PIXELS // (count * frames * height_px * width_px))
+    made: dict[str, torch.Tensor] = {}
+    for start in range(0, len(places), step):
+        chunk = places[start : start + step]
+        ahead = _Direction(moments, chunk)
+        back = _Direction(moments, [(second, first) for first, second in chunk])
+        for name in names:
+            if name == "intrinsics":
+                made[name] = moments.intrinsics
+                continue
+            values = _MAKERS[name](ahead, back)
+            if len(chunk) == len(places):
+                made[name] = values
+                continue
+            if name not in made:
+                made[name] = values.new_empty((count, len(places), *values.shape[2:]))
+            made[name][:, start : start + len(chunk)] = values
+    return made
+
+
+class _Contract(NamedTuple):
+    """What decides which formulas hold for a scene.
+
+    Attributes:
+        rig: "rectified" if disparity is the closed form, "posed" if points go through the poses.
+        kind: "planar" or "ray" depth.
+        form: Whether a stored number is proportional to "depth" or to its "inverse".
+    """
+
+    rig: str
+    kind: str
+    form: str
+
+
+def _contracts(batch: Mapping[str, Any]) -> list[tuple[_Contract, list[int]]]:
+    """Return the contracts of a batch's moments, and which have each. Texts: no device is asked."""
+    names = ("rig", "depth_kind", "depth_form")
+    texts = list(zip(*(batch[name] for name in names), strict=True))
+    apart = [each for row, each in enumerate(texts) if each not in texts[:row]]
+    return [
+        (_Contract(*each), [row for row, other in enumerate(texts) if other == each])
+        for each in apart
+    ]
+
+
+def _require_pairs(pairs: PairPlaces, *, views: int) -> list[tuple[int, int]]:
+    if isinstance(pairs, str):
+        if pairs != "all":
+            raise SelectionError(f"pairs must be 'all' or places of two views, got {pairs!r}.")
+        return [(first, second) for first in range(views) for second in range(first + 1, views)]
+    places = [(int(first), int(second)) for first, second in pairs]
+    for first, second in places:
+        if first == second or not (0 <= first < views and 0 <= second < views):
+            raise SelectionError(
+                f"pair {(first, second)} is not of two different views: the batch has {views}, "
+                f"numbered from 0."
+            )
+    if not places:
+        raise SelectionError("pairs must be at least one, got none.")
+    return places
+
+
+class _Memory(Protocol):
+    """What keeps the results of its `_once` properties."""
+
+    made: dict[str, Any]
+
+
+T = TypeVar("T")
+
+
+def _once(make: Callable[[Any], T]) -> T:
+    """Return a property that is made once. torch.compile cannot trace functools' one before 3.12.
+
+    It is typed as what it gives.
+    """
+    name = make.__name__
+
+    def get(holder: _Memory) -> T:
+        if name not in holder.made:
+            holder.made[name] = make(holder)
+        return cast("T", holder.made[name])
+
+    return cast("T", property(get, doc=make.__doc__))
+
+
+@dataclass(frozen=True)
+class _Moments:
+    """A batch of views: maps (b, v, t, h, w), numbers of each view (b, v).
+
+    Attributes:
+        contract: What decides which formulas hold for them.
+        image: (b, v, t, 3, h, w) uint8; None where no field shows pictures.
+        units: Stored numbers, int32.
+        measured: Where they mean a depth.
+        unit_m: Metres in a stored unit.
+        intrinsics: (b, 3, 3), of every view.
+        baselines_m: (b, v, v), from the first view's camera to the second's, signed.
+        cams_from_cam: (b, v, t, v, 4, 4), from the first view's camera's coordinates to those of
+            the second's.
+        camera: Numbers of the cameras.
+        made: What was made of them.
+    """
+
+    contract: _Contract
+    image: Any
+    units: torch.Tensor
+    measured: torch.Tensor
+    unit_m: torch.Tensor
+    intrinsics: torch.Tensor
+    baselines_m: torch.Tensor
+    cams_from_cam: torch.Tensor
+    camera: torch.Tensor
+    made: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, batch: Mapping[str, torch.Tensor], contract: _Contract) -> "_Moments":
+        """Return the views of a batch; stills become clips of one frame."""
+        depth, motions, image = batch["stored_depth"], batch["cams_from_cam"], batch.get("image")
+        if depth.ndim == 5:
+            depth, motions = depth.unsqueeze(2), motions.unsqueeze(2)
+            image = None if image is None else image.unsqueeze(2)
+        # torch has few operations for uint16: its bits are read as int16, and the sign is dropped.
+        units = (depth.squeeze(-3).view(torch.int16).to(torch.int32)) & 0xFFFF
+        return cls(
+            contract=contract,
+            image=image,
+            units=units,
+            measured=units != _per_map(batch["no_depth"]),
+            unit_m=batch["depth_unit_m"],
+            intrinsics=batch["intrinsics"],
+            baselines_m=batch["baselines_m"],
+            cams_from_cam=motions,
+            camera=batch["camera"],
+        )
+
+    @_once
+    def depth_m(self) -> torch.Tensor:
+        """Depth along the optical axis, as `depth_m_from_units` gives it."""
+        units, unit_m = self.units.to(torch.float64), _per_map(self.unit_m)
+        if self.contract.form == "depth":
+            depth_m = (units * unit_m).to(torch.float32) * self.measured
+        else:
+            depth_m = torch.where(self.measured, (unit_m / units).to(torch.float32), 0.0)
+        if self.contract.kind == "planar":
+            return depth_m
+        fx_px, fy_px, cx_px, cy_px = (
+            self.intrinsics[:, row, column, None, None, None, None]
+            for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))
+        )
+        lengths: torch.Tensor = ray_per_planar(
+            depth_m, focal_px=(fx_px, fy_px), centre_px=(cx_px, cy_px)
+        )
+        return depth_m / lengths
+
+
+def _per_map(values: torch.Tensor) -> torch.Tensor:
+    """Return numbers (b, p) such that they are broadcast to maps (b, p, t, h, w)."""
+    return values[..., None, None, None]
+
+
+def _taken(values: torch.Tensor, places: Sequence[int]) -> torch.Tensor:
+    """Return (b, p, ...) of (b, v, ...): some views, by slices that no device waits for."""
+    if len(places) == 1:
+        return values[:, places[0] : places[0] + 1]
+    return torch.stack([values[:, place] for place in places], dim=1)
+
+
+class _Direction:
+    """What follows from the depth of some source views for one target view each.
+
+    It does for tensors of many scenes what `PairGeometry` does for the arrays of one.
+
+    Attributes:
+        made: What was made of them.
+    """
+
+    def __init__(self, moments: _Moments, places: list[tuple[int, int]]) -> None:
+        """Take all views, and the places of the sources and targets among them."""
+        self.made: dict[str, Any] = {}
+        self._moments = moments
+        self._contract = moments.contract
+        self._places = places
+        self._sources = [source for source, _ in places]
+        self._targets = [target for _, target in places]
+
+    @_once
+    def measured(self) -> torch.Tensor:
+        """Where the source's depth was measured."""
+        return _taken(self._moments.measured, self._sources)
+
+    @_once
+    def depth_m(self) -> torch.Tensor:
+        """The source's depth along the optical axis."""
+        return _taken(self._moments.depth_m, self._sources)
+
+    @_once
+    def baseline_m(self) -> torch.Tensor:
+        """(b, p) signed baselines."""
+        baselines_m = self._moments.baselines_m
+        return torch.stack([baselines_m[:, source, target] for source, target in self._places], 1)
+
+    @property
+    def shift_px_m(self) -> torch.Tensor:
+        """(b, p) focal lengths in pixels times baselines."""
+        return self._moments.intrinsics[:, 0, 0, None] * self.baseline_m
+
+    @property
+    def unit_m(self) -> torch.Tensor:
+        """(b, p) metres in a stored unit of the source."""
+        return _taken(self._moments.unit_m, self._sources)
+
+    @_once
+    def disparity(self) -> torch.Tensor:
+        """Disparity in pixels, 0 where depth was not measured."""
+        if self._contract.rig != "rectified":
+            width_px = self.measured.shape[-1]
+            u_px = torch.arange(width_px, dtype=torch.float64, device=self.measured.device) + 0.5
+            moved = torch.where(self.measured, u_px - self.projection.u_px, 0.0)
+            return moved.to(torch.float32)
+        if self._contract.kind == "ray":
+            depth_m = torch.where(self.depth_m > 0, self.depth_m, torch.inf).to(torch.float64)
+            return (_per_map(self.shift_px_m) / depth_m).to(torch.float32)
+        disparity = disparity_from_shifts(
+            _taken(self._moments.units, self._sources),
+            _per_map(self.shift_px_m / self.unit_m),
+            form="depth" if self._contract.form == "depth" else "inverse",
+        )
+        return torch.where(self.measured, disparity, 0.0)
+
+    @_once
+    def projection(self) -> Projection:
+        """Where each source pixel lands in the target."""
+        if self._contract.rig == "rectified":
+            return project_rectified(self.depth_m, self.disparity)
+        target_from_source = torch.stack(
+            [self._moments.cams_from_cam[:, source, :, target] for source, target in self._places],
+            dim=1,
+        )
+        camera_matrix = self._moments.intrinsics[:, None, None]
+        homography = camera_matrix @ target_from_source[..., :3, :3] @ _inverse(camera_matrix)
+        step = (camera_matrix @ target_from_source[..., :3, 3:])[..., 0]
+        return project_by_homography(self.depth_m.to(torch.float64), homography, step)
+
+    def quantum_m(self, unit_m: torch.Tensor) -> torch.Tensor:
+        """Return the step between depths, of the coarser of the source's and given units."""
+        if self._contract.form == "inverse":
+            return self.depth_m**2 / _per_map(self.unit_m).to(torch.float32)
+        coarser_m = torch.maximum(self.unit_m, unit_m)
+        return _per_map(coarser_m).to(self.projection.depth_m.dtype)
+
+    @property
+    def disparity_error(self) -> torch.Tensor:
+        """How far quantised depth can put disparity off, in pixels."""
+        shift_px_m = _per_map(self.shift_px_m.abs())
+        if self._contract.form == "inverse":
+            half_step_px = shift_px_m / _per_map(self.unit_m) / 2
+            return self.measured * half_step_px.to(torch.float32)
+        bound_px: torch.Tensor = error_bound_px(
+            self.depth_m,
+            shift_px_m=shift_px_m.to(torch.float32),
+            half_step_m=(_per_map(self.unit_m) / 2).to(torch.float32),
+        )
+        return bound_px
+
+    @property
+    def visible_from_source(self) -> torch.Tensor:
+        """What is visible in the target, decided by the source's own depth alone."""
+        visible: torch.Tensor = visible_from_source(
+            self.projection, measured=self.measured, quantum_m=self.quantum_m(self.unit_m)
+        )
+        return visible
+
+    def visible(self, back: "_Direction") -> torch.Tensor:
+        """Return what is visible in the target, by the depth of the way back."""
+        visible: torch.Tensor = visible_in_target(
+            self.projection,
+            measured=self.measured,
+            target_depth_m=back.depth_m,
+            target_measured=back.measured,
+            quantum_m=self.quantum_m(back.unit_m),
+        )
+        return visible
+
+    @property
+    def picture(self) -> torch.Tensor:
+        """The source's pictures (b, p, t, 3, h, w)."""
+        return _taken(self._moments.image, self._sources)
+
+    @_once
+    def front(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Which source pixel is in front at each target pixel, and where none landed."""
+        index, hole = front_pixels(self.projection, measured=self.measured)
+        return index, hole
+
+    @property
+    def warped(self) -> torch.Tensor:
+        """The source's pictures in the target's view, 0 where no source pixel lands."""
+        index, hole = self.front
+        return torch.where(hole.unsqueeze(-3), 0, take_pixels(self.picture, index))
+
+    @property
+    def cameras(self) -> torch.Tensor:
+        """(b, p, 2) numbers of the two cameras."""
+        camera = self._moments.camera
+        return torch.stack([_taken(camera, self._sources), _taken(camera, self._targets)], dim=-1)
+
+
+def _inverse(camera_matrix: torch.Tensor) -> torch.Tensor:
+    """Return K^-1 of matrices K without skew."""
+    fx_px, fy_px, cx_px, cy_px = (
+        camera_matrix[..., row, column] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2))
+    )
+    zero, one = torch.zeros_like(fx_px), torch.ones_like(fx_px)
+    rows = [(1 / fx_px, zero, -cx_px / fx_px), (zero, 1 / fy_px, -cy_px / fy_px), (zero, zero, one)]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+_MAKERS: Final[dict[str, Callable[[_Direction, _Direction], torch.Tensor]]] = {
+    "left": lambda ahead, back: ahead.picture,
+    "right": lambda ahead, back: back.picture,
+    "disparity": lambda ahead, back: ahead.disparity.unsqueeze(-3),
+    "valid": lambda ahead, back: ahead.measured.unsqueeze(-3),
+    "visible": lambda ahead, back: ahead.visible(back).unsqueeze(-3),
+    "visible_from_left": lambda ahead, back: ahead.visible_from_source.unsqueeze(-3),
+    "disparity_error": lambda ahead, back: ahead.disparity_error.unsqueeze(-3),
+    "depth": lambda ahead, back: ahead.depth_m.unsqueeze(-3),
+    "depth_right": lambda ahead, back: back.depth_m.unsqueeze(-3),
+    "disparity_right": lambda ahead, back: 0 - back.disparity.unsqueeze(-3),
+    "valid_right": lambda ahead, back: back.measured.unsqueeze(-3),
+    "visible_right": lambda ahead, back: back.visible(ahead).unsqueeze(-3),
+    "warped_right": lambda ahead, back: ahead.warped,
+    "hole": lambda ahead, back: ahead.front[1].unsqueeze(-3),
+    "baseline_m": lambda ahead, back: ahead.baseline_m,
+    "pair": lambda ahead, back: ahead.cameras,
+}

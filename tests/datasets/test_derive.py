@@ -1,0 +1,410 @@
+"""Pairs derived from views on torch tensors, against the pairs that samples are made of."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereogenbench_data import (
+    DERIVE_FIELDS,
+    DERIVED_FIELDS,
+    Crop,
+    DepthEncoding,
+    Eraser,
+    FieldError,
+    Letterbox,
+    SceneViews,
+    SelectionError,
+    StereoPairs,
+    collate,
+    derive,
+)
+from stereogenbench_data.datasets.tensors import to_tensors
+from stereogenbench_data.geometry.camera import Intrinsics
+from stereogenbench_data.geometry.pose import CameraPoses
+from stereogenbench_data.samples.request import Request
+from stereogenbench_data.samples.views import StoredDepth, Views
+from stereogenbench_data.samples.writer import SampleWriter, new_array
+from stereogenbench_data.schema.records import Trajectory
+from stereogenbench_data.schema.release import CAMERA_PAIRS
+from stereogenbench_data.selection.plan import Address
+from tests.samples.test_derive import facts
+
+ROOT = Path(__file__).resolve().parents[2]
+SIZE = (12, 40)
+FRAMES = (0, 1)
+CONTRACTS = {
+    "planar depth": DepthEncoding(0.1),
+    "ray depth": DepthEncoding(0.1, kind="ray"),
+    "planar inverse": DepthEncoding(500.0, form="inverse"),
+    "ray inverse": DepthEncoding(500.0, kind="ray", form="inverse"),
+    "a measured 0": DepthEncoding(0.1, no_depth=("max",)),
+    "an infinite depth": DepthEncoding(500.0, form="inverse", no_depth=("max", 7)),
+    "a number of its own": DepthEncoding(0.07, no_depth=(77,)),
+}
+RIGS = ("rectified", "posed")
+MASKS = ("valid", "visible", "visible_from_left", "valid_right", "visible_right", "hole")
+
+
+def scene(encoding, *, rig="rectified", seed=0):
+    """Return the views of a scene of 6 cameras and 2 frames, of random depth, and its facts."""
+    rng = np.random.default_rng(seed)
+    known = facts(encoding, residual_px=1.0 if rig == "posed" else 0.0)
+    locations = np.zeros((len(FRAMES), 6, 3))
+    locations[:, :, 1] = 100 * np.asarray(known.scene.lateral_m)
+    locations += rng.normal(0, 3, locations.shape)
+    turns = rng.normal(0, 0.5, locations.shape)
+    poses = CameraPoses.from_trajectory(Trajectory(locations, 0.01, turns, "rotator_deg"))
+    units_m = [float(encoding.known_unit_m * ratio) for ratio in rng.choice([1.0, 2.5], 6)]
+    known = replace(
+        known,
+        poses=poses,
+        frames=FRAMES,
+        encodings={camera: replace(encoding, unit_m=units_m[camera]) for camera in range(6)},
+    )
+    depths = {}
+    for camera in range(6):
+        near, far = (rng.integers(20, 400, (len(FRAMES), *SIZE)) for _ in range(2))
+        stored = np.where(rng.random(near.shape) < 0.5, near, far // 8).astype(np.uint16)
+        for number in (0, 7, 77, 40000, 65535):
+            stored[rng.random(stored.shape) < 0.02] = number
+        numbers = [65535 if number == "max" else number for number in encoding.no_depth]
+        depths[camera] = StoredDepth(stored, ~np.isin(stored, numbers))
+    views = Views(
+        source=0, targets=(1, 2, 3, 4, 5), frames=FRAMES,
+        pictures={
+            camera: rng.integers(0, 256, (len(FRAMES), 3, *SIZE), dtype=np.uint8)
+            for camera in range(6)
+        },
+        depths=depths,
+        intrinsics=Intrinsics(100.0 + rng.random(), 99.0, 20.3, 6.2, SIZE[1], SIZE[0]),
+    )  # fmt: skip
+    return views, known
+
+
+def written(views, known, *, kind, fields):
+    """Return a clip with these fields, as a dataset writes it."""
+    address = Address(0, views.source, views.targets, FRAMES)
+    layout = "stacked" if kind == "views" else "single"
+    request = Request(kind=kind, fields=fields, layout=layout)
+    writer = SampleWriter(request, address, clip="clip", allocate=new_array)
+    writer.write(views, known, slice(0, len(FRAMES)))
+    return to_tensors({name: writer.sample[name] for name in fields})
+
+
+def batch_of(scenes):
+    return collate([written(*each, kind="views", fields=DERIVE_FIELDS) for each in scenes])
+
+
+def expected_of(scenes, pairs=CAMERA_PAIRS):
+    """Return the fields of every pair by the path of `StereoPairs`, (B, P, T, ...)."""
+    rows = []
+    for views, known in scenes:
+        made = [
+            written(
+                replace(views, source=source, targets=(target,)), known,
+                kind="pairs", fields=DERIVED_FIELDS,
+            )
+            for source, target in pairs
+        ]  # fmt: skip
+        rows.append(collate(made))
+    batch = collate(rows)
+    return batch | {"intrinsics": batch["intrinsics"][:, 0]}
+
+
+def assert_equal(made, expected):
+    """Require the same pictures, masks and numbers, and disparity within 1 ulp of float32."""
+    assert made.keys() == expected.keys()
+    for name, values in made.items():
+        assert values.dtype == expected[name].dtype, name
+        assert values.shape == expected[name].shape, name
+        if values.dtype == torch.float32:
+            ulp = np.spacing(np.abs(expected[name].numpy()))
+            same = np.array_equal(values.isnan(), expected[name].isnan())
+            apart = np.abs(values.numpy() - expected[name].numpy())
+            assert same, name
+            assert not (apart > ulp).any(), (name, np.nanmax(apart / ulp))
+        else:
+            assert torch.equal(values, expected[name]), name
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("contract", CONTRACTS)
+def test_every_field_is_that_of_stereo_pairs(contract, rig):
+    scenes = [scene(CONTRACTS[contract], rig=rig, seed=seed) for seed in (1, 2)]
+
+    made = derive(batch_of(scenes), fields=DERIVED_FIELDS)
+
+    expected = expected_of(scenes)
+    assert_equal(made, expected)
+    for name in MASKS:
+        assert 0.001 < made[name].float().mean() < 0.999, name
+
+
+@pytest.mark.parametrize("cx_px", [20.0, 20.3])
+def test_points_on_the_edge_between_two_pixels_land_on_the_same_one(cx_px):
+    """Here alone rounding could decide: through poses that are not turned, by half pixels."""
+    views, known = scene(CONTRACTS["planar depth"], rig="posed")
+    centres = np.zeros((len(FRAMES), 6, 3))
+    centres[:, :, 1] = 100 * np.asarray(known.scene.lateral_m)
+    poses = CameraPoses.from_trajectory(
+        Trajectory(centres, 0.01, np.zeros((len(FRAMES), 6, 3)), "rotator_deg")
+    )
+    known = replace(known, poses=poses, encodings=dict.fromkeys(range(6), DepthEncoding(0.1)))
+    halves_px = np.random.default_rng(0).choice([0.5, 1.5, 3.5, 4.5], (6, len(FRAMES), *SIZE))
+    units = np.rint(63.0 * 0.2 / halves_px * 10).astype(np.uint16)
+    depths = {camera: StoredDepth(units[camera], units[camera] > 0) for camera in range(6)}
+    camera = Intrinsics(63.0, 63.0, cx_px, 6.0, SIZE[1], SIZE[0])
+    scenes = [(replace(views, depths=depths, intrinsics=camera), known)]
+
+    made, expected = derive(batch_of(scenes), fields=DERIVED_FIELDS), expected_of(scenes)
+
+    differing = {name: int((made[name] != expected[name]).sum()) for name in MASKS}
+    assert differing == dict.fromkeys(MASKS, 0)
+    assert_equal(made, expected)
+
+
+def test_stills_have_no_axis_of_time():
+    batch = batch_of([scene(CONTRACTS["planar depth"])])
+    still = {
+        name: value[:, :, 0] if name in ("image", "stored_depth", "cams_from_cam") else value
+        for name, value in batch.items()
+    }
+
+    made, clips = (derive(each, fields=DERIVED_FIELDS) for each in (still, batch))
+
+    for name, values in made.items():
+        timed = clips[name].ndim > 4
+        assert torch.equal(values, clips[name][:, :, 0] if timed else clips[name]), name
+
+
+def test_rectified_and_posed_scenes_share_a_batch():
+    scenes = [scene(CONTRACTS["planar depth"], rig=rig, seed=3) for rig in (*RIGS, "rectified")]
+
+    made = derive(batch_of(scenes), fields=DERIVED_FIELDS)
+
+    assert_equal(made, expected_of(scenes))
+
+
+def test_only_the_pairs_and_fields_asked_for_are_made():
+    views = scene(CONTRACTS["planar depth"])
+    batch = batch_of([views])
+    fields = ("disparity", "pair", "hole")
+    del batch["image"]
+
+    made = derive(batch, fields=fields, pairs=[(4, 1), (0, 5)])
+
+    expected = expected_of([views], pairs=[(4, 1), (0, 5)])
+    assert_equal(made, {name: expected[name] for name in fields})
+    assert made["pair"].tolist() == [[[4, 1], [0, 5]]]
+
+
+def of_size(height, width, *, seed=0):
+    """Return a batch of one still of random depth, of a rectified rig."""
+    rng = np.random.default_rng(seed)
+    places_m = 0.1 * np.arange(6)
+    units = rng.integers(100, 500, (1, 6, 1, height, width), dtype=np.uint16)
+    return {
+        "image": torch.from_numpy(
+            rng.integers(0, 256, (1, 6, 3, height, width), dtype=np.uint8)
+        ),
+        "stored_depth": torch.from_numpy(units),
+        "depth_unit_m": torch.full((1, 6), 0.01, dtype=torch.float64),
+        "no_depth": torch.zeros(1, 6, dtype=torch.int64),
+        "depth_kind": ["planar"], "depth_form": ["depth"], "rig": ["rectified"],
+        "intrinsics": torch.tensor(
+            [[[60.0, 0, width / 2], [0, 60, height / 2], [0, 0, 1]]], dtype=torch.float64
+        ),
+        "baselines_m": torch.from_numpy(places_m[None, None] - places_m[None, :, None]),
+        "cams_from_cam": torch.eye(4, dtype=torch.float64).expand(1, 6, 6, 4, 4),
+        "camera": torch.arange(6)[None],
+    }  # fmt: skip
+
+
+def test_many_pixels_are_made_some_pairs_at_a_time():
+    """All 15 pairs are 6 million pixels: more than are made at once."""
+    batch = of_size(640, 640)
+    fields = ("disparity", "visible", "warped_right")
+
+    together = derive(batch, fields=fields)
+
+    for place in (0, 7, 14):
+        alone = derive(batch, fields=fields, pairs=[CAMERA_PAIRS[place]])
+        for name in fields:
+            assert torch.equal(together[name][:, place : place + 1], alone[name]), name
+
+
+def test_two_runs_are_equal_whatever_the_number_of_threads():
+    batch = of_size(96, 128)
+    threads = torch.get_num_threads()
+    runs = []
+    try:
+        for count in (1, 2, 1):
+            torch.set_num_threads(count)
+            runs.append(derive(batch, fields=DERIVED_FIELDS))
+    finally:
+        torch.set_num_threads(threads)
+
+    for run in runs[1:]:
+        assert all(torch.equal(run[name], runs[0][name]) for name in DERIVED_FIELDS)
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_autocast_halves_no_precision(rig):
+    batch = batch_of([scene(CONTRACTS["ray depth"], rig=rig)])
+    expected = derive(batch, fields=DERIVED_FIELDS)
+
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        made = derive(batch, fields=DERIVED_FIELDS)
+        after = torch.ones(2, 2) @ torch.ones(2, 2)
+
+    assert after.dtype == torch.bfloat16
+    for name, values in made.items():
+        assert torch.equal(values, expected[name]), name
+
+
+def test_torch_compile_takes_it_as_one_graph():
+    command = [sys.executable, "-W", "error", "-m", "tests.datasets.compile_derive", "aot_eager"]
+
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.count("17 fields are equal") == 2
+
+
+SHIFT = st.floats(0.01, 10.0), st.floats(20.0, 5000.0), st.floats(1e-4, 1.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(*SHIFT, st.sampled_from(["depth", "inverse"]), st.integers(0, 2**32 - 1))
+def test_disparity_is_within_one_ulp_for_any_rig(baseline_m, focal_px, unit_m, form, seed):
+    rng = np.random.default_rng(seed)
+    units = rng.integers(0, 2**16, (1, 6, 1, 2, 64), dtype=np.uint16)
+    batch = of_size(2, 64) | {
+        "stored_depth": torch.from_numpy(units),
+        "depth_form": [form],
+        "depth_unit_m": torch.full((1, 6), unit_m, dtype=torch.float64),
+        "baselines_m": torch.full((1, 6, 6), baseline_m, dtype=torch.float64),
+    }
+    batch["intrinsics"][:, 0, 0] = focal_px
+
+    made = derive(batch, fields=("disparity", "valid"), pairs=[(0, 1)])
+
+    stored = units[0, 0, 0].astype(np.float64)
+    ratio = 1 / np.maximum(stored, 1) if form == "depth" else stored
+    truth = np.where(stored > 0, focal_px * baseline_m / unit_m * ratio, 0)
+    found = made["disparity"][0, 0, 0].numpy()
+    assert (np.abs(found - truth) <= 0.56 * np.spacing(truth.astype(np.float32))).all()
+    assert np.array_equal(made["valid"][0, 0, 0].numpy(), stored > 0)
+
+
+def test_results_stay_on_the_device_that_is_asked_for():
+    """The meta device takes no tensor of another one, as a GPU does not."""
+    made = derive(of_size(8, 8), fields=DERIVED_FIELDS, device="meta")
+
+    assert {str(values.device) for values in made.values()} == {"meta"}
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU with CUDA")
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize("contract", CONTRACTS)
+def test_a_gpu_gives_what_the_processor_gives(contract, rig):
+    batch = batch_of([scene(CONTRACTS[contract], rig=rig, seed=seed) for seed in (1, 2)])
+
+    made = derive(batch, fields=DERIVED_FIELDS, device="cuda")
+
+    assert_equal(
+        {name: values.cpu() for name, values in made.items()}, derive(batch, fields=DERIVED_FIELDS)
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fields": ("disparity", "right_from_left")}, "cannot make 'right_from_left'.*left, ri"),
+        ({"fields": ()}, "no field"),
+    ],
+)
+def test_a_field_that_cannot_be_made_is_named(options, message):
+    with pytest.raises(FieldError, match=message):
+        derive(of_size(2, 4), **options)
+
+
+@pytest.mark.parametrize("name", ["stored_depth", "image", "rig"])
+def test_a_missing_field_of_the_batch_is_named_with_the_cure(name):
+    batch = of_size(2, 4)
+    del batch[name]
+
+    with pytest.raises(FieldError, match=f"no {name}: .*fields=DERIVE_FIELDS"):
+        derive(batch, fields=("left",))
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        (lambda depth: depth.to(torch.int32), r"torch\.int32 \(1, 6, 1, 2, 4\)"),
+        (lambda depth: depth[0], r"torch\.uint16 \(6, 1, 2, 4\)"),
+    ],
+)
+def test_depth_of_another_dtype_or_without_a_batch_is_refused(change, found):
+    batch = of_size(2, 4)
+
+    with pytest.raises(FieldError, match=f"stored_depth is {found}, not uint16"):
+        derive(batch | {"stored_depth": change(batch["stored_depth"])})
+
+
+@pytest.mark.parametrize("pairs", [[(1, 1)], [(0, 6)], [(-1, 2)], "some", []])
+def test_pairs_must_be_of_two_views_of_the_batch(pairs):
+    with pytest.raises(SelectionError, match=r"pair"):
+        derive(of_size(2, 4), pairs=pairs)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"frames": [0], "size": (48, 56)},
+        {"frames": [3, 6], "transform": Crop(8, 4, 40, 32), "depth": DepthEncoding(frame_lag=2)},
+    ],
+    ids=["resized", "cropped, of late depth"],
+)
+def test_batches_of_a_loader_become_the_pairs_of_the_dataset(small_release, options):
+    fields = (
+        "left", "right", "disparity", "valid", "visible", "warped_right", "baseline_m", "pair",
+    )  # fmt: skip
+    options |= {"split": "train", "family": "Uniform"}
+    moments = SceneViews(small_release, fields=DERIVE_FIELDS, **options)
+    loader = moments.loader(batch_size=2, num_workers=1, order="sequential")
+
+    made = [derive(batch, fields=fields) for batch in loader]
+
+    pairs = StereoPairs(small_release, fields=fields, pairs="all", **options)
+    for name in fields:
+        found = torch.cat([batch[name] for batch in made]).flatten(0, 1)
+        expected = torch.stack([pairs[number][name] for number in range(len(pairs))])
+        assert torch.equal(found, expected), name
+
+
+@pytest.mark.parametrize("transform", [Letterbox(48, 96), Eraser(probability=1)], ids=repr)
+def test_stored_depth_cannot_tell_what_a_transform_hid(small_release, transform):
+    moments = SceneViews(small_release, fields=("stored_depth",), transform=transform)
+
+    with pytest.raises(FieldError, match=r"/scene_\d+: stored_depth does not tell.*StereoPairs"):
+        moments[0]
+
+
+def test_a_contract_without_a_number_for_no_depth_is_refused_where_it_needs_one(small_release):
+    depth = DepthEncoding(no_depth=(), frame_lag=1)
+    moments = SceneViews(
+        small_release, fields=("stored_depth", "no_depth"), depth=depth, frames=[5, 6]
+    )
+
+    assert moments[0]["no_depth"].tolist() == [-1] * 6
+    with pytest.raises(FieldError, match=r"no_depth=\(\): name one that is not in use"):
+        moments[1]
