@@ -248,7 +248,8 @@ VIEW_FIELDS: Final[dict[str, Field]] = _table(
     Field(
         "depth_unit_m", "float64", "()",
         "m in a stored unit of depth; of inverse depth, the depth of the number 1",
-        make=lambda s: np.float64(s.backward.encoding.known_unit_m), per_target=True, per_frame=False,
+        make=lambda s: np.float64(s.backward.encoding.known_unit_m),
+        per_target=True, per_frame=False,
     ),
     Field(
         "depth_kind", "str", "", "planar or ray: what stored depth measures",
