@@ -95,11 +95,11 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
 
 def _with_added(table: pa.Table) -> pa.Table:
     """Return a table of an earlier version with the columns that came later, which say nothing."""
-    for name in ADDED:
-        if name not in table.column_names:
-            field = SCHEMA.field(name)
-            table = table.append_column(field, pa.nulls(table.num_rows, field.type))
-    return table
+    missing = [SCHEMA.field(name) for name in ADDED if name not in table.column_names]
+    for added in missing:
+        table = table.append_column(added, pa.nulls(table.num_rows, added.type))
+    is_whole = {*table.column_names} == {*SCHEMA.names}
+    return table.select(SCHEMA.names) if missing and is_whole else table
 
 
 def write_index_file(path: Path, table: pa.Table, head: IndexHead) -> None:

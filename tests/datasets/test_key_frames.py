@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.index.rows import ADDED
 from stereogenbench_data.samples import streams
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -134,7 +135,7 @@ def test_an_index_without_key_frames_opens_with_the_digest_it_had(whole, tmp_pat
     index.write(place)
     table = pq.read_table(place)
     metadata = table.schema.metadata
-    older = table.drop_columns(["key_frames"])
+    older = table.drop_columns([*ADDED])
     pq.write_table(older.replace_schema_metadata(metadata), place)
     opened = SceneIndex.open(place, root=whole)
 

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from stereogenbench_data.audit.geometry_audit import AuditRequest, audit
 from typer.testing import CliRunner
 
 from stereogenbench_data import (
@@ -27,6 +26,7 @@ from stereogenbench_data import (
     score_controls,
 )
 from stereogenbench_data.audit.contract.doctor import diagnose
+from stereogenbench_data.audit.geometry.audit import AuditRequest, audit
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import MediaError, SchemaError, ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
@@ -44,7 +44,7 @@ from stereogenbench_data.shards.training import TrainingSettings
 from stereogenbench_data.shards.unpack import unpack
 from stereogenbench_data.shards.verify import verify
 from stereogenbench_data.sources.files import try_locked
-from stereogenbench_data.synthesis import synthesise
+from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.servers.tools import require_module
 from tests.shards.shard_files import bytes_of, flip_byte
