@@ -62,8 +62,8 @@ class EpochOptions(TypedDict, total=False):
             pairs. Fewer take less memory and shuffle less well. A process has so many of each group
             that it reads.
         open_frames: How many neighbouring frames of each open scene are interleaved, where several
-            samples show a frame (all pairs): they stay in memory. By default so many that a batch
-            shows about as many moments as it has samples, as far as that memory goes.
+            samples show a frame (all pairs). A batch then shows more moments, and their pictures
+            and depth stay in memory. By default 1.
         start: Where in its first scene each of the interleaved streams starts. "anywhere" (the
             default): else the first batches would show first frames alone, and where scenes are
             as long as one another, all batches frames of one number. What lies before is decoded

@@ -31,8 +31,8 @@ _DECODER_BYTES: Final = 17
 """Of a camera's decoders for each pixel: 12.6 of H.264 with its reference pictures, 4.3 of FFV1,
 measured at 1280x1280."""
 
-_KEPT_BYTES: Final = 6
-"""Of a picture, its depth and where it is measured, kept for each pixel for other pairs."""
+_KEPT_BYTES: Final = 4
+"""Of the current picture and what is measured in it, kept for each pixel for other pairs."""
 
 
 class OpenVideosWarning(UserWarning):
@@ -87,35 +87,22 @@ def _warn_of_repeated_decoding(rule: OrderRule, *, lengths: Numbers, processes: 
 
 
 def fitting_rule(rule: OrderRule, index: SceneIndex, plan: Plan) -> OrderRule:
-    """Return a rule with as many open scenes and frames as fit into the memory of a shuffle group.
+    """Return a rule with as many open scenes as fit into the memory of a shuffle group.
 
     They depend on the selected pairs and the stored size of their pictures alone, not on fields,
-    ranks or workers: so does the order. Where pairs share frames, as many moments as a batch has
-    samples are wanted, or as many as fit: of frames of the same scene where that takes less memory
-    than the decoders of another scene, but of two scenes at least.
+    ranks or workers: so does the order.
     """
     rows = plan.scene_rows
     pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
     cameras = videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
-    budget = GROUP_BYTES / max(1, int(pixels) * cameras)
-    wanted = max(OPEN_SCENES, rule.batch_size)
-    if not (plan.runs.pairs > 1).any():
-        scenes, frames = min(wanted, max(2, int(budget // _DECODER_BYTES))), 1
-    else:
-        fitting = [
-            (
-                scenes,
-                min(-(-wanted // scenes), int((budget / scenes - _DECODER_BYTES) / _KEPT_BYTES)),
-            )
-            for scenes in range(2, wanted + 1)
-        ]
-        scenes, frames = max(
-            ((scenes, frames) for scenes, frames in fitting if frames > 0),
-            key=lambda each: (min(wanted, each[0] * each[1]), each[0]),
-            default=(2, 1),
-        )
-    groups = SHUFFLE_GROUPS if scenes >= OPEN_SCENES else GROUPS_OF_LARGE
-    return replace(rule, shuffle_groups=groups, open_scenes=scenes, open_frames=frames)
+    kept_bytes = _KEPT_BYTES if (plan.runs.pairs > 1).any() else 0
+    scene_bytes = int(pixels) * cameras * (_DECODER_BYTES + kept_bytes)
+    fitting = max(2, GROUP_BYTES // max(1, scene_bytes))
+    return replace(
+        rule,
+        shuffle_groups=SHUFFLE_GROUPS if fitting >= OPEN_SCENES else GROUPS_OF_LARGE,
+        open_scenes=min(max(OPEN_SCENES, rule.batch_size), fitting),
+    )
 
 
 def _most_files() -> int:

@@ -559,7 +559,7 @@ def test_workers_are_not_warned_of_where_more_groups_would_not_help(
     ("side_px", "selection", "expected", "shuffle_groups"),
     [
         (1280, {}, 16, 4),
-        (1280, {"pairs": "all"}, 2, 2),
+        (1280, {"pairs": "all"}, 4, 2),
         (1280, {"pairs": "sweep"}, 5, 2),
         (480, {"pairs": "all"}, 16, 4),
         (8192, {"pairs": "all"}, 2, 2),
@@ -578,8 +578,7 @@ def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
     pairs = StereoPairs(index, **options)
 
     assert pairs.loader(4).batches.rule.open_scenes == expected
-    shares_much_memory = side_px == 1280 and selection == {"pairs": "all"}
-    assert pairs.loader(4).batches.rule.open_frames == (4 if shares_much_memory else 1)
+    assert pairs.loader(4).batches.rule.open_frames == 1
     assert pairs.loader(4).batches.rule.shuffle_groups == shuffle_groups
     assert pairs.loader(4, num_workers=3).batches.rule == pairs.loader(4).batches.rule
     others = StereoPairs(index, **(options | {"fields": ("depth",)}))
