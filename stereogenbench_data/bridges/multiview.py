@@ -453,7 +453,8 @@ class VGGTMixin:
             views: The views.
             len_train: How many samples an epoch has [the number of sequences].
         """
-        super().__init__(common_conf=common_conf)  # type: ignore[call-arg]
+        base: Any = super()  # VGGT's BaseDataset, where this class stands in front of it
+        base.__init__(common_conf=common_conf)
         self.views = views
         self.training = common_conf.training
         self.inside_random = common_conf.inside_random

@@ -165,11 +165,12 @@ def _export(source: DataOptions, out: Path, chosen: ViewOptions, *, layout: Any)
     from stereogenbench_data.bridges.export_views import export_views
     from stereogenbench_data.selection.filters import filter_scenes
 
-    selection, filters = chosen.selection(), chosen.filters()
+    selection = chosen.selection()
+    filters: Any = chosen.filters()
     index = source.open()
     with progress_bar("writing", unit="pictures") as progress:
         folders = export_views(index, out, layout=layout, progress=progress, **selection)
-    matching = index.column("split")[filter_scenes(index, filters)]  # type: ignore[arg-type]
+    matching = index.column("split")[filter_scenes(index, filters)]
     for_evaluation = 0 if chosen.split else int((matching == "eval").sum())
     if for_evaluation:
         typer.echo(

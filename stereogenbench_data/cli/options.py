@@ -49,7 +49,8 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
             options.append(
                 inspect.Parameter(field.name, keyword_only, default=default, annotation=field.type)
             )
-    called.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    described: Any = called
+    described.__signature__ = inspect.Signature(options)
     called.__annotations__ = {option.name: option.annotation for option in options}
     return called
 

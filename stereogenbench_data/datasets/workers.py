@@ -41,7 +41,8 @@ class WorkerContext:
                 system's own.
         """
         base = given.get_context() if isinstance(given, BaseContext) else get_context(given)
-        self.context: Any = _watched(type(base))()  # type: ignore[arg-type]  # classes are hashable
+        kind: Any = type(base)
+        self.context: Any = _watched(kind)()
         self.dead: BaseProcess | None = None
         self._is_dead = threading.Event()
         self._stop_reader, self._stop_writer = connection.Pipe(duplex=False)
@@ -132,7 +133,8 @@ class _ClosableQueue(Queue):  # type: ignore[type-arg]  # no generic at run time
     def end(self) -> None:
         """Make readers see an empty queue, without waiting for a dead writer."""
         self._is_ended = True
-        self._writer.close()  # type: ignore[attr-defined]  # without it a reader sees no end
+        pipe: Any = self  # torch and the standard library do not declare the pipe's end
+        pipe._writer.close()  # without it a reader sees no end
 
     def get(self, block: bool = True, timeout: float | None = None) -> Any:  # noqa: FBT001, FBT002
         """Return the next item, as the queue that this stands for."""

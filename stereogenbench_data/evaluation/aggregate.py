@@ -138,7 +138,7 @@ def half_interval(means: Sequence[float]) -> float | None:
     if count < 2:
         return None
     try:
-        from scipy.stats import t as student_t  # type: ignore[import-untyped]  # scipy has no types
+        from scipy.stats import t as student_t
     except ImportError:
         raise ExtraError(
             "intervals need scipy: pip install 'stereogenbench-data[evaluation]'."
