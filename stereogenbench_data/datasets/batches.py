@@ -63,7 +63,9 @@ class EpochOptions(TypedDict, total=False):
             that it reads.
         open_frames: How many neighbouring frames of each open scene are interleaved, where several
             samples show a frame (all pairs). A batch then shows more moments, and their pictures
-            and depth stay in memory. By default 1.
+            and depth stay in memory. If left out, as many as a batch has samples of an open scene,
+            within 0.5 GB a group: 3 with all pairs of 1280x1280 pixels and a batch of 16, 1 with
+            one pair a scene.
         start: Where in its first scene each of the interleaved streams starts. "anywhere" (the
             default): else the first batches would show first frames alone, and where scenes are
             as long as one another, all batches frames of one number. What lies before is decoded
@@ -170,11 +172,12 @@ class EpochBatches(Sampler[list[int]]):
             start=options.get("start", "anywhere"),
             kind=_order_kind(options),
         )
-        rule = fitting_rule(rule, dataset.index, dataset.plan)
+        rule = fitting_rule(
+            rule, dataset.index, dataset.plan, open_scenes=options.get("open_scenes")
+        )
         self.rule = replace(
             rule,
             shuffle_groups=options.get("shuffle_groups", rule.shuffle_groups),
-            open_scenes=options.get("open_scenes", rule.open_scenes),
             open_frames=options.get("open_frames", rule.open_frames),
         )
         self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))

@@ -34,6 +34,12 @@ measured at 1280x1280."""
 _KEPT_BYTES: Final = 4
 """Of the current picture and what is measured in it, kept for each pixel for other pairs."""
 
+FRAMES_BYTES: Final = 500_000_000
+"""Memory for further frames of a shuffle group's open scenes, where several samples show one."""
+
+_FRAME_BYTES: Final = 6
+"""Of a further frame for each pixel: the picture, stored depth and where it is measured."""
+
 
 class OpenVideosWarning(UserWarning):
     """More videos are needed at a time than this process may open: some are opened repeatedly."""
@@ -86,22 +92,37 @@ def _warn_of_repeated_decoding(rule: OrderRule, *, lengths: Numbers, processes: 
         )
 
 
-def fitting_rule(rule: OrderRule, index: SceneIndex, plan: Plan) -> OrderRule:
-    """Return a rule with as many open scenes as fit into the memory of a shuffle group.
+def fitting_rule(
+    rule: OrderRule, index: SceneIndex, plan: Plan, *, open_scenes: int | None
+) -> OrderRule:
+    """Return a rule with as many open scenes and frames as fit into the memory of a shuffle group.
 
     They depend on the selected pairs and the stored size of their pictures alone, not on fields,
     ranks or workers: so does the order.
+
+    Args:
+        rule: The rule without them.
+        index: The scenes.
+        plan: The selection.
+        open_scenes: How many scenes the user asks for; None for as many as fit.
     """
     rows = plan.scene_rows
     pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
-    cameras = videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
-    kept_bytes = _KEPT_BYTES if (plan.runs.pairs > 1).any() else 0
-    scene_bytes = int(pixels) * cameras * (_DECODER_BYTES + kept_bytes)
+    of_cameras = int(pixels) * videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
+    shares_moments = bool((plan.runs.pairs > 1).any())
+    scene_bytes = of_cameras * (_DECODER_BYTES + (_KEPT_BYTES if shares_moments else 0))
     fitting = max(2, GROUP_BYTES // max(1, scene_bytes))
+    if open_scenes is None:
+        open_scenes = min(max(OPEN_SCENES, rule.batch_size), fitting)
+    rule = replace(rule, open_scenes=open_scenes)
+    frames = 1
+    if shares_moments:
+        further = FRAMES_BYTES // max(1, open_scenes * of_cameras * _FRAME_BYTES)
+        frames = max(1, min(1 + further, -(-rule.batch_size // open_scenes)))
     return replace(
         rule,
         shuffle_groups=SHUFFLE_GROUPS if fitting >= OPEN_SCENES else GROUPS_OF_LARGE,
-        open_scenes=min(max(OPEN_SCENES, rule.batch_size), fitting),
+        open_frames=frames,
     )
 
 

@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float64, Int64, UInt64
 
 from stereogenbench_data.errors import SelectionError
 
-ORDER_VERSION: Final = 3
+ORDER_VERSION: Final = 4
 """Changes whenever the same arguments give another order; a saved state names it."""
 
 SHUFFLE_GROUPS: Final = 4
@@ -318,8 +318,9 @@ class _Group:
         self._salt = int(order.raw(1, part=-1)[0])
         streams = [pieces.take(found) for found in _dealt(pieces, streams=count)]
         if order.rule.start == "anywhere":
-            # Evenly spread over the streams, so that few streams are apart, too.
-            starts = (np.argsort(draws[2]) + draws[2]) / max(1, count)
+            # Evenly spread over the streams, so that few streams are apart, too. Squares spread as
+            # wide as the shares themselves, and have a third before them instead of a half.
+            starts = ((np.argsort(draws[2]) + draws[2]) / max(1, count)) ** 2
             streams = [
                 self._started(stream, share)
                 for stream, share in zip(streams, starts.tolist(), strict=True)
@@ -396,7 +397,8 @@ class _Group:
     def _in_run(self, run: Numbers, place: Numbers) -> Numbers:
         """Return the sample at a place of a run: blocks of moments, each pair by pair.
 
-        In a block the moments take turns, and each begins with a pair of its own.
+        In a block the moments take turns with one pair after another, so each camera is read at
+        ascending moments; blocks begin with different pairs.
         """
         first, pairs = self._runs.first_sample[run], self._runs.pairs[run]
         if (pairs == 1).all():
@@ -408,7 +410,7 @@ class _Group:
         turn, within = np.divmod(inside, opened)
         moment = block * self._rule.open_frames + within
         mixed = (run.astype(np.uint64) + np.uint64(self._salt)) * _MIX
-        first_pair = (mixed >> np.uint64(40)).astype(np.int64) + moment
+        first_pair = (mixed >> np.uint64(40)).astype(np.int64) + block
         samples: Numbers = first + moment * pairs + (first_pair + turn) % pairs
         return samples
 
@@ -417,7 +419,7 @@ class _Group:
         run, begin, stop = int(stream.run[0]), int(stream.begin[0]), int(stream.stop[0])
         pairs = int(self._runs.pairs[run])
         block = pairs * self._rule.open_frames if pairs > 1 else 1
-        start = -(-int(begin + share * (stop - begin)) // block) * block
+        start = int(begin + share * (stop - begin)) // block * block
         if not begin < start < stop:
             return stream
         return _Pieces(

@@ -1,7 +1,7 @@
 """Videos with several key frames: what lies between two of them is shuffled by itself."""
 
 import shutil
-from collections import Counter
+from collections import Counter, defaultdict
 from fractions import Fraction
 
 import av
@@ -102,6 +102,27 @@ def test_a_run_begins_decoding_at_its_key_frame(keyed_release, monkeypatch):
         pass
 
     assert Counter(index for _, index in first.values()) == {0: 3, 8: 3}
+
+
+@pytest.mark.parametrize("open_frames", [1, 3])
+def test_interleaved_frames_of_all_pairs_are_decoded_once(keyed_release, monkeypatch, open_frames):
+    read = defaultdict(list)
+
+    class Counting(streams.VideoReader):
+        def frame(self, index):
+            read[self.name].append(index)
+            return super().frame(index)
+
+    monkeypatch.setattr(streams, "VideoReader", Counting)
+    pairs = StereoPairs(keyed_release, frames="all", pairs="all", fields=("left", "right"))
+    loader = pairs.loader(
+        4, tail="uneven", start="beginning", shuffle_groups=1, open_frames=open_frames
+    )
+    for _ in loader:
+        pass
+
+    assert len(read) == 6 * 3
+    assert all(sorted(frames) == list(range(len(frames))) for frames in read.values())
 
 
 @pytest.mark.parametrize("selection", [{}, {"pairs": "all"}, {"frames": ("clips", 3)}], ids=str)

@@ -556,18 +556,18 @@ def test_workers_are_not_warned_of_where_more_groups_would_not_help(
 
 
 @pytest.mark.parametrize(
-    ("side_px", "selection", "expected", "shuffle_groups"),
+    ("side_px", "selection", "expected", "shuffle_groups", "frames_of_16"),
     [
-        (1280, {}, 16, 4),
-        (1280, {"pairs": "all"}, 4, 2),
-        (1280, {"pairs": "sweep"}, 5, 2),
-        (480, {"pairs": "all"}, 16, 4),
-        (8192, {"pairs": "all"}, 2, 2),
+        (1280, {}, 16, 4, 1),
+        (1280, {"pairs": "all"}, 4, 2, 3),
+        (1280, {"pairs": "sweep"}, 5, 2, 1),
+        (480, {"pairs": "all"}, 16, 4, 1),
+        (8192, {"pairs": "all"}, 2, 2, 1),
     ],
     ids=str,
 )
 def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
-    small_index, side_px, selection, expected, shuffle_groups
+    small_index, side_px, selection, expected, shuffle_groups, frames_of_16
 ):
     scenes = [
         replace(scene, rig=replace(scene.rig, image_width_px=side_px, image_height_px=side_px))
@@ -579,6 +579,7 @@ def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
 
     assert pairs.loader(4).batches.rule.open_scenes == expected
     assert pairs.loader(4).batches.rule.open_frames == 1
+    assert pairs.loader(16).batches.rule.open_frames == frames_of_16
     assert pairs.loader(4).batches.rule.shuffle_groups == shuffle_groups
     assert pairs.loader(4, num_workers=3).batches.rule == pairs.loader(4).batches.rule
     others = StereoPairs(index, **(options | {"fields": ("depth",)}))
