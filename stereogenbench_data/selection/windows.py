@@ -18,6 +18,7 @@ FramesSpec = (
     | tuple[Literal["every"], int]
     | tuple[Literal["random"], int]
     | tuple[Literal["clips"], int, int, int]
+    | tuple[Literal["random clips"], int, int, int]
 )
 
 
@@ -59,27 +60,6 @@ class Every:
 
 
 @dataclass(frozen=True, slots=True)
-class Random:
-    """n different frames of each scene, drawn anew for every epoch, ascending, one a window."""
-
-    n: int
-    is_clip: bool = False
-
-    def count(self, frames: int) -> int:
-        """Return n, which a scene must have frames for."""
-        if self.n > frames:
-            raise SelectionError(
-                f"('random', {self.n}) asks for more frames than the {frames} of a scene."
-            )
-        return self.n
-
-    def window(self, number: int, *, frames: int, draw: Sequence[int]) -> tuple[int, ...]:
-        """Return one of the frames drawn."""
-        generator = np.random.default_rng(np.random.SeedSequence(tuple(draw)))
-        return (int(np.sort(generator.choice(frames, size=self.n, replace=False))[number]),)
-
-
-@dataclass(frozen=True, slots=True)
 class Clips:
     """Clips of ``length`` frames, ``stride`` frames apart, a clip starting every ``step`` frames.
 
@@ -107,6 +87,37 @@ class Clips:
         return tuple(range(start, start + self.length * self.stride, self.stride))
 
 
+@dataclass(frozen=True, slots=True)
+class Random:
+    """n different windows of each scene, drawn from others anew for every epoch, ascending."""
+
+    n: int
+    drawn_from: Every | Clips = Every(1)
+
+    @property
+    def is_clip(self) -> bool:
+        """Whether they are clips."""
+        return self.drawn_from.is_clip
+
+    def count(self, frames: int) -> int:
+        """Return n, for which a scene must have enough windows."""
+        there = self.drawn_from.count(frames)
+        if self.n > there:
+            what = f"{there} clips" if self.is_clip else f"{there} frames"
+            raise SelectionError(
+                f"{self.n} windows a scene are to be drawn at random, more than the {what} of a "
+                f"scene: ask for fewer."
+            )
+        return self.n
+
+    def window(self, number: int, *, frames: int, draw: Sequence[int]) -> tuple[int, ...]:
+        """Return one of the windows drawn."""
+        generator = np.random.default_rng(np.random.SeedSequence(tuple(draw)))
+        there = self.drawn_from.count(frames)
+        drawn = int(np.sort(generator.choice(there, size=self.n, replace=False))[number])
+        return self.drawn_from.window(drawn, frames=frames, draw=draw)
+
+
 Windows = Chosen | Every | Random | Clips
 """A rule that gives the windows of a scene with a known number of frames.
 
@@ -122,7 +133,7 @@ def run_starts(
     """Return the windows with which runs begin: groups of windows that decode by themselves.
 
     A run holds the windows whose first frames lie between two key frames, with ``least`` frames or
-    more from the one to the other. Frames drawn at random, of which only the number is known
+    more from the one to the other. Windows drawn at random, of which only the number is known
     before, are dealt evenly to as many runs.
     """
     count = windows.count(frames)
@@ -145,7 +156,8 @@ def parse_frames(spec: Any) -> Windows:
         spec: "first", "all", a frame number, a sequence of them, ("every", k), ("random", n),
             ("clips", length), ("clips", length, stride) or ("clips", length, stride, step);
             stride is 1 and step is the clip's span where left out, so that clips do not overlap.
-            Or any `Windows`.
+            ("random clips", n, length) or ("random clips", n, length, stride): n clips that start
+            anywhere. Or any `Windows`.
 
     Raises:
         SelectionError: If it is none of these, or a number in it is out of range.
@@ -159,13 +171,9 @@ def parse_frames(spec: Any) -> Windows:
     elif isinstance(spec, int | np.integer):
         return Chosen((_whole(spec, least=0),))
     elif isinstance(spec, Sequence) and len(spec) > 0 and isinstance(spec[0], str):
-        numbers = [_whole(number, least=1) for number in spec[1:]]
-        if spec[0] in ("every", "random") and len(numbers) == 1:
-            return Every(numbers[0]) if spec[0] == "every" else Random(numbers[0])
-        if spec[0] == "clips" and 1 <= len(numbers) <= 3:
-            length, stride = numbers[0], (numbers[1:] or [1])[0]
-            step = numbers[2] if len(numbers) == 3 else (length - 1) * stride + 1
-            return Clips(length, stride, step)
+        found = _of_kind(spec[0], [_whole(number, least=1) for number in spec[1:]])
+        if found is not None:
+            return found
     elif isinstance(spec, Sequence | np.ndarray) and len(spec) > 0:
         frames = tuple(_whole(number, least=0) for number in spec)
         if len(set(frames)) < len(frames):
@@ -173,8 +181,23 @@ def parse_frames(spec: Any) -> Windows:
         return Chosen(tuple(sorted(frames)))
     raise SelectionError(
         f"frames={spec!r} is not understood; use 'first', 'all', a frame number, a list of them, "
-        "('every', k), ('random', n) or ('clips', length, stride, step)."
+        "('every', k), ('random', n), ('clips', length, stride, step) or ('random clips', n, "
+        "length, stride)."
     )
+
+
+def _of_kind(kind: str, numbers: list[int]) -> Windows | None:
+    match kind, numbers:
+        case "every", [step]:
+            return Every(step)
+        case "random", [n]:
+            return Random(n)
+        case "clips", [length, *more] if len(more) <= 2:
+            stride = more[0] if more else 1
+            return Clips(length, stride, more[1] if len(more) == 2 else (length - 1) * stride + 1)
+        case "random clips", [n, length, *more] if len(more) <= 1:
+            return Random(n, Clips(length, more[0] if more else 1))
+    return None
 
 
 def _whole(number: Any, *, least: int) -> int:

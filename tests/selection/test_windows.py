@@ -68,6 +68,27 @@ def test_random_frames_change_with_epoch_seed_and_scene_and_else_stay():
     assert found[0] == tuple(windows(("random", 8), draw=draws[0]))
 
 
+@given(st.integers(1, 5), st.integers(1, 8), st.integers(1, 4), st.integers(0, 2**31))
+def test_random_clips_start_anywhere_and_lie_within_the_scene(n, length, stride, epoch):
+    found = list(windows(("random clips", n, length, stride), 40, (0, epoch, 99)))
+
+    assert len(set(found)) == n
+    assert found == sorted(found)
+    for clip in found:
+        assert clip == tuple(range(clip[0], clip[0] + length * stride, stride))
+        assert 0 <= clip[0] <= clip[-1] < 40
+
+
+def test_starts_of_random_clips_cover_a_scene_evenly():
+    counts = [0] * 7
+    for epoch in range(2000):
+        for clip in windows(("random clips", 2, 4), 10, (0, epoch, 0)):
+            counts[clip[0]] += 1
+
+    assert min(counts) > 485
+    assert max(counts) < 660
+
+
 def test_random_frames_cover_a_scene_evenly():
     counts = [0] * 10
     for epoch in range(2000):
@@ -90,6 +111,8 @@ def test_random_frames_cover_a_scene_evenly():
         (("every", 0), "at least 1, got 0"),
         (("random", 2, 3), "is not understood"),
         (("clips",), "is not understood"),
+        (("random clips", 1), "is not understood"),
+        (("random clips", 0, 16), "at least 1, got 0"),
         (("clips", 1, 1, 1, 1), "is not understood"),
         (None, "is not understood"),
     ],
@@ -104,7 +127,9 @@ def test_frames_that_mean_nothing_are_refused(spec, message):
     ("spec", "message"),
     [
         (81, "frame 81 is asked for of a scene with 81 frames"),
-        (("random", 82), "more frames than the 81"),
+        (("random", 82), "82 windows .* more than the 81 frames"),
+        (("random clips", 67, 16), "67 windows .* more than the 66 clips"),
+        (("random clips", 1, 82), "spans 82 frames; a scene has 81"),
         (("clips", 82), "spans 82 frames; a scene has 81"),
     ],
     ids=str,
