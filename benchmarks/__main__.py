@@ -23,11 +23,21 @@ from benchmarks.race import Plan, run_races
 from benchmarks.results import Results, machine
 from benchmarks.start import measure_memory, measure_start
 from benchmarks.tables import tables
+from benchmarks.training import measure_training
 from benchmarks.tried import measure_tried
 from benchmarks.workloads import RATES, WORKLOADS, Workload
 
 ROOT: Final = Path(__file__).parents[1]
-OTHERS: Final = ("accuracy", "profile", "start", "memory", "tried", "evaluation", "derive")
+OTHERS: Final = (
+    "accuracy",
+    "profile",
+    "start",
+    "memory",
+    "tried",
+    "evaluation",
+    "derive",
+    "training",
+)
 """Measurements beside the races; `--only` takes these names too."""
 
 QUICK: Final = ("first", "all-frames", "random", "accuracy", "profile")
@@ -118,6 +128,9 @@ def measure_others(
         "memory": lambda: measure_memory(material, batches=options.batches, report=report),
         "tried": lambda: measure_tried(material, rounds=min(rounds, 3), report=report),
         "derive": lambda: measure_derive(material, rounds=min(rounds, 3), report=report),
+        "training": lambda: measure_training(
+            material, rounds=min(rounds, 3), workers=os.cpu_count() or 1, report=report
+        ),
         "evaluation": lambda: measure_evaluation(rounds=min(rounds, 3), report=report),
     }
     failed = []
@@ -126,8 +139,9 @@ def measure_others(
             continue
         began = time.perf_counter()
         try:
-            # "derive" forks by itself: a GPU is of no use in a fork.
-            results.put(name, work[name]() if name == "derive" else in_a_fork(work[name]))
+            # These fork by themselves: a GPU is of no use in a fork.
+            forks = name in ("derive", "training")
+            results.put(name, work[name]() if forks else in_a_fork(work[name]))
         except MeasurementError as error:
             failed.append(f"{name}: {error}")
             report(f"{name} failed: {error}")

@@ -8,6 +8,7 @@ from benchmarks.derive import MARK
 from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, NO_DEPTH, OURS, title
 from benchmarks.material import DRAWN_CRF, OTHER_CRFS
 from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios, sent_mb, shares
+from benchmarks.training import MARK_OWN
 from benchmarks.workloads import RATED, RATES, WORKLOADS, Workload
 from stereogenbench_data.schema.text import counted
 
@@ -25,6 +26,7 @@ def tables(sections: dict[str, Any]) -> str:
     for name, make in (
         ("start", _start), ("memory", _memory), ("accuracy", _accuracy), ("profile", _profile),
         ("tried", _tried), ("evaluation", _evaluation), ("derive", _derive),
+        ("training", _training),
     ):  # fmt: skip
         if name in sections:
             parts.append(make(sections[name]))
@@ -281,6 +283,25 @@ def _derive(found: dict[str, Any]) -> str:
     return "\n".join([*parts, table(head, rows)])
 
 
+def _training(found: dict[str, Any]) -> str:
+    rows = []
+    for row in found.values():
+        cost = row["cpu_s"]
+        to_released = cost["released"] / cost["ours, training"]
+        to_own = cost["training"] / cost["ours, training"]
+        rows.append(
+            [row["title"], *(f"{cost_s * 1e3:.1f}" for cost_s in cost.values()),
+             f"{to_released:.1f}", _reached(to_released, row["mark"]),
+             f"{to_own:.2f}", _reached(to_own, MARK_OWN)]
+        )  # fmt: skip
+    head = (
+        "832x480, processor ms a sample", "bare loop, released", "bare loop, training shards",
+        "ours, released", "ours, training shards", "to the released limit", "target",
+        "to their own limit", "target",
+    )  # fmt: skip
+    return "\n".join(["## Training shards\n", table(head, rows)])
+
+
 def headlines(races: dict[str, Any]) -> str:
     """Return the table of our ratios beside their targets."""
     rows = []
@@ -417,9 +438,11 @@ def rate_text(spread: Spread | None) -> str:
 
 def at_least(spread: Spread | None, wanted: float | None) -> str:
     """Return the target ratio, and whether the median reaches it."""
-    if spread is None or wanted is None:
-        return ""
-    return f"{wanted:g} {'reached' if spread.median >= wanted else '**missed**'}"
+    return "" if spread is None or wanted is None else _reached(spread.median, wanted)
+
+
+def _reached(ratio: float, wanted: float) -> str:
+    return f"{wanted:g} {'reached' if ratio >= wanted else '**missed**'}"
 
 
 def at_most(value: float, wanted: float, form: str = "g", *, scale: float = 1) -> str:

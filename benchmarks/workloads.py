@@ -85,7 +85,7 @@ class Workload:
     @property
     def is_clip(self) -> bool:
         """Whether samples have a time axis."""
-        return isinstance(self.frames, tuple) and self.frames[0] == "clips"
+        return isinstance(self.frames, tuple) and "clip" in self.frames[0]
 
     @property
     def fields(self) -> tuple[str, ...]:

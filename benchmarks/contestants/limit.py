@@ -8,7 +8,7 @@ this loop bounds the gain of any other codec for depth.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -131,12 +131,34 @@ def _plane(frame: Any, number: int, dtype: str) -> np.ndarray:
     return np.frombuffer(held, dtype).reshape(held.height, -1)[:, : held.width]
 
 
+Opened = tuple[dict[str, Any], Mapping[str, Any]]
+"""A scene's baseline.json, and its open videos by their released names."""
+
+
+def released(job: Job, key: str, names: Sequence[str], *, depth: Depth) -> Opened:
+    """Open videos of a scene in the released layout."""
+    folder = job.tree / key
+    size = job.workload.size or (job.material.size_px, job.material.size_px)
+    stored = np.full((job.material.size_px, job.material.size_px), 5000, dtype=np.uint16)
+    streams = {
+        name: GivenDepth(stored, size)
+        if depth == "given" and name.endswith(".mkv")
+        else Stream(folder / name, size)
+        for name in names
+    }
+    return json.loads((folder / "baseline.json").read_text()), streams
+
+
 def samples(
-    job: Job, scenes: Mapping[str, Sequence[Wanted]], *, depth: Depth = "decoded"
+    job: Job,
+    scenes: Mapping[str, Sequence[Wanted]],
+    *,
+    depth: Depth = "decoded",
+    opened: Callable[..., Opened] = released,
 ) -> Iterator[dict[str, Any]]:
     """Yield samples by scene, each scene's by frame; the next one overwrites the arrays."""
     workload = job.workload
-    height, width = size = workload.size or (job.material.size_px, job.material.size_px)
+    height, width = workload.size or (job.material.size_px, job.material.size_px)
     frames = len(next(iter(scenes.values()))[0].frames)
     arrays = {
         name: np.empty((frames, 3, height, width), np.uint8)
@@ -145,18 +167,11 @@ def samples(
         for name in ("left", "right", "disparity", "disparity_right")
         if name in workload.fields
     }
-    stored = np.full((job.material.size_px, job.material.size_px), 5000, dtype=np.uint16)
     cut = slice(None) if workload.is_clip else 0
     shown = {name: array[cut] for name, array in arrays.items()}
     for key, wanted in scenes.items():
-        folder = job.tree / key
-        document = json.loads((folder / "baseline.json").read_text())
-        streams = {
-            name: GivenDepth(stored, size)
-            if depth == "given" and name.endswith(".mkv")
-            else Stream(folder / name, size)
-            for name in camera_files(wanted, both_ways=workload.both_ways)
-        }
+        names = camera_files(wanted, both_ways=workload.both_ways)
+        document, streams = opened(job, key, names, depth=depth)
         unit_m = streams[f"cam_{wanted[0].left:02d}_depth.mkv"].unit_m()
         for sample in wanted:
             pair = pair_numbers(document, left=sample.left, right=sample.right, width_px=width)

@@ -20,14 +20,17 @@ from benchmarks import (
     race,
     start,
     tables,
+    training,
     tried,
 )
 from benchmarks.__main__ import chosen, parse
+from benchmarks.contestants import limit
 from benchmarks.material import facts
 from benchmarks.plots import plot_all
 from benchmarks.results import Results, Spread, ratios, shares
 from benchmarks.ways import WAYS
 from benchmarks.workloads import WORKLOADS, Job, tiny
+from stereogenbench_data import StereoPairs
 
 TINY = {workload.name: tiny(workload) for workload in WORKLOADS}
 
@@ -126,18 +129,44 @@ def test_the_parts_of_a_profile_add_up_to_the_whole(material):
     assert found["ms"]["queueing"] > 0
 
 
-def test_pairs_in_the_loader_are_compared_with_views_that_become_pairs(material):
+def test_pairs_in_the_loader_are_compared_with_views_that_become_pairs(material, monkeypatch):
+    monkeypatch.setattr(derive, "SIZES", {"as stored": None, "smaller": (24, 40)})
     found = derive.measure_derive(material, rounds=1, report=str)
 
     text = tables.tables({"derive": found})
-    for size in ("as stored", "832x480"):
+    for size in ("as stored", "smaller"):
         ways = found[size]["ways"]
-        pixels = 64 * 64 if size == "as stored" else 832 * 480
+        pixels = 64 * 64 if size == "as stored" else 24 * 40
         # Six pictures and six maps of two bytes, and numbers of cameras beside them.
         assert ways["views and stored depth"]["bytes"] == pytest.approx(30 * pixels, abs=6000)
         assert ways["15 pairs in the loader"]["bytes"] == 15 * (2 * 3 + 2 * 4 + 5 + 3) * pixels
         assert all(way["cpu_s"] > 0 for way in ways.values())
         assert f"views and stored depth, {size}" in text
+
+
+def test_training_shards_are_compared_with_bare_loops_over_the_same_samples(material, monkeypatch):
+    drawn = {"random frames": ("random", 3), "random clip": ("random clips", 1, 2)}
+    chosen = [
+        (replace(workload, frames=drawn[workload.name], window=drawn[workload.name]), mark)
+        for workload, mark in training.WORKLOADS
+        if workload.name in drawn
+    ]
+    monkeypatch.setattr(training, "WORKLOADS", chosen)
+    found = training.measure_training(material, rounds=1, workers=1, report=str)
+
+    assert found.keys() == {"random frames", "random clip"}
+    assert all(cost_s > 0 for row in found.values() for cost_s in row["cpu_s"].values())
+    text = tables.tables({"training": found})
+    assert "| 8 random frames a scene |" in text
+    shards = material.root / "training"
+    job = Job(replace(chosen[0][0], size=(32, 32)), material)
+    pairs = StereoPairs(shards, **job.selection)
+    loop = limit.samples(job, job.of_scene, opened=training._Shards(shards))
+    for number, bare in enumerate(loop):
+        own = pairs[number]
+        np.testing.assert_array_equal(bare["left"], own["left"])
+        seen = own["disparity"][0].numpy() > 0
+        np.testing.assert_allclose(bare["disparity"][0][seen], own["disparity"][0][seen], rtol=1e-6)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU with CUDA")
