@@ -115,6 +115,9 @@ class _MappedScenes(Dataset[Sample]):
     def __getitems__(self, numbers: Sequence[int]) -> list[Sample]:
         """Return several samples in the order asked, each stream read forwards on the way.
 
+        What `EpochBatches` gives is read as it comes: a stream that ends with what lies before its
+        start goes back once.
+
         Samples of one shape lie side by side in memory, so that `collate` need not copy them. What
         `EpochBatches` gives is drawn for its own epoch, and has the field ``is_padding`` where its
         tail is "wrap".
@@ -124,7 +127,10 @@ class _MappedScenes(Dataset[Sample]):
             numbers if isinstance(numbers, EpochBatch) else EpochBatch(numbers, epoch=self.epoch)
         )
         loaded: dict[int, Sample] = {}
-        for place, number in sorted(enumerate(numbers), key=operator.itemgetter(1)):
+        reading = list(enumerate(numbers))
+        if not isinstance(numbers, EpochBatch):
+            reading.sort(key=operator.itemgetter(1))
+        for place, number in reading:
             loaded[place] = self._load_into(arrays, place, number, batch=batch)
         return [loaded[place] for place in range(len(numbers))]
 

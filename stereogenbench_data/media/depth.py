@@ -241,8 +241,10 @@ def resized_nearest(
     """Return maps at another size by the nearest pixel centre, never averaged across an edge.
 
     Pixel i of n takes the source pixel that holds the centre (i + 0.5) * source / n: what torch
-    calls nearest-exact.
+    calls nearest-exact. Maps of that size are returned as they are.
     """
+    if maps.shape[-2:] == size:
+        return maps
     rows, columns = (
         np.minimum((np.arange(wanted) + 0.5) * found / wanted, found - 1).astype(np.intp)
         for wanted, found in zip(size, maps.shape[-2:], strict=True)

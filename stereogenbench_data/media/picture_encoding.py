@@ -66,9 +66,11 @@ class PictureCodec:
         return described
 
 
-def _h264(rate_factor: int, *, bits_a_pixel: float) -> PictureCodec:
+def _h264(rate_factor: int, *, key_frame_distance: int, bits_a_pixel: float) -> PictureCodec:
+    # Without B-frames each packet gives its picture at once: nothing beyond a run is decoded.
     parameters = {
-        "keyint": 8, "min-keyint": 8, "scenecut": 0, "open-gop": 0, "cpu-independent": 1,
+        "keyint": key_frame_distance, "min-keyint": key_frame_distance, "scenecut": 0,
+        "open-gop": 0, "bframes": 0, "mbtree": 0, "cpu-independent": 1,
         "colormatrix": "smpte170m", "fullrange": "off", "chromaloc": 1,
     }  # fmt: skip
     options = {
@@ -77,12 +79,12 @@ def _h264(rate_factor: int, *, bits_a_pixel: float) -> PictureCodec:
         "tune": "fastdecode",
         "x264-params": ":".join(f"{name}={value}" for name, value in parameters.items()),
     }
-    return PictureCodec("h264", "yuv420p", options, 8, bits_a_pixel)
+    return PictureCodec("h264", "yuv420p", options, key_frame_distance, bits_a_pixel)
 
 
 QUALITIES: Final[dict[Quality, PictureCodec]] = {
-    "small": _h264(18, bits_a_pixel=0.8),
-    "balanced": _h264(10, bits_a_pixel=2.0),
+    "small": _h264(18, key_frame_distance=8, bits_a_pixel=0.8),
+    "balanced": _h264(10, key_frame_distance=4, bits_a_pixel=2.0),
     "high": PictureCodec(
         "mjpeg", "yuvj444p", {"quality": "95", "subsampling": "4:4:4"}, 1, bits_a_pixel=5.0
     ),

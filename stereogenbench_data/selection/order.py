@@ -318,9 +318,9 @@ class _Group:
         self._salt = int(order.raw(1, part=-1)[0])
         streams = [pieces.take(found) for found in _dealt(pieces, streams=count)]
         if order.rule.start == "anywhere":
-            # Evenly spread over the streams, so that few streams are apart, too. Squares spread as
-            # wide as the shares themselves, and have a third before them instead of a half.
-            starts = ((np.argsort(draws[2]) + draws[2]) / max(1, count)) ** 2
+            # Evenly spread over the streams, so that few streams are apart, too. Cubes spread nearly
+            # as wide as the shares themselves, and have a quarter before them instead of a half.
+            starts = ((np.argsort(draws[2]) + draws[2]) / max(1, count)) ** 3
             streams = [
                 self._started(stream, share)
                 for stream, share in zip(streams, starts.tolist(), strict=True)
@@ -419,7 +419,7 @@ class _Group:
         run, begin, stop = int(stream.run[0]), int(stream.begin[0]), int(stream.stop[0])
         pairs = int(self._runs.pairs[run])
         block = pairs * self._rule.open_frames if pairs > 1 else 1
-        start = int(begin + share * (stop - begin)) // block * block
+        start = round((begin + share * (stop - begin)) / block) * block
         if not begin < start < stop:
             return stream
         return _Pieces(
