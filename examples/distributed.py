@@ -45,7 +45,8 @@ def main() -> None:
             optimiser.step()
             if rank == 0 and number % 5 == 0:
                 state = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
-                torch.save(state | {"loader": loader.state_dict()}, STATE)
+                torch.save(state | {"loader": loader.state_dict()}, STATE.with_suffix(".tmp"))
+                STATE.with_suffix(".tmp").replace(STATE)
         print(f"rank {rank}: epoch {epoch}, error {error.item():.2f} px", flush=True)
     distributed.destroy_process_group()
 

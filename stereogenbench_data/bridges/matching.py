@@ -50,13 +50,26 @@ class _LeftToRight(AdaptedPairs[Item]):
         frames: Literal["frame", "clip"],
         options: PairsOptions,
     ) -> None:
-        if options.get("direction", "left_to_right") != "left_to_right":
-            raise SelectionError(
-                f"direction={options.get('direction')!r} gives negative disparities, and "
-                f"{type(self).__name__} is trained on positive ones: leave it out. "
-                "transform=HorizontalFlip(1.0) shows the right camera's view first, mirrored."
-            )
         super().__init__(data, fields=fields, adapt=adapt, frames=frames, options=options)
+        index, pairs = self.pairs.index, self.pairs.plan.pairs
+        places_m, number = index.column("lateral_m")[pairs.row], np.arange(len(pairs))
+        first, second = pairs.source, pairs.targets[:, 0]
+        crossed = np.flatnonzero(places_m[number, second] < places_m[number, first])
+        if len(crossed):
+            where = crossed[0]
+            direction = options.get("direction", "left_to_right")
+            cure = (
+                "leave it out. transform=HorizontalFlip(1.0) shows the right camera's view first, "
+                "mirrored."
+                if direction == "right_to_left"
+                else "give direction='right_to_left' for such scenes."
+            )
+            raise SelectionError(
+                f"{index.column('key')[pairs.row[where]]}: with direction={direction!r} camera "
+                f"{first[where]} is the first of a pair and stands to the right of camera "
+                f"{second[where]} (so do {len(crossed)} pairs of {len(pairs)}). Their disparities "
+                f"are negative, and {type(self).__name__} is trained on positive ones: {cure}"
+            )
 
 
 class RaftStereo(_LeftToRight[RaftItem]):

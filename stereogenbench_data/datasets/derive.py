@@ -23,10 +23,11 @@ from stereogenbench_data.geometry.disparity import (
 )
 from stereogenbench_data.geometry.projection import (
     Projection,
+    landing_pixels,
     project_by_homography,
     project_rectified,
 )
-from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
+from stereogenbench_data.geometry.visibility import agrees_with_target, visible_from_source
 from stereogenbench_data.geometry.warp import front_pixels
 
 DERIVE_FIELDS: Final = (
@@ -45,9 +46,12 @@ DERIVED_FIELDS: Final = (
 PairPlaces = Literal["all"] | Sequence[tuple[int, int]]
 """The pairs to make: (first view, second view), as places on the axis of views."""
 
-_CHUNK_PIXELS: Final = 2**22
-"""How many pixels of pairs are made at a time: what lies between steps takes up to 80 bytes each.
-"""
+_CHUNK_PIXELS: Final = 2**19
+"""How many pixels of pairs are made at a time on a processor, in whose cache they then stay. What
+lies between steps takes up to 80 bytes each."""
+
+_CHUNK_PIXELS_ELSEWHERE: Final = 2**22
+"""The same on other devices, and in a compiled graph, whose size grows with the number of steps."""
 
 _PICTURES: Final = frozenset({"left", "right", "warped_right"})
 
@@ -95,18 +99,7 @@ def derive(
             f"{', '.join(DERIVED_FIELDS)}."
         )
     needed = [name for name in DERIVE_FIELDS if name != "image" or not _PICTURES.isdisjoint(names)]
-    missing = [name for name in needed if name not in batch]
-    if missing:
-        raise FieldError(
-            f"the batch has no {', '.join(missing)}: load it with "
-            "SceneViews(..., fields=DERIVE_FIELDS)."
-        )
-    depth = batch["stored_depth"]
-    if depth.dtype != torch.uint16 or depth.ndim not in (5, 6):
-        raise FieldError(
-            f"stored_depth is {depth.dtype} {tuple(depth.shape)}, not uint16 (B, V, 1, H, W) or, "
-            "of clips, (B, V, T, 1, H, W): give derive a batch of stacked views."
-        )
+    depth = _require_views(batch, needed)
     places = _require_pairs(pairs, views=depth.shape[1])
     where = depth.device if device is None else torch.device(device)
     # The meta device has no autocast to switch off.
@@ -134,12 +127,39 @@ def derive(
         return made
 
 
+def _require_views(batch: Mapping[str, Any], needed: list[str]) -> torch.Tensor:
+    """Return the stored depth of a batch that has the fields that are needed, of pictures alike."""
+    missing = [name for name in needed if name not in batch]
+    if missing:
+        raise FieldError(
+            f"the batch has no {', '.join(missing)}: load it with "
+            "SceneViews(..., fields=DERIVE_FIELDS)."
+        )
+    depth: torch.Tensor = batch["stored_depth"]
+    if depth.dtype != torch.uint16 or depth.ndim not in (5, 6):
+        raise FieldError(
+            f"stored_depth is {depth.dtype} {tuple(depth.shape)}, not uint16 (B, V, 1, H, W) or, "
+            "of clips, (B, V, T, 1, H, W): give derive a batch of stacked views."
+        )
+    expected = (*depth.shape[:-3], 3, *depth.shape[-2:])
+    if "image" in needed and batch["image"].shape != expected:
+        raise FieldError(
+            f"image is {tuple(batch['image'].shape)}, and stored_depth {tuple(depth.shape)} is of "
+            f"pictures {expected}: resize and crop by SceneViews(..., size=, transform=), which "
+            "moves both and the cameras."
+        )
+    return depth
+
+
 def _derived(
     moments: "_Moments", names: tuple[str, ...], places: list[tuple[int, int]]
 ) -> dict[str, torch.Tensor]:
     """Return fields of moments that have one contract, some pairs at a time."""
     count, _, frames, height_px, width_px = moments.units.shape
-    step = max(1, _CHUNK_PIXELS // (count * frames * height_px * width_px))
+    chunk_pixels = _CHUNK_PIXELS_ELSEWHERE
+    if moments.units.device.type == "cpu" and not torch.compiler.is_compiling():
+        chunk_pixels = _CHUNK_PIXELS
+    step = max(1, chunk_pixels // (count * frames * height_px * width_px))
     made: dict[str, torch.Tensor] = {}
     for start in range(0, len(places), step):
         chunk = places[start : start + step]
@@ -276,6 +296,19 @@ class _Moments:
         )
 
     @_once
+    def stored(self) -> torch.Tensor:
+        """Stored numbers as `disparity_from_shifts` takes them."""
+        stored = self.units.to(torch.float64)
+        return (
+            torch.where(stored == 0, torch.inf, stored) if self.contract.form == "depth" else stored
+        )
+
+    @_once
+    def seen_m(self) -> torch.Tensor:
+        """Depth along the optical axis, -inf where it was not measured."""
+        return torch.where(self.measured, self.depth_m, -torch.inf)
+
+    @_once
     def depth_m(self) -> torch.Tensor:
         """Depth along the optical axis, as `depth_m_from_units` gives it."""
         units, unit_m = self.units.to(torch.float64), _per_map(self.unit_m)
@@ -363,7 +396,7 @@ class _Direction:
             depth_m = torch.where(self.depth_m > 0, self.depth_m, torch.inf).to(torch.float64)
             return (_per_map(self.shift_px_m) / depth_m).to(torch.float32)
         disparity = disparity_from_shifts(
-            _taken(self._moments.units, self._sources),
+            _taken(self._moments.stored, self._sources),
             _per_map(self.shift_px_m / self.unit_m),
             form="depth" if self._contract.form == "depth" else "inverse",
         )
@@ -382,6 +415,13 @@ class _Direction:
         homography = camera_matrix @ target_from_source[..., :3, :3] @ _inverse(camera_matrix)
         step = (camera_matrix @ target_from_source[..., :3, 3:])[..., 0]
         return project_by_homography(self.depth_m.to(torch.float64), homography, step)
+
+    @_once
+    def landed(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Which measured source pixels land in the target, and on which of its pixels."""
+        height_px, width_px = self.measured.shape[-2:]
+        inside, pixel = landing_pixels(self.projection, height_px=height_px, width_px=width_px)
+        return inside & self.measured, pixel
 
     def quantum_m(self, unit_m: torch.Tensor) -> torch.Tensor:
         """Return the step between depths, of the coarser of the source's and given units."""
@@ -414,11 +454,10 @@ class _Direction:
 
     def visible(self, back: "_Direction") -> torch.Tensor:
         """Return what is visible in the target, by the depth of the way back."""
-        visible: torch.Tensor = visible_in_target(
+        visible: torch.Tensor = agrees_with_target(
             self.projection,
-            measured=self.measured,
-            target_depth_m=back.depth_m,
-            target_measured=back.measured,
+            landed=self.landed,
+            seen_m=_taken(self._moments.seen_m, self._targets),
             quantum_m=self.quantum_m(back.unit_m),
         )
         return visible
@@ -431,14 +470,15 @@ class _Direction:
     @_once
     def front(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Which source pixel is in front at each target pixel, and where none landed."""
-        index, hole = front_pixels(self.projection, measured=self.measured)
+        index, hole = front_pixels(self.projection, measured=self.measured, landed=self.landed)
         return index, hole
 
     @property
     def warped(self) -> torch.Tensor:
         """The source's pictures in the target's view, 0 where no source pixel lands."""
         index, hole = self.front
-        return torch.where(hole.unsqueeze(-3), 0, take_pixels(self.picture, index))
+        warped: torch.Tensor = take_pixels(self.picture, index) * ~hole.unsqueeze(-3)
+        return warped
 
     @property
     def cameras(self) -> torch.Tensor:

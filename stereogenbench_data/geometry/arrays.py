@@ -74,16 +74,17 @@ def quotient(number: float | Array, divisor: Array) -> Array:
 def whole_where(mask: Array, values: Array) -> Array:
     """Return values rounded towards 0 as int64, and 0 where the mask is False.
 
-    Where it is True, values must be below 2 ** 31: with numpy, two conversions by way of int32 are
-    faster than one to int64.
+    Where it is True, values must be below 2 ** 31: two conversions by way of int32 are faster than
+    one to int64.
     """
     xp = array_namespace(values)
-    if not is_numpy_array(values):
-        return xp.astype(xp.where(mask, values, 0.0), xp.int64)
-    with np.errstate(invalid="ignore"):
-        whole = values.astype(np.int32)
+    if is_numpy_array(values):
+        with np.errstate(invalid="ignore"):
+            whole = values.astype(np.int32)
+    else:
+        whole = xp.astype(values, xp.int32)
     whole *= mask
-    return whole.astype(np.int64)
+    return xp.astype(whole, xp.int64)
 
 
 def values_where(mask: Array, values: Array, *, otherwise: float) -> Array:
@@ -109,6 +110,9 @@ def take_flat(values: Array, index: Array) -> Array:
     xp = array_namespace(values, index)
     if is_numpy_array(values):
         return np.take(values.reshape(-1), index, mode="wrap")
+    if is_torch_array(values):
+        # array_api_compat's take first looks for negative numbers, in three passes.
+        return values.reshape(-1).index_select(0, index.reshape(-1)).reshape(index.shape)
     taken = xp.take(xp.reshape(values, (-1,)), xp.reshape(index, (-1,)), axis=0)
     return xp.reshape(taken, index.shape)
 
@@ -121,7 +125,12 @@ def take_pixels(image: Array, index: Array) -> Array:
     xp = array_namespace(image, index)
     channels = image.shape[-3]
     flat = xp.reshape(xp.moveaxis(image, -3, 0), (channels, -1))
-    taken = xp.take(flat, xp.reshape(index, (-1,)), axis=1)
+    places = xp.reshape(index, (-1,))
+    if is_torch_array(image):
+        # Seven times as fast as index_select along the second axis.
+        taken = flat.gather(1, places.expand(channels, -1))
+    else:
+        taken = xp.take(flat, places, axis=1)
     return xp.moveaxis(xp.reshape(taken, (channels, *index.shape)), 0, -3)
 
 

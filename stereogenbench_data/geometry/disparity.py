@@ -136,7 +136,7 @@ def disparity_from_units(
 
 
 def disparity_from_shifts(
-    units: Integer[Any, "*batch h w"],
+    stored: Float64[Any, "*batch h w"],
     shift_units: Float64[Any, "*rigs"],
     *,
     form: DepthForm = "depth",
@@ -147,7 +147,7 @@ def disparity_from_shifts(
     digits enough that rounding it to float32 is rounding the exact quotient.
 
     Args:
-        units: Stored numbers below 2 ** 16, as decoded.
+        stored: Stored numbers below 2 ** 16; with ``form="depth"``, inf instead of 0.
         shift_units: Focal length in pixels times signed baseline, divided by metres in a stored
             unit. Its shape is broadcast to the maps'.
         form: Whether a stored number is proportional to depth or to its inverse.
@@ -155,15 +155,12 @@ def disparity_from_shifts(
     Returns:
         Disparity in pixels, 0 where the stored number is 0.
     """
-    xp = array_namespace(units)
-    stored = as_float64(units)
+    xp = array_namespace(stored)
     if form == "inverse":
         return xp.astype(stored * shift_units, xp.float32)
     product, factor, is_exact = _exact_quotients(shift_units)
     product, factor = xp.where(is_exact, product, shift_units), xp.where(is_exact, factor, 1.0)
-    divisor = stored * factor
-    divisor = xp.where(divisor == 0, math.inf, divisor)
-    return xp.astype(product / divisor, xp.float32)
+    return xp.astype(product / (stored * factor), xp.float32)
 
 
 def write_disparity(

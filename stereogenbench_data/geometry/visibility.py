@@ -9,7 +9,7 @@ import math
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 
 from stereogenbench_data.geometry.arrays import scatter_min, take_flat, values_where
 from stereogenbench_data.geometry.projection import Projection, landing_pixels, row_blocks, rows_of
@@ -63,11 +63,39 @@ def visible_in_target(
         return visible
     height_px, width_px = target_depth_m.shape[-2:]
     inside, pixel = landing_pixels(projection, height_px=height_px, width_px=width_px)
-    seen_m = take_flat(values_where(target_measured, target_depth_m, otherwise=-math.inf), pixel)
     inside &= measured
-    inside &= seen_m >= projection.depth_m * (1.0 - tolerance) - 2.0 * quantum_m
-    inside &= seen_m <= projection.depth_m * (1.0 + tolerance) + 2.0 * quantum_m
-    return inside
+    seen_m = values_where(target_measured, target_depth_m, otherwise=-math.inf)
+    return agrees_with_target(
+        projection, landed=(inside, pixel), seen_m=seen_m, quantum_m=quantum_m, tolerance=tolerance
+    )
+
+
+def agrees_with_target(
+    projection: Projection,
+    *,
+    landed: tuple[Bool[Any, "*batch h w"], Int64[Any, "*batch h w"]],
+    seen_m: Float[Any, "*batch target_h target_w"],
+    quantum_m: float | Float[Any, "*#batch #h #w"],
+    tolerance: float = 0.02,
+) -> Bool[Any, "*batch h w"]:
+    """Return which source pixels have the depth that the target measured where they land.
+
+    It is what `visible_in_target` decides, of steps that its caller may have done before.
+
+    Args:
+        projection: Where source pixels land in the target.
+        landed: Which source pixels were measured and land inside the target image, and on which of
+            its pixels, as `landing_pixels` counts them.
+        seen_m: The target camera's depth in metres, -inf where it was not measured.
+        quantum_m: As for `visible_in_target`.
+        tolerance: As for `visible_in_target`.
+    """
+    inside, pixel = landed
+    there_m = take_flat(seen_m, pixel)
+    visible = there_m >= projection.depth_m * (1.0 - tolerance) - 2.0 * quantum_m
+    visible &= there_m <= projection.depth_m * (1.0 + tolerance) + 2.0 * quantum_m
+    visible &= inside
+    return visible
 
 
 def visible_from_source(

@@ -32,7 +32,10 @@ _NOTHING: Final = -(2**63)
 
 
 def front_pixels(
-    projection: Projection, *, measured: Bool[Any, "*batch h w"]
+    projection: Projection,
+    *,
+    measured: Bool[Any, "*batch h w"],
+    landed: tuple[Bool[Any, "*batch h w"], Int64[Any, "*batch h w"]] | None = None,
 ) -> tuple[Int64[Any, "*batch h w"], Bool[Any, "*batch h w"]]:
     """Return which source pixel is in front at each target pixel, and where none landed.
 
@@ -41,14 +44,20 @@ def front_pixels(
     positive floats have the order of the floats, so the integer (-bits, index) is largest for the
     pixel in front.
 
+    Args:
+        projection: Where source pixels land.
+        measured: Where source depth was measured.
+        landed: What `landing_pixels` returns, if it is known.
+
     Returns:
         Flat indices into source maps (..., h, w), 0 where nothing landed; and the holes.
     """
     xp = array_namespace(projection.u_px)
     shape = projection.u_px.shape
-    inside, pixel = landing_pixels(projection, height_px=shape[-2], width_px=shape[-1])
+    inside, pixel = landed or landing_pixels(projection, height_px=shape[-2], width_px=shape[-1])
     depth_m = xp.astype(projection.depth_m, xp.float32, copy=False)
-    key = xp.astype(depth_m.view(xp.int32), xp.int64) * -(2**32)
+    key = xp.astype(depth_m.view(xp.int32), xp.int64)
+    key *= -(2**32)
     key += leading_offsets(shape, step=1, like=key)
     key = xp.where(inside & measured, key, _NOTHING)
     best = scatter_max(
@@ -56,7 +65,8 @@ def front_pixels(
     )
     best = xp.reshape(best, shape)
     hole = best == _NOTHING
-    return xp.where(hole, 0, best & _INDEX_BITS), hole
+    best &= _INDEX_BITS  # 0 of _NOTHING
+    return best, hole
 
 
 def splat(

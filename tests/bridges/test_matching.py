@@ -1,6 +1,7 @@
 """Matching: each adapter's items, and what the project's own training loop does with batches."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from stereogenbench_data.bridges.matching import (
     RaftStereo,
     UniMatch,
 )
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
@@ -254,6 +256,23 @@ def test_what_the_project_cannot_take_is_refused(small_release, adapter, options
         adapter(StereoPairs(small_release), **options)
     with pytest.raises(SelectionError, match=f"tail='wrap'.*{name}.*tail='drop'"):
         adapter(small_release, **options).loader(2, tail="wrap")
+
+
+@pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
+def test_cameras_that_stand_from_right_to_left_need_the_other_direction(
+    small_release, adapter, options
+):
+    scene = StereoPairs(small_release).index.scene(0)
+    places_m = tuple(-place_m for place_m in scene.lateral_m)
+    index = SceneIndex.from_scenes([replace(scene, lateral_m=places_m)], small_release)
+
+    with pytest.raises(
+        SelectionError,
+        match=rf"{scene.id.key}: .*camera 0 is the first.*right of camera 1.*15 pairs of 15.*"
+        rf"{adapter.__name__}.*direction='right_to_left'",
+    ):
+        adapter(index, pairs="all", **options)
+    assert len(adapter(index, pairs="all", direction="right_to_left", **options)) > 0
 
 
 def test_clips_and_single_frames_are_not_mixed_up(small_release):

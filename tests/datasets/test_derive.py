@@ -360,6 +360,46 @@ def test_depth_of_another_dtype_or_without_a_batch_is_refused(change, found):
         derive(batch | {"stored_depth": change(batch["stored_depth"])})
 
 
+def test_pictures_of_another_size_than_their_depth_are_refused():
+    batch = of_size(4, 8)
+    batch["image"] = batch["image"].repeat_interleave(2, dim=-1)
+
+    with pytest.raises(FieldError, match=r"image is \(1, 6, 3, 4, 16\).*\(1, 6, 1, 4, 8\).*size="):
+        derive(batch, fields=("left",))
+
+
+def test_scenes_of_several_sizes_are_refused_where_they_are_put_together():
+    with pytest.raises(FieldError, match=r"image is \(1, 6, 3, 4, 8\).*\(1, 6, 3, 2, 8\).*size="):
+        collate([of_size(2, 8), of_size(4, 8)])
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_memory_that_is_not_contiguous_gives_the_same(rig):
+    batch = batch_of([scene(CONTRACTS["planar depth"], rig=rig)])
+    turned = {
+        name: values.transpose(-1, -2).contiguous().transpose(-1, -2)
+        if name in ("image", "stored_depth", "cams_from_cam")
+        else values
+        for name, values in batch.items()
+    }
+    assert not turned["stored_depth"].is_contiguous()
+
+    made, expected = derive(turned, fields=DERIVED_FIELDS), derive(batch, fields=DERIVED_FIELDS)
+
+    for name, values in made.items():
+        assert torch.equal(values, expected[name]), name
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_pairs_in_any_order_are_those_of_stereo_pairs(rig):
+    scenes = [scene(CONTRACTS["ray depth"], rig=rig, seed=seed) for seed in (4, 5)]
+    pairs = [(5, 0), (1, 2), (4, 3), (0, 5)]
+
+    made = derive(batch_of(scenes), fields=DERIVED_FIELDS, pairs=pairs)
+
+    assert_equal(made, expected_of(scenes, pairs=pairs))
+
+
 @pytest.mark.parametrize("pairs", [[(1, 1)], [(0, 6)], [(-1, 2)], "some", []])
 def test_pairs_must_be_of_two_views_of_the_batch(pairs):
     with pytest.raises(SelectionError, match=r"pair"):

@@ -1,5 +1,6 @@
 """Every example runs as its own text says, on the sample shards, and stays short."""
 
+import json
 import os
 import re
 import subprocess
@@ -12,20 +13,47 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 MOST_LINES = 60
 
 
-def run(tmp_path, *command):
-    settings = {"OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "PYTHONWARNINGS": "ignore"}
-    done = subprocess.run(
+def start(tmp_path, *command):
+    settings = {
+        "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "PYTHONWARNINGS": "ignore",
+        "HF_HOME": str(tmp_path / "home"), "ACCELERATE_USE_CPU": "true",
+    }  # fmt: skip
+    return subprocess.run(
         [sys.executable, *map(str, command)], cwd=tmp_path, capture_output=True, text=True,
-        check=False, timeout=240, env=os.environ | settings | {"HF_HOME": str(tmp_path / "home")},
+        check=False, timeout=240, env=os.environ | settings,
     )  # fmt: skip
+
+
+def run(tmp_path, *command):
+    done = start(tmp_path, *command)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
 
+RANKS = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node")
+
+
 def torchrun(tmp_path, *arguments):
-    return run(
-        tmp_path, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", 2, *arguments
-    )  # fmt: skip
+    return run(tmp_path, *RANKS, 2, *arguments)
+
+
+def taken(notes, ranks):
+    """Return the batches of each rank, as `watched` noted them."""
+    lines = [Path(f"{notes}.{rank}").read_text().splitlines() for rank in range(ranks)]
+    return [[json.loads(line) for line in of_rank] for of_rank in lines]
+
+
+def killed_and_resumed(tmp_path, example, *, ranks, after):
+    """Kill an example after so many batches, start it again, and return what each run took."""
+    runs = []
+    for batches in (after, 0):
+        notes = tmp_path / f"until_{batches}"
+        watched = (Path(__file__).with_name("watched.py"), notes, batches, EXAMPLES / example)
+        launcher = (*RANKS, ranks) if ranks > 1 else ()
+        done = start(tmp_path, *launcher, *watched, EXAMPLES.parent / "shards", ranks)
+        assert (done.returncode == 0) == (batches == 0), done.stderr[-3000:]
+        runs.append(taken(notes, ranks))
+    return runs
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
@@ -60,7 +88,7 @@ def test_pairs_are_made_on_the_device(tmp_path):
     assert float(errors[1]) < float(errors[0])
 
 
-def test_lightning_trains_and_validates(tmp_path):
+def test_lightning_validates(tmp_path):
     assert re.search(r"error [\d.]+ px", run(tmp_path, EXAMPLES / "lightning_module.py"))
 
 
@@ -68,6 +96,32 @@ def test_accelerate_trains(tmp_path):
     said = run(tmp_path, EXAMPLES / "accelerate_loop.py")
 
     assert re.findall(r"epoch (\d): error", said) == ["0", "1"]
+
+
+@pytest.mark.parametrize(
+    ("example", "ranks", "after", "saved", "epoch"),
+    [
+        pytest.param("accelerate_loop.py", 2, 9, 5, 12, id="Accelerate, 2 ranks"),
+        pytest.param("lightning_module.py", 2, 9, 5, 11, id="Lightning, 2 ranks"),
+        pytest.param("distributed.py", 2, 9, 6, 12, id="torchrun, 2 ranks"),
+        pytest.param("lightning_module.py", 1, 13, 10, 22, id="Lightning"),
+        pytest.param("huggingface_trainer.py", 1, 13, 10, 25, id="Hugging Face's Trainer"),
+    ],
+)
+def test_a_killed_run_goes_on_in_mid_epoch_and_takes_each_sample_once(
+    tmp_path, example, ranks, after, saved, epoch
+):
+    """Of an epoch's batches of a rank, so many are saved; another epoch follows."""
+    before, going_on = killed_and_resumed(tmp_path, example, ranks=ranks, after=after)
+
+    assert [len(of_rank) for of_rank in before] == [after] * ranks
+    assert [len(of_rank) for of_rank in going_on] == [2 * epoch - saved] * ranks
+    whole = [old[:saved] + new for old, new in zip(before, going_on, strict=True)]
+    for part in (slice(0, epoch), slice(epoch, None)):
+        batches = [batch for of_rank in whole for batch in of_rank[part]]
+        names = [name for batch in batches for name in batch]
+        assert len(set(names)) == len(names) == ranks * epoch * len(batches[0])
+    assert whole[0][:epoch] != whole[0][epoch:]
 
 
 def test_hugging_face_streams_samples_and_raw_shards(tmp_path):
@@ -78,7 +132,32 @@ def test_hugging_face_streams_samples_and_raw_shards(tmp_path):
     assert said.count("raw shards: train/") == 4
 
 
-def test_webdataset_decodes_by_our_stage(tmp_path):
+def test_webdataset_shuffles_and_decodes_by_our_stage(tmp_path):
     said = run(tmp_path, EXAMPLES / "webdataset_pipeline.py")
 
-    assert len(re.findall(r"batch \d+: \(5, 3, 72, 72\)", said)) == 12
+    epochs = [re.findall(r"^  (train/.*)$", part, re.MULTILINE) for part in said.split("epoch 1")]
+    epochs = [epochs[0], [key for part in epochs[1:] for key in part]]
+    assert len(epochs[0]) == len(set(epochs[0])) == 60
+    assert epochs[0] != epochs[1]
+    assert sorted(epochs[0]) == sorted(epochs[1])
+    assert max(len(scenes_of(epoch[:5])) for epoch in epochs) > 1
+
+
+def scenes_of(keys):
+    return {key.rsplit("/", 2)[0] for key in keys}
+
+
+def test_a_video_diffusion_step_takes_clips_with_captions(tmp_path):
+    said = run(tmp_path, EXAMPLES / "clip_diffusion.py")
+
+    losses = [float(loss) for loss in re.findall(r"loss ([\d.]+), .* Stereo baseline", said)]
+    assert len(losses) == 4
+    assert min(losses[1:]) < losses[0]
+
+
+def test_several_views_train_a_network_of_points(tmp_path):
+    said = run(tmp_path, EXAMPLES / "multiview_points.py")
+
+    errors = [float(error) for error in re.findall(r"error ([\d.]+) of", said)]
+    assert len(errors) == 4
+    assert errors[-1] < errors[0]
