@@ -318,8 +318,8 @@ class _Group:
         self._salt = int(order.raw(1, part=-1)[0])
         streams = [pieces.take(found) for found in _dealt(pieces, streams=count)]
         if order.rule.start == "anywhere":
-            # Evenly spread over the streams, so that few streams are apart, too. Cubes spread nearly
-            # as wide as the shares themselves, and have a quarter before them instead of a half.
+            # Evenly spread over the streams, so that few streams are apart, too. Cubes spread
+            # nearly as wide as the shares themselves, with a quarter before them instead of half.
             starts = ((np.argsort(draws[2]) + draws[2]) / max(1, count)) ** 3
             streams = [
                 self._started(stream, share)
