@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.bridges import dataset_facts
+from stereogenbench_data.bridges import viewer
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
@@ -19,7 +19,10 @@ from stereogenbench_data.sources.location import local_path
 from stereogenbench_data.sources.members import require_own_files
 
 DESCRIPTOR_NAME: Final = "croissant.json"
-_COMPANIONS: Final = (INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "croissant/*.parquet")
+_COMPANIONS: Final = (
+    INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "croissant/*.parquet", "croissant/*.txt",
+    f"{viewer.FOLDER}/*.tar",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +40,9 @@ class Upload:
     files: int
 
 
-def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Upload:
+def upload(
+    shards: str | Path, repository: str, *, branch: str = "main", about: Path | None = None
+) -> Upload:
     """Upload a folder of packed shards.
 
     The card and the descriptor's tables are written into the folder first. The descriptor names
@@ -48,10 +53,12 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
         shards: The folder that ``pack`` wrote.
         repository: "ORG/NAME" of a dataset on the Hub; created if it does not exist.
         branch: The branch to commit to.
+        about: What the maker of the scenes states of them, as for `dataset_facts.facts_of`.
 
     Raises:
         ExtraError: If huggingface_hub is not installed.
-        DescriptorError: If the folder has a README.md that this package did not write.
+        DescriptorError: If the folder has a README.md that this package did not write, or who made
+            the scenes is not known.
         StorageError: If the folder has no shards or lacks one, or the Hub refuses the upload.
     """
     try:
@@ -64,8 +71,10 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
     folder = local_path(shards)
     index = SceneIndex.open(folder)
     _require_whole(index, folder)
-    write_card(index, folder, repository=repository)
-    write_descriptor(index, folder / DESCRIPTOR_NAME)
+    write_card(index, folder, repository=repository, about=about)
+    descriptor = write_descriptor(
+        index, folder / DESCRIPTOR_NAME, publication=Publication(about=about)
+    )
     api = HfApi(library_name="stereogenbench-data")
     patterns = [*sorted(index.shards), *_COMPANIONS]
     require_own_files(folder, [str(path.relative_to(folder)) for path in _found(folder, patterns)])
@@ -78,12 +87,12 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
             folder_path=folder,
             revision=branch,
             allow_patterns=patterns,
-            commit_message=f"{dataset_facts.TITLE}: {counted(len(index), 'scene')} in "
+            commit_message=f"{descriptor['name']}: {counted(len(index), 'scene')} in "
             f"{counted(len(index.shards), 'shard')}",
         )
         revision = str(api.dataset_info(repository, revision=branch).sha)
         address = f"{api.endpoint}/datasets/{repository}/resolve/{revision}"
-        pinned = Publication(data_url=address, tables_url=f"{address}/croissant")
+        pinned = Publication(data_url=address, tables_url=f"{address}/croissant", about=about)
         write_descriptor(index, folder / DESCRIPTOR_NAME, publication=pinned)
         api.upload_file(
             path_or_fileobj=folder / DESCRIPTOR_NAME,

@@ -107,8 +107,8 @@ MUTATIONS = {
         "is a branch, which changes: pin a revision",
     ),
     "inline data of no field": (
-        lambda d: node(d, "splits")["data"][0].update({"splits/url": "x"}),
-        "splits: has data for splits/url",
+        lambda d: node(d, "splits")["data"][0].update({"splits/link": "x"}),
+        "splits: has data for splits/link",
     ),
     "no record sets": (lambda d: d.update(recordSet=[]), "recordSet: is empty"),
     "empty responsible-AI value": (
