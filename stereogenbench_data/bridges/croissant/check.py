@@ -9,12 +9,14 @@ import fnmatch
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, date, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from stereogenbench_data.bridges.croissant.nodes import (
@@ -67,6 +69,32 @@ _KNOWN: Final = frozenset(
         "@value", "@language",
     }
 )  # fmt: skip
+_TYPES: Final = frozenset(
+    {
+        *(f"sc:{name}" for name in (
+            "Text", "URL", "Integer", "Float", "Boolean", "Date", "DateTime", "Time", "ImageObject",
+            "AudioObject", "VideoObject",
+        )),
+        *(f"cr:{name}" for name in (
+            "BoundingBox", "Float16", "Float32", "Float64", "Int8", "Int16", "Int32", "Int64",
+            "UInt8", "UInt16", "UInt32", "UInt64",
+        )),
+    }
+)  # fmt: skip
+"""The data types that mlcroissant reads. Others may stand beside one of them."""
+_IS_TEXT: Final = (pa.types.is_string, pa.types.is_large_string)
+_ARROW_TYPES: Final[dict[str, tuple[str, tuple[Callable[[pa.DataType], bool], ...]]]] = {
+    "sc:Text": ("text", _IS_TEXT),
+    "sc:URL": ("text", _IS_TEXT),
+    "sc:Integer": ("whole numbers", (pa.types.is_integer,)),
+    "sc:Float": ("numbers", (pa.types.is_floating, pa.types.is_integer)),
+    "sc:Boolean": ("true or false", (pa.types.is_boolean,)),
+}
+"""What a column of each data type holds, and the tests of Arrow's types for it."""
+_INLINE_TYPES: Final[dict[str, type | tuple[type, ...]]] = {
+    "sc:Text": str, "sc:URL": str, "sc:Integer": int, "sc:Float": (int, float), "sc:Boolean": bool,
+}  # fmt: skip
+_MONTH: Final = re.compile(r"\d{4}(-(0[1-9]|1[0-2]))?")
 _VERSION: Final = re.compile(r"\d+\.\d+\.\d+")
 _SHA256: Final = re.compile(r"[0-9a-f]{64}")
 _MOVING: Final = re.compile(r"/(?:resolve|raw|blob|tree)/(?:main|master|HEAD)(?:/|$)")
@@ -154,8 +182,8 @@ class _Check:
         return {str(node.get("@id")): node for node in nodes}
 
     @cached_property
-    def _columns(self) -> dict[str, list[str]]:
-        """The columns of every table that is available locally."""
+    def _columns(self) -> dict[str, pa.Schema]:
+        """The columns of every table that is available locally, with their types."""
         columns = {}
         for name, file in self._files.items():
             path = self._local(file)
@@ -165,7 +193,7 @@ class _Check:
                 and PARQUET in _listed(file.get("encodingFormat"))
             ):
                 try:
-                    columns[name] = pq.read_schema(path).names
+                    columns[name] = pq.read_schema(path)
                 except (pa.ArrowException, OSError) as error:
                     self.report(name, f"cannot be read as Parquet ({error})")
         return columns
@@ -258,6 +286,20 @@ class _Check:
         version = self._node.get("version")
         if not _VERSION.fullmatch(str(version or "")):
             self.report("version", f"is {version!r}, and must be MAJOR.MINOR.PATCH")
+        self._check_date(str(self._node.get("datePublished") or ""))
+
+    def _check_date(self, text: str) -> None:
+        """Check that the day of publication is a day, month or year that has come."""
+        found = None
+        try:
+            found = date.fromisoformat(text)
+        except ValueError:
+            if _MONTH.fullmatch(text):
+                found = date.fromisoformat(f"{text}-01" if "-" in text else f"{text}-01-01")
+        if found is None:
+            self.report("datePublished", f"is {text!r}, and must be a date such as 2026-11-22")
+        elif found > datetime.now(UTC).date():
+            self.report("datePublished", f"is {text}, which has not come yet: write the real date")
 
     def _check_names(self) -> None:
         """Check the spelling of every property."""
@@ -379,6 +421,7 @@ class _Check:
                 self.report(name, f"has data for {strange}, which it has no field for")
         for field in records.get("field", []):
             self._check_reference(field)
+            self._check_type(field, _listed(records.get("data")))
             self._check_source(field, has_data="data" in records)
 
     def _check_reference(self, node: Node) -> None:
@@ -398,6 +441,60 @@ class _Check:
                 name, f"refers to {target}, which is itself a reference: chains load wrong rows"
             )
 
+    def _check_type(self, node: Node, rows: list[Node]) -> None:
+        """Check a field's data type, and that the values given with the descriptor have it."""
+        name, kinds = str(node.get("@id")), _listed(node.get("dataType"))
+        if not _TYPES & {str(kind) for kind in kinds}:
+            found = ", ".join(map(str, kinds)) or "none"
+            self.report(
+                name, f"has the data type {found}, and one must be of {', '.join(sorted(_TYPES))}"
+            )
+        wanted = [_INLINE_TYPES[kind] for kind in kinds if kind in _INLINE_TYPES]
+        for value in (row[name] for row in rows if name in row):
+            is_flag = isinstance(value, bool) and "sc:Boolean" not in kinds
+            if wanted and (is_flag or not isinstance(value, wanted[0])):
+                self.report(name, f"has the value {value!r}, which is not {', '.join(kinds)}")
+
+    def _check_column(self, node: Node, *, file: str, column: str) -> None:
+        """Check that a column holds what its field says: type, list or not, length of lists."""
+        name, found = str(node.get("@id")), self._columns[file].field(column).type
+        is_list = pa.types.is_list(found) or pa.types.is_large_list(found)
+        is_list = is_list or pa.types.is_fixed_size_list(found)
+        if is_list != bool(node.get("isArray")):
+            says = "isArray" if node.get("isArray") else "no isArray"
+            self.report(name, f"has {says}, but the column {column!r} of {file} holds {found}")
+            return
+        value = found.value_type if is_list else found
+        for kind in _listed(node.get("dataType")):
+            what, tests = _ARROW_TYPES.get(kind, ("", ()))
+            if tests and not any(test(value) for test in tests):
+                self.report(
+                    name,
+                    f"has the data type {kind} ({what}), but the column {column!r} of {file} "
+                    f"holds {found}",
+                )
+        if is_list:
+            self._check_shape(node, file=file, column=column)
+
+    def _check_shape(self, node: Node, *, file: str, column: str) -> None:
+        shape = [part.strip() for part in str(node.get("arrayShape", "-1")).split(",")]
+        path = self._local(self._files[file])
+        if not all(re.fullmatch(r"-1|\d+", part) for part in shape):
+            self.report(
+                str(node.get("@id")),
+                f"has the arrayShape {node['arrayShape']!r}, and must have numbers such as 15 or "
+                "2,3 (-1 for any)",
+            )
+        elif path is not None and len(shape) == 1 and shape != ["-1"]:
+            lists = pq.read_table(path, columns=[column]).column(0)
+            lengths = set(pc.list_value_length(lists).unique().to_pylist()) - {None, int(shape[0])}
+            if lengths:
+                self.report(
+                    str(node.get("@id")),
+                    f"has the arrayShape {shape[0]}, but the column {column!r} of {file} has a "
+                    f"list of {min(lengths)}",
+                )
+
     def _check_source(self, node: Node, *, has_data: bool) -> None:
         name, source = str(node.get("@id")), node.get("source")
         if source is None:
@@ -409,8 +506,14 @@ class _Check:
         if origin not in self._files and origin not in self._fields:
             self.report(name, f"is read from {origin!r}, which is not in the descriptor")
         column, columns = source.get("extract", {}).get("column"), self._columns.get(str(origin))
-        if column is not None and columns is not None and column not in columns:
-            self.report(name, f"reads the column {column!r} of {origin}; its columns are {columns}")
+        if column is not None and columns is not None:
+            if column in columns.names:
+                self._check_column(node, file=str(origin), column=column)
+            else:
+                self.report(
+                    name,
+                    f"reads the column {column!r} of {origin}; its columns are {columns.names}",
+                )
         regex = source.get("transform", {}).get("regex")
         if regex is not None and not _has_group(regex):
             self.report(name, f"takes the first group of the regex {regex!r}, which has no group")
@@ -442,9 +545,16 @@ class _Check:
         if not paths or wanted not in {"fullpath", "filename"} or not _has_group(regex or ""):
             return
         texts = [path if wanted == "fullpath" else path.rpartition("/")[2] for path in paths]
-        missed = [text for text in texts if not re.match(regex, text)]
+        found = {text: re.match(regex, text) for text in texts}
+        missed = [text for text, match in found.items() if match is None]
+        taken = [each[1] or "" for each in found.values() if each]
+        no_number = [text for text in taken if not text.isdigit()]
         if missed:
             self.report(name, f"has the regex {regex!r}, which does not match {missed[0]}")
+        elif "sc:Integer" in _listed(node.get("dataType")) and no_number:
+            self.report(
+                name, f"is an sc:Integer, but the regex {regex!r} takes {no_number[0]!r} of a name"
+            )
         elif "references" in node and not _is_kept(regex, texts[0]):
             self.report(
                 name,
@@ -470,7 +580,9 @@ class _Check:
         source = node.get("source", {})
         file = str(source.get("fileObject", {}).get("@id"))
         column = source.get("extract", {}).get("column")
-        path = self._local(self._files[file]) if column in self._columns.get(file, ()) else None
+        schema = self._columns.get(file)
+        has_column = schema is not None and column in schema.names
+        path = self._local(self._files[file]) if has_column else None
         if path is None:
             return None
         values: pa.ChunkedArray = pq.read_table(path, columns=[column]).column(0)
