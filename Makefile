@@ -14,10 +14,16 @@ SYNTH := $(BIN)/stereogenbench synth $(SAMPLE)/release --size 72 --frames 81 --d
 .PHONY: demo test lint docs bench sample clean
 .DELETE_ON_ERROR:
 
-demo: $(READY)
+# The sdist leaves out the sample.
+shards/index.parquet:
+	@echo "shards/ is missing: the sdist leaves out the sample scenes (11 MB) that tests and demo" \
+		"read. Run make in a clone of the repository." >&2
+	@exit 1
+
+demo: shards/index.parquet $(READY)
 	$(BIN)/python examples/train.py
 
-test: lint
+test: shards/index.parquet lint
 	$(BIN)/python -m pytest $(PYTEST_ARGS) --numprocesses auto --maxprocesses 8 --dist worksteal
 
 lint: $(READY)
