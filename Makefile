@@ -11,7 +11,7 @@ READY := $(VENV)/.ready
 SAMPLE := build/sample
 SYNTH := $(BIN)/stereogenbench synth $(SAMPLE)/release --size 72 --frames 81 --depth-unit-m 0.01
 
-.PHONY: demo test lint docs bench sample clean
+.PHONY: demo test lint docs bench sample descriptors clean
 .DELETE_ON_ERROR:
 
 # The sdist leaves out the sample.
@@ -55,6 +55,14 @@ sample: $(READY)
 	rm -rf shards/*.tar shards/dali
 	cp -r $(SAMPLE)/shards/* shards/
 	$(BIN)/stereogenbench verify --deep shards
+
+# croissant/, from the sample and the paper. The day is that of the sample.
+descriptors: $(READY)
+	rm -rf croissant
+	$(BIN)/stereogenbench croissant shards -o croissant/sample.json \
+		--name "StereoGenBench sample" --published 2026-11-21
+	$(BIN)/stereogenbench croissant -o croissant/release.json
+	$(BIN)/stereogenbench croissant --template -o croissant/template.json
 
 $(READY): pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)

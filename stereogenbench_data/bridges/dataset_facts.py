@@ -4,8 +4,9 @@ The properties are those of Croissant, under their names. They differ by where t
 
 - `RELEASE`: the scenes of the StereoGenBench paper. Source: its sections on limitations,
   responsible use and release, and its appendices on hosting and on the generation environment.
-- `DRAWN`: scenes that `stereogenbench synth` made.
-- other scenes: their maker states the properties, in a copy of `template`.
+- `DRAWN`: scenes that `stereogenbench synth` made from its own shapes.
+- other scenes, also those that it rendered from assets of the user: their maker states the
+  properties, in a copy of `template`.
 """
 
 import json
@@ -221,7 +222,7 @@ DRAWN: Final[Facts] = {
     ),
     "rai:dataCollectionType": ["Others: synthetic rendering"],
     "rai:dataPreprocessingProtocol": [
-        "RGB and metric depth are encoded as videos; no scene is left out.",
+        "RGB and metric depth are encoded as videos. Scenes may be filtered while they are made.",
     ],
     "rai:dataAnnotationProtocol": [
         "Depth, intrinsics, baselines and poses are those of the drawing. Scene descriptions are "
@@ -237,12 +238,11 @@ DRAWN: Final[Facts] = {
         "Few scenes, which cover no range of contents.",
     ],
     "rai:dataBiases": [
-        "One style of drawing: a ground, crates, balls, poles and walls under one sky, and one "
-        "kind of walking figure.",
+        "One style of drawing: simple shapes and procedural textures, a few built-in places and "
+        "figures.",
     ],
     "rai:personalSensitiveInformation": ["None: figures are made of simple shapes."],
     "rai:dataSocialImpact": "None is expected of scenes that serve to test software.",
-    "rai:dataReleaseMaintenancePlan": "Drawn again where the program changes.",
     "rai:hasSyntheticData": True,
     "prov:wasGeneratedBy": [
         activity(
@@ -262,6 +262,8 @@ DRAWN: Final[Facts] = {
 }  # fmt: skip
 """The properties of scenes that `stereogenbench synth` made."""
 
+_BUILT_IN: Final = "ray-casting"
+"""How marks of completion name the renderer of `DRAWN` scenes; the earliest name none."""
 _BLANK: Final = "FILL IN: "
 _QUESTIONS: Final[Facts] = {
     "name": "the dataset's name",
@@ -402,4 +404,6 @@ def _is_drawn(index: SceneIndex, row: int) -> bool:
         mark = json.loads(source.read(scene, COMPLETE_JSON))
     except ValueError:
         return False
-    return isinstance(mark, dict) and "synthesis" in mark
+    request = mark.get("synthesis") if isinstance(mark, dict) else None
+    renderer = request.get("renderer", _BUILT_IN) if isinstance(request, dict) else ""
+    return str(renderer).startswith(_BUILT_IN)

@@ -16,8 +16,7 @@ AboutOption = Annotated[
     Path | None,
     typer.Option(
         "--about",
-        help="JSON file in which the maker of the scenes states authors, licence, provenance and "
-        "limits; `croissant --template` writes one to fill in.",
+        help="JSON file with authors, licence and provenance, as `croissant --template` asks.",
     ),
 ]
 
@@ -62,7 +61,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     ] = None,
     about: AboutOption = None,
     template: Annotated[
-        bool, typer.Option("--template", help="Write the questions for --about, and nothing else.")
+        bool, typer.Option("--template", help="Write the questions that --about answers.")
     ] = False,
     mapping: Annotated[
         list[str] | None,

@@ -17,9 +17,9 @@ from stereogenbench_data.shards.pack import pack
 from tests.cli.command import invoke
 
 
-@pytest.fixture
-def elsewhere(small_release, tmp_path):
-    """Shards of scenes whose marks of completion name no program."""
+@pytest.fixture(params=["no program", "assets of the user"])
+def elsewhere(request, small_release, tmp_path):
+    """Shards of scenes whose marks of completion name no program, or a renderer of assets."""
     tree = tmp_path / "tree"
     for path in small_release.rglob("*"):
         if path.is_file() and path.suffix != ".parquet":
@@ -28,7 +28,9 @@ def elsewhere(small_release, tmp_path):
             copied.write_bytes(path.read_bytes())
     for mark in tree.rglob(COMPLETE_JSON):
         facts = json.loads(mark.read_text())
-        del facts["synthesis"]
+        facts["synthesis"]["renderer"] = "blender 4.5 0123abcd"
+        if request.param == "no program":
+            del facts["synthesis"]
         mark.write_text(json.dumps(facts))
     pack(tree, tmp_path / "shards", workers=1)
     return SceneIndex.open(tmp_path / "shards")
