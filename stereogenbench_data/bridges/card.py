@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from stereogenbench_data.bridges import dataset_facts, viewer
+from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
@@ -63,9 +64,21 @@ def card(index: SceneIndex, *, repository: str, about: Path | None = None) -> st
 
 
 def write_card(
-    index: SceneIndex, folder: Path, *, repository: str, about: Path | None = None
+    index: SceneIndex,
+    folder: Path,
+    *,
+    repository: str,
+    about: Path | None = None,
+    progress: Progress | None = None,
 ) -> Path:
     """Write the card beside the shards, and the scenes that the Hub's viewer shows.
+
+    Args:
+        index: The index of the shards.
+        folder: Where to write.
+        repository: "ORG/NAME" on the Hub.
+        about: As for `card`.
+        progress: Called with (scenes done, scenes in all) while pictures of scenes are written.
 
     Raises:
         DescriptorError: If a file cannot be written, the folder has another README.md, or who made
@@ -80,7 +93,7 @@ def write_card(
                 f"{path}: exists and was not written by this package. Move it away, or add "
                 f"{MARK!r} to it to have it replaced."
             )
-        viewer.write_viewer_rows(index, folder)
+        viewer.write_viewer_rows(index, folder, progress=progress)
         write_atomic(path, text.encode())
     except OSError as error:
         raise DescriptorError(
@@ -190,8 +203,8 @@ def _body(
         *_derivation(index),
         "## How to load",
         "",
-        "With stereogenbench-data (`pip install 'stereogenbench-data[hub]'`), which reads only the",
-        "bytes that a sample needs, derives disparity from depth and keeps one order of samples:",
+        "With stereogenbench-data and its extra `hub`, which reads only the bytes that a sample",
+        "needs, derives disparity from depth and keeps one order of samples:",
         "",
         "```python",
         "from stereogenbench_data import StereoPairs",

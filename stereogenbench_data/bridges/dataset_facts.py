@@ -187,7 +187,7 @@ RELEASE: Final[Facts] = {
 }  # fmt: skip
 """The properties of the scenes of the paper."""
 
-RELEASE_WITHOUT_INDEX: Final[Facts] = {
+RELEASE_ITSELF: Final[Facts] = RELEASE | {
     "datePublished": "2026-05",
     "version": "1.0.0",
     "description": (
@@ -196,7 +196,7 @@ RELEASE_WITHOUT_INDEX: Final[Facts] = {
         "stand for them; how many scenes each part has are the paper's counts."
     ),
 }
-"""What stands for what the release does not state of itself."""
+"""The properties of the public release as a whole, described without its files."""
 
 DRAWN: Final[Facts] = {
     "name": "Drawn stereo scenes in the layout of StereoGenBench",
@@ -336,6 +336,7 @@ def facts_of(index: SceneIndex | None, *, about: Path | None = None) -> Facts:
     """
     origin: Origin = "release" if index is None else origin_of(index)
     known = {"release": RELEASE, "drawn": DRAWN, "elsewhere": {}}[origin]
+    known = RELEASE_ITSELF if index is None else known
     facts = known | ({} if about is None else _stated(about))
     missing = [name for name in _QUESTIONS if name not in facts]
     if missing:

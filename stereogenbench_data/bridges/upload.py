@@ -3,6 +3,7 @@
 huggingface_hub handles logins, offline mode and retries; this module never sees a token.
 """
 
+import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -10,6 +11,7 @@ from typing import Final
 from stereogenbench_data.bridges import viewer
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
+from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
@@ -40,14 +42,53 @@ class Upload:
     files: int
 
 
+def prepare_upload(
+    shards: str | Path,
+    repository: str,
+    *,
+    about: Path | None = None,
+    progress: Progress | None = None,
+) -> tuple[SceneIndex, str]:
+    """Write the card, the rows of the Hub's viewer and the descriptor into a folder of shards.
+
+    Args:
+        shards: The folder that ``pack`` wrote.
+        repository: "ORG/NAME" of a dataset on the Hub.
+        about: What the maker of the scenes states of them, as for `dataset_facts.facts_of`.
+        progress: Called with (scenes done, scenes in all) while pictures of scenes are written.
+
+    Returns:
+        The index of the shards and the name of the dataset.
+
+    Raises:
+        ExtraError: If huggingface_hub is not installed.
+        DescriptorError: If the folder has a README.md that this package did not write, or who made
+            the scenes is not known.
+        StorageError: If the folder has no shards or lacks one.
+    """
+    try:
+        importlib.import_module("huggingface_hub")
+    except ImportError as error:
+        raise ExtraError(
+            f"huggingface_hub cannot be imported ({error}): pip install 'stereogenbench-data[hub]'."
+        ) from error
+    folder = local_path(shards)
+    index = SceneIndex.open(folder)
+    _require_whole(index, folder)
+    write_card(index, folder, repository=repository, about=about, progress=progress)
+    descriptor = write_descriptor(
+        index, folder / DESCRIPTOR_NAME, publication=Publication(about=about)
+    )
+    return index, str(descriptor["name"])
+
+
 def upload(
     shards: str | Path, repository: str, *, branch: str = "main", about: Path | None = None
 ) -> Upload:
     """Upload a folder of packed shards.
 
-    The card and the descriptor's tables are written into the folder first. The descriptor names
-    the commit of the other files, so it has a commit of its own. To continue after an
-    interruption, call it again.
+    `prepare_upload` writes its files into the folder first. The descriptor names the commit of the
+    other files, so it has a commit of its own. To continue after an interruption, call it again.
 
     Args:
         shards: The folder that ``pack`` wrote.
@@ -61,20 +102,11 @@ def upload(
             the scenes is not known.
         StorageError: If the folder has no shards or lacks one, or the Hub refuses the upload.
     """
-    try:
-        from huggingface_hub import HfApi
-        from huggingface_hub.errors import HfHubHTTPError
-    except ImportError as error:
-        raise ExtraError(
-            f"huggingface_hub cannot be imported ({error}): pip install 'stereogenbench-data[hub]'."
-        ) from error
+    index, name = prepare_upload(shards, repository, about=about)
+    from huggingface_hub import HfApi
+    from huggingface_hub.errors import HfHubHTTPError
+
     folder = local_path(shards)
-    index = SceneIndex.open(folder)
-    _require_whole(index, folder)
-    write_card(index, folder, repository=repository, about=about)
-    descriptor = write_descriptor(
-        index, folder / DESCRIPTOR_NAME, publication=Publication(about=about)
-    )
     api = HfApi(library_name="stereogenbench-data")
     patterns = [*sorted(index.shards), *_COMPANIONS]
     require_own_files(folder, [str(path.relative_to(folder)) for path in _found(folder, patterns)])
@@ -87,7 +119,7 @@ def upload(
             folder_path=folder,
             revision=branch,
             allow_patterns=patterns,
-            commit_message=f"{descriptor['name']}: {counted(len(index), 'scene')} in "
+            commit_message=f"{name}: {counted(len(index), 'scene')} in "
             f"{counted(len(index.shards), 'shard')}",
         )
         revision = str(api.dataset_info(repository, revision=branch).sha)

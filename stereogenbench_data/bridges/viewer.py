@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from stereogenbench_data.datasets.mapped import StereoPairs
+from stereogenbench_data.engine import Advance, Progress, advance_of
 from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.picture import contact_sheet
@@ -51,10 +52,17 @@ def split_name(scene: SceneId) -> str:
     return scene.split if scene.subset is None else f"{scene.split}_{scene.subset}"
 
 
-def write_viewer_rows(index: SceneIndex, folder: Path) -> list[Path]:
+def write_viewer_rows(
+    index: SceneIndex, folder: Path, *, progress: Progress | None = None
+) -> list[Path]:
     """Write a tar of rows for each split below a folder of shards, and return their paths.
 
     A tar that was written from the same index is left as it is.
+
+    Args:
+        index: The index of the shards.
+        folder: The folder below which ``viewer/`` is written.
+        progress: Called with (scenes done, scenes in all).
 
     Raises:
         DescriptorError: If a file cannot be written.
@@ -65,12 +73,15 @@ def write_viewer_rows(index: SceneIndex, folder: Path) -> list[Path]:
         rows.setdefault(split_name(index.scene(row).id), []).append(row)
     place = folder / FOLDER
     paths = []
+    advance = advance_of(progress, total=len(index))
     try:
         place.mkdir(parents=True, exist_ok=True)
         for split, chosen in rows.items():
             path = place / f"{split}.tar"
-            if _digest_of(path) != index.digest:
-                _write(index, chosen, path)
+            if _digest_of(path) == index.digest:
+                advance(len(chosen))
+            else:
+                _write(index, chosen, path, advance=advance)
             paths.append(path)
     except OSError as error:
         raise DescriptorError(
@@ -88,7 +99,7 @@ def _digest_of(path: Path) -> str:
         return ""
 
 
-def _write(index: SceneIndex, rows: list[int], path: Path) -> None:
+def _write(index: SceneIndex, rows: list[int], path: Path, *, advance: Advance) -> None:
     previews = _previews(index, rows)
     with (
         open_atomic(path) as file,
@@ -102,6 +113,7 @@ def _write(index: SceneIndex, rows: list[int], path: Path) -> None:
                 member = tarfile.TarInfo(f"{scene.id.key}.{name}")
                 member.size = len(content)
                 tar.addfile(member, io.BytesIO(content))
+            advance(1)
 
 
 def _columns(scene: Scene) -> dict[str, bytes]:

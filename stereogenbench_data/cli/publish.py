@@ -10,6 +10,7 @@ import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import DataOptions, JsonOption, RootOption, grouped
+from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
 
 AboutOption = Annotated[
@@ -160,7 +161,9 @@ def card(
     if out is None:
         typer.echo(card_text(index, repository=repository, about=about), nl=False)
         return
-    typer.echo(str(write_card(index, out, repository=repository, about=about)))
+    with progress_bar("picturing", unit="scenes") as progress:
+        path = write_card(index, out, repository=repository, about=about, progress=progress)
+    typer.echo(str(path))
 
 
 def upload(
@@ -176,8 +179,12 @@ def upload(
     The card and the descriptor are written into the folder first. Log in with `hf auth login`. To
     continue a stopped run, run it again.
     """
+    from stereogenbench_data.bridges.upload import prepare_upload
     from stereogenbench_data.bridges.upload import upload as uploaded
 
+    # The Hub's client has progress bars of its own.
+    with progress_bar("picturing", unit="scenes") as progress:
+        prepare_upload(shards, repository, about=about, progress=progress)
     report = uploaded(shards, repository, branch=branch, about=about)
     if as_json:
         typer.echo(json.dumps(asdict(report), indent=2))

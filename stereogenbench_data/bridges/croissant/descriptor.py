@@ -112,7 +112,6 @@ def write_descriptor(
     else:
         data_url = publication.data_url or dataset_facts.HOME
         files, records = release_nodes(repository_url=data_url)
-        facts = dataset_facts.RELEASE_WITHOUT_INDEX | facts
     if index is not None and index.is_derived:
         facts |= _derived(index, facts)
     elif index is not None and index.shards:
