@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from stereogenbench_data.bridges.dataset_facts import DRAWN, RELEASE, facts_of, 
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.schema.release import COMPLETE_JSON
 from stereogenbench_data.shards.pack import pack
+from tests.audit.release_counts import paper_scenes
 from tests.cli.command import invoke
 
 
@@ -47,6 +49,22 @@ def about(tmp_path):
 def test_scenes_that_synth_drew_are_drawn(small_shards):
     assert origin_of(SceneIndex.open(small_shards)) == "drawn"
     assert facts_of(SceneIndex.open(small_shards)) == DRAWN
+
+
+def test_scenes_are_of_the_release_by_map_size_and_length(tmp_path):
+    scenes = paper_scenes()[::100]
+
+    def origin(*, index=0, **changes):
+        changed = [*scenes[:index], replace(scenes[index], **changes), *scenes[index + 1 :]]
+        return origin_of(SceneIndex.from_scenes(changed, tmp_path))
+
+    small = replace(scenes[0].rig, image_width_px=320, image_height_px=320)
+    own_map = replace(scenes[0].id, map_name="MyTown")
+
+    assert origin() == "release"
+    assert origin(rig=small) == "elsewhere"
+    assert origin(id=own_map) == "elsewhere"
+    assert origin(frames=80) == "elsewhere"
 
 
 def test_without_data_the_release_is_meant():
