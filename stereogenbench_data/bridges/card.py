@@ -8,7 +8,7 @@ import fnmatch
 import json
 from collections import Counter
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -252,7 +252,7 @@ def _body(
         *(
             f"- {markdown_text(text)}"
             for section in sections
-            for text in _listed(facts[f"rai:{section}"])
+            for text in dataset_facts.listed(facts[f"rai:{section}"])
         ),
         "",
         "## Citation",
@@ -264,15 +264,14 @@ def _body(
 
 
 def _provenance(facts: dataset_facts.Facts) -> list[str]:
-    nodes = [*_listed(facts["prov:wasGeneratedBy"]), *_listed(facts["prov:wasDerivedFrom"])]
+    nodes = [
+        *dataset_facts.listed(facts["prov:wasGeneratedBy"]),
+        *dataset_facts.listed(facts["prov:wasDerivedFrom"]),
+    ]
     return [
         f"- {markdown_text(str(node['prov:label']))}: {markdown_text(str(node['description']))}"
         for node in nodes
     ]
-
-
-def _listed(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
 
 
 def _derivation(index: SceneIndex) -> list[str]:

@@ -321,6 +321,13 @@ def blanks(value: Any, *, at: str = "") -> list[str]:
     return [at] if isinstance(value, str) and value.startswith(_BLANK.strip()) else []
 
 
+def listed(value: Any) -> list[Any]:
+    """Return a single value, a list of values or None as a list."""
+    if value is None:
+        return []
+    return value if isinstance(value, list) else [value]
+
+
 def facts_of(index: SceneIndex | None, *, about: Path | None = None) -> Facts:
     """Return the properties of a dataset.
 

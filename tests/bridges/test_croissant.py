@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
 from tests.cli.command import invoke
-from tests.servers.tools import require_module
+from tests.servers.tools import require_module, require_tool
 
 HOME = Path(__file__).resolve().parents[2]
 SHIPPED = HOME / "croissant"
@@ -139,15 +140,19 @@ def test_the_shipped_descriptor_of_the_sample_loads_every_record_in_both_orders(
     assert records["baselines"] == sample.column("baselines_cm").reshape(-1).tolist()
 
 
-def test_the_shipped_descriptors_are_those_that_the_sample_gives(tmp_path):
+def test_the_shipped_descriptors_are_those_of_make_descriptors(tmp_path, monkeypatch):
     copied = tmp_path / "croissant"
     shutil.copytree(HOME / "shards", tmp_path / "shards")
-    packed = SceneIndex.open(tmp_path / "shards")
-    sample = Publication(published=date(2026, 11, 21), name="StereoGenBench sample")
+    planned = subprocess.run(
+        [require_tool("make"), "--dry-run", "--old-file", ".venv/.ready", "descriptors"],
+        cwd=HOME, capture_output=True, text=True, check=True,
+    ).stdout.replace("\\\n", " ")  # fmt: skip
+    commands = re.findall(r"^\S*stereogenbench (croissant .*)", planned, re.MULTILINE)
+    monkeypatch.chdir(tmp_path)
 
-    write_descriptor(packed, copied / "sample.json", publication=sample)
-    write_descriptor(None, copied / "release.json")
-    invoke("croissant", "--template", "-o", copied / "template.json")
+    done = [invoke(*shlex.split(command)) for command in commands]
+
+    assert [each.exit_code for each in done] == [0, 0, 0]
 
     written = {path.relative_to(copied) for path in copied.rglob("*") if path.is_file()}
     assert written == {path.relative_to(SHIPPED) for path in SHIPPED.rglob("*") if path.is_file()}

@@ -165,6 +165,10 @@ MUTATIONS = {
     "day to come": (
         lambda d: d.update(datePublished="9999-01-01"), "datePublished: is 9999-01-01, which has",
     ),
+    "question without an answer": (
+        lambda d: d["creator"][0].update(name="FILL IN: who made it"),
+        "creator.name: must be filled in",
+    ),
     "no record sets": (lambda d: d.update(recordSet=[]), "recordSet: is empty"),
     "empty responsible-AI value": (
         lambda d: d.update({"rai:dataBiases": []}), "rai:dataBiases: is empty",

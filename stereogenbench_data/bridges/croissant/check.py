@@ -29,6 +29,7 @@ from stereogenbench_data.bridges.croissant.nodes import (
     TEXT,
     Node,
 )
+from stereogenbench_data.bridges.dataset_facts import blanks, listed
 from stereogenbench_data.errors import DescriptorError, StorageError
 from stereogenbench_data.shards.tar import read_members
 
@@ -190,7 +191,7 @@ class _Check:
             if (
                 path is not None
                 and path.is_file()
-                and PARQUET in _listed(file.get("encodingFormat"))
+                and PARQUET in listed(file.get("encodingFormat"))
             ):
                 try:
                     columns[name] = pq.read_schema(path)
@@ -225,7 +226,7 @@ class _Check:
             return [each.relative_to(path).as_posix() for each in path.rglob("*") if each.is_file()]
         if not path.is_file():
             return None
-        encodings = _listed(file.get("encodingFormat"))
+        encodings = listed(file.get("encodingFormat"))
         if TAR in encodings:
             try:
                 with path.open("rb") as opened:
@@ -242,7 +243,7 @@ class _Check:
         found = [self._members_of(each) for each in _containers(files) if each in self._files]
         if any(members is None for members in found) or not found:
             return None
-        patterns = [str(each) for each in _listed(files.get("includes"))]
+        patterns = [str(each) for each in listed(files.get("includes"))]
         return [
             member
             for members in found
@@ -253,7 +254,7 @@ class _Check:
     # The dataset as a whole.
 
     def _check_context(self) -> None:
-        conforms = _listed(self._node.get("conformsTo"))
+        conforms = listed(self._node.get("conformsTo"))
         for wanted in (CROISSANT, RAI):
             if wanted not in conforms:
                 found = ", ".join(map(str, conforms))
@@ -278,8 +279,10 @@ class _Check:
         for name in (*REQUIRED, *REQUIRED_RAI):
             if self._node.get(name) in (None, "", [], {}):
                 self.report(name, "is missing" if name not in self._node else "is empty")
+        for place in blanks(self._node):
+            self.report(place, "must be filled in: what stands there is the question")
         for local in RAI_ONCE:
-            if len(_listed(self._node.get(f"rai:{local}"))) > 1:
+            if len(listed(self._node.get(f"rai:{local}"))) > 1:
                 self.report(
                     f"rai:{local}", "has several values, but readers keep only the first: join them"
                 )
@@ -345,7 +348,7 @@ class _Check:
             if "contentUrl" not in file or "encodingFormat" not in file:
                 self.report(name, "must have a contentUrl and an encodingFormat")
                 continue
-            encodings, url = _listed(file["encodingFormat"]), str(file["contentUrl"])
+            encodings, url = listed(file["encodingFormat"]), str(file["contentUrl"])
             is_repository = GIT in encodings
             if not is_repository and not _SHA256.fullmatch(str(file.get("sha256", ""))):
                 self.report(
@@ -402,7 +405,7 @@ class _Check:
                         name, f"is contained in {container!r}, which is not in the descriptor"
                     )
             if self._files_of_set(name) == []:
-                patterns = ", ".join(map(str, _listed(files["includes"])))
+                patterns = ", ".join(map(str, listed(files["includes"])))
                 self.report(
                     name, f"includes {patterns}, which matches no file: correct the pattern"
                 )
@@ -412,16 +415,16 @@ class _Check:
     def _check_records(self, records: Node) -> None:
         name = str(records.get("@id"))
         own = {str(each.get("@id")) for each in records.get("field", [])}
-        for key in _listed(records.get("key")):
+        for key in listed(records.get("key")):
             if str(key.get("@id")) not in own:
                 self.report(name, f"has the key {key.get('@id')}, which is not one of its fields")
-        for row in _listed(records.get("data")):
+        for row in listed(records.get("data")):
             if set(row) - own:
                 strange = ", ".join(sorted(set(row) - own))
                 self.report(name, f"has data for {strange}, which it has no field for")
         for field in records.get("field", []):
             self._check_reference(field)
-            self._check_type(field, _listed(records.get("data")))
+            self._check_type(field, listed(records.get("data")))
             self._check_source(field, has_data="data" in records)
 
     def _check_reference(self, node: Node) -> None:
@@ -443,7 +446,7 @@ class _Check:
 
     def _check_type(self, node: Node, rows: list[Node]) -> None:
         """Check a field's data type, and that the values given with the descriptor have it."""
-        name, kinds = str(node.get("@id")), _listed(node.get("dataType"))
+        name, kinds = str(node.get("@id")), listed(node.get("dataType"))
         if not _TYPES & {str(kind) for kind in kinds}:
             found = ", ".join(map(str, kinds)) or "none"
             self.report(
@@ -465,7 +468,7 @@ class _Check:
             self.report(name, f"has {says}, but the column {column!r} of {file} holds {found}")
             return
         value = found.value_type if is_list else found
-        for kind in _listed(node.get("dataType")):
+        for kind in listed(node.get("dataType")):
             what, tests = _ARROW_TYPES.get(kind, ("", ()))
             if tests and not any(test(value) for test in tests):
                 self.report(
@@ -551,7 +554,7 @@ class _Check:
         no_number = [text for text in taken if not text.isdigit()]
         if missed:
             self.report(name, f"has the regex {regex!r}, which does not match {missed[0]}")
-        elif "sc:Integer" in _listed(node.get("dataType")) and no_number:
+        elif "sc:Integer" in listed(node.get("dataType")) and no_number:
             self.report(
                 name, f"is an sc:Integer, but the regex {regex!r} takes {no_number[0]!r} of a name"
             )
@@ -592,7 +595,7 @@ class _Check:
         """Return a field's values in inline data, none if it has none."""
         for records in self._record_sets:
             if name in {str(each.get("@id")) for each in records.get("field", [])}:
-                return {str(row.get(name)) for row in _listed(records.get("data"))}
+                return {str(row.get(name)) for row in listed(records.get("data"))}
         return set()
 
 
@@ -611,7 +614,7 @@ def _names(node: Any, *, at: str) -> Iterator[tuple[str, str]]:
 
 def _containers(files: Node) -> list[str]:
     """Return the ids of the files that contain a set of files."""
-    nodes = _listed(files.get("containedIn"))
+    nodes = listed(files.get("containedIn"))
     return [str(each.get("fileObject", each).get("@id")) for each in nodes]
 
 
@@ -627,10 +630,3 @@ def _is_kept(regex: str, text: str) -> bool:
     once = re.match(regex, text)
     again = None if once is None else re.match(regex, once[1])
     return once is not None and again is not None and again[1] == once[1]
-
-
-def _listed(value: Any) -> list[Any]:
-    """Return a single value, a list of values or None as a list."""
-    if value is None:
-        return []
-    return value if isinstance(value, list) else [value]

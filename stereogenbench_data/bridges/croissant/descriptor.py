@@ -159,7 +159,7 @@ def _packed(index: SceneIndex, facts: Node) -> Node:
         f"Files of the scenes put into WebDataset shards, unchanged{depth}.",
         by="stereogenbench pack",
     )
-    return {"prov:wasGeneratedBy": [*_listed(facts["prov:wasGeneratedBy"]), packing]}
+    return {"prov:wasGeneratedBy": [*dataset_facts.listed(facts["prov:wasGeneratedBy"]), packing]}
 
 
 def _derived(index: SceneIndex, facts: Node) -> Node:
@@ -179,13 +179,9 @@ def _derived(index: SceneIndex, facts: Node) -> Node:
     )
     return {
         "description": f"{facts['description']} {dataset_facts.DERIVED}",
-        "prov:wasGeneratedBy": [*_listed(facts["prov:wasGeneratedBy"]), encoding],
-        "prov:wasDerivedFrom": [*_listed(facts["prov:wasDerivedFrom"]), source],
+        "prov:wasGeneratedBy": [*dataset_facts.listed(facts["prov:wasGeneratedBy"]), encoding],
+        "prov:wasDerivedFrom": [*dataset_facts.listed(facts["prov:wasDerivedFrom"]), source],
     }
-
-
-def _listed(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else [value]
 
 
 def _relative(root: str, *, to: Path) -> str:
