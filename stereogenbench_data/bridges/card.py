@@ -172,7 +172,7 @@ def _configs(index: SceneIndex) -> _Configs:
         }
         for config, splits in sorted(found.items(), key=lambda item: (item[0] != "all", item[0]))
     }
-    scenes = {split: [f"{viewer.FOLDER}/{split}.tar"] for split in configs["all"]}
+    scenes = {split: [viewer.viewer_tar(split)] for split in configs["all"]}
     return configs | {_SCENES: scenes}
 
 

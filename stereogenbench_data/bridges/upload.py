@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.bridges import viewer
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
+from stereogenbench_data.bridges.viewer import viewer_tars
 from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
 from stereogenbench_data.index.parquet import INDEX_NAME
@@ -23,7 +23,6 @@ from stereogenbench_data.sources.members import require_own_files
 DESCRIPTOR_NAME: Final = "croissant.json"
 _COMPANIONS: Final = (
     INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "croissant/*.parquet", "croissant/*.txt",
-    f"{viewer.FOLDER}/*.tar",
 )  # fmt: skip
 
 
@@ -108,7 +107,7 @@ def upload(
 
     folder = local_path(shards)
     api = HfApi(library_name="stereogenbench-data")
-    patterns = [*sorted(index.shards), *_COMPANIONS]
+    patterns = [*sorted(index.shards), *viewer_tars(index), *_COMPANIONS]
     require_own_files(folder, [str(path.relative_to(folder)) for path in _found(folder, patterns)])
     refusals: tuple[type[BaseException], ...] = (HfHubHTTPError, ValueError, *network_errors())
     try:

@@ -3,8 +3,8 @@
 The viewer and `datasets` read all configs of a card in the format of its first one. The first is
 of tars, so the rows are tars too: one sample a scene, a member for each column.
 
-    viewer/train.tar              train/Uniform/Town/scene_000001.preview.jpg
-    viewer/eval_seen_map.tar      train/Uniform/Town/scene_000001.map.txt, ...
+    viewer/train.tar              train/Uniform/Town/scene_000001.preview.jpg, ...map.txt, ...
+    viewer/eval_seen_map.tar      eval/MapSeenInTrain/Uniform/Town/scene_000000.preview.jpg, ...
 """
 
 import io
@@ -19,14 +19,14 @@ from PIL import Image
 
 from stereogenbench_data.datasets.mapped import StereoPairs
 from stereogenbench_data.engine import Advance, Progress, advance_of
-from stereogenbench_data.errors import DescriptorError, describe_os_error
+from stereogenbench_data.errors import DescriptorError, StorageError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.picture import contact_sheet
 from stereogenbench_data.schema.records import Scene, SceneId
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.files import open_atomic
 
-FOLDER: Final = "viewer"
+_FOLDER: Final = "viewer"
 FEATURES: Final[dict[str, str]] = {
     "preview.jpg": "image",
     "map.txt": "string",
@@ -52,6 +52,20 @@ def split_name(scene: SceneId) -> str:
     return scene.split if scene.subset is None else f"{scene.split}_{scene.subset}"
 
 
+def viewer_tars(index: SceneIndex) -> dict[str, list[int]]:
+    """Return the scenes' rows of the index for each tar, by its path below the shards."""
+    rows: dict[str, list[int]] = {}
+    for row in range(len(index)):
+        path = viewer_tar(split_name(index.scene(row).id))
+        rows.setdefault(path, []).append(row)
+    return rows
+
+
+def viewer_tar(split: str) -> str:
+    """Return the path of a split's tar below the shards."""
+    return f"{_FOLDER}/{split}.tar"
+
+
 def write_viewer_rows(
     index: SceneIndex, folder: Path, *, progress: Progress | None = None
 ) -> list[Path]:
@@ -68,21 +82,20 @@ def write_viewer_rows(
         DescriptorError: If a file cannot be written.
         StorageError, MediaError: If a scene's pictures cannot be read.
     """
-    rows: dict[str, list[int]] = {}
-    for row in range(len(index)):
-        rows.setdefault(split_name(index.scene(row).id), []).append(row)
-    place = folder / FOLDER
+    place = folder / _FOLDER
     paths = []
     advance = advance_of(progress, total=len(index))
     try:
         place.mkdir(parents=True, exist_ok=True)
-        for split, chosen in rows.items():
-            path = place / f"{split}.tar"
+        for name, chosen in viewer_tars(index).items():
+            path = folder / name
             if _digest_of(path) == index.digest:
                 advance(len(chosen))
             else:
                 _write(index, chosen, path, advance=advance)
             paths.append(path)
+    except StorageError:
+        raise
     except OSError as error:
         raise DescriptorError(
             describe_os_error(f"{place}: cannot be written", error, "Check the disk.")
