@@ -11,13 +11,19 @@ READY := $(VENV)/.ready
 SAMPLE := build/sample
 SYNTH := $(BIN)/stereogenbench synth $(SAMPLE)/release --size 72 --frames 81 --depth-unit-m 0.01
 
-.PHONY: demo test lint docs bench sample clean
+.PHONY: demo test lint docs bench sample descriptors clean
 .DELETE_ON_ERROR:
 
-demo: $(READY)
+# The sdist leaves out the sample.
+shards/index.parquet:
+	@echo "shards/ is missing: the sdist leaves out the sample scenes (11 MB) that tests and demo" \
+		"read. Run make in a clone of the repository." >&2
+	@exit 1
+
+demo: shards/index.parquet $(READY)
 	$(BIN)/python examples/train.py
 
-test: lint
+test: shards/index.parquet lint
 	$(BIN)/python -m pytest $(PYTEST_ARGS) --numprocesses auto --maxprocesses 8 --dist worksteal
 
 lint: $(READY)
@@ -49,6 +55,14 @@ sample: $(READY)
 	rm -rf shards/*.tar shards/dali
 	cp -r $(SAMPLE)/shards/* shards/
 	$(BIN)/stereogenbench verify --deep shards
+
+# croissant/, from the sample and the paper. The day is that of the sample.
+descriptors: $(READY)
+	rm -rf croissant
+	$(BIN)/stereogenbench croissant shards -o croissant/sample.json \
+		--name "StereoGenBench sample" --published 2026-11-21
+	$(BIN)/stereogenbench croissant -o croissant/release.json
+	$(BIN)/stereogenbench croissant --template -o croissant/template.json
 
 $(READY): pyproject.toml $(CONSTRAINTS)
 	$(PYTHON) -m venv $(VENV)

@@ -3,6 +3,7 @@
 import gc
 import io
 import json
+import shutil
 import warnings
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import webdataset
 
 from stereogenbench_data import SceneIndex
+from stereogenbench_data.bridges.card import write_card
 from stereogenbench_data.schema.release import VIDEO_FILES
 
 SHARDS = Path(__file__).resolve().parents[1] / "shards"
@@ -45,6 +47,26 @@ def test_webdataset_reads_one_scene_as_one_sample(index):
         assert len(json.loads(sample["baseline.json"])["pairwise_pairs"]) == 15
     assert frames_of(samples[0]["cam_03_rgb.mp4"]) == 81
     assert frames_of(samples[0]["cam_03_depth.mkv"]) == 81
+
+
+def test_hugging_face_datasets_loads_a_folder_with_a_card_by_its_name(index, tmp_path):
+    """With ``data_dir`` it would take the index for a tar."""
+    folder = shutil.copytree(SHARDS, tmp_path / "packed", ignore=lambda *_: {"README.md"})
+    write_card(index, folder, repository="a/b")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from datasets import load_dataset
+
+        rows = list(load_dataset(str(folder), "Uniform", split="train", streaming=True))
+        scenes = list(load_dataset(str(folder), "scenes", split="train", streaming=True))
+
+    assert [row["__key__"] for row in rows] == [
+        f"train/Uniform/SynthStage/scene_{number:06d}" for number in range(2)
+    ]
+    assert frames_of(rows[0]["cam_05_depth.mkv"]) == 81
+    assert {scene["family.txt"] for scene in scenes} == {
+        "IPD_Gaussian", "Pairwise_Uniform", "Uniform",
+    }  # fmt: skip
 
 
 def test_hugging_face_datasets_streams_one_scene_as_one_row(index):

@@ -67,7 +67,7 @@ def test_every_path_and_name_on_a_page_for_developers_exists(page):
         pytest.skip(f"there is no {page}")
     whole = (HOME / page).read_text()
     text = re.sub(r"```.*?```", "", whole, flags=re.DOTALL)
-    words = {*re.findall(r"`([^`\n]+)`", text), *re.findall(r"(?:\w+/)+\w+\.py", whole)} - {
+    words = {*re.findall(r"`([^`\n]+)`", text), *re.findall(r"(?:[\w.]+/)+\w+\.py", whole)} - {
         "shared/"
     }
     is_path = re.compile(r"[\w.-]+(/[\w.-]+)*(/|\.(py|md|txt|toml))").fullmatch

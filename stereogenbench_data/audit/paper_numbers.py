@@ -29,17 +29,6 @@ median and 95th percentile of the reprojection error of non-occluded pixels, of 
 and of cameras 0 and 5."""
 
 COUNTS_TABLE: Final = "table of scene counts by split and family"
-COUNTS: Final[dict[tuple[str, str, str], int]] = {
-    ("train", "", "IPD_Gaussian"): 3289,
-    ("train", "", "Uniform"): 774,
-    ("train", "", "Pairwise_Uniform"): 3691,
-    ("eval", "seen_map", "IPD_Gaussian"): 265,
-    ("eval", "seen_map", "Uniform"): 281,
-    ("eval", "unseen_map", "IPD_Gaussian"): 91,
-    ("eval", "unseen_map", "Uniform"): 102,
-}
-"""Scenes of each (split, subset, family); the subset of train is empty."""
-
 SPLITS: Final = {"train": 7754, "eval": 739}
 
 ADJACENT_TABLE: Final = "table of realized adjacent-baseline statistics"

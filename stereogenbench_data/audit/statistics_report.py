@@ -16,7 +16,6 @@ from stereogenbench_data.audit.paper_numbers import (
     ALL_PAIRS_TABLE,
     BINS,
     BINS_TABLE,
-    COUNTS,
     COUNTS_TABLE,
     EVAL_MAPS,
     EVAL_MAPS_TABLE,
@@ -36,6 +35,7 @@ from stereogenbench_data.audit.statistics import (
     branch_rows,
 )
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.release import SCENE_COUNTS
 from stereogenbench_data.schema.text import markdown_text
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.sources.files import open_atomic
@@ -87,9 +87,12 @@ def compared(found: Statistics, *, splits: tuple[str, ...] = tuple(SPLITS)) -> t
 
 def _count_lines(found: Statistics) -> Iterator[tuple[str, Line]]:
     ours = {(each.split, each.subset, each.family): each.scenes for each in found.families}
-    for place in dict.fromkeys([*COUNTS, *ours]):
+    for place in dict.fromkeys([*SCENE_COUNTS, *ours]):
         item = "scenes, " + " ".join(part for part in place if part)
-        yield place[0], Line(COUNTS_TABLE, item, str(COUNTS.get(place, 0)), str(ours.get(place, 0)))
+        yield (
+            place[0],
+            Line(COUNTS_TABLE, item, str(SCENE_COUNTS.get(place, 0)), str(ours.get(place, 0))),
+        )
     for split, count in SPLITS.items():
         total = _scenes_of(found, split)
         yield split, Line(COUNTS_TABLE, f"scenes, {split} total", str(count), str(total))

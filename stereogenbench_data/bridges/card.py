@@ -8,11 +8,12 @@ import fnmatch
 import json
 from collections import Counter
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from stereogenbench_data.bridges import dataset_facts
+from stereogenbench_data.bridges import dataset_facts, viewer
+from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
@@ -28,44 +29,71 @@ from stereogenbench_data.shards.companion_files import derivation_facts
 from stereogenbench_data.sources.files import write_atomic
 
 CARD_NAME: Final = "README.md"
+_SCENES: Final = "scenes"
 MARK: Final = "<!-- made by stereogenbench card -->"
 """Marks a card that this package wrote. A README.md without it is never overwritten."""
+_TASKS: Final = ("depth-estimation", "image-to-image", "image-to-video", "image-to-3d")
+"""Tasks that the Hub lists for datasets; it hides video-to-video there."""
+_TAGS: Final = (
+    "stereo", "disparity", "view-synthesis", "multi-view", "synthetic", "benchmark", "3d", "image",
+    "video", "webdataset", "mlcroissant", f"arxiv:{dataset_facts.ARXIV}",
+)  # fmt: skip
+"""Among them the Hub's names of modalities (3d, image, video) and libraries."""
 _Configs = dict[str, dict[str, list[str]]]
 _SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 _ADJACENT: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
 
 
-def card(index: SceneIndex, *, repository: str) -> str:
-    """Return the card of shards.
+def card(index: SceneIndex, *, repository: str, about: Path | None = None) -> str:
+    """Return the card of shards, whose config "scenes" is what `viewer` writes beside them.
 
     Args:
         index: The index of the shards.
         repository: "ORG/NAME" on the Hub.
+        about: What the maker of the scenes states of them, as for `dataset_facts.facts_of`.
 
     Raises:
-        DescriptorError: If the data are not shards.
+        DescriptorError: If the data are not shards, or who made them is not known.
     """
     if not index.shards:
         raise DescriptorError(f"{index.where}: not a folder of shards. Pack the data first.")
+    facts = dataset_facts.facts_of(index, about=about)
     configs = _configs(index)
-    lines = [*_head(index, configs), MARK, "", *_body(index, configs, repository)]
+    lines = [*_head(index, facts, configs), MARK, "", *_body(index, facts, configs, repository)]
     return "\n".join(lines) + "\n"
 
 
-def write_card(index: SceneIndex, folder: Path, *, repository: str) -> Path:
-    """Write the card beside the shards.
+def write_card(
+    index: SceneIndex,
+    folder: Path,
+    *,
+    repository: str,
+    about: Path | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write the card beside the shards, and the scenes that the Hub's viewer shows.
+
+    Args:
+        index: The index of the shards.
+        folder: Where to write.
+        repository: "ORG/NAME" on the Hub.
+        about: As for `card`.
+        progress: Called with (scenes done, scenes in all) while pictures of scenes are written.
 
     Raises:
-        DescriptorError: If it cannot be written, or the folder has another README.md.
+        DescriptorError: If a file cannot be written, the folder has another README.md, or who made
+            the scenes is not known.
+        StorageError, MediaError: If a scene's pictures cannot be read.
     """
     path = folder / CARD_NAME
-    text = card(index, repository=repository)
+    text = card(index, repository=repository, about=about)
     try:
         if path.exists() and MARK.encode() not in path.read_bytes():
             raise DescriptorError(
                 f"{path}: exists and was not written by this package. Move it away, or add "
                 f"{MARK!r} to it to have it replaced."
             )
+        viewer.write_viewer_rows(index, folder, progress=progress)
         write_atomic(path, text.encode())
     except OSError as error:
         raise DescriptorError(
@@ -76,17 +104,28 @@ def write_card(index: SceneIndex, folder: Path, *, repository: str) -> Path:
     return path
 
 
-def _head(index: SceneIndex, configs: _Configs) -> list[str]:
-    """Return the YAML head; JSON texts are YAML too."""
+def _head(index: SceneIndex, facts: dataset_facts.Facts, configs: _Configs) -> list[str]:
+    """Return the YAML head; JSON texts are YAML too.
+
+    The Hub shows "all" first, and `datasets` loads it without a config. It reads every config in
+    the format of the first one.
+    """
+    licence = dataset_facts.LICENCE_NAMES.get(facts["license"])
+    other = [
+        "license: other",
+        "license_name: other",
+        f"license_link: {json.dumps(facts['license'])}",
+    ]
     lines = [
         "---",
-        f"pretty_name: {dataset_facts.TITLE}",
-        "license: cc-by-4.0",
+        f"pretty_name: {json.dumps(facts['name'])}",
+        *(other if licence is None else [f"license: {licence}"]),
+        "language:",
+        f"- {facts.get('inLanguage', 'en')}",
         "task_categories:",
-        "- depth-estimation",
-        "- image-to-image",
+        *(f"- {task}" for task in _TASKS),
         "tags:",
-        *(f"- {tag}" for tag in (*dataset_facts.KEYWORDS, "webdataset", "croissant")),
+        *(f"- {tag}" for tag in _TAGS),
         "size_categories:",
         f"- {next((name for most, name in _SIZES if len(index) < most), '100K<n<1M')}",
         "configs:",
@@ -101,7 +140,8 @@ def _head(index: SceneIndex, configs: _Configs) -> list[str]:
     lines.append("dataset_info:")
     for config in configs:
         lines += [f"- config_name: {config}", "  features:"]
-        for name, kind in _features(index).items():
+        features = viewer.FEATURES if config == _SCENES else _features(index)
+        for name, kind in features.items():
             lines += [f"  - name: {name}", f"    dtype: {kind}"]
     return [*lines, "---"]
 
@@ -115,16 +155,15 @@ def _features(index: SceneIndex) -> dict[str, str]:
 
 
 def _configs(index: SceneIndex) -> _Configs:
-    """Return config to split to patterns of shards: a config per family, and one for all."""
+    """Return config to split to patterns of tars: a config for all, one a family, the scenes."""
     found: dict[str, dict[str, set[str]]] = {}
     for row in range(len(index)):
         scene = index.scene(row)
-        subset = scene.id.subset
-        split = scene.id.split if subset is None else f"{scene.id.split}_{subset}"
+        split = viewer.split_name(scene.id)
         path = next(iter(scene.members.values())).path
         for config in ("all", scene.id.family):
             found.setdefault(config, {}).setdefault(split, set()).add(path)
-    return {
+    configs = {
         config: {
             split: _patterns(paths, index)
             for split, paths in sorted(
@@ -133,6 +172,8 @@ def _configs(index: SceneIndex) -> _Configs:
         }
         for config, splits in sorted(found.items(), key=lambda item: (item[0] != "all", item[0]))
     }
+    scenes = {split: [viewer.viewer_tar(split)] for split in configs["all"]}
+    return configs | {_SCENES: scenes}
 
 
 def _patterns(paths: set[str], index: SceneIndex) -> list[str]:
@@ -145,22 +186,25 @@ def _patterns(paths: set[str], index: SceneIndex) -> list[str]:
     return sorted(patterns)
 
 
-def _body(index: SceneIndex, configs: _Configs, repository: str) -> list[str]:
+def _body(
+    index: SceneIndex, facts: dataset_facts.Facts, configs: _Configs, repository: str
+) -> list[str]:
     config = next(name for name in configs if name != "all")
     split = next(iter(configs[config]))
-    rules: dict[str, Any] = dataset_facts.RESPONSIBLE_USE
     size = "" if index.is_derived else ", size=(480, 832)"
     sections = ("dataUseCases", "dataLimitations", "dataBiases", "personalSensitiveInformation")
     return [
-        f"# {dataset_facts.TITLE}",
+        f"# {markdown_text(facts['name'])}",
         "",
-        dataset_facts.DESCRIPTION,
+        markdown_text(facts["description"]),
+        "",
+        f"Paper: [{dataset_facts.TITLE}]({dataset_facts.PAPER}).",
         "",
         *_derivation(index),
         "## How to load",
         "",
-        "With stereogenbench-data (`pip install 'stereogenbench-data[hub]'`), which reads only the",
-        "bytes that a sample needs, derives disparity from depth and keeps one order of samples:",
+        "With stereogenbench-data and its extra `hub`, which reads only the bytes that a sample",
+        "needs, derives disparity from depth and keeps one order of samples:",
         "",
         "```python",
         "from stereogenbench_data import StereoPairs",
@@ -181,6 +225,10 @@ def _body(index: SceneIndex, configs: _Configs, repository: str) -> list[str]:
         "The shards are plain WebDataset tars, one scene a sample: `webdataset`, Ray and `tar`",
         "read them as they are. `index.parquet` holds where every file lies, with its checksum.",
         "",
+        f"The config `{_SCENES}` has one row a scene, with a small picture: choose it in the",
+        f'viewer, or load it by `load_dataset("{repository}", "{_SCENES}")`. `croissant.json`',
+        "describes the files for mlcroissant, with tables of scenes and pairs in `croissant/`.",
+        "",
         "## What is in it",
         "",
         *_counts(index),
@@ -193,17 +241,36 @@ def _body(index: SceneIndex, configs: _Configs, repository: str) -> list[str]:
         "",
         "## Licence",
         "",
-        dataset_facts.LICENCE_NOTE,
+        f"{facts['license']}. {markdown_text(facts['usageInfo'])}",
+        "",
+        "## Where it comes from",
+        "",
+        *_provenance(facts),
         "",
         "## Responsible use",
         "",
-        *(f"- {text}" for section in sections for text in rules[f"rai:{section}"]),
+        *(
+            f"- {markdown_text(text)}"
+            for section in sections
+            for text in dataset_facts.listed(facts[f"rai:{section}"])
+        ),
         "",
         "## Citation",
         "",
         "```bibtex",
-        dataset_facts.CITATION,
+        facts["citeAs"].rstrip().replace("```", ""),
         "```",
+    ]
+
+
+def _provenance(facts: dataset_facts.Facts) -> list[str]:
+    nodes = [
+        *dataset_facts.listed(facts["prov:wasGeneratedBy"]),
+        *dataset_facts.listed(facts["prov:wasDerivedFrom"]),
+    ]
+    return [
+        f"- {markdown_text(str(node['prov:label']))}: {markdown_text(str(node['description']))}"
+        for node in nodes
     ]
 
 

@@ -3,13 +3,15 @@
 huggingface_hub handles logins, offline mode and retries; this module never sees a token.
 """
 
+import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from stereogenbench_data.bridges import dataset_facts
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
+from stereogenbench_data.bridges.viewer import viewer_tars
+from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
@@ -19,7 +21,9 @@ from stereogenbench_data.sources.location import local_path
 from stereogenbench_data.sources.members import require_own_files
 
 DESCRIPTOR_NAME: Final = "croissant.json"
-_COMPANIONS: Final = (INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "croissant/*.parquet")
+_COMPANIONS: Final = (
+    INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "croissant/*.parquet", "croissant/*.txt",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,26 +41,32 @@ class Upload:
     files: int
 
 
-def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Upload:
-    """Upload a folder of packed shards.
-
-    The card and the descriptor's tables are written into the folder first. The descriptor names
-    the commit of the other files, so it has a commit of its own. To continue after an
-    interruption, call it again.
+def prepare_upload(
+    shards: str | Path,
+    repository: str,
+    *,
+    about: Path | None = None,
+    progress: Progress | None = None,
+) -> tuple[SceneIndex, str]:
+    """Write the card, the rows of the Hub's viewer and the descriptor into a folder of shards.
 
     Args:
         shards: The folder that ``pack`` wrote.
-        repository: "ORG/NAME" of a dataset on the Hub; created if it does not exist.
-        branch: The branch to commit to.
+        repository: "ORG/NAME" of a dataset on the Hub.
+        about: What the maker of the scenes states of them, as for `dataset_facts.facts_of`.
+        progress: Called with (scenes done, scenes in all) while pictures of scenes are written.
+
+    Returns:
+        The index of the shards and the name of the dataset.
 
     Raises:
         ExtraError: If huggingface_hub is not installed.
-        DescriptorError: If the folder has a README.md that this package did not write.
-        StorageError: If the folder has no shards or lacks one, or the Hub refuses the upload.
+        DescriptorError: If the folder has a README.md that this package did not write, or who made
+            the scenes is not known.
+        StorageError: If the folder has no shards or lacks one.
     """
     try:
-        from huggingface_hub import HfApi
-        from huggingface_hub.errors import HfHubHTTPError
+        importlib.import_module("huggingface_hub")
     except ImportError as error:
         raise ExtraError(
             f"huggingface_hub cannot be imported ({error}): pip install 'stereogenbench-data[hub]'."
@@ -64,10 +74,40 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
     folder = local_path(shards)
     index = SceneIndex.open(folder)
     _require_whole(index, folder)
-    write_card(index, folder, repository=repository)
-    write_descriptor(index, folder / DESCRIPTOR_NAME)
+    write_card(index, folder, repository=repository, about=about, progress=progress)
+    descriptor = write_descriptor(
+        index, folder / DESCRIPTOR_NAME, publication=Publication(about=about)
+    )
+    return index, str(descriptor["name"])
+
+
+def upload(
+    shards: str | Path, repository: str, *, branch: str = "main", about: Path | None = None
+) -> Upload:
+    """Upload a folder of packed shards.
+
+    `prepare_upload` writes its files into the folder first. The descriptor names the commit of the
+    other files, so it has a commit of its own. To continue after an interruption, call it again.
+
+    Args:
+        shards: The folder that ``pack`` wrote.
+        repository: "ORG/NAME" of a dataset on the Hub; created if it does not exist.
+        branch: The branch to commit to.
+        about: What the maker of the scenes states of them, as for `dataset_facts.facts_of`.
+
+    Raises:
+        ExtraError: If huggingface_hub is not installed.
+        DescriptorError: If the folder has a README.md that this package did not write, or who made
+            the scenes is not known.
+        StorageError: If the folder has no shards or lacks one, or the Hub refuses the upload.
+    """
+    index, name = prepare_upload(shards, repository, about=about)
+    from huggingface_hub import HfApi
+    from huggingface_hub.errors import HfHubHTTPError
+
+    folder = local_path(shards)
     api = HfApi(library_name="stereogenbench-data")
-    patterns = [*sorted(index.shards), *_COMPANIONS]
+    patterns = [*sorted(index.shards), *viewer_tars(index), *_COMPANIONS]
     require_own_files(folder, [str(path.relative_to(folder)) for path in _found(folder, patterns)])
     refusals: tuple[type[BaseException], ...] = (HfHubHTTPError, ValueError, *network_errors())
     try:
@@ -78,12 +118,12 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
             folder_path=folder,
             revision=branch,
             allow_patterns=patterns,
-            commit_message=f"{dataset_facts.TITLE}: {counted(len(index), 'scene')} in "
+            commit_message=f"{name}: {counted(len(index), 'scene')} in "
             f"{counted(len(index.shards), 'shard')}",
         )
         revision = str(api.dataset_info(repository, revision=branch).sha)
         address = f"{api.endpoint}/datasets/{repository}/resolve/{revision}"
-        pinned = Publication(data_url=address, tables_url=f"{address}/croissant")
+        pinned = Publication(data_url=address, tables_url=f"{address}/croissant", about=about)
         write_descriptor(index, folder / DESCRIPTOR_NAME, publication=pinned)
         api.upload_file(
             path_or_fileobj=folder / DESCRIPTOR_NAME,

@@ -10,7 +10,16 @@ import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import DataOptions, JsonOption, RootOption, grouped
+from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
+
+AboutOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--about",
+        help="JSON file with authors, licence and provenance, as `croissant --template` asks.",
+    ),
+]
 
 
 def croissant(  # noqa: PLR0913 - one parameter an option
@@ -41,7 +50,9 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         str | None,
         typer.Option(help="URL of the tables' folder [BASE_URL/NAME, NAME being the file's]."),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="The dataset's name [StereoGenBench].")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="The dataset's name [as its maker states].")
+    ] = None,
     release: Annotated[
         str | None, typer.Option(help="MAJOR.MINOR.PATCH of the data [1.0.0].")
     ] = None,
@@ -49,6 +60,10 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         datetime | None,
         typer.Option(formats=["%Y-%m-%d"], help="Day of publication [today]."),
     ] = None,
+    about: AboutOption = None,
+    template: Annotated[
+        bool, typer.Option("--template", help="Write the questions that --about answers.")
+    ] = False,
     mapping: Annotated[
         list[str] | None,
         typer.Option("--map-file", help="ID=PATH with --check: local copy of a file behind a URL."),
@@ -70,16 +85,25 @@ def croissant(  # noqa: PLR0913 - one parameter an option
             "no file for the descriptor: name it with -o FILE.", param_hint="--out"
         )
     from stereogenbench_data.bridges import dataset_facts
-    from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
+    from stereogenbench_data.bridges.croissant.descriptor import (
+        Publication,
+        write_descriptor,
+        write_node,
+    )
     from stereogenbench_data.index.table import SceneIndex
 
+    if template:
+        write_node(dataset_facts.template(), out)
+        typer.echo(f"{out}: answer the questions, then add --about {out}")
+        return
     index = None if data is None else SceneIndex.open(data, root=data_root)
     publication = Publication(
-        name=name or dataset_facts.TITLE,
-        version=release or dataset_facts.VERSION,
+        name=name,
+        version=release,
         published=None if published is None else published.date(),
         data_url=None if base_url is None else base_url.rstrip("/"),
         tables_url=None if tables_url is None else tables_url.rstrip("/"),
+        about=about,
     )
     descriptor = write_descriptor(index, out, publication=publication)
     files, records = len(descriptor["distribution"]), len(descriptor["recordSet"])
@@ -123,17 +147,23 @@ def card(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder to write README.md into [stdout].")
     ] = None,
+    about: AboutOption = None,
 ) -> None:
-    """Write the dataset card of shards, which the Hub shows and `datasets` reads."""
+    """Write the dataset card of shards, which the Hub shows and `datasets` reads.
+
+    With --out, the rows that the Hub's viewer shows are written beside it, in `viewer/`.
+    """
     from stereogenbench_data.bridges.card import card as card_text
     from stereogenbench_data.bridges.card import write_card
     from stereogenbench_data.index.table import SceneIndex
 
     index = SceneIndex.open(source.data, root=source.data_root)
     if out is None:
-        typer.echo(card_text(index, repository=repository), nl=False)
+        typer.echo(card_text(index, repository=repository, about=about), nl=False)
         return
-    typer.echo(str(write_card(index, out, repository=repository)))
+    with progress_bar("picturing", unit="scenes") as progress:
+        path = write_card(index, out, repository=repository, about=about, progress=progress)
+    typer.echo(str(path))
 
 
 def upload(
@@ -141,6 +171,7 @@ def upload(
     repository: Annotated[str, typer.Argument(help="ORG/NAME of a dataset on the Hub.")],
     *,
     branch: Annotated[str, typer.Option(help="Branch to commit to.")] = "main",
+    about: AboutOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Upload shards with index, dataset card and Croissant descriptor (extra 'hub').
@@ -148,9 +179,13 @@ def upload(
     The card and the descriptor are written into the folder first. Log in with `hf auth login`. To
     continue a stopped run, run it again.
     """
+    from stereogenbench_data.bridges.upload import prepare_upload
     from stereogenbench_data.bridges.upload import upload as uploaded
 
-    report = uploaded(shards, repository, branch=branch)
+    # The Hub's client has progress bars of its own.
+    with progress_bar("picturing", unit="scenes") as progress:
+        prepare_upload(shards, repository, about=about, progress=progress)
+    report = uploaded(shards, repository, branch=branch, about=about)
     if as_json:
         typer.echo(json.dumps(asdict(report), indent=2))
         return

@@ -74,6 +74,17 @@ TRAIN_MAPS: Final = frozenset(
 )
 UNSEEN_MAPS: Final = frozenset({"DeepWaterStation_DemoMapScalabilityEpic", "STF_TestMap"})
 
+SCENE_COUNTS: Final[dict[tuple[str, str, str], int]] = {
+    ("train", "", "IPD_Gaussian"): 3289,
+    ("train", "", "Uniform"): 774,
+    ("train", "", "Pairwise_Uniform"): 3691,
+    ("eval", "seen_map", "IPD_Gaussian"): 265,
+    ("eval", "seen_map", "Uniform"): 281,
+    ("eval", "unseen_map", "IPD_Gaussian"): 91,
+    ("eval", "unseen_map", "Uniform"): 102,
+}
+"""Scenes of the release in each (split, subset, family); the subset of train is empty."""
+
 BASELINE_BINS: Final[dict[str, tuple[float, float]]] = {
     "[0,1)": (0.0, 1.0),
     "[1,10)": (1.0, 10.0),

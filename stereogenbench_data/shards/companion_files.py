@@ -1,5 +1,7 @@
 """Files beside the shards for other readers: a list for wids, an index of each shard for DALI.
 
+wids was part of webdataset before 1.0; later releases do not read the list.
+
 Source: webdataset 0.2, `wids-shard-index-v1`; NVIDIA DALI, `tools/wds2idx.py`, v1.2.
 """
 

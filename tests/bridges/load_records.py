@@ -32,9 +32,12 @@ def main(path: str, mapping: dict[str, str]) -> None:
                 for row in found[name]
             )
             for name in MEDIA
+            if name in found
         },
-        "scenes": [{key: _text(value) for key, value in row.items()} for row in found["scenes"]],
-        "baselines": [row["pairs/baseline_cm"] for row in found["pairs"]],
+        "scenes": [
+            {key: _text(value) for key, value in row.items()} for row in found.get("scenes", [])
+        ],
+        "baselines": [row["pairs/baseline_cm"] for row in found.get("pairs", [])],
     }
     if all("://" in each.get("contentUrl", "://") for each in document["distribution"]):
         strict = mlc.Dataset(jsonld=document, mapping=local)

@@ -1,18 +1,25 @@
 """The dataset card: for people, and for `datasets`."""
 
+import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import MARK, card, write_card
-from stereogenbench_data.errors import DescriptorError
+from stereogenbench_data.bridges.viewer import write_viewer_rows
+from stereogenbench_data.errors import DescriptorError, StorageError
+from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
 from tests.servers.failing_server import serving
 from tests.servers.hub import REPOSITORY, HubHandler
@@ -30,7 +37,9 @@ for name, split in json.loads(sys.argv[2]):
         [row["__key__"], type(row["cam_00_depth.mkv"]).__name__, len(row["cam_00_depth.mkv"])]
         for row in rows
     ]
-print(json.dumps(found))
+scenes = list(load_dataset(sys.argv[1], "scenes", split="eval_unseen_map", streaming=True))
+scenes = [row | {"preview.jpg": row["preview.jpg"].format} for row in scenes]
+print(json.dumps({"videos": found, "scenes": scenes}))
 """
 WITHOUT_TORCHCODEC = "import sys; sys.modules['torchcodec'] = None\n"
 
@@ -43,7 +52,11 @@ def head():
 def test_every_family_is_a_config_with_its_splits(head):
     configs = {each["config_name"]: each["data_files"] for each in head["configs"]}
 
-    assert list(configs) == ["all", "IPD_Gaussian", "Pairwise_Uniform", "Uniform"]
+    assert list(configs) == ["all", "IPD_Gaussian", "Pairwise_Uniform", "Uniform", "scenes"]
+    assert [each["config_name"] for each in head["configs"] if each.get("default")] == ["all"]
+    assert [each["split"] for each in configs["scenes"]] == [
+        each["split"] for each in configs["all"]
+    ]
     splits = [each["split"] for each in configs["Uniform"]]
     assert splits == ["train", "eval_seen_map", "eval_unseen_map"]
     assert configs["Pairwise_Uniform"] == [
@@ -56,6 +69,21 @@ def test_the_patterns_of_all_find_every_shard_once(head):
 
     found = sorted(path.name for pattern in patterns for path in SAMPLE.glob(pattern))
     assert found == sorted(path.name for path in SAMPLE.glob("*.tar"))
+
+
+def test_the_head_says_what_the_hub_lists_datasets_by(head):
+    assert head["language"] == ["en"]
+    assert "arxiv:2605.23237" in head["tags"]
+    assert {"video", "webdataset", "mlcroissant"} <= set(head["tags"])
+    assert "image-to-video" in head["task_categories"]
+    assert head["license"] == "mit"
+
+
+def test_a_card_of_drawn_scenes_claims_nothing_of_the_release():
+    text = card(SceneIndex.open(SAMPLE), repository="a/b")
+
+    assert "stereogenbench synth" in text
+    assert not re.search(r"Unreal|Qwen2|Yangzhi|cc-by", text, re.IGNORECASE)
 
 
 def test_the_counts_are_those_of_the_index():
@@ -83,7 +111,15 @@ def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_pa
         )  # fmt: skip
 
     assert done.returncode == 0, done.stderr[-3000:]
-    found = json.loads(done.stdout)
+    found = json.loads(done.stdout)["videos"]
+    rows = json.loads(done.stdout)["scenes"]
+    assert [row["__key__"] for row in rows] == [
+        f"eval/MapUnseenInTrain/{family}/SynthYard/scene_000000"
+        for family in ("IPD_Gaussian", "Uniform")
+    ]
+    assert {(row["map.txt"], row["frames.json"], row["preview.jpg"]) for row in rows} == {
+        ("SynthYard", 81, "JPEG")
+    }
     assert len(found["None train"]) == 4, "without a config: all families"
     index = SceneIndex.open(SAMPLE)
     scenes = {index.scene(row).id.key: index.scene(row) for row in range(len(index))}
@@ -98,6 +134,50 @@ def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_pa
 def write_card_over(folder):
     (folder / "README.md").unlink()
     write_card(SceneIndex.open(folder), folder, repository=REPOSITORY)
+
+
+def test_the_rows_of_the_viewer_are_written_once_for_an_index(small_shards, tmp_path):
+    index = SceneIndex.open(small_shards)
+
+    paths = write_viewer_rows(index, tmp_path)
+    before = [path.stat().st_mtime_ns for path in paths]
+    again = [path.stat().st_mtime_ns for path in write_viewer_rows(index, tmp_path)]
+    other = write_viewer_rows(SceneIndex.open(SAMPLE), tmp_path)
+
+    assert again == before
+    assert [path.name for path in other] == [
+        "eval_seen_map.tar", "eval_unseen_map.tar", "train.tar",
+    ]  # fmt: skip
+    with tarfile.open(tmp_path / "viewer" / "train.tar") as tar:
+        names = [name for name in tar.getnames() if name.endswith(".preview.jpg")]
+        pictures = [Image.open(io.BytesIO(tar.extractfile(name).read())) for name in names]
+    assert len(names) == 4
+    assert {picture.format for picture in pictures} == {"JPEG"}
+    assert min(np.asarray(picture).std() for picture in pictures) > 10
+
+
+def test_a_scene_that_cannot_be_read_is_named(small_shards, tmp_path):
+    folder = shutil.copytree(small_shards, tmp_path / "shards")
+    index = SceneIndex.open(folder)
+    (shard, *_) = index.shards
+    (folder / shard).unlink()
+
+    with pytest.raises(StorageError, match=re.escape(shard)):
+        write_viewer_rows(index, tmp_path)
+    assert list((tmp_path / "viewer").glob("*.tar*")) == []
+
+
+def test_a_part_without_the_primary_pair_has_white_pictures(small_shards, tmp_path):
+    whole = SceneIndex.open(small_shards)
+    part = plan_download(whole, [0, 1], cameras=(2, 3), streams=("rgb",))
+    download(whole, part, tmp_path / "tree")
+    pack(tmp_path / "tree", tmp_path / "shards", workers=1)
+
+    (path, *_) = write_viewer_rows(SceneIndex.open(tmp_path / "shards"), tmp_path)
+
+    with tarfile.open(path) as tar:
+        (name, *_) = tar.getnames()
+        assert np.asarray(Image.open(io.BytesIO(tar.extractfile(name).read()))).min() == 255
 
 
 def test_a_card_is_replaced_but_another_readme_is_not(tmp_path):

@@ -2,11 +2,14 @@
 
 import json
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
 from datetime import date
 from pathlib import Path
+from urllib.parse import urljoin
 
 import pytest
 
@@ -16,12 +19,16 @@ from stereogenbench_data.bridges.croissant.descriptor import Publication, write_
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.shards.download import download, plan_download
 from stereogenbench_data.shards.pack import pack
-from tests.servers.tools import require_module
+from tests.cli.command import invoke
+from tests.servers.tools import require_module, require_tool
 
 HOME = Path(__file__).resolve().parents[2]
 SHIPPED = HOME / "croissant"
 LOADER = Path(__file__).with_name("load_records.py")
 DAY = Publication(published=date(2026, 11, 21))
+AT_HOME = Publication(
+    published=date(2026, 11, 21), data_url="https://huggingface.co/datasets/some-group/some-data"
+)
 
 
 def validated(*paths):
@@ -64,10 +71,52 @@ def index(small_shards):
 
 
 def test_the_shipped_descriptors_are_valid_without_a_warning():
-    paths = sorted(SHIPPED.glob("*.json"))
+    paths = [SHIPPED / "release.json", SHIPPED / "sample.json"]
 
-    assert [path.name for path in paths] == ["hub.json", "metadata.json", "sample.json"]
-    assert validated(*paths) == [(0, [])] * 3
+    assert sorted(SHIPPED.glob("*.json")) == [*paths, SHIPPED / "template.json"]
+    assert validated(*paths) == [(0, [])] * 2
+    assert [check_descriptor(path) for path in paths] == [[], []]
+
+
+def test_the_shipped_descriptors_name_where_their_own_data_come_from():
+    """Neither claims the other's renderer, authors, licence or page."""
+    sample = (SHIPPED / "sample.json").read_text()
+    release = (SHIPPED / "release.json").read_text()
+
+    assert not re.search(r"Unreal|Qwen|Yangzhi|creativecommons|huggingface", sample)
+    assert "stereogenbench synth" in sample
+    assert "stereogenbench synth" not in release
+    assert json.loads(sample)["url"] == "../shards/README.md"
+    assert (SHIPPED / json.loads(sample)["url"]).is_file()
+    assert json.loads(release)["datePublished"] == "2026-05"
+
+
+def test_splits_have_the_urls_of_the_specification():
+    for name in ("release", "sample"):
+        document = json.loads((SHIPPED / f"{name}.json").read_text())
+        splits = next(each for each in document["recordSet"] if each["@id"] == "splits")
+
+        assert splits["dataType"] == "cr:Split"
+        assert {row["splits/name"]: row["splits/url"] for row in splits["data"]} == {
+            "train": "cr:TrainingSplit",
+            "eval": "cr:TestSplit",
+        }
+
+
+def test_the_descriptor_of_the_release_needs_no_file_of_it(tmp_path):
+    """Reading one through its repository would clone hundreds of gigabytes."""
+    records = loaded(SHIPPED / "release.json", tmp_path)
+
+    assert records["counts"] == {
+        "splits": 2, "eval_subsets": 2, "families": 3, "maps": 25, "parts": 7,
+    }  # fmt: skip
+    assert records["first_of_each"] == [True] * 5
+    document = json.loads((SHIPPED / "release.json").read_text())
+    (parts,) = (each for each in document["recordSet"] if each["@id"] == "parts")
+    assert sum(row["parts/scenes"] for row in parts["data"]) == 8493
+    assert (
+        "cloning the whole repository, with GitPython" in document["distribution"][0]["description"]
+    )
 
 
 def test_the_shipped_descriptor_of_the_sample_loads_every_record_in_both_orders(tmp_path):
@@ -91,18 +140,19 @@ def test_the_shipped_descriptor_of_the_sample_loads_every_record_in_both_orders(
     assert records["baselines"] == sample.column("baselines_cm").reshape(-1).tolist()
 
 
-def test_the_shipped_descriptors_are_those_that_the_sample_gives(tmp_path):
+def test_the_shipped_descriptors_are_those_of_make_descriptors(tmp_path, monkeypatch):
     copied = tmp_path / "croissant"
     shutil.copytree(HOME / "shards", tmp_path / "shards")
-    packed = SceneIndex.open(tmp_path / "shards")
-    sample = {"published": date(2026, 11, 21), "name": "StereoGenBench sample"}
-    address = json.loads((SHIPPED / "metadata.json").read_text())["url"]
+    planned = subprocess.run(
+        [require_tool("make"), "--dry-run", "--old-file", ".venv/.ready", "descriptors"],
+        cwd=HOME, capture_output=True, text=True, check=True,
+    ).stdout.replace("\\\n", " ")  # fmt: skip
+    commands = re.findall(r"^\S*stereogenbench (croissant .*)", planned, re.MULTILINE)
+    monkeypatch.chdir(tmp_path)
 
-    write_descriptor(packed, copied / "sample.json", publication=Publication(**sample))
-    write_descriptor(
-        packed, copied / "metadata.json", publication=Publication(**sample, data_url=address)
-    )
-    write_descriptor(None, copied / "hub.json", publication=DAY)
+    done = [invoke(*shlex.split(command)) for command in commands]
+
+    assert [each.exit_code for each in done] == [0, 0, 0]
 
     written = {path.relative_to(copied) for path in copied.rglob("*") if path.is_file()}
     assert written == {path.relative_to(SHIPPED) for path in SHIPPED.rglob("*") if path.is_file()}
@@ -128,10 +178,25 @@ def test_absolute_addresses_pass_the_steps_of_the_conference_checker(web, index,
     assert records["first_of_each"] == [True] * len(records["counts"])
 
 
-def test_a_released_tree_is_read_from_its_own_files(small_release, tmp_path):
+def test_the_sample_behind_a_url_passes_the_steps_of_the_conference_checker(web, tmp_path):
+    for name in ("shards", "croissant"):
+        shutil.copytree(HOME / name, web.folder / name)
+    document = json.loads((SHIPPED / "sample.json").read_text())
+    for file in document["distribution"]:
+        if "contentUrl" in file:
+            file["contentUrl"] = urljoin(f"{web.url}/croissant/", file["contentUrl"])
+    place = tmp_path / "sample.json"
+    place.write_text(json.dumps(document))
+
+    records = loaded(place, tmp_path / "cache")
+
+    assert records["first_of_each"] == [True] * len(document["recordSet"])
+
+
+def test_a_tree_is_read_from_its_own_files(small_release, tmp_path):
     tree = SceneIndex.open(small_release)
-    path = tmp_path / "hub.json"
-    write_descriptor(tree, path, publication=DAY)
+    path = tmp_path / "tree.json"
+    write_descriptor(tree, path, publication=AT_HOME)
 
     records = loaded(path, tmp_path / "cache", {"repository": str(small_release)})
 
@@ -175,7 +240,7 @@ def test_a_partial_download_is_described_by_its_videos(small_shards, tmp_path, s
     for name, mapping in places.items():
         index = tree if name == "tree" else SceneIndex.open(tmp_path / name)
         path = tmp_path / f"{name}.json"
-        written = write_descriptor(index, path, publication=DAY)
+        written = write_descriptor(index, path, publication=AT_HOME if name == "tree" else DAY)
 
         kinds = [each["@id"] for each in written["recordSet"] if each["@id"].endswith("_videos")]
         assert kinds == [f"{stream}_videos"]
@@ -227,6 +292,11 @@ def test_a_descriptor_that_cannot_be_written_names_the_place(index, tmp_path):
 
     with pytest.raises(DescriptorError, match=r"file/data: tables cannot be written"):
         write_descriptor(index, tmp_path / "file" / "data.json", publication=DAY)
+
+
+def test_a_tree_of_ones_own_needs_the_url_of_its_repository(small_release, tmp_path):
+    with pytest.raises(DescriptorError, match=r"as a git repository, so name its URL \(--base-url"):
+        write_descriptor(SceneIndex.open(small_release), tmp_path / "data.json", publication=DAY)
 
 
 @pytest.mark.parametrize("name", ["data_url", "tables_url"])

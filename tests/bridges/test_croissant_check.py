@@ -107,8 +107,67 @@ MUTATIONS = {
         "is a branch, which changes: pin a revision",
     ),
     "inline data of no field": (
-        lambda d: node(d, "splits")["data"][0].update({"splits/url": "x"}),
-        "splits: has data for splits/url",
+        lambda d: node(d, "splits")["data"][0].update({"splits/link": "x"}),
+        "splits: has data for splits/link",
+    ),
+    "unknown data type": (
+        lambda d: node(d, "scenes/map").update(dataType="sc:String"),
+        "scenes/map: has the data type sc:String, and one must be of",
+    ),
+    "split as the only data type": (
+        lambda d: node(d, "splits/url").update(dataType="cr:Split"),
+        "splits/url: has the data type cr:Split",
+    ),
+    "no data type": (
+        lambda d: node(d, "scenes/map").pop("dataType"), "scenes/map: has the data type none",
+    ),
+    "text as a number": (
+        lambda d: node(d, "scenes/map").update(dataType="sc:Integer"),
+        r"scenes/map: has the data type sc:Integer \(whole numbers\), but the column 'map' of "
+        r"scenes\.parquet holds string",
+    ),
+    "number as text": (
+        lambda d: node(d, "pairs/camera_left").update(dataType="sc:Text"),
+        r"pairs/camera_left: .*holds int64",
+    ),
+    "list as a value": (
+        lambda d: node(d, "scenes/depth_unit_m").pop("isArray"),
+        "scenes/depth_unit_m: has no isArray, but .* holds list",
+    ),
+    "value as a list": (
+        lambda d: node(d, "scenes/map").update(isArray=True, arrayShape="3"),
+        "scenes/map: has isArray, but .* holds string",
+    ),
+    "list of another length": (
+        lambda d: node(d, "scenes/pairwise_baselines_cm").update(arrayShape="14"),
+        "scenes/pairwise_baselines_cm: has the arrayShape 14, but .* has a list of 15",
+    ),
+    "shape that is none": (
+        lambda d: node(d, "scenes/depth_unit_m").update(arrayShape="six"),
+        "scenes/depth_unit_m: has the arrayShape 'six', and must have numbers",
+    ),
+    "inline value of another type": (
+        lambda d: node(d, "splits")["data"][0].update({"splits/meaning": 3}),
+        "splits/meaning: has the value 3, which is not sc:Text",
+    ),
+    "regex that takes no number": (
+        lambda d: node(d, "rgb_videos/camera")["source"].update(
+            transform={"regex": r"^.*?(cam_\d{2})_rgb\.\w+$"}
+        ),
+        "rgb_videos/camera: is an sc:Integer, but .* takes 'cam_00' of a name",
+    ),
+    "date that is none": (
+        lambda d: d.update(datePublished="22.11.2026"), "datePublished: is '22.11.2026', and must",
+    ),
+    "no such day": (
+        lambda d: d.update(datePublished="2026-02-30"), "datePublished: is '2026-02-30', and must",
+    ),
+    "day to come": (
+        lambda d: d.update(datePublished="9999-01-01"), "datePublished: is 9999-01-01, which has",
+    ),
+    "question without an answer": (
+        lambda d: d["creator"][0].update(name="FILL IN: who made it"),
+        "creator.name: must be filled in",
     ),
     "no record sets": (lambda d: d.update(recordSet=[]), "recordSet: is empty"),
     "empty responsible-AI value": (
@@ -166,6 +225,15 @@ def test_a_mutation_is_reported_by_name(written, name):
     problems = check_descriptor(written)
 
     assert any(re.search(message, problem) for problem in problems), problems
+
+
+@pytest.mark.parametrize("published", ["2026", "2026-05", "2026-05-31"])
+def test_a_year_a_month_and_a_day_are_dates(written, published):
+    document = json.loads(written.read_text())
+    document["datePublished"] = published
+    written.write_text(json.dumps(document))
+
+    assert check_descriptor(written) == []
 
 
 def test_a_file_behind_a_url_is_checked_at_its_local_path(written, small_shards):

@@ -88,13 +88,13 @@ def test_the_descriptor_says_from_what_how_and_with_what_error(packed, small_rel
     written = write_descriptor(index, path, publication=Publication(published=date(2026, 11, 21)))
 
     assert check_descriptor(path) == []
-    assert "derived from the release for training" in written["description"]
+    assert "derived from other scenes for training" in written["description"]
     (source,) = [
         each
         for each in written["prov:wasDerivedFrom"]
         if SceneIndex.open(small_release).digest in each["description"]
     ]
-    assert source["prov:label"] == "StereoGenBench"
+    assert source["prov:label"] == "Drawn stereo scenes in the layout of StereoGenBench"
     how = written["prov:wasGeneratedBy"][-1]["description"]
     assert all(part in how for part in ("48x32", "h264", "small", "crf", "dB"))
 

@@ -50,9 +50,12 @@ def test_shards_index_card_and_descriptor_arrive_whole(folder, upload_hub, tmp_p
     for name in (*index.shards, "index.parquet", "shards.json", "README.md", "croissant.json"):
         assert (there / name).read_bytes() == (folder / name).read_bytes()
     assert SceneIndex.open(there).digest == index.digest
+    for split in ("train", "eval_seen_map"):
+        assert (there / "viewer" / f"{split}.tar").is_file()
     assert report["url"] == f"hf://datasets/{REPOSITORY}@{report['revision']}"
     descriptor = json.loads((there / "croissant.json").read_text())
     addresses = [file["contentUrl"] for file in descriptor["distribution"] if "contentUrl" in file]
+    assert descriptor["url"] == f"{upload_hub.url}/datasets/{REPOSITORY}"
     start = f"{upload_hub.url}/datasets/{REPOSITORY}/resolve/{report['revision']}/"
     assert all(address.startswith(start) for address in addresses)
     places = {

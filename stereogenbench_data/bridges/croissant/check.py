@@ -9,12 +9,14 @@ import fnmatch
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, date, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from stereogenbench_data.bridges.croissant.nodes import (
@@ -27,6 +29,7 @@ from stereogenbench_data.bridges.croissant.nodes import (
     TEXT,
     Node,
 )
+from stereogenbench_data.bridges.dataset_facts import blanks, listed
 from stereogenbench_data.errors import DescriptorError, StorageError
 from stereogenbench_data.shards.tar import read_members
 
@@ -67,6 +70,32 @@ _KNOWN: Final = frozenset(
         "@value", "@language",
     }
 )  # fmt: skip
+_TYPES: Final = frozenset(
+    {
+        *(f"sc:{name}" for name in (
+            "Text", "URL", "Integer", "Float", "Boolean", "Date", "DateTime", "Time", "ImageObject",
+            "AudioObject", "VideoObject",
+        )),
+        *(f"cr:{name}" for name in (
+            "BoundingBox", "Float16", "Float32", "Float64", "Int8", "Int16", "Int32", "Int64",
+            "UInt8", "UInt16", "UInt32", "UInt64",
+        )),
+    }
+)  # fmt: skip
+"""The data types that mlcroissant reads. Others may stand beside one of them."""
+_IS_TEXT: Final = (pa.types.is_string, pa.types.is_large_string)
+_ARROW_TYPES: Final[dict[str, tuple[str, tuple[Callable[[pa.DataType], bool], ...]]]] = {
+    "sc:Text": ("text", _IS_TEXT),
+    "sc:URL": ("text", _IS_TEXT),
+    "sc:Integer": ("whole numbers", (pa.types.is_integer,)),
+    "sc:Float": ("numbers", (pa.types.is_floating, pa.types.is_integer)),
+    "sc:Boolean": ("true or false", (pa.types.is_boolean,)),
+}
+"""What a column of each data type holds, and the tests of Arrow's types for it."""
+_INLINE_TYPES: Final[dict[str, type | tuple[type, ...]]] = {
+    "sc:Text": str, "sc:URL": str, "sc:Integer": int, "sc:Float": (int, float), "sc:Boolean": bool,
+}  # fmt: skip
+_MONTH: Final = re.compile(r"\d{4}(-(0[1-9]|1[0-2]))?")
 _VERSION: Final = re.compile(r"\d+\.\d+\.\d+")
 _SHA256: Final = re.compile(r"[0-9a-f]{64}")
 _MOVING: Final = re.compile(r"/(?:resolve|raw|blob|tree)/(?:main|master|HEAD)(?:/|$)")
@@ -154,18 +183,18 @@ class _Check:
         return {str(node.get("@id")): node for node in nodes}
 
     @cached_property
-    def _columns(self) -> dict[str, list[str]]:
-        """The columns of every table that is available locally."""
+    def _columns(self) -> dict[str, pa.Schema]:
+        """The columns of every table that is available locally, with their types."""
         columns = {}
         for name, file in self._files.items():
             path = self._local(file)
             if (
                 path is not None
                 and path.is_file()
-                and PARQUET in _listed(file.get("encodingFormat"))
+                and PARQUET in listed(file.get("encodingFormat"))
             ):
                 try:
-                    columns[name] = pq.read_schema(path).names
+                    columns[name] = pq.read_schema(path)
                 except (pa.ArrowException, OSError) as error:
                     self.report(name, f"cannot be read as Parquet ({error})")
         return columns
@@ -197,7 +226,7 @@ class _Check:
             return [each.relative_to(path).as_posix() for each in path.rglob("*") if each.is_file()]
         if not path.is_file():
             return None
-        encodings = _listed(file.get("encodingFormat"))
+        encodings = listed(file.get("encodingFormat"))
         if TAR in encodings:
             try:
                 with path.open("rb") as opened:
@@ -214,7 +243,7 @@ class _Check:
         found = [self._members_of(each) for each in _containers(files) if each in self._files]
         if any(members is None for members in found) or not found:
             return None
-        patterns = [str(each) for each in _listed(files.get("includes"))]
+        patterns = [str(each) for each in listed(files.get("includes"))]
         return [
             member
             for members in found
@@ -225,7 +254,7 @@ class _Check:
     # The dataset as a whole.
 
     def _check_context(self) -> None:
-        conforms = _listed(self._node.get("conformsTo"))
+        conforms = listed(self._node.get("conformsTo"))
         for wanted in (CROISSANT, RAI):
             if wanted not in conforms:
                 found = ", ".join(map(str, conforms))
@@ -250,14 +279,30 @@ class _Check:
         for name in (*REQUIRED, *REQUIRED_RAI):
             if self._node.get(name) in (None, "", [], {}):
                 self.report(name, "is missing" if name not in self._node else "is empty")
+        for place in blanks(self._node):
+            self.report(place, "must be filled in: what stands there is the question")
         for local in RAI_ONCE:
-            if len(_listed(self._node.get(f"rai:{local}"))) > 1:
+            if len(listed(self._node.get(f"rai:{local}"))) > 1:
                 self.report(
                     f"rai:{local}", "has several values, but readers keep only the first: join them"
                 )
         version = self._node.get("version")
         if not _VERSION.fullmatch(str(version or "")):
             self.report("version", f"is {version!r}, and must be MAJOR.MINOR.PATCH")
+        self._check_date(str(self._node.get("datePublished") or ""))
+
+    def _check_date(self, text: str) -> None:
+        """Check that the day of publication is a day, month or year that has come."""
+        found = None
+        try:
+            found = date.fromisoformat(text)
+        except ValueError:
+            if _MONTH.fullmatch(text):
+                found = date.fromisoformat(f"{text}-01" if "-" in text else f"{text}-01-01")
+        if found is None:
+            self.report("datePublished", f"is {text!r}, and must be a date such as 2026-11-22")
+        elif found > datetime.now(UTC).date():
+            self.report("datePublished", f"is {text}, which has not come yet: write the real date")
 
     def _check_names(self) -> None:
         """Check the spelling of every property."""
@@ -303,7 +348,7 @@ class _Check:
             if "contentUrl" not in file or "encodingFormat" not in file:
                 self.report(name, "must have a contentUrl and an encodingFormat")
                 continue
-            encodings, url = _listed(file["encodingFormat"]), str(file["contentUrl"])
+            encodings, url = listed(file["encodingFormat"]), str(file["contentUrl"])
             is_repository = GIT in encodings
             if not is_repository and not _SHA256.fullmatch(str(file.get("sha256", ""))):
                 self.report(
@@ -360,7 +405,7 @@ class _Check:
                         name, f"is contained in {container!r}, which is not in the descriptor"
                     )
             if self._files_of_set(name) == []:
-                patterns = ", ".join(map(str, _listed(files["includes"])))
+                patterns = ", ".join(map(str, listed(files["includes"])))
                 self.report(
                     name, f"includes {patterns}, which matches no file: correct the pattern"
                 )
@@ -370,15 +415,16 @@ class _Check:
     def _check_records(self, records: Node) -> None:
         name = str(records.get("@id"))
         own = {str(each.get("@id")) for each in records.get("field", [])}
-        for key in _listed(records.get("key")):
+        for key in listed(records.get("key")):
             if str(key.get("@id")) not in own:
                 self.report(name, f"has the key {key.get('@id')}, which is not one of its fields")
-        for row in _listed(records.get("data")):
+        for row in listed(records.get("data")):
             if set(row) - own:
                 strange = ", ".join(sorted(set(row) - own))
                 self.report(name, f"has data for {strange}, which it has no field for")
         for field in records.get("field", []):
             self._check_reference(field)
+            self._check_type(field, listed(records.get("data")))
             self._check_source(field, has_data="data" in records)
 
     def _check_reference(self, node: Node) -> None:
@@ -398,6 +444,60 @@ class _Check:
                 name, f"refers to {target}, which is itself a reference: chains load wrong rows"
             )
 
+    def _check_type(self, node: Node, rows: list[Node]) -> None:
+        """Check a field's data type, and that the values given with the descriptor have it."""
+        name, kinds = str(node.get("@id")), listed(node.get("dataType"))
+        if not _TYPES & {str(kind) for kind in kinds}:
+            found = ", ".join(map(str, kinds)) or "none"
+            self.report(
+                name, f"has the data type {found}, and one must be of {', '.join(sorted(_TYPES))}"
+            )
+        wanted = [_INLINE_TYPES[kind] for kind in kinds if kind in _INLINE_TYPES]
+        for value in (row[name] for row in rows if name in row):
+            is_flag = isinstance(value, bool) and "sc:Boolean" not in kinds
+            if wanted and (is_flag or not isinstance(value, wanted[0])):
+                self.report(name, f"has the value {value!r}, which is not {', '.join(kinds)}")
+
+    def _check_column(self, node: Node, *, file: str, column: str) -> None:
+        """Check that a column holds what its field says: type, list or not, length of lists."""
+        name, found = str(node.get("@id")), self._columns[file].field(column).type
+        is_list = pa.types.is_list(found) or pa.types.is_large_list(found)
+        is_list = is_list or pa.types.is_fixed_size_list(found)
+        if is_list != bool(node.get("isArray")):
+            says = "isArray" if node.get("isArray") else "no isArray"
+            self.report(name, f"has {says}, but the column {column!r} of {file} holds {found}")
+            return
+        value = found.value_type if is_list else found
+        for kind in listed(node.get("dataType")):
+            what, tests = _ARROW_TYPES.get(kind, ("", ()))
+            if tests and not any(test(value) for test in tests):
+                self.report(
+                    name,
+                    f"has the data type {kind} ({what}), but the column {column!r} of {file} "
+                    f"holds {found}",
+                )
+        if is_list:
+            self._check_shape(node, file=file, column=column)
+
+    def _check_shape(self, node: Node, *, file: str, column: str) -> None:
+        shape = [part.strip() for part in str(node.get("arrayShape", "-1")).split(",")]
+        path = self._local(self._files[file])
+        if not all(re.fullmatch(r"-1|\d+", part) for part in shape):
+            self.report(
+                str(node.get("@id")),
+                f"has the arrayShape {node['arrayShape']!r}, and must have numbers such as 15 or "
+                "2,3 (-1 for any)",
+            )
+        elif path is not None and len(shape) == 1 and shape != ["-1"]:
+            lists = pq.read_table(path, columns=[column]).column(0)
+            lengths = set(pc.list_value_length(lists).unique().to_pylist()) - {None, int(shape[0])}
+            if lengths:
+                self.report(
+                    str(node.get("@id")),
+                    f"has the arrayShape {shape[0]}, but the column {column!r} of {file} has a "
+                    f"list of {min(lengths)}",
+                )
+
     def _check_source(self, node: Node, *, has_data: bool) -> None:
         name, source = str(node.get("@id")), node.get("source")
         if source is None:
@@ -409,8 +509,14 @@ class _Check:
         if origin not in self._files and origin not in self._fields:
             self.report(name, f"is read from {origin!r}, which is not in the descriptor")
         column, columns = source.get("extract", {}).get("column"), self._columns.get(str(origin))
-        if column is not None and columns is not None and column not in columns:
-            self.report(name, f"reads the column {column!r} of {origin}; its columns are {columns}")
+        if column is not None and columns is not None:
+            if column in columns.names:
+                self._check_column(node, file=str(origin), column=column)
+            else:
+                self.report(
+                    name,
+                    f"reads the column {column!r} of {origin}; its columns are {columns.names}",
+                )
         regex = source.get("transform", {}).get("regex")
         if regex is not None and not _has_group(regex):
             self.report(name, f"takes the first group of the regex {regex!r}, which has no group")
@@ -442,9 +548,16 @@ class _Check:
         if not paths or wanted not in {"fullpath", "filename"} or not _has_group(regex or ""):
             return
         texts = [path if wanted == "fullpath" else path.rpartition("/")[2] for path in paths]
-        missed = [text for text in texts if not re.match(regex, text)]
+        found = {text: re.match(regex, text) for text in texts}
+        missed = [text for text, match in found.items() if match is None]
+        taken = [each[1] or "" for each in found.values() if each]
+        no_number = [text for text in taken if not text.isdigit()]
         if missed:
             self.report(name, f"has the regex {regex!r}, which does not match {missed[0]}")
+        elif "sc:Integer" in listed(node.get("dataType")) and no_number:
+            self.report(
+                name, f"is an sc:Integer, but the regex {regex!r} takes {no_number[0]!r} of a name"
+            )
         elif "references" in node and not _is_kept(regex, texts[0]):
             self.report(
                 name,
@@ -470,7 +583,9 @@ class _Check:
         source = node.get("source", {})
         file = str(source.get("fileObject", {}).get("@id"))
         column = source.get("extract", {}).get("column")
-        path = self._local(self._files[file]) if column in self._columns.get(file, ()) else None
+        schema = self._columns.get(file)
+        has_column = schema is not None and column in schema.names
+        path = self._local(self._files[file]) if has_column else None
         if path is None:
             return None
         values: pa.ChunkedArray = pq.read_table(path, columns=[column]).column(0)
@@ -480,7 +595,7 @@ class _Check:
         """Return a field's values in inline data, none if it has none."""
         for records in self._record_sets:
             if name in {str(each.get("@id")) for each in records.get("field", [])}:
-                return {str(row.get(name)) for row in _listed(records.get("data"))}
+                return {str(row.get(name)) for row in listed(records.get("data"))}
         return set()
 
 
@@ -499,7 +614,7 @@ def _names(node: Any, *, at: str) -> Iterator[tuple[str, str]]:
 
 def _containers(files: Node) -> list[str]:
     """Return the ids of the files that contain a set of files."""
-    nodes = _listed(files.get("containedIn"))
+    nodes = listed(files.get("containedIn"))
     return [str(each.get("fileObject", each).get("@id")) for each in nodes]
 
 
@@ -515,10 +630,3 @@ def _is_kept(regex: str, text: str) -> bool:
     once = re.match(regex, text)
     again = None if once is None else re.match(regex, once[1])
     return once is not None and again is not None and again[1] == once[1]
-
-
-def _listed(value: Any) -> list[Any]:
-    """Return a single value, a list of values or None as a list."""
-    if value is None:
-        return []
-    return value if isinstance(value, list) else [value]

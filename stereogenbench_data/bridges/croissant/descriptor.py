@@ -2,21 +2,29 @@
 
 It describes either shards or a tree in the released layout. Shards are files with checksums, and
 small tables beside the descriptor hold their scenes and pairs (`shards`). A tree is a repository,
-and its JSON files hold its scenes and pairs (`folders`).
+and its JSON files hold its scenes and pairs (`folders`). What it says of the dataset as a whole is
+in `dataset_facts`.
 
 Source: the Croissant 1.1 and RAI 1.0 specifications.
 """
 
 import json
 import os
+import re
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from stereogenbench_data.bridges import dataset_facts
-from stereogenbench_data.bridges.croissant.folders import folder_nodes
-from stereogenbench_data.bridges.croissant.nodes import CONTEXT, CROISSANT, RAI, Node
+from stereogenbench_data.bridges.croissant.folders import folder_nodes, release_nodes
+from stereogenbench_data.bridges.croissant.nodes import (
+    CONTEXT,
+    CROISSANT,
+    RAI,
+    Node,
+    suffixes_of,
+)
 from stereogenbench_data.bridges.croissant.shards import packed_nodes, write_tables
 from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
@@ -24,27 +32,34 @@ from stereogenbench_data.shards.companion_files import derivation_facts
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import shown
 
+_HUB_FILE: Final = re.compile(r"(https?://[^/]+/datasets/[^/]+/[^/]+)/(?:resolve|tree|blob|raw)/")
+"""A URL of files of a dataset on the Hub; the group is the dataset's page."""
+_FIRST_VERSION: Final = "1.0.0"
+
 
 @dataclass(frozen=True, slots=True)
 class Publication:
     """The name, version and URLs that a descriptor states.
 
     Attributes:
-        name: The dataset's name.
-        version: MAJOR.MINOR.PATCH.
-        published: The day of publication; None for today.
-        data_url: URL of the folder of shards, pinned to a revision, or of the repository of a
-            tree. With None, shards have paths relative to the descriptor, and a tree has the URL
-            of the release's own repository.
+        name: The dataset's name; None for what its maker states.
+        version: MAJOR.MINOR.PATCH; None for what its maker states, else 1.0.0.
+        published: The day of publication; None for what its maker states, else today.
+        data_url: URL of the folder of shards, pinned to a revision, or of the git repository of a
+            tree. With None, shards have paths relative to the descriptor, and a tree of the
+            release has the URL of the release's own repository.
         tables_url: URL of the folder of tables. None for the folder in ``data_url`` with the name
             of the descriptor, or for paths relative to the descriptor.
+        about: A JSON file in which the maker of the scenes states what `dataset_facts` does not
+            know.
     """
 
-    name: str = dataset_facts.TITLE
-    version: str = dataset_facts.VERSION
+    name: str | None = None
+    version: str | None = None
     published: date | None = None
     data_url: str | None = None
     tables_url: str | None = None
+    about: Path | None = None
 
 
 def write_descriptor(
@@ -63,8 +78,9 @@ def write_descriptor(
         The descriptor as written.
 
     Raises:
-        DescriptorError: If a file cannot be written, the shards are behind a URL and ``data_url``
-            is None, or a URL contains a login or a query.
+        DescriptorError: If a file cannot be written, ``data_url`` is None but shards are behind a
+            URL or a tree is not the release's, a URL contains a login or a query, or who made the
+            scenes is not known.
     """
     publication = publication or Publication()
     for url in (publication.data_url, publication.tables_url):
@@ -73,6 +89,7 @@ def write_descriptor(
                 f"{shown(url)}: the URL contains a login or a query, which must not be published. "
                 f"Give the URL without them."
             )
+    facts = dataset_facts.facts_of(index, about=publication.about)
     if index is not None and index.shards:
         data_url = publication.data_url or _relative(index.root, to=path.parent)
         beside = (
@@ -84,15 +101,36 @@ def write_descriptor(
             data_url=data_url,
             tables_url=publication.tables_url or beside,
         )
+    elif index is not None:
+        data_url = publication.data_url or facts.get("url", "")
+        if not data_url:
+            raise DescriptorError(
+                f"{index.where}: folders of scenes are described as a git repository, so name its "
+                "URL (--base-url). Or pack them: shards are described where they are."
+            )
+        files, records = folder_nodes(index, repository_url=data_url)
     else:
         data_url = publication.data_url or dataset_facts.HOME
-        files, records = folder_nodes(index, repository_url=data_url)
-    descriptor = _head(publication, url=data_url) | {"distribution": files, "recordSet": records}
+        files, records = release_nodes(repository_url=data_url)
     if index is not None and index.is_derived:
-        descriptor |= _derived(index)
+        facts |= _derived(index, facts)
+    elif index is not None and index.shards:
+        facts |= _packed(index, facts)
+    head = _head(facts, publication, url=_page(data_url, beside=path))
+    descriptor = head | {"distribution": files, "recordSet": records}
+    write_node(descriptor, path)
+    return descriptor
+
+
+def write_node(node: Node, path: Path) -> None:
+    """Write a JSON object as descriptors are written.
+
+    Raises:
+        DescriptorError: If the file cannot be written.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(descriptor, indent=1, ensure_ascii=False) + "\n"
+        text = json.dumps(node, indent=1, ensure_ascii=False) + "\n"
         write_atomic(path, text.encode())
     except OSError as error:
         raise DescriptorError(
@@ -100,33 +138,49 @@ def write_descriptor(
                 f"{path}: cannot be written", error, "Choose another place with --out."
             )
         ) from error
-    return descriptor
 
 
-def _derived(index: SceneIndex) -> Node:
+def _page(data_url: str, *, beside: Path) -> str:
+    """Return the page of data: on the Hub, or their README.md if they are local."""
+    found = _HUB_FILE.match(f"{data_url}/")
+    if found:
+        return found[1]
+    readme = f"{data_url}/README.md"
+    return readme if "://" not in data_url and (beside.parent / readme).is_file() else data_url
+
+
+def _packed(index: SceneIndex, facts: Node) -> Node:
+    """Return the provenance of packed shards."""
+    depth = (
+        ", depth packed by blosc2 without loss" if "b2frame" in suffixes_of(index).values() else ""
+    )
+    packing = dataset_facts.activity(
+        "Packing",
+        f"Files of the scenes put into WebDataset shards, unchanged{depth}.",
+        by="stereogenbench pack",
+    )
+    return {"prov:wasGeneratedBy": [*dataset_facts.listed(facts["prov:wasGeneratedBy"]), packing]}
+
+
+def _derived(index: SceneIndex, facts: Node) -> Node:
     """Return what the descriptor of training shards says instead: from what, how, what error."""
-    facts = derivation_facts(index)
-    psnr_db = facts["psnr_db"]
-    encoding = {
-        "@type": "prov:Activity",
-        "prov:type": {"@id": "https://www.wikidata.org/wiki/Q1172378"},
-        "prov:label": "Derivation for training",
-        "description": (
-            f"Pictures scaled to {facts['size']} and encoded by {facts['codec']} (quality "
-            f"{facts['quality']}, settings {json.dumps(facts['settings'], sort_keys=True)}), PSNR "
-            f"{psnr_db['mean']:.2f} dB on average and {psnr_db['worst_frame']:.2f} dB in the worst "
-            f"frame; depth of the nearest pixels, by blosc2 without loss."
-        ),
-    }
-    source = {
-        "@type": "prov:Entity",
-        "prov:label": dataset_facts.TITLE,
-        "description": f"The release, with the index {facts['source_digest']}.",
-    }
+    derived = derivation_facts(index)
+    psnr_db, settings = derived["psnr_db"], json.dumps(derived["settings"], sort_keys=True)
+    encoding = dataset_facts.activity(
+        "Derivation for training",
+        f"Pictures scaled to {derived['size']} and encoded by {derived['codec']} (quality "
+        f"{derived['quality']}, settings {settings}), PSNR "
+        f"{psnr_db['mean']:.2f} dB on average and {psnr_db['worst_frame']:.2f} dB in the worst "
+        f"frame; depth of the nearest pixels, by blosc2 without loss.",
+        by="stereogenbench pack --size",
+    )
+    source = dataset_facts.entity(
+        facts["name"], f"The scenes with the index {derived['source_digest']}."
+    )
     return {
-        "description": f"{dataset_facts.DESCRIPTION} {dataset_facts.DERIVED}",
-        "prov:wasGeneratedBy": [*dataset_facts.PROVENANCE["prov:wasGeneratedBy"], encoding],
-        "prov:wasDerivedFrom": [*dataset_facts.PROVENANCE["prov:wasDerivedFrom"], source],
+        "description": f"{facts['description']} {dataset_facts.DERIVED}",
+        "prov:wasGeneratedBy": [*dataset_facts.listed(facts["prov:wasGeneratedBy"]), encoding],
+        "prov:wasDerivedFrom": [*dataset_facts.listed(facts["prov:wasDerivedFrom"]), source],
     }
 
 
@@ -139,28 +193,24 @@ def _relative(root: str, *, to: Path) -> str:
     return Path(os.path.relpath(root, to)).as_posix()
 
 
-def _head(publication: Publication, *, url: str) -> Node:
-    """Return the properties of the dataset as a whole."""
-    published = publication.published or datetime.now(UTC).date()
-    organisation = {"@type": "sc:Organization", "name": dataset_facts.AFFILIATION}
-    return {
+def _head(facts: Node, publication: Publication, *, url: str) -> Node:
+    """Return the properties of the dataset as a whole, in the order in which people read them."""
+    stated = dict(facts)
+    published = publication.published or stated.pop("datePublished", datetime.now(UTC).date())
+    head = {
         "@context": CONTEXT,
         "@type": "sc:Dataset",
         "conformsTo": [CROISSANT, RAI],
-        "name": publication.name,
-        "description": dataset_facts.DESCRIPTION,
-        "url": url if "://" in url else dataset_facts.HOME,
-        "license": dataset_facts.DATA_LICENCE,
-        "usageInfo": dataset_facts.LICENCE_NOTE,
-        "version": publication.version,
-        "datePublished": published.isoformat(),
-        "citeAs": dataset_facts.CITATION,
-        "keywords": list(dataset_facts.KEYWORDS),
-        "creator": [
-            {"@type": "sc:Person", "name": author, "affiliation": organisation}
-            for author in dataset_facts.AUTHORS
-        ],
-        "inLanguage": "en",
-        **dataset_facts.RESPONSIBLE_USE,
-        **dataset_facts.PROVENANCE,
+        "name": publication.name or stated["name"],
+        "description": stated.pop("description"),
+        "url": url,
+        "license": stated.pop("license"),
+        "usageInfo": stated.pop("usageInfo"),
+        "version": publication.version or stated.pop("version", _FIRST_VERSION),
+        "datePublished": str(published),
     }
+    return (
+        head
+        | {name: value for name, value in stated.items() if name not in head}
+        | {"inLanguage": stated.get("inLanguage", "en")}
+    )

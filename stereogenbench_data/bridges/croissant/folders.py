@@ -10,6 +10,7 @@ from stereogenbench_data.bridges.croissant.nodes import (
     ENCODINGS,
     GIT,
     GIT_CHECKSUM,
+    RELEASED_SUFFIXES,
     TEXT,
     UNKNOWN_ENCODING,
     VIDEO_TEXTS,
@@ -29,6 +30,7 @@ from stereogenbench_data.schema.release import (
     BASELINE_JSON,
     COMPLETE_JSON,
     DESCRIPTION_TXT,
+    SCENE_COUNTS,
     TRAJECTORY_JSON,
 )
 
@@ -37,24 +39,74 @@ _KEY: Final = r"^.*?((?:train|eval)/.+?/[^/.]+?)(?:/[^/]*\.[^/]*)?$"
 """The scene of a file in a folder. It does not change a key: a join applies the regex twice."""
 
 
-def folder_nodes(index: SceneIndex | None, *, repository_url: str) -> tuple[list[Node], list[Node]]:
+def release_nodes(*, repository_url: str) -> tuple[list[Node], list[Node]]:
+    """Return the files and the record sets of the release, as the paper describes it.
+
+    The record sets hold their data themselves: reading one through the repository would clone all
+    of it.
+    """
+    files = [_repository(repository_url)]
+    files += [
+        file_set(name, within=[REPOSITORY], encoding=encoding, includes=f"**/{file}", about=about)
+        for name, (encoding, file, about) in _release_sets().items()
+    ]
+    return files, [*enumerations(None), _parts()]
+
+
+def _release_sets() -> dict[str, tuple[str, str, str]]:
+    """Return, for each id, the encoding, the file name and the meaning."""
+    json_files = {
+        "baseline-files": (BASELINE_JSON, "Intrinsics and baselines."),
+        "trajectory-files": (TRAJECTORY_JSON, "Poses."),
+        "scene_complete-files": (COMPLETE_JSON, "Marks of completion."),
+    }
+    return {
+        **{
+            f"{kind}-files": (ENCODINGS[suffix], f"cam_??_{kind}.{suffix}", VIDEO_TEXTS[kind])
+            for kind, suffix in RELEASED_SUFFIXES.items()
+        },
+        **{name: ("application/json", file, about) for name, (file, about) in json_files.items()},
+        "description-files": (TEXT, DESCRIPTION_TXT, "Descriptions."),
+    }
+
+
+def _parts() -> Node:
+    """Return the record set of the release's parts with their numbers of scenes."""
+    fields = [
+        field("parts/split", "sc:Text", "One of splits."),
+        field("parts/eval_subset", "sc:Text", "One of eval_subsets; empty in train."),
+        field("parts/family", "sc:Text", "One of families."),
+        field("parts/scenes", "sc:Integer", "How many scenes the paper counts."),
+    ]
+    data = [
+        dict(zip((each["@id"] for each in fields), (*part, count), strict=True))
+        for part, count in SCENE_COUNTS.items()
+    ]
+    return record_set("parts", "Every part of the release once.", fields, data=data)
+
+
+def _repository(url: str) -> Node:
+    return file_object(
+        REPOSITORY,
+        url=url,
+        encoding=GIT,
+        sha256=GIT_CHECKSUM,
+        about=(
+            "The git repository that holds the scenes as folders. mlcroissant reads files of it by "
+            "cloning the whole repository, with GitPython."
+        ),
+    )
+
+
+def folder_nodes(index: SceneIndex, *, repository_url: str) -> tuple[list[Node], list[Node]]:
     """Return the files and the record sets of a tree in the released layout.
 
     Args:
-        index: The index of the tree, for the names of families, maps and files; None for the
-            names in the paper.
+        index: The index of the tree, for the names of families, maps and files.
         repository_url: URL of the git repository that holds it.
     """
     suffixes = suffixes_of(index)
-    files = [
-        file_object(
-            REPOSITORY,
-            url=repository_url,
-            encoding=GIT,
-            sha256=GIT_CHECKSUM,
-            about="The repository that holds the scenes as folders.",
-        )
-    ]
+    files = [_repository(repository_url)]
     files += [
         file_set(name, within=[REPOSITORY], encoding=encoding, includes=f"**/{file}", about=about)
         for name, (encoding, file, about) in _file_sets(suffixes).items()
@@ -138,8 +190,8 @@ def _pairs() -> Node:
 
 def _descriptions() -> Node:
     text = field(
-        "descriptions/text", "sc:Text", "What a model says of the scene.",
+        "descriptions/text", "sc:Text", "What is in the file.",
         **of_file("description-files", "content"),
     )  # fmt: skip
     fields = [_scene_of("descriptions", "description-files"), text]
-    return record_set("descriptions", "Machine-written descriptions, where there are any.", fields)
+    return record_set("descriptions", "Descriptions of scenes, where there are any.", fields)

@@ -56,6 +56,9 @@ PARQUET: Final = "application/x-parquet"
 GIT: Final = "git+https"
 TEXT: Final = "text/plain"
 
+SPLIT_URLS: Final = {"train": "cr:TrainingSplit", "eval": "cr:TestSplit"}
+"""The roles of splits, as the specification writes them."""
+
 GIT_CHECKSUM: Final = "https://github.com/mlcommons/croissant/issues/80"
 """The checksum of a git repository, by common practice: it has none of its own."""
 
@@ -146,7 +149,7 @@ def record_set(name: str, about: str, fields: list[Node], **more: Any) -> Node:
     return head | more | {"field": fields}
 
 
-def enumeration(name: str, about: str, values: dict[str, str], *, kind: str) -> Node:
+def enumeration(name: str, about: str, values: dict[str, str]) -> Node:
     """Return a record set of all values with their meanings."""
     key, meaning = f"{name}/name", f"{name}/meaning"
     fields = [
@@ -154,7 +157,21 @@ def enumeration(name: str, about: str, values: dict[str, str], *, kind: str) -> 
         field(meaning, "sc:Text", "What it means."),
     ]
     data = [{key: value, meaning: means} for value, means in values.items()]
+    kind = "sc:Enumeration"
     return record_set(name, about, fields, dataType=kind, key={"@id": key}, data=data)
+
+
+def _splits() -> Node:
+    """Return the record set of the splits, with the specification's URLs of their roles."""
+    node = enumeration(
+        "splits", "Parts of the dataset.",
+        {"train": "For training.", "eval": "For evaluation; no scene of it is in train."},
+    )  # fmt: skip
+    url = field("splits/url", ["sc:URL", "cr:Split"], "The role of the split in Croissant's terms.")
+    node |= {"dataType": "cr:Split", "field": [*node["field"], url]}
+    for row in node["data"]:
+        row["splits/url"] = SPLIT_URLS[row["splits/name"]]
+    return node
 
 
 def enumerations(index: SceneIndex | None) -> list[Node]:
@@ -171,27 +188,20 @@ def enumerations(index: SceneIndex | None) -> list[Node]:
         maps = sorted(set(index.column("map_name")))
         train = set(index.column("map_name")[index.column("split") == "train"])
     return [
-        enumeration(
-            "splits", "Parts of the dataset.", {
-                "train": "For training.",
-                "eval": "For evaluation; no scene of it is in train.",
-            }, kind="cr:Split",
-        ),
+        _splits(),
         enumeration(
             "eval_subsets", "Parts of eval.", {
                 "seen_map": "On maps that train has scenes of.",
                 "unseen_map": "On maps that train has no scene of.",
-            }, kind="sc:Enumeration",
+            },
         ),
         enumeration(
             "families", "How the distances between cameras are drawn.",
             {name: _FAMILIES.get(name, "A family of its own.") for name in families},
-            kind="sc:Enumeration",
         ),
         enumeration(
             "maps", "The environments of the scenes.",
             {name: "in train" if name in train else "in eval alone" for name in maps},
-            kind="sc:Enumeration",
         ),
     ]  # fmt: skip
 

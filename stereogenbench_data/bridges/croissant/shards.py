@@ -93,7 +93,7 @@ _SCENE_COLUMNS: Final = (
         "depth_unit_m", pa.list_(pa.float64()),
         "Metres in a stored unit of depth, for each camera.",
     ),
-    ("description", pa.string(), "Machine-written description; empty where there is none."),
+    ("description", pa.string(), "Description of the scene; empty where there is none."),
 )  # fmt: skip
 """Columns of the table of scenes: name, type, meaning."""
 _INDEX_COLUMNS: Final = {
@@ -274,11 +274,11 @@ def _shards() -> Node:
 
 def _descriptions() -> Node:
     text = field(
-        "descriptions/text", "sc:Text", "Machine-written; empty where there is none.",
+        "descriptions/text", "sc:Text", "The description; empty where there is none.",
         **column(SCENES, "description"),
     )  # fmt: skip
     keys = _columns("descriptions", SCENES, [("scene_id", "sc:Text", "Path of the scene.")])
-    return record_set("descriptions", "What a model says of every scene.", [*keys, text])
+    return record_set("descriptions", "The description of every scene.", [*keys, text])
 
 
 def _columns(records: str, file: str, rows: Iterable[tuple[str, str, str]]) -> list[Node]:

@@ -1,0 +1,149 @@
+"""What is said of a dataset as a whole is what is known of it."""
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from stereogenbench_data import SceneIndex
+from stereogenbench_data.bridges.card import card
+from stereogenbench_data.bridges.croissant.check import check_descriptor
+from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
+from stereogenbench_data.bridges.dataset_facts import DRAWN, RELEASE, facts_of, origin_of, template
+from stereogenbench_data.errors import DescriptorError
+from stereogenbench_data.schema.release import COMPLETE_JSON
+from stereogenbench_data.shards.pack import pack
+from tests.audit.release_counts import paper_scenes
+from tests.cli.command import invoke
+
+
+@pytest.fixture(params=["no program", "assets of the user"])
+def elsewhere(request, small_release, tmp_path):
+    """Shards of scenes whose marks of completion name no program, or a renderer of assets."""
+    tree = tmp_path / "tree"
+    for path in small_release.rglob("*"):
+        if path.is_file() and path.suffix != ".parquet":
+            copied = tree / path.relative_to(small_release)
+            copied.parent.mkdir(parents=True, exist_ok=True)
+            copied.write_bytes(path.read_bytes())
+    for mark in tree.rglob(COMPLETE_JSON):
+        facts = json.loads(mark.read_text())
+        facts["synthesis"]["renderer"] = "blender 4.5 0123abcd"
+        if request.param == "no program":
+            del facts["synthesis"]
+        mark.write_text(json.dumps(facts))
+    pack(tree, tmp_path / "shards", workers=1)
+    return SceneIndex.open(tmp_path / "shards")
+
+
+@pytest.fixture
+def about(tmp_path):
+    """The template with every blank filled in."""
+    path = tmp_path / "about.json"
+    path.write_text(json.dumps(template()).replace("FILL IN: ", "Known: "))
+    return path
+
+
+def test_scenes_that_synth_drew_are_drawn(small_shards):
+    assert origin_of(SceneIndex.open(small_shards)) == "drawn"
+    assert facts_of(SceneIndex.open(small_shards)) == DRAWN
+
+
+def test_scenes_are_of_the_release_by_map_size_and_length(tmp_path):
+    scenes = paper_scenes()[::100]
+
+    def origin(*, index=0, **changes):
+        changed = [*scenes[:index], replace(scenes[index], **changes), *scenes[index + 1 :]]
+        return origin_of(SceneIndex.from_scenes(changed, tmp_path))
+
+    small = replace(scenes[0].rig, image_width_px=320, image_height_px=320)
+    own_map = replace(scenes[0].id, map_name="MyTown")
+
+    assert origin() == "release"
+    assert origin(rig=small) == "elsewhere"
+    assert origin(id=own_map) == "elsewhere"
+    assert origin(frames=80) == "elsewhere"
+
+
+def test_without_data_the_release_is_meant():
+    facts = facts_of(None)
+
+    assert facts["creator"] == RELEASE["creator"]
+    assert "the release states no version and no day of publication" in facts["description"]
+
+
+@pytest.mark.parametrize("write", ["descriptor", "card"])
+def test_scenes_of_an_unknown_maker_are_described_as_the_maker_states(
+    elsewhere, about, tmp_path, write
+):
+    path = tmp_path / "data.json"
+
+    def written(stated):
+        if write == "card":
+            return card(elsewhere, repository="a/b", about=stated)
+        return json.dumps(write_descriptor(elsewhere, path, publication=Publication(about=stated)))
+
+    with pytest.raises(DescriptorError, match=r"is not known.*Not stated: name, .*--template"):
+        written(None)
+    text = written(about)
+
+    assert not re.search(r"Unreal|Qwen2|Yangzhi|Drawing", text)
+    assert "Known: who made it" in text or write == "card"
+    assert "Known: where results on it do not hold" in text
+    if write == "descriptor":
+        assert check_descriptor(path) == []
+
+
+def test_blanks_are_named(elsewhere, about):
+    facts = json.loads(about.read_text())
+    facts["creator"] = template()["creator"]
+    about.write_text(json.dumps(facts))
+
+    with pytest.raises(DescriptorError, match=r"about\.json: creator\.name must be filled in"):
+        facts_of(elsewhere, about=about)
+
+
+def test_a_misspelt_statement_is_named(elsewhere, about):
+    facts = json.loads(about.read_text())
+    facts["licence"] = "x"
+    about.write_text(json.dumps(facts))
+
+    with pytest.raises(DescriptorError, match=r"about\.json: has 'licence', .* license"):
+        facts_of(elsewhere, about=about)
+
+
+def test_a_statement_that_is_no_json_is_named(elsewhere, tmp_path):
+    with pytest.raises(DescriptorError, match=r"none\.json: cannot be read as JSON"):
+        facts_of(elsewhere, about=tmp_path / "none.json")
+
+
+def test_a_maker_may_state_only_what_differs(small_shards, tmp_path):
+    stated = tmp_path / "about.json"
+    stated.write_text(json.dumps({"name": "Mine", "license": "https://example.org/licence"}))
+
+    facts = facts_of(SceneIndex.open(small_shards), about=stated)
+    text = card(SceneIndex.open(small_shards), repository="a/b", about=stated)
+
+    assert facts == DRAWN | {"name": "Mine", "license": "https://example.org/licence"}
+    assert "license: other" in text
+    assert 'license_link: "https://example.org/licence"' in text
+
+
+def test_the_template_is_written_and_refused_while_it_has_blanks(elsewhere, tmp_path):
+    path = tmp_path / "about.json"
+
+    written = invoke("croissant", "--template", "-o", path)
+    refused = invoke("croissant", elsewhere.root, "-o", tmp_path / "a.json", "--about", path)
+
+    assert written.exit_code == 0, written.output
+    assert refused.exit_code == 2
+    assert "must be filled in" in refused.output
+    assert not (tmp_path / "a.json").exists()
+
+
+def test_the_bibliography_is_that_of_the_descriptors():
+    home = Path(__file__).resolve().parents[2]
+
+    assert (home / "CITATION.bib").read_text() == RELEASE["citeAs"]

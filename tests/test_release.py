@@ -1,0 +1,137 @@
+"""What a release must have, and how its changelog is dated."""
+
+import importlib.util
+import os
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+
+from tests.servers.tools import require_tool
+
+HOME = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((HOME / "pyproject.toml").read_text())
+ENTRIES = """# Changelog
+
+## [Unreleased]
+
+### Added
+- A thing.
+
+[Unreleased]: ../../commits/main
+"""
+
+
+@pytest.fixture(scope="module")
+def release():
+    spec = importlib.util.spec_from_file_location("release", HOME / ".ci" / "release.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_first_release_is_dated_and_linked(release):
+    text = release.dated(ENTRIES, version="0.1.0", day="2026-11-22")
+
+    assert "## [Unreleased]\n\n## [0.1.0] - 2026-11-22\n\n### Added\n- A thing.\n" in text
+    assert text.endswith(
+        "[Unreleased]: ../../compare/v0.1.0...HEAD\n[0.1.0]: ../../releases/tag/v0.1.0\n"
+    )
+
+
+def test_a_later_release_is_compared_with_the_one_before(release):
+    first = release.dated(ENTRIES, version="0.1.0", day="2026-11-22")
+    entries = first.replace("## [Unreleased]\n", "## [Unreleased]\n\n### Fixed\n- Another.\n")
+
+    text = release.dated(entries, version="0.2.0", day="2026-12-24")
+
+    assert text.index("## [0.2.0] - 2026-12-24") < text.index("- Another.")
+    assert text.index("- Another.") < text.index("## [0.1.0] - 2026-11-22")
+    assert text.endswith(
+        "[Unreleased]: ../../compare/v0.2.0...HEAD\n"
+        "[0.2.0]: ../../compare/v0.1.0...v0.2.0\n[0.1.0]: ../../releases/tag/v0.1.0\n"
+    )
+
+
+def test_nothing_is_dated_twice(release):
+    text = release.dated(ENTRIES, version="0.1.0", day="2026-11-22")
+
+    with pytest.raises(ValueError, match=r"has 0\.1\.0 already. Raise the version"):
+        release.dated(text, version="0.1.0", day="2026-11-23")
+    with pytest.raises(ValueError, match="has no entries under"):
+        release.dated(text, version="0.2.0", day="2026-11-23")
+
+
+def test_the_changelog_can_be_dated_and_its_links_are_those_of_its_headings(release):
+    text = (HOME / "CHANGELOG.md").read_text()
+    headings = set(re.findall(r"^## \[(.+?)\]", text, re.MULTILINE))
+
+    assert set(dict(release.LINK.findall(text))) == headings
+    assert "## [9.9.9] - 2026-11-22" in release.dated(text, version="9.9.9", day="2026-11-22")
+
+
+def test_what_a_tag_lacks_is_named(release):
+    project = {"version": "0.1.0", "urls": {"Paper": "https://example.org"}}
+
+    lines = release.problems("v0.2.0", project=project, changelog=ENTRIES)
+
+    assert [line.partition(":")[0] for line in lines] == [
+        "pyproject.toml", "CHANGELOG.md", "CHANGELOG.md", *["pyproject.toml"] * 3,
+    ]  # fmt: skip
+    assert "has the version 0.1.0, and the tag is v0.2.0" in lines[0]
+    assert "no Repository in [project.urls]" in lines[3]
+
+
+def test_a_dated_release_with_addresses_may_be_published(release):
+    urls = dict.fromkeys(("Repository", "Changelog", "Issues"), "https://example.org")
+    text = release.dated(ENTRIES, version="0.1.0", day="2026-11-22")
+
+    found = release.problems("v0.1.0", project={"version": "0.1.0", "urls": urls}, changelog=text)
+
+    assert found == []
+
+
+def test_the_version_stands_in_one_place():
+    import stereogenbench_data
+
+    files = subprocess.run(
+        [require_tool("git"), "grep", "--files-with-matches", "--fixed-strings", "0.1.0"],
+        cwd=HOME, capture_output=True, text=True, check=False,
+    ).stdout.split()  # fmt: skip
+    named = {path for path in files if path.endswith((".py", ".pyi", ".toml", ".cff"))}
+
+    assert stereogenbench_data.__version__ == PROJECT["project"]["version"]
+    assert {path for path in named if not path.startswith(("tests/", ".ci/"))} <= {"pyproject.toml"}
+
+
+def test_every_python_that_is_named_gets_the_wheel_before_it_is_published():
+    jobs = yaml.safe_load((HOME / ".github" / "workflows" / "build.yml").read_text())["jobs"]
+    tried = jobs["install"]["strategy"]["matrix"]["include"]
+    classified = {
+        line.rpartition(" ")[2]
+        for line in PROJECT["project"]["classifiers"]
+        if line.startswith("Programming Language :: Python :: ")
+    }
+
+    assert {each["python"] for each in tried} == classified
+    assert {"lowest", "newest"} <= {each["versions"] for each in tried}
+    assert all((HOME / "constraints" / f"{each['versions']}.txt").is_file() for each in tried)
+    assert (jobs["publish"]["needs"], jobs["install"]["needs"]) == ("install", "build")
+    assert jobs["publish"]["permissions"] == {"id-token": "write"}
+
+
+@pytest.mark.parametrize("target", ["test", "demo"])
+def test_make_in_an_sdist_says_that_the_sample_is_missing(tmp_path, target):
+    (tmp_path / "Makefile").write_text((HOME / "Makefile").read_text())
+
+    done = subprocess.run(
+        [require_tool("make"), target], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env=os.environ | {"MAKEFLAGS": ""},
+    )  # fmt: skip
+
+    assert done.returncode != 0
+    assert "the sdist leaves out the sample scenes (11 MB)" in done.stderr
+    assert "clone of the repository" in done.stderr
