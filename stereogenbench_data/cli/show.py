@@ -25,7 +25,7 @@ def show(  # noqa: PLR0913 - one parameter an option
     scene: Annotated[
         str | None,
         typer.Argument(
-            help="Key of a scene, or a part that no other key has [the first scene].",
+            help="Key of a scene, or a part of it that is unique [the first].",
             autocompletion=complete_scene,
         ),
     ] = None,
@@ -35,11 +35,11 @@ def show(  # noqa: PLR0913 - one parameter an option
         typer.Option(
             "--out",
             "-o",
-            help="File to write: .png, .mp4 or .gif for a clip, .rrd for Rerun [KEY.png].",
+            help="File to write: .png, .mp4, .gif, or .rrd [KEY.png].",
         ),
     ] = None,
     pair: Annotated[
-        str | None, typer.Option(help="Two cameras, such as 0-5 [the recorded pair].")
+        str | None, typer.Option(help="Two cameras, such as 0-5 [as recorded].")
     ] = None,
     frame: Annotated[int, typer.Option(min=0, help="Number of the frame.")] = 0,
     size: Annotated[
@@ -47,25 +47,25 @@ def show(  # noqa: PLR0913 - one parameter an option
         typer.Option(min=1, max=2048, help="Width of each drawn picture, px [320]."),
     ] = None,
     clip: Annotated[
-        bool, typer.Option("--clip", help="Write all frames as a clip, .mp4 or .gif [KEY.mp4].")
+        bool, typer.Option("--clip", help="Write all frames as a clip [KEY.mp4].")
     ] = False,
     rerun: Annotated[
         bool,
         typer.Option(
             "--rerun",
-            help="Write cameras, pictures, depth and disparity over time for Rerun's viewer (extra "
-            "'rerun') [KEY.rrd].",
+            help="Write a recording for Rerun's viewer [KEY.rrd].",
         ),
     ] = False,
     live: Annotated[
-        bool, typer.Option("--live", help="With --rerun: open the viewer, write no file.")
+        bool, typer.Option("--live", help="Open Rerun's viewer; write no file.")
     ] = False,
     depth_unit_m: DepthUnitOption = None,
 ) -> None:
-    """Draw one scene: its six views, and a pair's disparity, depth, visibility and warp.
+    """Draw one scene with the disparity of a pair.
 
-    The bar of disparity shows pixels and metres, of the stored pictures. A clip shows left, right,
-    disparity and anaglyph over time. A recording for Rerun's viewer has all six cameras over time.
+    A sheet shows the six views, and a pair's disparity, depth, visibility and warp. The bar of
+    disparity shows pixels and metres, of the stored pictures. A clip shows left, right, disparity
+    and anaglyph over time. A recording for Rerun's viewer has all six cameras over time.
     """
     from stereogenbench_data.audit.pictures import scene_pictures
     from stereogenbench_data.audit.pictures.scene_reader import SceneReader
