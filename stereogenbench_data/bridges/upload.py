@@ -10,7 +10,7 @@ from typing import Final
 from stereogenbench_data.bridges import dataset_facts
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
-from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
+from stereogenbench_data.errors import DescriptorError, StorageError, missing_extra
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import counted
@@ -58,9 +58,7 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
         from huggingface_hub import HfApi
         from huggingface_hub.errors import HfHubHTTPError
     except ImportError as error:
-        raise ExtraError(
-            f"huggingface_hub cannot be imported ({error}): pip install 'stereogenbench-data[hub]'."
-        ) from error
+        raise missing_extra("upload to the Hub", "hub", error) from error
     folder = local_path(shards)
     index = SceneIndex.open(folder)
     _require_whole(index, folder)

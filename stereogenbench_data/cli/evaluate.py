@@ -238,16 +238,16 @@ class ReportOptions:
         *,
         found: "Sequence[Relation]" = (),
     ) -> None:
-        """Write the files of the report; print it as a page or as JSON."""
+        """Print the report as a page or as JSON, then write its files."""
         from stereogenbench_data.evaluation.report import document, page, write_report
 
-        files = write_report(
-            folder, results, tables, found=found, plots="write" if self.plots else "skip"
-        )
         if self.as_json:
             typer.echo(json.dumps(document(results, tables, found=found), allow_nan=False))
         else:
             typer.echo(page(results, tables, found=found).rstrip())
+        files = write_report(
+            folder, results, tables, found=found, plots="write" if self.plots else "skip"
+        )
         names = ", ".join(str(path.relative_to(folder)) for path in files)
         typer.echo(f"{folder}: {names}", err=True)
 

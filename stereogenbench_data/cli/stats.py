@@ -57,13 +57,13 @@ def stats(
     }
     text = json.dumps(document, indent=1)
     markdown = statistics_markdown(found, lines)
+    if out is not None:
+        write_report(out, text if out.suffix == ".json" else markdown)
+    typer.echo(text if as_json else markdown.rstrip())
     if plots is not None:
         with writing(plots):
             written = write_plots(index, plots, **filters)
         for path in written:
             typer.echo(str(path), err=True)
-    if out is not None:
-        write_report(out, text if out.suffix == ".json" else markdown)
-    typer.echo(text if as_json else markdown.rstrip())
     if compare == "always" and not all(line.agrees for line in lines):
         raise typer.Exit(FINDINGS)
