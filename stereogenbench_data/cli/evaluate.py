@@ -22,6 +22,7 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     depth_of,
     grouped,
+    pair_of,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, require_metrics
@@ -44,7 +45,7 @@ def pairs_option(text: str) -> Any:
             f"{text!r} is not primary, adjacent, all or pairs such as 0-1,0-5.",
             param_hint="--pairs",
         )
-    return [(int(left), int(right)) for left, right in pairs]
+    return [pair_of("-".join(pair), option="--pairs") for pair in pairs]
 
 
 def frames_option(text: str) -> Any:

@@ -15,7 +15,14 @@ import typer
 
 from stereogenbench_data.cli.data import open_data
 from stereogenbench_data.cli.help import RARE, SCENES
-from stereogenbench_data.schema.release import FAMILIES, TRAIN_MAPS, UNSEEN_MAPS, Split, Subset
+from stereogenbench_data.schema.release import (
+    CAMERA_PAIRS,
+    FAMILIES,
+    TRAIN_MAPS,
+    UNSEEN_MAPS,
+    Split,
+    Subset,
+)
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
@@ -79,6 +86,29 @@ def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
     except StereoGenBenchError:
         return []
     return complete_from(map(str, keys))(incomplete)
+
+
+def pair_of(text: str, *, option: str) -> tuple[int, int]:
+    """Return the two cameras of a pair such as 0-5.
+
+    Raises:
+        typer.BadParameter: If they are not two cameras, the left one first.
+    """
+    left, _, right = text.replace(",", "-").partition("-")
+    if not (left.strip().isdecimal() and right.strip().isdecimal()):
+        raise typer.BadParameter(
+            f"{text!r} is not a pair: write two cameras, such as 0-5.", param_hint=option
+        )
+    pair = int(left), int(right)
+    if pair not in CAMERA_PAIRS:
+        swapped = pair[1], pair[0]
+        cure = f"write it as {right}-{left}" if swapped in CAMERA_PAIRS else "such as 0-5"
+        raise typer.BadParameter(
+            f"{text!r} is not a pair: two different cameras from 0 to 5, the left one first; "
+            f"{cure}.",
+            param_hint=option,
+        )
+    return pair
 
 
 def depth_of(unit_m: float | None) -> "DepthEncoding | None":

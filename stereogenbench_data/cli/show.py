@@ -11,6 +11,7 @@ from stereogenbench_data.cli.options import (
     complete_scene,
     depth_of,
     grouped,
+    pair_of,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
@@ -72,14 +73,7 @@ def show(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.samples.picture import write_png
     from stereogenbench_data.selection.filters import find_scene
 
-    cameras = None
-    if pair is not None:
-        left, _, right = pair.replace(",", "-").partition("-")
-        if not (left.strip().isdecimal() and right.strip().isdecimal()):
-            raise typer.BadParameter(
-                f"{pair!r} is not a pair: write two cameras, such as 0-5.", param_hint="--pair"
-            )
-        cameras = int(left), int(right)
+    cameras = None if pair is None else pair_of(pair, option="--pair")
     if rerun or live or (out is not None and out.suffix.lower() in _RECORDINGS):
         shown: dict[str, Any] = {"pair": cameras, "depth": depth_of(depth_unit_m)}
         _show_in_rerun(source, scene, out, width_px=size, is_live=live, **shown)

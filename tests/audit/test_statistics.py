@@ -98,7 +98,7 @@ def test_baselines_bins_and_focal_lengths_of_three_scenes(three):
 
 def test_filters_choose_what_is_counted(three):
     assert statistics(three, focal_mm=(15, 30)).scenes == 1
-    with pytest.raises(SelectionError, match="split='eval' matches none of 3 scenes"):
+    with pytest.raises(SelectionError, match="split eval matches none of 3 scenes"):
         statistics(three, split="eval")
 
 
