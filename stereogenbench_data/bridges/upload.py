@@ -94,9 +94,16 @@ def upload(shards: str | Path, repository: str, *, branch: str = "main") -> Uplo
     except refusals as error:
         if isinstance(error, StorageError | DescriptorError):
             raise
+        is_answer = isinstance(error, HfHubHTTPError | ValueError)
+        what = "the Hub refused the upload" if is_answer else "the Hub cannot be reached"
+        cure = (
+            "Log in with `hf auth login` if needed"
+            if is_answer
+            else "Check the network and HF_HUB_OFFLINE"
+        )
         raise StorageError(
-            f"{repository}: the Hub refused the upload ({_reason(error)}). Log in with "
-            "`hf auth login` if needed, and run the same command again to continue."
+            f"{repository}: {what} ({_reason(error)}). {cure}, and run the same command again to "
+            "continue."
         ) from None
     files = _found(folder, patterns)
     return Upload(f"hf://datasets/{repository}@{revision}", revision, len(files) + 1)

@@ -40,7 +40,7 @@ _COMMANDS: Final[dict[str, dict[Callable[..., None], str]]] = {
         pack: "pack scenes/ shards/ --shard-size 2GB",
         unpack: "unpack shards/ scenes/",
         croissant: "croissant shards/ -o croissant/sample.json",
-        card: "card shards/ --repo ORG/NAME -o shards/",
+        card: "card shards/ ORG/NAME -o shards/",
         upload: "upload shards/ ORG/NAME",
     },
     "Check them": {

@@ -1,10 +1,11 @@
 """``stereogenbench croissant``, ``card``, ``upload``: describe and publish shards."""
 
 import json
+import re
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -12,6 +13,24 @@ from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import DataOptions, JsonOption, RootOption, grouped
 from stereogenbench_data.schema.text import counted
+
+_REPOSITORY: Final = re.compile(r"[\w.-]+/[\w.-]+")
+
+
+def _require_repository(text: str) -> str:
+    if not _REPOSITORY.fullmatch(text):
+        raise typer.BadParameter(
+            f"{text!r} is not a repository: write ORG/NAME, such as my-lab/stereo-scenes."
+        )
+    return text
+
+
+RepositoryArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="ORG/NAME", help="Dataset repository on the Hub.", callback=_require_repository
+    ),
+]
 
 
 def croissant(  # noqa: PLR0913 - one parameter an option
@@ -121,10 +140,11 @@ def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
 @grouped
 def card(
     source: DataOptions,
+    repository: RepositoryArgument,
     *,
-    repository: Annotated[str, typer.Option("--repo", help="ORG/NAME on the Hub.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write README.md into [stdout].")
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Folder for README.md [stdout]."),
     ] = None,
 ) -> None:
     """Write the dataset card of shards.
@@ -144,7 +164,7 @@ def card(
 
 def upload(
     shards: Annotated[Path, typer.Argument(help="Folder of shards, as `pack` wrote it.")],
-    repository: Annotated[str, typer.Argument(help="ORG/NAME of a dataset on the Hub.")],
+    repository: RepositoryArgument,
     *,
     branch: Annotated[str, typer.Option(help="Branch to commit to.")] = "main",
     as_json: JsonOption = False,

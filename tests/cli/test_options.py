@@ -86,6 +86,21 @@ def test_a_refused_option_is_named_with_its_value_and_what_it_may_be(words, opti
     assert all(word in message for word in (option, value, cure)), message
 
 
+@pytest.mark.parametrize("command", ["card", "upload"])
+@pytest.mark.parametrize("repository", ["name", "a/b/c", "https://huggingface.co/a/b", ""])
+def test_card_and_upload_take_a_repository_alike(command, repository, small_shards):
+    message = refused(command, small_shards, repository)
+
+    assert f"{repository!r} is not a repository: write ORG/NAME" in message
+
+
+def test_the_card_of_shards_names_the_repository(small_shards):
+    shown = invoke("card", small_shards, "my-lab/stereo.scenes")
+
+    assert shown.exit_code == 0
+    assert "my-lab/stereo.scenes" in shown.stdout
+
+
 def test_synth_takes_one_number_for_width_and_height_and_names_the_option_of_another():
     assert "'--size'" in refused("synth", "out", "--size", "64x48")
 
