@@ -201,6 +201,37 @@ def test_a_bar_that_counted_nothing_is_taken_off_the_terminal(monkeypatch, capsy
 @pytest.mark.parametrize(
     "words",
     [
+        "index nowhere -o out/index.parquet",
+        "pack nowhere out",
+        "verify nowhere",
+        "croissant nowhere -o out/croissant.json",
+        "card nowhere a/b -o out",
+        "upload nowhere a/b",
+        "download nowhere --dest out",
+        "show nowhere -o out/sheet.png",
+        "browse nowhere --no-open",
+        "stats nowhere -o out/stats.md --plots plots",
+        "audit nowhere -o out/audit.md",
+        "doctor nowhere -o out/doctor.png",
+        "export-inputs nowhere out --tier G1",
+        "evaluate nowhere nothing --tier G1 -o out",
+        "controls nowhere -o out",
+        "export clips nowhere out --layout musubi",
+        "export ply nowhere out",
+    ],
+)
+def test_a_mistyped_path_is_reported_and_makes_no_folder(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shown = invoke(*words.split())
+
+    assert shown.exit_code == 2
+    assert "nowhere: does not exist" in str(shown.exception or "") + shown.output
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
         "index nowhere",
         "unpack nowhere out",
         "audit nowhere",
