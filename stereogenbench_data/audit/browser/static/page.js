@@ -7,7 +7,7 @@ import { pressed } from "/keys.js";
 import { play, selectFrame, selectView } from "/moment.js";
 import { buildPanes, fitPanes } from "/panes.js";
 import { ask } from "/reading.js";
-import { $, SHOWN, VIEWS, plural, state, tell } from "/state.js";
+import { $, SHOWN, VIEWS, plural, state, tell, writePath } from "/state.js";
 import { palette } from "/views.js";
 
 function reset() {
@@ -94,7 +94,10 @@ async function follow() {
     if (!await selectScene(place.get("key"), { pair, frame })) refused = $("error").textContent;
   }
   await choose(state.choice);
-  if (refused) tell($("notice"), `${refused.split(/\.? Did you mean/)[0]}. Another scene is shown.`);
+  if (refused) {
+    writePath($("notice"), `${refused.split(/\.? Did you mean/)[0]}. Another scene is shown.`);
+    $("notice").hidden = false;
+  }
 }
 
 async function start() {
