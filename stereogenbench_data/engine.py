@@ -23,7 +23,7 @@ from multiprocessing.synchronize import Event
 from pathlib import Path
 from typing import Any, Final, NoReturn, Protocol, TypeVar, runtime_checkable
 
-from stereogenbench_data.errors import ExtraError, StorageError, explain_os_errors
+from stereogenbench_data.errors import StorageError, explain_os_errors, missing_extra
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -326,10 +326,7 @@ class RayCluster:
         try:
             ray = importlib.import_module("ray")
         except ImportError as error:
-            raise ExtraError(
-                f"Ray cannot be imported ({error}): install `stereogenbench-data[ray]`, or choose "
-                f"the engine `local`."
-            ) from error
+            raise missing_extra("the engine 'ray'", "ray", error) from error
         with _connected(ray, self.address):
             remote = ray.remote(max_retries=0, num_cpus=1, num_gpus=self.gpus)(_run_on_ray)
             there = ray.cluster_resources()

@@ -199,6 +199,20 @@ class ExtraError(StereoGenBenchError, ImportError):
     """A feature's optional dependency, or the weights it needs, are not installed."""
 
 
+def missing_extra(what: str, extra: str, error: ImportError | str) -> ExtraError:
+    """Return the error of a feature whose extra is not installed.
+
+    Args:
+        what: The feature, such as "plots".
+        extra: The extra of this package that has what the feature needs.
+        error: What cannot be imported.
+    """
+    return ExtraError(
+        f"{what}: the extra {extra!r} is not installed ({error}). Run "
+        f"`pip install 'stereogenbench-data[{extra}]'`."
+    )
+
+
 @contextmanager
 def explain_os_errors(
     what: str, otherwise: str = "", *, kind: type[StereoGenBenchError] = StorageError

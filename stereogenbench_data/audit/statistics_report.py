@@ -279,9 +279,9 @@ def write_plots(
          index.column("focal_mm")[chosen])
         for split, family, chosen in branch_rows(index, rows)
     ]  # fmt: skip
+    figure = _figure(len(panels))
     folder.mkdir(parents=True, exist_ok=True)
     baselines, focals = folder / "baselines.png", folder / "focal_lengths.png"
-    figure = _figure(len(panels))
     for axes, (title, family, baselines_cm, _) in zip(figure.axes, panels, strict=False):
         is_pairwise = family == "Pairwise_Uniform"
         shown_cm = baselines_cm if is_pairwise else baselines_cm[:, ADJACENT_COLUMNS]

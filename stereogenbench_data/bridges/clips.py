@@ -49,6 +49,7 @@ from stereogenbench_data.samples.size import require_size
 from stereogenbench_data.samples.transforms import Crop
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Address, PairOptions, Plan
 from stereogenbench_data.selection.windows import FramesSpec, parse_frames
 from stereogenbench_data.sources.files import open_atomic, try_locked, write_atomic
@@ -189,6 +190,7 @@ def export_clips(
             something cannot be read or written.
         MediaError: If a video cannot be decoded, or not be encoded as asked.
     """
+    require_options(export_clips, selection)
     root = Path(out)
     rules = _require_layout(layout)
     kinds, control = _require_kinds(form, rules=rules, layout=layout)

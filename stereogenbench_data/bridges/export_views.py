@@ -33,6 +33,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import check_samples
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import plan_views
 from stereogenbench_data.selection.windows import FramesSpec
 from stereogenbench_data.sources.files import try_locked, write_atomic
@@ -96,6 +97,7 @@ def export_views(
             something cannot be read or written.
         MediaError: If depth cannot have been stored whole, or a video does not decode.
     """
+    require_options(export_views, options)
     root, selected = Path(out), _Selected(layout, options)
     index = index_of(data)
     frames_of = selected.frames_of(index)

@@ -5,7 +5,13 @@ from typing import TYPE_CHECKING, Any, Final, Unpack
 
 from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of, to_arrays
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
-from stereogenbench_data.errors import ExtraError, FieldError, SelectionError, StorageError
+from stereogenbench_data.errors import (
+    ExtraError,
+    FieldError,
+    SelectionError,
+    StorageError,
+    missing_extra,
+)
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
 from stereogenbench_data.samples.transforms import (
     ColorJitter,
@@ -233,7 +239,4 @@ class _RowDecoder:
 
 
 def _missing(error: ImportError) -> ExtraError:
-    return ExtraError(
-        f"Hugging Face datasets cannot be imported ({error}): "
-        "pip install 'stereogenbench-data[huggingface]'."
-    )
+    return missing_extra("Hugging Face datasets", "huggingface", error)

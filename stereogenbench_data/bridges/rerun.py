@@ -29,7 +29,13 @@ from stereogenbench_data.bridges.posed_images import (
 )
 from stereogenbench_data.datasets.mapped import Data, StereoPairs
 from stereogenbench_data.engine import Progress
-from stereogenbench_data.errors import ExtraError, SelectionError, StorageError, describe_os_error
+from stereogenbench_data.errors import (
+    ExtraError,
+    SelectionError,
+    StorageError,
+    describe_os_error,
+    missing_extra,
+)
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.text import markdown_text
@@ -251,7 +257,5 @@ def _rerun() -> Any:
     try:
         import rerun
     except ImportError as error:
-        raise ExtraError(
-            f"Rerun cannot be imported ({error}): pip install 'stereogenbench-data[rerun]'."
-        ) from error
+        raise missing_extra("recordings for Rerun", "rerun", error) from error
     return rerun

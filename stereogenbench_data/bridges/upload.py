@@ -12,7 +12,7 @@ from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
 from stereogenbench_data.bridges.viewer import viewer_tars
 from stereogenbench_data.engine import Progress
-from stereogenbench_data.errors import DescriptorError, ExtraError, StorageError
+from stereogenbench_data.errors import DescriptorError, StorageError, missing_extra
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import counted
@@ -68,9 +68,7 @@ def prepare_upload(
     try:
         importlib.import_module("huggingface_hub")
     except ImportError as error:
-        raise ExtraError(
-            f"huggingface_hub cannot be imported ({error}): pip install 'stereogenbench-data[hub]'."
-        ) from error
+        raise missing_extra("upload to the Hub", "hub", error) from error
     folder = local_path(shards)
     index = SceneIndex.open(folder)
     _require_whole(index, folder)
@@ -136,9 +134,16 @@ def upload(
     except refusals as error:
         if isinstance(error, StorageError | DescriptorError):
             raise
+        is_answer = isinstance(error, HfHubHTTPError | ValueError)
+        what = "the Hub refused the upload" if is_answer else "the Hub cannot be reached"
+        cure = (
+            "Log in with `hf auth login` if needed"
+            if is_answer
+            else "Check the network and HF_HUB_OFFLINE"
+        )
         raise StorageError(
-            f"{repository}: the Hub refused the upload ({_reason(error)}). Log in with "
-            "`hf auth login` if needed, and run the same command again to continue."
+            f"{repository}: {what} ({_reason(error)}). {cure}, and run the same command again to "
+            "continue."
         ) from None
     files = _found(folder, patterns)
     return Upload(f"hf://datasets/{repository}@{revision}", revision, len(files) + 1)

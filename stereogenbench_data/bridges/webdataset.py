@@ -12,6 +12,8 @@ from typing import Any, Unpack
 from stereogenbench_data.bridges.in_memory import SampleOptions, samples_of
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.samples.fields import DEFAULT_PAIR_FIELDS, Sample
+from stereogenbench_data.selection.filters import SceneFilters
+from stereogenbench_data.selection.options import require_options
 
 
 class SceneDecoder:
@@ -77,10 +79,5 @@ def decode(
     Raises:
         SelectionError: If an option is unknown.
     """
-    unknown = sorted(set(options) - set(SampleOptions.__annotations__))
-    if unknown:
-        raise SelectionError(
-            f"unknown option {unknown[0]!r}; the options are "
-            f"{', '.join(SampleOptions.__annotations__)}. Select scenes before this stage."
-        )
+    require_options(decode, options, elsewhere={"an earlier stage": SceneFilters.__annotations__})
     return SceneDecoder(tuple(fields), options)

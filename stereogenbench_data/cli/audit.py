@@ -10,6 +10,7 @@ import typer
 
 from stereogenbench_data.cli.data import full_place
 from stereogenbench_data.cli.errors import FINDINGS, resumable
+from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import (
     DataOptions,
     JsonOption,
@@ -44,19 +45,25 @@ def audit(  # noqa: PLR0913 - one parameter an option
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the draw.")] = 0,
     frames: Annotated[
-        str, typer.Option(help="Frames of each scene, evenly spread; 'all' as in the paper.")
+        str, typer.Option(help="Frames of each scene, or all, as in the paper.")
     ] = "5",
     chosen: SceneOptions,
     depth_unit_m: Annotated[
-        float | None, typer.Option(help="Metres in a stored unit of depth [as tagged, else 0.1].")
+        float | None,
+        typer.Option(
+            help="Metres in a stored unit of depth [as files state].", rich_help_panel=RARE
+        ),
     ] = None,
     depth_kind: Annotated[
-        Literal["planar", "ray"], typer.Option(help="Depth along the axis or along the ray.")
+        Literal["planar", "ray"],
+        typer.Option(help="Depth along the axis or the ray.", rich_help_panel=RARE),
     ] = "planar",
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            help="Accept depth with a loss: 8-bit (to 14-bit), lossy, chroma; may be repeated.",
+            metavar="LOSS",
+            help="Accept depth with a loss: 8-bit ... 14-bit, lossy, chroma. May be repeated.",
+            rich_help_panel=RARE,
             autocompletion=complete_from(
                 ("8-bit", "9-bit", "10-bit", "12-bit", "14-bit", "lossy", "chroma")
             ),
@@ -65,26 +72,31 @@ def audit(  # noqa: PLR0913 - one parameter an option
     limit: Annotated[
         list[str] | None,
         typer.Option(
-            help="NAME=NUMBER, such as baseline_cm=0.01; may be repeated.",
+            metavar="NAME=NUMBER",
+            help="Such as baseline_cm=0.01. May be repeated.",
+            rich_help_panel=RARE,
             autocompletion=_complete_limit,
         ),
     ] = None,
     derived: Annotated[
         Literal["refuse", "ok"],
-        typer.Option(help="Whether to audit training shards, whose pictures have an error."),
+        typer.Option(
+            help="Whether to audit training shards, which differ from the release.",
+            rich_help_panel=RARE,
+        ),
     ] = "refuse",
     out: OutOption = None,
     journal: Annotated[
         Path | None,
         typer.Option(
-            help="File that keeps a stopped audit until it is finished [beside --out, "
-            "else in ~/.cache/stereogenbench]."
+            help="File of a stopped audit [beside --out, else in ~/.cache].",
+            rich_help_panel=RARE,
         ),
     ] = None,
     as_json: JsonOption = False,
     work: WorkOptions,
 ) -> None:
-    """Measure whether data are right, and list what is wrong.
+    """Measure whether data are right; list what is wrong.
 
     The audit compares intrinsics, baselines, poses and depth with each other, as the paper's audit
     does, and shows the paper's figures beside. It counts frames and looks for dark, flat and

@@ -15,12 +15,12 @@ def bench(  # noqa: PLR0913 - one parameter an option
     *,
     only: Annotated[
         list[str] | None,
-        typer.Option(help="Measure only this, such as all-frames or accuracy; may be repeated."),
+        typer.Option(metavar="NAME", help="Only all-frames, accuracy or another. May be repeated."),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="One round of the main races.")] = False,
     rounds: Annotated[int, typer.Option(min=1, help="Rounds of every race.")] = 5,
     workers: Annotated[
-        str | None, typer.Option(help="Worker processes of every race, such as 2,0,1,4.")
+        str | None, typer.Option(metavar="N,N", help="Worker processes, such as 2,0,1,4.")
     ] = None,
     whole: Annotated[
         bool, typer.Option("--whole", help="Race over all frames instead of a window.")
@@ -31,22 +31,22 @@ def bench(  # noqa: PLR0913 - one parameter an option
     ] = False,
     draw: Annotated[bool, typer.Option("--draw", help="Only draw and pack the data.")] = False,
     check: Annotated[
-        bool, typer.Option("--check", help="Only compare every contestant's samples with ours.")
+        bool, typer.Option("--check", help="Only compare the contestants' samples.")
     ] = False,
     tables: Annotated[
         bool, typer.Option("--tables", help="Only write tables and plots again.")
     ] = False,
     data: Annotated[
-        Path | None, typer.Option(help="Folder of the data [build/bench of the checkout].")
+        Path | None, typer.Option(metavar="DIR", help="Folder of the data [build/bench].")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the results [docs/performance].")
+        Path | None, typer.Option(metavar="DIR", help="Of the results [docs/performance].")
     ] = None,
 ) -> None:
-    """Race this package against a bare decoding loop and other loaders; needs a checkout.
+    """Race this package against other loaders; needs a checkout.
 
-    The first run draws four scenes (20 minutes of processor time) and keeps them. Results are
-    written after every round.
+    The contestants are a bare decoding loop and other packages. The first run draws four scenes (20
+    minutes of processor time) and keeps them. Results are written after every round.
     """
     beside = Path(__file__).resolve().parents[2]
     places = [beside, Path.cwd()]

@@ -16,11 +16,11 @@ def browse(
     *,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port [any free one].")] = 0,
     open_page: Annotated[
-        bool, typer.Option("--open/--no-open", help="Open the page in the web browser.")
+        bool, typer.Option("--open/--no-open", help="Open the web browser.")
     ] = True,
     depth_unit_m: DepthUnitOption = None,
 ) -> None:
-    """Look through scenes, pairs and frames in a local web page.
+    """Look through scenes in a local web page.
 
     The page filters scenes, flips through pairs and frames, shows disparity in pixels and depth in
     metres under the cursor, and gives the Python line for what is shown. Only this machine can

@@ -8,7 +8,6 @@ from io import TextIOWrapper
 from typing import Annotated, Any, Final
 
 import typer
-from typer.core import TyperGroup
 
 from stereogenbench_data.cli import export_clips, export_views
 from stereogenbench_data.cli.audit import audit
@@ -18,6 +17,7 @@ from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
 from stereogenbench_data.cli.errors import ErrorsReported
 from stereogenbench_data.cli.evaluate import controls, evaluate, export_inputs
+from stereogenbench_data.cli.help import HelpedCommand, HelpedGroup
 from stereogenbench_data.cli.index import index
 from stereogenbench_data.cli.pack import pack, unpack, verify
 from stereogenbench_data.cli.publish import card, croissant, upload
@@ -40,7 +40,7 @@ _COMMANDS: Final[dict[str, dict[Callable[..., None], str]]] = {
         pack: "pack scenes/ shards/ --shard-size 2GB",
         unpack: "unpack shards/ scenes/",
         croissant: "croissant shards/ -o croissant/sample.json",
-        card: "card shards/ --repo ORG/NAME -o shards/",
+        card: "card shards/ ORG/NAME -o shards/",
         upload: "upload shards/ ORG/NAME",
     },
     "Check them": {
@@ -62,7 +62,7 @@ _DEBUG: Final = "--debug"
 _HELP_OPTIONS: Final = {"help_option_names": ["-h", "--help"]}
 
 
-class _Commands(TyperGroup):
+class _Commands(HelpedGroup):
     """The group of commands. Errors end it with a message, with --debug in a traceback."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -79,7 +79,6 @@ app = typer.Typer(
     cls=_Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
     context_settings=_HELP_OPTIONS,
     help=(
         "Stereo pairs out of StereoGenBench scenes: 6 cameras, 15 pairs, exact disparity.\n\n"
@@ -91,10 +90,10 @@ app = typer.Typer(
         "folder of shards, an index file, or the URL of either."
     ),
     epilog=(
-        "Exit status: 0 done and nothing is wrong; 1 something is wrong with the data; 2 it could "
-        "not be done; 130 stopped by Ctrl-C or SIGTERM.\n\n"
-        "Shell completion: `stereogenbench --install-completion`. "
-        "Help on a command: `stereogenbench COMMAND --help`."
+        "Help on a command: `stereogenbench COMMAND --help`. Completion by Tab: "
+        "`stereogenbench --install-completion` (or `--show-completion`). Exit status: 0 done and "
+        "nothing is wrong; 1 something is wrong with the data; 2 it could not be done; 130 stopped "
+        "by Ctrl-C or SIGTERM."
     ),
 )
 
@@ -102,12 +101,13 @@ app = typer.Typer(
 for _panel, _examples in _COMMANDS.items():
     for _function, _example in _examples.items():
         app.command(
+            cls=HelpedCommand,
             rich_help_panel=_panel,
             epilog=f"Example: `stereogenbench {_example}`",
             context_settings=_HELP_OPTIONS,
         )(_function)
 
-export = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
+export = typer.Typer(cls=HelpedGroup, no_args_is_help=True)
 app.add_typer(
     export,
     name="export",
@@ -118,7 +118,10 @@ app.add_typer(
 )
 for _name, _function, _example in (*export_clips.EXPORTS, *export_views.EXPORTS):
     export.command(
-        _name, epilog=f"Example: `stereogenbench {_example}`", context_settings=_HELP_OPTIONS
+        _name,
+        cls=HelpedCommand,
+        epilog=f"Example: `stereogenbench {_example}`",
+        context_settings=_HELP_OPTIONS,
     )(_function)
 
 
@@ -132,7 +135,7 @@ def _print_version(value: bool) -> None:
 def _common(
     debug: Annotated[
         bool,
-        typer.Option(_DEBUG, help="Show the whole traceback of an error (may stand anywhere)."),
+        typer.Option(_DEBUG, help="Show the traceback of an error (may stand anywhere)."),
     ] = False,
     version: Annotated[
         bool,

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from stereogenbench_data.audit.contract.verdict import Answer, Verdict
 
 
+_DECLARED = "The contract that is tested"
+"""Panel of the help for the options that declare a depth contract."""
 QUOTIENT_MEANS = (
     "Disparity shows only the quotient unit / (focal length x baseline). No picture tells which of "
     "the three is wrong, or whether two of them cancel out."
@@ -51,22 +53,25 @@ def doctor(  # noqa: PLR0913 - one parameter an option
     chosen: SceneOptions,
     unit_m: Annotated[
         float | None,
-        typer.Option(help="Declare this many metres in a stored unit [as tagged, else 0.1]."),
+        typer.Option(help="Metres in a stored unit [as tagged].", rich_help_panel=_DECLARED),
     ] = None,
     kind: Annotated[
-        Literal["planar", "ray"], typer.Option(help="Declare depth along the axis or the ray.")
+        Literal["planar", "ray"],
+        typer.Option(help="Depth along the axis or the ray.", rich_help_panel=_DECLARED),
     ] = "planar",
     form: Annotated[
-        Literal["depth", "inverse"], typer.Option(help="Declare stored depth or its inverse.")
+        Literal["depth", "inverse"],
+        typer.Option(help="Depth is stored, or its inverse.", rich_help_panel=_DECLARED),
     ] = "depth",
     frame_lag: Annotated[
-        int, typer.Option(help="Declare that RGB frame t has depth frame t + LAG.")
+        int,
+        typer.Option(help="Picture t belongs to depth frame t + N.", rich_help_panel=_DECLARED),
     ] = 0,
     out: OutOption = None,
     as_json: JsonOption = False,
     work: WorkOptions,
 ) -> None:
-    """Find from the pictures how stored depth becomes metres, and which picture it belongs to.
+    """Find from the pictures how stored depth becomes metres.
 
     The doctor compares what the cameras of a scene see with what depth predicts: planar or ray,
     inverse, frame lag, camera order, flips, offset, unit / (focal length x baseline), and each

@@ -17,7 +17,7 @@ from stereogenbench_data.schema.text import counted
 def download(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     *,
-    dest: Annotated[Path, typer.Option(help="Folder to write into.")],
+    dest: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write into.")],
     cameras: Annotated[
         str, typer.Option(help="Numbers of the cameras, such as 0,1.")
     ] = "0,1,2,3,4,5",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stereogenbench_data.cli.errors import FINDINGS, resumable
+from stereogenbench_data.cli.help import SCENES
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
@@ -21,6 +22,7 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     depth_of,
     grouped,
+    pair_of,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, require_metrics
@@ -43,7 +45,7 @@ def pairs_option(text: str) -> Any:
             f"{text!r} is not primary, adjacent, all or pairs such as 0-1,0-5.",
             param_hint="--pairs",
         )
-    return [(int(left), int(right)) for left, right in pairs]
+    return [pair_of("-".join(pair), option="--pairs") for pair in pairs]
 
 
 def frames_option(text: str) -> Any:
@@ -85,15 +87,17 @@ def parse_strata(texts: list[str] | None) -> dict[str, tuple[float, ...]]:
     return strata
 
 
+_METRICS = "How metrics are computed"
+"""Panel of the help for the options of metrics."""
 TierOption = Annotated[
     str,
     typer.Option(
-        help="Input of the method: G0 target geometry, G1 camera, G2 only the left view.",
+        metavar="G0|G1|G2",
+        help="What the method is given beside the left view: G0 the target's depth, G1 the camera, "
+        "G2 nothing.",
     ),
 ]
-SizeOption = Annotated[
-    str, typer.Option(help="WIDTHxHEIGHT at which everything is scored [the paper's].")
-]
+SizeOption = Annotated[str, typer.Option(metavar="WxH", help="Width x height of what is scored.")]
 PAPER_SIZE = "832x480"
 
 
@@ -102,14 +106,16 @@ class PairsOptions(SceneOptions):
     """Which pairs and frames of which scenes are scored."""
 
     pairs: Annotated[
-        str, typer.Option(help="primary, adjacent, all, or pairs such as 0-1,0-5.")
+        str,
+        typer.Option(help="primary, adjacent, all, or such as 0-1,0-5.", rich_help_panel=SCENES),
     ] = "primary"
     frames: Annotated[
-        str, typer.Option(help="all, first, every:K, or numbers such as 0,40,80.")
+        str,
+        typer.Option(help="all, first, every:K, or such as 0,40,80.", rich_help_panel=SCENES),
     ] = "all"
     baseline_cm: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Shortest and longest baseline, in cm."),
+        typer.Option(help="Baselines, such as 10 60.", rich_help_panel=SCENES),
     ] = None
 
     def selection(self) -> dict[str, Any]:
@@ -139,33 +145,54 @@ class ProtocolOptions:
         str,
         typer.Option(
             help=f"Of {', '.join(METRICS)}.",
+            metavar="NAMES",
         ),
     ] = ",".join(OFFLINE_METRICS)
     keypoint_matcher: Annotated[
-        str, typer.Option(help="For E_match: sift, or dedode (the paper's).")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Of E_match: sift, or dedode (the paper's).",
+            rich_help_panel=_METRICS,
+        ),
     ] = "sift"
     stereo_matcher: Annotated[
         str,
-        typer.Option(help="For SD: sgbm, or foundation-stereo (the paper's)."),
+        typer.Option(
+            metavar="NAME",
+            help="Of SD: sgbm, or foundation-stereo (the paper's).",
+            rich_help_panel=_METRICS,
+        ),
     ] = "sgbm"
     fit: Annotated[
         str,
         typer.Option(
-            help="Fit of SD that decides relations: filtered, least_squares or theil_sen. "
-            "Reports always show the first two.",
+            help="Of SD, for relations: filtered, least_squares, theil_sen.",
+            rich_help_panel=_METRICS,
         ),
     ] = "filtered"
     depth_unit_m: DepthUnitOption = None
     weights: Annotated[
         Path | None,
         typer.Option(
-            "--weights", "--checkpoint", help="Folder of weights [torch.hub's checkpoints]."
+            "--weights",
+            "--checkpoint",
+            metavar="DIR",
+            help="Folder of weights [torch.hub's checkpoints].",
+            rich_help_panel=_METRICS,
         ),
     ] = None
     checkout: Annotated[
-        Path | None, typer.Option(help="Clone of FoundationStereo's repository.")
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Clone of FoundationStereo's repository.",
+            rich_help_panel=_METRICS,
+        ),
     ] = None
-    device: Annotated[str, typer.Option(help="Device of learned models.")] = "cpu"
+    device: Annotated[
+        str, typer.Option(help="Device of learned models.", rich_help_panel=_METRICS)
+    ] = "cpu"
 
     def protocol(self) -> "EvaluationProtocol":
         """Return the protocol of the options.
@@ -195,7 +222,9 @@ class ReportOptions:
 
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder of the report and of partial results."),
+        typer.Option(
+            "--out", "-o", metavar="DIR", help="Folder of the report and of partial results."
+        ),
     ] = None
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Draw metric by baseline.")] = (
         True
@@ -210,16 +239,16 @@ class ReportOptions:
         *,
         found: "Sequence[Relation]" = (),
     ) -> None:
-        """Write the files of the report; print it as a page or as JSON."""
+        """Print the report as a page or as JSON, then write its files."""
         from stereogenbench_data.evaluation.report import document, page, write_report
 
-        files = write_report(
-            folder, results, tables, found=found, plots="write" if self.plots else "skip"
-        )
         if self.as_json:
             typer.echo(json.dumps(document(results, tables, found=found), allow_nan=False))
         else:
             typer.echo(page(results, tables, found=found).rstrip())
+        files = write_report(
+            folder, results, tables, found=found, plots="write" if self.plots else "skip"
+        )
         names = ", ".join(str(path.relative_to(folder)) for path in files)
         typer.echo(f"{folder}: {names}", err=True)
 
@@ -245,11 +274,12 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
     depth_unit_m: DepthUnitOption = None,
     work: WorkOptions,
 ) -> None:
-    """Write the inputs of a tier: left views as PNG; G0 adds geometry, G1 the camera.
+    """Write what a method is given: left views, geometry, camera.
 
-    An item is one pair of one scene; its folder's name reveals neither. Write the output of the
-    method as PREDICTIONS/ITEM/000.png ... or PREDICTIONS/ITEM.mp4, then run `stereogenbench
-    evaluate` with the same selection. To continue a stopped run, run it again.
+    Left views are PNG; tier G0 adds the target's geometry, G1 the camera, G2 nothing. An item is
+    one pair of one scene; its folder's name reveals neither. Write the output of the method as
+    PREDICTIONS/ITEM/000.png ... or PREDICTIONS/ITEM.mp4, then run `stereogenbench evaluate` with
+    the same selection. To continue a stopped run, run it again.
     """
     from stereogenbench_data.evaluation.inputs import export_inputs as exported
 
@@ -274,7 +304,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
 def evaluate(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
     predictions: Annotated[
-        Path, typer.Argument(help="Folder of right views: ITEM/000.png ... or ITEM.mp4.")
+        Path, typer.Argument(help="Folder of right views, ITEM/000.png ... or ITEM.mp4.")
     ],
     *,
     tier: TierOption,
@@ -286,20 +316,21 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     by: Annotated[
         list[str] | None,
         typer.Option(
-            help="Column of the index to stratify by, such as map_name, or focal_mm:18,35,85 with "
-            "edges; may be repeated.",
+            metavar="COLUMN[:EDGES]",
+            help="Also score by map_name or focal_mm:18,35,85. May be repeated.",
         ),
     ] = None,
     allow_missing: Annotated[
         int,
-        typer.Option(min=0, help="Most pairs whose right view may be missing or unusable."),
+        typer.Option(min=0, help="Most pairs without a usable right view."),
     ] = 0,
     report: ReportOptions,
     work: WorkOptions,
 ) -> None:
-    """Score a method's right views by the paper's protocol, beside the paper's own rows.
+    """Score a method's right views by the paper's protocol.
 
-    `stereogenbench export-inputs` writes the inputs of a tier. PREDICTIONS holds, for each item, a
+    `stereogenbench export-inputs` writes what the method is given. The paper's own rows stand
+    beside the scores. PREDICTIONS holds, for each item, a
     folder of PNGs or a video of the same name. The report (Markdown, LaTeX, CSV, JSON, plots) and
     partial results go to --out [evaluation/NAME-TIER]. To continue a stopped run, run it again.
     """
@@ -338,10 +369,10 @@ def controls(
     report: ControlsReportOptions,
     work: WorkOptions,
 ) -> None:
-    """Score the calibration controls: a perfect, a copied, a wrong and a random right view.
+    """Score a perfect, a copied, a wrong and a random right view.
 
-    They are the rendered target, the left view, the view of the next camera (02 for 01), and the
-    right view of another scene. The report shows the paper's own controls beside them, and
+    The controls are the rendered target, the left view, the view of the next camera (02 for 01),
+    and the right view of another scene. The report shows the paper's own controls beside them, and
     whether the relations between them hold; the exit status is 1 if one does not. It goes to --out
     [evaluation/controls]. To continue a stopped run, run it again.
     """

@@ -10,6 +10,7 @@ import typer
 
 from stereogenbench_data.cli.errors import resumable
 from stereogenbench_data.cli.evaluate import pairs_option, parse_picture_size
+from stereogenbench_data.cli.help import SCENES
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
     from stereogenbench_data.media.encoder import Encoding
 
 
+_ENCODING: Final = "How videos are encoded"
+"""Panel of the help for the options of the encoder."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class PairOptions(SceneOptions):
     """Which pairs of which scenes are exported."""
@@ -36,15 +41,19 @@ class PairOptions(SceneOptions):
         typer.Option(
             "--split",
             help="train; eval only if you say so [train].",
+            rich_help_panel=SCENES,
             autocompletion=complete_from(("train", "eval")),
         ),
     ] = None
     pairs: Annotated[
-        str, typer.Option("--pairs", help="primary, adjacent, all, or pairs such as 0-1,0-5.")
+        str,
+        typer.Option(
+            "--pairs", help="primary, adjacent, all, or such as 0-1,0-5.", rich_help_panel=SCENES
+        ),
     ] = "primary"
     baseline_cm: Annotated[
         tuple[float, float] | None,
-        typer.Option("--baseline-cm", help="Shortest and longest baseline, in cm."),
+        typer.Option("--baseline-cm", help="Baselines, such as 10 60.", rich_help_panel=SCENES),
     ] = None
 
     def selection(self) -> dict[str, Any]:
@@ -62,16 +71,24 @@ class EncodingOptions:
     """How videos are encoded."""
 
     crf: Annotated[
-        int, typer.Option(help="Constant rate factor, 0 to 51: fewer is better and larger.")
+        int,
+        typer.Option(
+            help="Constant rate factor, 0 to 51; fewer is better.", rich_help_panel=_ENCODING
+        ),
     ] = 12
-    preset: Annotated[str, typer.Option(help="Effort for small files, ultrafast to veryslow.")] = (
-        "medium"
-    )
+    preset: Annotated[
+        str,
+        typer.Option(help="Effort, ultrafast to veryslow.", rich_help_panel=_ENCODING),
+    ] = "medium"
     pixel_format: Annotated[
-        Literal["yuv420p", "yuv444p"], typer.Option(help="yuv444p keeps colours at full size.")
+        Literal["yuv420p", "yuv444p"],
+        typer.Option(help="yuv444p keeps colours at full size.", rich_help_panel=_ENCODING),
     ] = "yuv420p"
     key_frame_every: Annotated[
-        int | None, typer.Option(help="Most frames between key frames [the codec's own].")
+        int | None,
+        typer.Option(
+            help="Most frames between key frames [the codec's].", rich_help_panel=_ENCODING
+        ),
     ] = None
 
     def encoding(self) -> "Encoding":
@@ -96,7 +113,7 @@ class ClipOptions(EncodingOptions):
 
     length: Annotated[
         int | None,
-        typer.Option(help="Frames of a clip [the most that scenes and layout allow]."),
+        typer.Option(help="Frames of a clip [the most that fit]."),
     ] = None
     stride: Annotated[int, typer.Option(help="Take every so many frames.")] = 1
     step: Annotated[
@@ -106,7 +123,8 @@ class ClipOptions(EncodingOptions):
         bool, typer.Option("--any-length", help="Allow lengths that the trainer cuts to 4N+1.")
     ] = False
     size: Annotated[
-        str | None, typer.Option("--size", help="WIDTHxHEIGHT of pictures [as stored].")
+        str | None,
+        typer.Option("--size", metavar="WxH", help="Width x height of pictures [as stored]."),
     ] = None
     fit: Annotated[
         Literal["stretch", "crop"],
@@ -120,7 +138,8 @@ class ClipOptions(EncodingOptions):
         list[str] | None,
         typer.Option(
             "--also",
-            help="Another video: depth or disparity; may be given again.",
+            metavar="VIDEO",
+            help="Write depth or disparity too. May be repeated.",
             autocompletion=complete_from(("depth", "disparity")),
         ),
     ] = None
@@ -176,7 +195,7 @@ def export_clips(  # noqa: PLR0913 - one parameter an option
     workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write stereo clips as MP4 with captions and the manifest that a video trainer reads.
+    """Write stereo clips with captions and manifest for video trainers.
 
     Of each pair: the right view, the left one, the left one warped into the right, and a lossless
     mask of its holes. A stopped run goes on if it is run again; manifests are written last.

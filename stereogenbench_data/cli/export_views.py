@@ -9,6 +9,7 @@ import typer
 
 from stereogenbench_data.cli.errors import resumable
 from stereogenbench_data.cli.evaluate import frames_option, parse_picture_size
+from stereogenbench_data.cli.help import SCENES
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
@@ -33,17 +34,25 @@ class ViewOptions(SceneOptions):
         typer.Option(
             "--split",
             help="train; eval only if you say so [train].",
+            rich_help_panel=SCENES,
             autocompletion=complete_from(("train", "eval")),
         ),
     ] = None
-    cameras: Annotated[str, typer.Option("--cameras", help="all, or numbers such as 0,2,5.")] = (
-        "all"
-    )
+    cameras: Annotated[
+        str,
+        typer.Option("--cameras", help="all, or numbers such as 0,2,5.", rich_help_panel=SCENES),
+    ] = "all"
     frames: Annotated[
-        str, typer.Option("--frames", help="first, all, every:K, or numbers such as 0,40,80.")
+        str,
+        typer.Option(
+            "--frames", help="first, all, every:K, or such as 0,40,80.", rich_help_panel=SCENES
+        ),
     ] = "first"
     size: Annotated[
-        str | None, typer.Option("--size", help="WIDTHxHEIGHT of pictures and depth [as stored].")
+        str | None,
+        typer.Option(
+            "--size", metavar="WxH", help="Width x height of what is written [as stored]."
+        ),
     ] = None
     depth_unit_m: DepthUnitOption = None
     workers: WorkersOption = None
@@ -78,16 +87,14 @@ class ModelOptions(ViewOptions):
         Literal["moment", "scene"],
         typer.Option(
             "--group",
-            help="moment: a folder for each frame, in which nothing moves; scene: one for all the "
-            "frames of a scene, between which characters move.",
+            help="A folder for each moment, in which nothing moves, or for each scene.",
         ),
     ] = "moment"
     points: Annotated[
         str | None,
         typer.Option(
             "--points",
-            help="3D points taken from each picture, or all: every measured pixel [5000; of a "
-            "cloud 100000].",
+            help="3D points of a picture, or all [5000; clouds 100000].",
         ),
     ] = None
 
@@ -110,11 +117,11 @@ class ModelOptions(ViewOptions):
 @grouped
 @resumable()
 def export_colmap(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
-    """Write COLMAP's text model with points from depth, for COLMAP, gsplat and 3D Gaussians.
+    """Write COLMAP's text model with points from depth.
 
-    In each folder: images/ and sparse/0/ (cameras.txt, images.txt, points3D.txt), poses and points
-    in metres, exact; the world's origin is the first camera. A stopped run goes on if it is run
-    again.
+    COLMAP, gsplat and 3D Gaussians read it. In each folder: images/ and sparse/0/ (cameras.txt,
+    images.txt, points3D.txt), poses and points in metres, exact; the world's origin is the first
+    camera. A stopped run goes on if it is run again.
     """
     _export(source, out, chosen, layout="colmap")
 
@@ -122,7 +129,7 @@ def export_colmap(source: DataOptions, out: OutArgument, *, chosen: ModelOptions
 @grouped
 @resumable()
 def export_transforms(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
-    """Write transforms.json for nerfstudio, with pictures, depth and a point cloud.
+    """Write transforms.json for nerfstudio, with depth and points.
 
     Cameras have OpenGL's axes, the world's z points up, depth is in millimetres in .npy files. A
     stopped run goes on if it is run again.
@@ -133,10 +140,10 @@ def export_transforms(source: DataOptions, out: OutArgument, *, chosen: ModelOpt
 @grouped
 @resumable()
 def export_ply(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
-    """Write point clouds from depth as PLY: metres, x right, y down, z forward, with colours.
+    """Write coloured point clouds from depth as PLY.
 
-    Each folder has points.ply, and stereogenbench.json with the cameras. A stopped run goes on if
-    it is run again.
+    Points are in metres, x right, y down, z forward. Each folder has points.ply, and
+    stereogenbench.json with the cameras. A stopped run goes on if it is run again.
     """
     _export(source, out, chosen, layout="ply")
 
@@ -144,10 +151,11 @@ def export_ply(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -
 @grouped
 @resumable()
 def export_moge(source: DataOptions, out: OutArgument, *, chosen: ViewOptions) -> None:
-    """Write the training folders of MoGe: image.jpg, depth.png, meta.json, and .index.txt.
+    """Write the training folders of MoGe.
 
-    In MoGe's configuration of this dataset set "depth_unit": 1.0, as depth is metric, and
-    "finite_depth_mask": "only_known". A stopped run goes on if it is run again.
+    Each holds image.jpg, depth.png and meta.json; .index.txt lists them. In MoGe's configuration of
+    this dataset set "depth_unit": 1.0, as depth is metric, and "finite_depth_mask": "only_known". A
+    stopped run goes on if it is run again.
     """
     _export(source, out, chosen, layout="moge")
 

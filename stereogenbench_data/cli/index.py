@@ -10,6 +10,7 @@ from rich.console import Console
 
 from stereogenbench_data.cli.data import full_place
 from stereogenbench_data.cli.errors import FINDINGS, resumable
+from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import (
     FamilyOption,
     JsonOption,
@@ -31,9 +32,7 @@ _INDEX_NAME = "index.parquet"
 @grouped
 @resumable()
 def index(  # noqa: PLR0913 - one parameter an option
-    root: Annotated[
-        str, typer.Argument(help="Folder that holds train/ and eval/, or its URL (hf://, s3://).")
-    ],
+    root: Annotated[str, typer.Argument(help="Folder that holds train/ or eval/, or its URL.")],
     *,
     out: Annotated[
         Path | None,
@@ -46,8 +45,8 @@ def index(  # noqa: PLR0913 - one parameter an option
         bool,
         typer.Option(
             "--valid-depth",
-            help="Decode a few depth pictures of each scene, to be able to select by the share "
-            "of measured pixels.",
+            help="Measure the share of valid depth, to select by it.",
+            rich_help_panel=RARE,
         ),
     ] = False,
     split: SplitOption = None,

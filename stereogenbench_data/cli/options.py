@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 from stereogenbench_data.cli.data import open_data
-from stereogenbench_data.schema.release import FAMILIES, TRAIN_MAPS, UNSEEN_MAPS, Split, Subset
+from stereogenbench_data.cli.help import RARE, SCENES
+from stereogenbench_data.schema.release import (
+    CAMERA_PAIRS,
+    FAMILIES,
+    TRAIN_MAPS,
+    UNSEEN_MAPS,
+    Split,
+    Subset,
+)
 
 if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
@@ -80,6 +88,29 @@ def complete_scene(context: typer.Context, incomplete: str) -> list[str]:
     return complete_from(map(str, keys))(incomplete)
 
 
+def pair_of(text: str, *, option: str) -> tuple[int, int]:
+    """Return the two cameras of a pair such as 0-5.
+
+    Raises:
+        typer.BadParameter: If they are not two cameras, the left one first.
+    """
+    left, _, right = text.replace(",", "-").partition("-")
+    if not (left.strip().isdecimal() and right.strip().isdecimal()):
+        raise typer.BadParameter(
+            f"{text!r} is not a pair: write two cameras, such as 0-5.", param_hint=option
+        )
+    pair = int(left), int(right)
+    if pair not in CAMERA_PAIRS:
+        swapped = pair[1], pair[0]
+        cure = f"write it as {right}-{left}" if swapped in CAMERA_PAIRS else "such as 0-5"
+        raise typer.BadParameter(
+            f"{text!r} is not a pair: two different cameras from 0 to 5, the left one first; "
+            f"{cure}.",
+            param_hint=option,
+        )
+    return pair
+
+
 def depth_of(unit_m: float | None) -> "DepthEncoding | None":
     """Return the depth contract of ``--depth-unit-m``; None without it: files state their own."""
     from stereogenbench_data.schema.records import DepthEncoding
@@ -91,33 +122,41 @@ RootOption = Annotated[
     str | None,
     typer.Option(
         "--root",
-        help="Folder or URL of an index file's data, where they are not beside it and it names "
-        "no plain URL.",
+        help="Where the data of an index file are, if not beside.",
+        rich_help_panel=RARE,
     ),
 ]
 SplitOption = Annotated[
     str | None,
-    typer.Option(help="train or eval.", autocompletion=complete_from(get_args(Split))),
+    typer.Option(
+        help="train or eval.",
+        autocompletion=complete_from(get_args(Split)),
+        rich_help_panel=SCENES,
+    ),
 ]
 FamilyOption = Annotated[
     list[str] | None,
     typer.Option(
-        help="Baseline family; may be given again.",
+        help="Family of baselines. May be repeated.",
         autocompletion=complete_from(FAMILIES),
+        rich_help_panel=SCENES,
     ),
 ]
 MapOption = Annotated[
     list[str] | None,
     typer.Option(
         "--map",
-        help="Map; may be given again.",
+        metavar="MAP",
+        help="Map, such as Stylized_Egypt. May be repeated.",
         autocompletion=complete_from(TRAIN_MAPS | UNSEEN_MAPS),
+        rich_help_panel=SCENES,
     ),
 ]
 DepthUnitOption = Annotated[
     float | None,
     typer.Option(
-        help="Metres in a stored unit of depth, whatever the files state [their own tag].",
+        help="Metres in a stored unit of depth [as files state].",
+        rich_help_panel=RARE,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")]
@@ -125,9 +164,9 @@ WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes [one a
 EngineOption = Annotated[
     str,
     typer.Option(
-        help="local: processes here; ray: the Ray cluster of RAY_ADDRESS or of this machine "
-        "(extra 'ray'); ray://HOST:PORT or HOST:PORT: the one there.",
+        help="local, ray, or ray://HOST:PORT.",
         autocompletion=complete_from(("local", "ray")),
+        rich_help_panel=RARE,
     ),
 ]
 OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
@@ -139,7 +178,7 @@ class DataOptions:
 
     data: Annotated[
         str,
-        typer.Argument(help="Released tree, folder of shards, index file, or the URL of either."),
+        typer.Argument(help="Folder of scenes or shards, an index file, or a URL."),
     ]
     data_root: RootOption = None
 
@@ -164,22 +203,33 @@ class SceneOptions:
     subset: Annotated[
         str | None,
         typer.Option(
-            help="seen_map or unseen_map (of eval scenes).",
+            help="Of eval scenes: seen_map or unseen_map.",
             autocompletion=complete_from(get_args(Subset)),
+            rich_help_panel=SCENES,
         ),
     ] = None
     family: FamilyOption = None
     map_name: MapOption = None
     scene: Annotated[
         list[str] | None,
-        typer.Option(help="Key of a scene; may be given again.", autocompletion=complete_scene),
+        typer.Option(
+            metavar="KEY",
+            help="Key of a scene. May be repeated.",
+            autocompletion=complete_scene,
+            rich_help_panel=SCENES,
+        ),
     ] = None
     focal_mm: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Shortest and longest focal length, in mm."),
+        typer.Option(help="Focal lengths, such as 18 35.", rich_help_panel=SCENES),
     ] = None
     caption: Annotated[
-        str | None, typer.Option(help="Words that must all be in the description.")
+        str | None,
+        typer.Option(
+            metavar="WORDS",
+            help="Words that must all be in the caption.",
+            rich_help_panel=SCENES,
+        ),
     ] = None
 
     def filters(self) -> dict[str, Any]:

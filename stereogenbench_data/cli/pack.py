@@ -10,6 +10,7 @@ import typer
 
 from stereogenbench_data.cli.data import open_index
 from stereogenbench_data.cli.errors import FINDINGS, resumable
+from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import (
     JsonOption,
     RootOption,
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
     from stereogenbench_data.index.table import SceneIndex
     from stereogenbench_data.shards.training import TrainingSettings
 
+_TRAINING = "Training shards"
+"""Panel of the help for the options that training shards have."""
+
 
 @grouped
 @resumable()
@@ -32,7 +36,7 @@ def pack(  # noqa: PLR0913 - one parameter an option
     root: Annotated[
         str,
         typer.Argument(
-            help="Released tree, or its index file; with --size also shards, or the URL of either."
+            help="Folder of scenes or its index file; with --size also shards or a URL."
         ),
     ],
     out: Annotated[Path, typer.Argument(help="Folder for the shards and their index.")],
@@ -40,39 +44,38 @@ def pack(  # noqa: PLR0913 - one parameter an option
     data_root: RootOption = None,
     shard_size: Annotated[
         str,
-        typer.Option(
-            help="Largest size of a shard, such as 500MB or 2GiB (training shards: about). A scene "
-            "is never divided: a larger one has a larger shard to itself."
-        ),
+        typer.Option(help="Largest shard, such as 500MB or 2GiB; a scene is never divided."),
     ] = "2GB",
     part: Annotated[
         str,
-        typer.Option(help="I/N packs every N-th shard from the I-th on: one part per machine."),
+        typer.Option(
+            metavar="I/N",
+            help="Every N-th shard from the I-th on: a part for each machine.",
+            rich_help_panel=RARE,
+        ),
     ] = "1/1",
     size: Annotated[
         str | None,
         typer.Option(
-            help="WIDTHxHEIGHT, such as 832x480: make training shards, with pictures encoded at "
-            "this size for fast decoding in any order, and depth at this size without loss."
+            metavar="WxH",
+            help="Width x height, such as 832x480; makes training shards.",
+            rich_help_panel=_TRAINING,
         ),
     ] = None,
     quality: Annotated[
         Literal["small", "balanced", "high"] | None,
-        typer.Option(
-            help="Of training shards [balanced]; small: fewest bytes (H.264); balanced: less error "
-            "(H.264); high: least error, and any frame at once (JPEG)."
-        ),
+        typer.Option(help="Fewest bytes, or least error [balanced].", rich_help_panel=_TRAINING),
     ] = None,
     cameras: Annotated[
         str | None,
-        typer.Option(help="Cameras of training shards, such as 0,1 [all that a scene has]."),
+        typer.Option(help="Such as 0,1 [all that a scene has].", rich_help_panel=_TRAINING),
     ] = None,
     dry_run: Annotated[
         bool,
         typer.Option(
             "--dry-run",
-            help="Derive a sample of the training shards, print the bytes and core-hours that all "
-            "would take, and write nothing.",
+            help="Estimate bytes and core-hours; write nothing.",
+            rich_help_panel=_TRAINING,
         ),
     ] = False,
     chosen: SceneOptions,
@@ -80,21 +83,22 @@ def pack(  # noqa: PLR0913 - one parameter an option
     depth_codec: Annotated[
         Literal["released", "blosc2"],
         typer.Option(
-            help="released: depth as it is; blosc2: lossless frames that decode one by one, about "
-            "ten times faster (extra 'blosc2'; the released size counts for --shard-size)."
+            help="As released, or lossless and ten times as fast to decode.",
+            rich_help_panel=RARE,
         ),
     ] = "released",
     as_json: JsonOption = False,
 ) -> None:
-    """Pack a released tree into WebDataset tars, with the same bytes each time.
+    """Pack scenes into WebDataset shards.
 
-    To continue a stopped run, run it again: it keeps finished shards by their sizes, times of
-    change and metadata. `stereogenbench verify` reads every byte. With --part, run the same command
-    once for each I; the last one to finish writes the index.
+    The same scenes give the same bytes each time. To continue a stopped run, run it again: it keeps
+    finished shards by their sizes, times of change and metadata. `stereogenbench verify` reads
+    every byte. With --part, run the same command once for each I; the last one to finish writes the
+    index.
 
     With --size the shards are derived for training: smaller pictures, a key frame every few frames,
-    depth bit for bit as `size=` gives it. Each video is decoded again, and its error is in the
-    index. Evaluation and audit refuse such data.
+    depth bit for bit as `size=` gives it. --quality small and balanced encode H.264, high encodes
+    JPEG. The error of each video is in the index. Evaluation and audit refuse such data.
     """
     from stereogenbench_data.selection.filters import filter_scenes
     from stereogenbench_data.shards.pack import pack as packed_by
@@ -203,13 +207,15 @@ def verify(
     source: ShardsOptions,
     *,
     deep: Annotated[
-        bool, typer.Option("--deep", help="Decode every video too, and count its frames.")
+        bool, typer.Option("--deep", help="Decode every video, and count its frames.")
     ] = False,
     comparison: Annotated[
         str | None,
         typer.Option(
             "--source",
-            help="With --deep: the released data of training shards, to compare every frame with.",
+            metavar="DATA",
+            help="With --deep: released data to compare training shards with.",
+            rich_help_panel=RARE,
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -260,11 +266,11 @@ def unpack(
     work: WorkOptions,
     as_json: JsonOption = False,
 ) -> None:
-    """Turn shards back into released scenes; check each file against the index.
+    """Turn shards back into scenes.
 
-    Files that were packed unchanged come out byte for byte. Depth that blosc2 packed becomes FFV1
-    video again, with the same numbers, times and tags. Nothing is overwritten. To continue a
-    stopped run, run it again: it keeps the scenes that exist.
+    Each file is checked against the index. Files that were packed unchanged come out byte for byte.
+    Depth that blosc2 packed becomes FFV1 video again, with the same numbers, times and tags.
+    Nothing is overwritten. To continue a stopped run, run it again: it keeps the scenes that exist.
     """
     from stereogenbench_data.shards.unpack import unpack as unpacked
 

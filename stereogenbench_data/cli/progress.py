@@ -48,6 +48,9 @@ class _CountColumn(ProgressColumn):
 def progress_bar(doing: str, *, unit: str, log_every_s: float = 60) -> Iterator[Report]:
     """Show a bar while the block runs; yield a function that takes (done, total).
 
+    A bar that has counted nothing when the block ends is taken away, as that of a command that
+    fails at once.
+
     Args:
         doing: What the command does, such as "packing".
         unit: What is counted. For "MB", pass done and total in bytes.
@@ -61,15 +64,24 @@ def progress_bar(doing: str, *, unit: str, log_every_s: float = 60) -> Iterator[
         _CountColumn(unit),
         TimeRemainingColumn(compact=True, elapsed_when_finished=True),
     )
-    with Progress(*columns, console=console) as bar:
-        task = bar.add_task(doing, total=None)
-        last_line_s = time.monotonic()
+    bar = Progress(*columns, console=console)
+    task = bar.add_task(doing, total=None)
+    last_line_s = time.monotonic()
+    if console.is_terminal:
+        bar.start()
 
-        def report(done: int, total: int) -> None:
-            nonlocal last_line_s
-            bar.update(task, completed=-(-done // divisor), total=-(-total // divisor))
-            if not console.is_terminal and time.monotonic() - last_line_s >= log_every_s:
-                last_line_s = time.monotonic()
-                console.print(bar)
+    def report(done: int, total: int) -> None:
+        nonlocal last_line_s
+        if not bar.live.is_started:
+            bar.start()
+        bar.update(task, completed=-(-done // divisor), total=-(-total // divisor))
+        if not console.is_terminal and time.monotonic() - last_line_s >= log_every_s:
+            last_line_s = time.monotonic()
+            console.print(bar)
 
+    try:
         yield report
+    finally:
+        if bar.live.is_started:
+            bar.live.transient = not bar.tasks[task].completed
+            bar.stop()

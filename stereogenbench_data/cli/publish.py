@@ -1,23 +1,44 @@
 """``stereogenbench croissant``, ``card``, ``upload``: describe and publish shards."""
 
 import json
+import re
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
+from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import DataOptions, JsonOption, RootOption, grouped
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
+
+_REPOSITORY: Final = re.compile(r"[\w.-]+/[\w.-]+")
+
+
+def _require_repository(text: str) -> str:
+    if not _REPOSITORY.fullmatch(text):
+        raise typer.BadParameter(
+            f"{text!r} is not a repository: write ORG/NAME, such as my-lab/stereo-scenes."
+        )
+    return text
+
 
 AboutOption = Annotated[
     Path | None,
     typer.Option(
         "--about",
-        help="JSON file with authors, licence and provenance, as `croissant --template` asks.",
+        metavar="FILE",
+        help="Authors, licence, provenance: see `croissant --template`.",
+    ),
+]
+
+RepositoryArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="ORG/NAME", help="Dataset repository on the Hub.", callback=_require_repository
     ),
 ]
 
@@ -26,39 +47,38 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     data: Annotated[
         str | None,
         typer.Argument(
-            help="Folder of shards, released tree, index file or URL; with --check, a descriptor. "
-            "Without it, the public release in folders on the Hub."
+            help="Folder of shards or scenes, an index file, or a URL; with --check a descriptor "
+            "[the public release]."
         ),
     ] = None,
     *,
     data_root: RootOption = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Descriptor to write; tables go beside it.")
+        Path | None, typer.Option("--out", "-o", help="Descriptor to write, with tables beside.")
     ] = None,
     check: Annotated[
         bool,
-        typer.Option("--check", help="Check a descriptor against its files; exit 1 on findings."),
+        typer.Option("--check", help="Check a descriptor and its files."),
     ] = False,
     base_url: Annotated[
         str | None,
-        typer.Option(
-            help="URL of the folder of shards, pinned to a revision, or of the repository of a "
-            "tree [paths relative to the descriptor]."
-        ),
+        typer.Option(help="URL of the data, pinned to a revision [paths from the descriptor]."),
     ] = None,
     tables_url: Annotated[
         str | None,
-        typer.Option(help="URL of the tables' folder [BASE_URL/NAME, NAME being the file's]."),
+        typer.Option(help="URL of the tables' folder [beside the data].", rich_help_panel=RARE),
     ] = None,
     name: Annotated[
         str | None, typer.Option(help="The dataset's name [as its maker states].")
     ] = None,
     release: Annotated[
-        str | None, typer.Option(help="MAJOR.MINOR.PATCH of the data [1.0.0].")
+        str | None, typer.Option(metavar="VERSION", help="Version of the data [1.0.0].")
     ] = None,
     published: Annotated[
         datetime | None,
-        typer.Option(formats=["%Y-%m-%d"], help="Day of publication [today]."),
+        typer.Option(
+            formats=["%Y-%m-%d"], metavar="YYYY-MM-DD", help="Day of publication [today]."
+        ),
     ] = None,
     about: AboutOption = None,
     template: Annotated[
@@ -66,13 +86,16 @@ def croissant(  # noqa: PLR0913 - one parameter an option
     ] = False,
     mapping: Annotated[
         list[str] | None,
-        typer.Option("--map-file", help="ID=PATH with --check: local copy of a file behind a URL."),
+        typer.Option(
+            "--map-file",
+            metavar="ID=PATH",
+            help="With --check: local copy of a file behind a URL.",
+            rich_help_panel=RARE,
+        ),
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Report as JSON; with --check the findings.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Report as JSON on stdout.")] = False,
 ) -> None:
-    """Write a Croissant 1.1 descriptor with responsible-AI fields, or check one.
+    """Write a Croissant 1.1 descriptor, or check one.
 
     The check covers what `mlcroissant validate` does not: files, checksums, columns, references,
     names and the context.
@@ -142,16 +165,18 @@ def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
 @grouped
 def card(
     source: DataOptions,
+    repository: RepositoryArgument,
     *,
-    repository: Annotated[str, typer.Option("--repo", help="ORG/NAME on the Hub.")],
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder to write README.md into [stdout].")
+        Path | None,
+        typer.Option("--out", "-o", metavar="DIR", help="Folder for README.md [stdout]."),
     ] = None,
     about: AboutOption = None,
 ) -> None:
-    """Write the dataset card of shards, which the Hub shows and `datasets` reads.
+    """Write the dataset card of shards.
 
-    With --out, the rows that the Hub's viewer shows are written beside it, in `viewer/`.
+    The Hub shows it, and `datasets` reads its configurations. With --out, the rows that the Hub's
+    viewer shows are written beside it, in `viewer/`.
     """
     from stereogenbench_data.bridges.card import card as card_text
     from stereogenbench_data.bridges.card import write_card
@@ -168,16 +193,16 @@ def card(
 
 def upload(
     shards: Annotated[Path, typer.Argument(help="Folder of shards, as `pack` wrote it.")],
-    repository: Annotated[str, typer.Argument(help="ORG/NAME of a dataset on the Hub.")],
+    repository: RepositoryArgument,
     *,
     branch: Annotated[str, typer.Option(help="Branch to commit to.")] = "main",
     about: AboutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Upload shards with index, dataset card and Croissant descriptor (extra 'hub').
+    """Upload shards with card and descriptor to the Hub.
 
-    The card and the descriptor are written into the folder first. Log in with `hf auth login`. To
-    continue a stopped run, run it again.
+    It needs the extra 'hub'. The card and the descriptor are written into the folder first. Log in
+    with `hf auth login`. To continue a stopped run, run it again.
     """
     from stereogenbench_data.bridges.upload import prepare_upload
     from stereogenbench_data.bridges.upload import upload as uploaded

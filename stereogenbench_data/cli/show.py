@@ -11,6 +11,7 @@ from stereogenbench_data.cli.options import (
     complete_scene,
     depth_of,
     grouped,
+    pair_of,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import writing
@@ -25,7 +26,7 @@ def show(  # noqa: PLR0913 - one parameter an option
     scene: Annotated[
         str | None,
         typer.Argument(
-            help="Key of a scene, or a part that no other key has [the first scene].",
+            help="Key of a scene, or a part of it that is unique [the first].",
             autocompletion=complete_scene,
         ),
     ] = None,
@@ -35,11 +36,11 @@ def show(  # noqa: PLR0913 - one parameter an option
         typer.Option(
             "--out",
             "-o",
-            help="File to write: .png, .mp4 or .gif for a clip, .rrd for Rerun [KEY.png].",
+            help="File to write: .png, .mp4, .gif, or .rrd [KEY.png].",
         ),
     ] = None,
     pair: Annotated[
-        str | None, typer.Option(help="Two cameras, such as 0-5 [the recorded pair].")
+        str | None, typer.Option(help="Two cameras, such as 0-5 [as recorded].")
     ] = None,
     frame: Annotated[int, typer.Option(min=0, help="Number of the frame.")] = 0,
     size: Annotated[
@@ -47,39 +48,32 @@ def show(  # noqa: PLR0913 - one parameter an option
         typer.Option(min=1, max=2048, help="Width of each drawn picture, px [320]."),
     ] = None,
     clip: Annotated[
-        bool, typer.Option("--clip", help="Write all frames as a clip, .mp4 or .gif [KEY.mp4].")
+        bool, typer.Option("--clip", help="Write all frames as a clip [KEY.mp4].")
     ] = False,
     rerun: Annotated[
         bool,
         typer.Option(
             "--rerun",
-            help="Write cameras, pictures, depth and disparity over time for Rerun's viewer (extra "
-            "'rerun') [KEY.rrd].",
+            help="Write a recording for Rerun's viewer [KEY.rrd].",
         ),
     ] = False,
     live: Annotated[
-        bool, typer.Option("--live", help="With --rerun: open the viewer, write no file.")
+        bool, typer.Option("--live", help="Open Rerun's viewer; write no file.")
     ] = False,
     depth_unit_m: DepthUnitOption = None,
 ) -> None:
-    """Draw one scene: its six views, and a pair's disparity, depth, visibility and warp.
+    """Draw one scene with the disparity of a pair.
 
-    The bar of disparity shows pixels and metres, of the stored pictures. A clip shows left, right,
-    disparity and anaglyph over time. A recording for Rerun's viewer has all six cameras over time.
+    A sheet shows the six views, and a pair's disparity, depth, visibility and warp. The bar of
+    disparity shows pixels and metres, of the stored pictures. A clip shows left, right, disparity
+    and anaglyph over time. A recording for Rerun's viewer has all six cameras over time.
     """
     from stereogenbench_data.audit.pictures import scene_pictures
     from stereogenbench_data.audit.pictures.scene_reader import SceneReader
     from stereogenbench_data.samples.picture import write_png
     from stereogenbench_data.selection.filters import find_scene
 
-    cameras = None
-    if pair is not None:
-        left, _, right = pair.replace(",", "-").partition("-")
-        if not (left.strip().isdecimal() and right.strip().isdecimal()):
-            raise typer.BadParameter(
-                f"{pair!r} is not a pair: write two cameras, such as 0-5.", param_hint="--pair"
-            )
-        cameras = int(left), int(right)
+    cameras = None if pair is None else pair_of(pair, option="--pair")
     if rerun or live or (out is not None and out.suffix.lower() in _RECORDINGS):
         shown: dict[str, Any] = {"pair": cameras, "depth": depth_of(depth_unit_m)}
         _show_in_rerun(source, scene, out, width_px=size, is_live=live, **shown)

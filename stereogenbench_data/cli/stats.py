@@ -25,20 +25,19 @@ def stats(
     chosen: SceneOptions,
     compare: Annotated[
         Literal["auto", "always", "never"],
-        typer.Option(
-            help="Show the paper's figures beside; auto: for splits of about the release's size."
-        ),
+        typer.Option(help="Show the paper's figures; auto: beside whole splits."),
     ] = "auto",
     plots: Annotated[
-        Path | None, typer.Option(help="Folder to write histograms into (extra 'plots').")
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for histograms (extra 'plots')."),
     ] = None,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Count scenes, maps, baselines and focal lengths, as the paper's tables do.
+    """Count scenes, maps, baselines and focal lengths.
 
-    It reads only the index. With --compare always, the exit status is 1 if a figure differs from
-    the paper's.
+    The tables are the paper's. It reads only the index. With --compare always, the exit status is 1
+    if a figure differs from the paper's.
     """
     from stereogenbench_data.audit.paper_numbers import SPLITS
     from stereogenbench_data.audit.statistics import statistics
@@ -58,13 +57,13 @@ def stats(
     }
     text = json.dumps(document, indent=1)
     markdown = statistics_markdown(found, lines)
+    if out is not None:
+        write_report(out, text if out.suffix == ".json" else markdown)
+    typer.echo(text if as_json else markdown.rstrip())
     if plots is not None:
         with writing(plots):
             written = write_plots(index, plots, **filters)
         for path in written:
             typer.echo(str(path), err=True)
-    if out is not None:
-        write_report(out, text if out.suffix == ".json" else markdown)
-    typer.echo(text if as_json else markdown.rstrip())
     if compare == "always" and not all(line.agrees for line in lines):
         raise typer.Exit(FINDINGS)

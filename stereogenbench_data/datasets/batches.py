@@ -14,6 +14,7 @@ from stereogenbench_data.datasets.open_videos import fitting_rule
 from stereogenbench_data.datasets.shared_epoch import SharedEpoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.order import (
     ORDER_VERSION,
     EpochOrder,
@@ -158,12 +159,7 @@ class EpochBatches(Sampler[list[int]]):
         Raises:
             SelectionError: If an option is out of its range, or every batch would be dropped.
         """
-        unknown = sorted(set(options) - set(EpochOptions.__annotations__))
-        if unknown:
-            raise SelectionError(
-                f"there is no option {unknown[0]!r}; there are "
-                f"{', '.join(EpochOptions.__annotations__)}."
-            )
+        require_options(EpochBatches, options)
         self.dataset = dataset
         self._epoch = dataset._epoch
         rule = OrderRule(

@@ -549,20 +549,17 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_keep_inherited)
 
 
-def require_options(options: Mapping[str, Any]) -> None:
-    """Refuse options that a loader does not take, naming what to use instead.
+def require_no_sampler(options: Mapping[str, Any]) -> None:
+    """Refuse options of torch's `DataLoader` that order the epoch, naming what to use instead.
 
     Raises:
         SelectionError: If there is such an option.
     """
-    known = LoaderOptions.__annotations__
     for name in options:
         if name in _INSTEAD:
             raise SelectionError(
                 f"a loader orders the epoch and takes no {name}: {_INSTEAD[name]}."
             )
-        if name not in known:
-            raise SelectionError(f"there is no option {name!r}; there are {', '.join(known)}.")
 
 
 def split_options(options: Mapping[str, Any]) -> tuple[EpochOptions, dict[str, Any]]:

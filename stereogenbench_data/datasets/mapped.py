@@ -16,7 +16,7 @@ from stereogenbench_data.datasets.frameworks import accelerates_epoch
 from stereogenbench_data.datasets.loader import (
     LoaderOptions,
     PairsLoader,
-    require_options,
+    require_no_sampler,
     split_options,
 )
 from stereogenbench_data.datasets.open_videos import videos_to_keep
@@ -36,6 +36,7 @@ from stereogenbench_data.samples.streams import StreamStats
 from stereogenbench_data.samples.writer import Allocate, new_array
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
+from stereogenbench_data.selection.options import options_of, require_options
 from stereogenbench_data.selection.plan import Plan, Selection, plan_pairs, plan_views
 from stereogenbench_data.selection.windows import FramesSpec
 from stereogenbench_data.sources.cache import ShardCache
@@ -191,7 +192,8 @@ class _MappedScenes(Dataset[Sample]):
             SelectionError: If there is no such option, it is out of its range, or every batch would
                 be dropped.
         """
-        require_options(options)
+        require_no_sampler(options)
+        require_options(self.loader, options)
         ordering, others = split_options(options)
         own = self._copy()
         batches = EpochBatches(own, batch_size, **ordering)
@@ -298,6 +300,8 @@ class StereoPairs(_MappedScenes):
             MediaError: If depth that a field needs cannot have been stored whole (8 bits, a lossy
                 codec, chroma) and the depth contract does not accept it.
         """
+        of_loader = ["batch_size", *options_of(self.loader)]
+        require_options(StereoPairs, selection, elsewhere={"loader": of_loader})
         index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
         plan = plan_pairs(index, seed=seed, **selection)
         request = parse_request(
@@ -357,6 +361,8 @@ class SceneViews(_MappedScenes):
             FieldError: If a field does not exist, or the transform swaps views.
             StorageError: If the data are not there, or hold broken scenes (all are named).
         """
+        of_loader = ["batch_size", *options_of(self.loader)]
+        require_options(SceneViews, filters, elsewhere={"loader": of_loader})
         each = isinstance(cameras, str) and cameras == "each"
         request = parse_request(
             "views",

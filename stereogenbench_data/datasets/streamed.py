@@ -20,6 +20,7 @@ from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.request import Transform
 from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.sources.cache import ShardCache
 
@@ -69,6 +70,7 @@ class StereoPairStream(IterableDataset[Sample]):
             StorageError: If the data are not there, or hold broken scenes (all are named).
             MediaError: If depth that a field needs cannot have been stored whole.
         """
+        require_options(StereoPairStream, options)
         ordering, others = split_options(options)
         if "seed" in ordering:
             others["seed"] = ordering["seed"]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Any, Final, TypeVar
 
-from stereogenbench_data.errors import EvaluationError, ExtraError
+from stereogenbench_data.errors import EvaluationError, missing_extra
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
 from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
@@ -139,10 +139,8 @@ def half_interval(means: Sequence[float]) -> float | None:
         return None
     try:
         from scipy.stats import t as student_t
-    except ImportError:
-        raise ExtraError(
-            "intervals need scipy: pip install 'stereogenbench-data[evaluation]'."
-        ) from None
+    except ImportError as error:
+        raise missing_extra("confidence intervals", "evaluation", error) from None
     centre = math.fsum(means) / count
     variance = math.fsum((each - centre) ** 2 for each in means) / (count - 1)
     quantile = float(student_t.ppf((1 + CONFIDENCE) / 2, count - 1))

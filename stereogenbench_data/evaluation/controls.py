@@ -28,6 +28,7 @@ from stereogenbench_data.evaluation.protocol import EvaluationProtocol
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.selection.options import require_options
 
 TARGET: Final = "rendered target"
 COPIED_LEFT: Final = "copied left"
@@ -158,6 +159,7 @@ def score_controls(
     Raises:
         EvaluationError: If there are fewer than two scenes; or as `evaluate`.
     """
+    require_options(score_controls, options)
     protocol = protocol or EvaluationProtocol()
     workload = select_workload(data, protocol, inputs=(), options=options)
     donors = derangement([pairs[0].scene for pairs in workload.pairs], seed=seed)

@@ -33,6 +33,7 @@ from stereogenbench_data.evaluation.protocol import EvaluationProtocol, require_
 from stereogenbench_data.evaluation.scene_scores import SceneWork, score_scene
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import counted
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.selection.windows import Random
 
@@ -96,6 +97,7 @@ def evaluate(
         SelectionError: If nothing matches the selection.
         ExtraError: If a package or weights that a metric needs are not there.
     """
+    require_options(evaluate, options)
     protocol = protocol or EvaluationProtocol()
     known = require_tier(tier)
     source: PredictionSource

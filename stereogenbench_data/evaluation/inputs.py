@@ -35,6 +35,7 @@ from stereogenbench_data.evaluation.protocol import (
 )
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.sources.files import write_atomic
 
@@ -93,6 +94,7 @@ def export_inputs(
         StorageError: If something cannot be read or written.
         SelectionError: If nothing matches the selection.
     """
+    require_options(export_inputs, options)
     known, root = require_tier(tier), Path(out)
     protocol = EvaluationProtocol(metrics=("psnr",), size=size, depth=depth)
     workload = select_workload(data, protocol, inputs=known.inputs, options=options)

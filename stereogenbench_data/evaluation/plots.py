@@ -8,7 +8,7 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any, Final
 
-from stereogenbench_data.errors import ExtraError, StorageError, describe_os_error
+from stereogenbench_data.errors import StorageError, describe_os_error, missing_extra
 from stereogenbench_data.evaluation.aggregate import (
     CONTROL,
     PairMeans,
@@ -41,10 +41,8 @@ def write_plots(folder: Path, results: Sequence[Scores]) -> list[Path]:
     require_comparable(results)
     try:
         from matplotlib.figure import Figure
-    except ImportError:
-        raise ExtraError(
-            "plots need matplotlib: pip install 'stereogenbench-data[plots]'."
-        ) from None
+    except ImportError as error:
+        raise missing_extra("plots", "plots", error) from None
     written = []
     for column, facts in COLUMNS.items():
         if facts.better == "neither" or not any(_scored(one.pairs, column) for one in results):

@@ -23,7 +23,7 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import UInt16
 
-from stereogenbench_data.errors import ExtraError, MediaError
+from stereogenbench_data.errors import MediaError, missing_extra
 from stereogenbench_data.media.container import (
     BinaryFile,
     FrameReader,
@@ -124,10 +124,7 @@ def blosc2_module() -> Any:
     try:
         return importlib.import_module("blosc2")
     except ImportError as error:
-        raise ExtraError(
-            f"depth that is packed by blosc2 needs it ({error}): "
-            f"pip install 'stereogenbench-data[blosc2]'."
-        ) from error
+        raise missing_extra("depth that blosc2 packed", "blosc2", error) from error
 
 
 def compressed_chunk(units: bytes) -> bytes:

@@ -1,6 +1,7 @@
 """Which scenes: by filters, each of which names itself where it leaves nothing, or by a key."""
 
 import difflib
+import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypedDict
 
@@ -10,6 +11,7 @@ from jaxtyping import Bool, Int64
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import counted
+from stereogenbench_data.selection.options import nearest_first
 
 Range = tuple[float, float]
 
@@ -27,7 +29,8 @@ class SceneFilters(TypedDict, total=False):
         map: Such as "Stylized_Egypt".
         character: The identifier of the character's mesh.
         animation: The identifier of the animation.
-        scenes: Keys, such as "train/Uniform/Stylized_Egypt/scene_000041".
+        scenes: Keys, such as "train/Uniform/Stylized_Egypt/scene_000041", or parts of keys that
+            only one scene has, as `find_scene` understands them.
         focal_mm: Range of focal lengths in mm.
         valid_depth_ratio: Range of the share of measured depth pixels, known only for an index
             that was made with it.
@@ -57,6 +60,8 @@ _TEXT_COLUMNS = {
 }
 _RANGE_COLUMNS = ("focal_mm", "valid_depth_ratio")
 _MOST_VALUES = 12
+_PLAIN = re.compile(r"[\w./@+:-]+")
+"""A value that needs no quotes in a message."""
 _MOST_KEYS = 6
 
 
@@ -76,11 +81,11 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
         if not keep.any():
             before = f" of those left by {', '.join(applied)}" if applied else ""
             raise SelectionError(
-                f"{name}={wanted!r} matches none of {counted(len(rows), 'scene')}{before}; "
+                f"{typed(name, wanted)} matches none of {counted(len(rows), 'scene')}{before}; "
                 f"found {there()}.{stale_note(index)}"
             )
         rows = rows[keep]
-        applied.append(f"{name}={wanted!r}")
+        applied.append(typed(name, wanted))
     if len(rows) == 0:
         raise SelectionError(f"{index.where}: the index holds no scene at all.")
     return rows
@@ -99,10 +104,12 @@ def _apply(
         column = index.column(_TEXT_COLUMNS[name])
         values = column[rows]
         names = _texts(name, wanted)
+        if name == "scenes":
+            names = _whole_keys(index, names)
         nowhere = sorted(set(names) - set(column.tolist()))
         if nowhere and len(nowhere) < len(set(names)):
             raise SelectionError(
-                f"{name}={nowhere[0]!r} matches none of {counted(len(column), 'scene')} of the "
+                f"{typed(name, nowhere[0])} matches none of {counted(len(column), 'scene')} of the "
                 f"index; found {_listed(column, near=nowhere)}.{stale_note(index)}"
             )
         return np.isin(values.astype(str), names), lambda: _listed(values, near=names)
@@ -111,7 +118,7 @@ def _apply(
         low, high = require_range(name, wanted)
         if np.isnan(numbers).all():
             raise SelectionError(
-                f"{name}={wanted!r}: the index does not know it for any of "
+                f"{typed(name, wanted)}: the index does not know it for any of "
                 f"{counted(len(rows), 'scene')}. "
                 "Make the index with `stereogenbench index ROOT --valid-depth`."
             )
@@ -120,11 +127,38 @@ def _apply(
     if name == "caption":
         return _caption_filter(index, wanted, rows=rows)
     known = [*_TEXT_COLUMNS, *_RANGE_COLUMNS, "caption"]
-    near = difflib.get_close_matches(name, known, n=1)
     raise SelectionError(
-        f"there is no filter {name!r}"
-        + (f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(known)}.")
+        f"there is no filter {name!r}; there are {', '.join(nearest_first(name, known))}."
     )
+
+
+def typed(name: str, wanted: Any) -> str:
+    """Return a filter in the words in which it is typed, in Python and on a command line alike.
+
+    >>> typed("family", ["Uniform", "IPD_Gaussian"]), typed("focal_mm", (18, 35))
+    ('family Uniform or IPD_Gaussian', 'focal_mm 18 to 35')
+    """
+    if isinstance(wanted, str) or not isinstance(wanted, Iterable):
+        return f"{name} {_quoted(wanted)}"
+    values = [*wanted]
+    is_range = len(values) == 2 and not any(isinstance(value, str) for value in values)
+    return f"{name} {(' to ' if is_range else ' or ').join(map(_quoted, values))}"
+
+
+def _quoted(value: Any) -> str:
+    """Return a value as text, in quotes if spaces or odd characters are in it."""
+    if isinstance(value, int | float):
+        return f"{value:g}"
+    return value if isinstance(value, str) and _PLAIN.fullmatch(value) else repr(value)
+
+
+def _whole_keys(index: SceneIndex, names: list[str]) -> list[str]:
+    """Return keys of scenes in place of parts of keys."""
+    known = set(index.column("key").tolist())
+    return [
+        name if name in known else str(index.column("key")[find_scene(index, name)])
+        for name in names
+    ]
 
 
 def _caption_filter(
@@ -136,7 +170,8 @@ def _caption_filter(
     captions = [str(caption).lower() for caption in index.column("caption")[rows]]
     keep = np.array([all(word in caption for word in words) for caption in captions], dtype=bool)
     written = sum(map(bool, captions))
-    return keep, lambda: f"captions of {counted(written, 'scene')}, none with all of {words}"
+    all_words = f"all of {', '.join(map(_quoted, words))}" if len(words) > 1 else _quoted(words[0])
+    return keep, lambda: f"captions of {counted(written, 'scene')}, none with {all_words}"
 
 
 def require_range(name: str, wanted: Any) -> Range:
@@ -168,7 +203,7 @@ def _listed(values: Any, *, near: list[str]) -> str:
     close = [match for name in near for match in difflib.get_close_matches(name, found, n=2)]
     first = list(dict.fromkeys([*close, *found]))[:_MOST_VALUES]
     more = f" and {len(found) - len(first)} more" if len(found) > len(first) else ""
-    return ", ".join(map(repr, first)) + more
+    return ", ".join(map(_quoted, first)) + more
 
 
 def find_scene(index: SceneIndex, text: str) -> int:

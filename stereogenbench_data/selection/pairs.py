@@ -18,7 +18,7 @@ from stereogenbench_data.schema.release import (
     baseline_bin,
 )
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.selection.filters import Range, require_range
+from stereogenbench_data.selection.filters import Range, require_range, typed
 
 PairsSpec = Literal["primary", "adjacent", "all", "sweep"] | Sequence[tuple[int, int]]
 Direction = Literal["left_to_right", "right_to_left"]
@@ -118,10 +118,13 @@ def require_pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
         except (TypeError, ValueError):
             raise SelectionError(f"a pair is (left, right) camera numbers, got {pair!r}.") from None
         if (left, right) not in CAMERA_PAIRS:
-            raise SelectionError(
-                f"there is no pair {(left, right)}: cameras are 0 to {CAMERA_COUNT - 1}, the left "
-                "one first (for the other way round use direction='right_to_left')."
-            )
+            cure = f"write two different cameras from 0 to {CAMERA_COUNT - 1}, the left one first"
+            if (right, left) in CAMERA_PAIRS:
+                cure = (
+                    f"the left camera comes first: write {(right, left)}, and for the other way "
+                    "round also direction='right_to_left'"
+                )
+            raise SelectionError(f"there is no pair {(left, right)}: {cure}.")
         found.append((left, right))
     if not found or len(set(found)) < len(found):
         raise SelectionError(f"pairs must be at least one and each only once, got {pairs!r}.")
@@ -184,7 +187,7 @@ def _within(index: SceneIndex, pairs: PairList, wanted: BaselineSpec) -> PairLis
     if not keep.any():
         bins = sorted({baseline_bin(value) for value in found[~np.isnan(found)]})
         raise SelectionError(
-            f"baseline_cm={wanted!r} matches none of {counted(len(pairs), 'pair')}; "
+            f"{typed('baseline_cm', wanted)} matches none of {counted(len(pairs), 'pair')}; "
             f"found {np.nanmin(found):g} to {np.nanmax(found):g} cm, in the bins "
             f"{', '.join(bins)}."
         )

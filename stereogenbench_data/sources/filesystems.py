@@ -12,7 +12,7 @@ from functools import partial
 from threading import Thread
 from typing import Any, Final, TypeVar
 
-from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.errors import ExtraError, ShardError, StorageError, missing_extra
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.retry import Attempt, TransientError
 
@@ -150,7 +150,7 @@ class FilesystemTransport:
         """Raise errors of file systems as a `TransientError`, or an error that names the cure."""
         try:
             yield
-        except StorageError:
+        except (ExtraError, StorageError):
             raise
         except FileNotFoundError:
             raise MissingObject(
@@ -163,9 +163,9 @@ class FilesystemTransport:
             ) from None
         except ImportError as error:
             extra = _EXTRAS.get(self._url.partition("://")[0])
-            cure = f"pip install 'stereogenbench-data[{extra}]'" if extra else "install it"
-            raise StorageError(
-                f"{self._where}: needs a package that is not installed ({error}): {cure}."
+            what = f"{self._where}: needs a package that is not installed ({error}). Install it."
+            raise (
+                missing_extra(self._where, extra, error) if extra else ExtraError(what)
             ) from None
         except ValueError:
             raise StorageError(

@@ -322,13 +322,256 @@ def test_nothing_left_says_why(page):
         "document.getElementById('caption').value = 'submarine';"
         "document.getElementById('filters').dispatchEvent(new Event('input'));"
     )
-    page.until(lambda: "caption='submarine' matches none of 160" in page.text("reason"))
+    page.until(lambda: "caption submarine matches none of 160" in page.text("reason"))
 
     assert page.text("count") == "0 scenes, 0 pairs"
     assert keys_listed(page) == []
 
 
+def reset(page):
+    page.script("document.getElementById('reset-all').click()")
+    page.until(lambda: page.text("count") == "160 scenes, 2,400 pairs")
+
+
+def visible(page, *places):
+    """Return which of some elements a user sees, by their selectors."""
+    return [
+        page.script(
+            "const box = document.querySelector(arguments[0]);"
+            "return box.checkVisibility({visibilityProperty: true})"
+            " && box.getBoundingClientRect().width > 0",
+            place,
+        )
+        for place in places
+    ]
+
+
+def test_where_nothing_is_left_nothing_stale_is_shown_and_a_button_resets(page):
+    before = page.text("key")
+    page.script(
+        "document.getElementById('caption').value = 'zebra at night';"
+        "document.getElementById('filters').dispatchEvent(new Event('input'));"
+    )
+    page.until(lambda: page.text("count") == "0 scenes, 0 pairs")
+
+    assert visible(page, "#nothing", "#reset-all", "#stage", ".heading", "#pairs", ".code") == [
+        True, True, False, False, False, False,
+    ]  # fmt: skip
+    assert "none with all of zebra, at, night" in page.text("nothing-reason")
+    assert not any(mark in page.text("nothing-reason") for mark in "[]=")
+    page.until(lambda: "caption=zebra+at+night" in page.script("return location.hash"))
+    assert "key=" not in page.script("return location.hash")
+
+    reset(page)
+    page.until(lambda: visible(page, "#stage", "#nothing") == [True, False])
+    assert page.text("key") == before
+    assert page.script("return document.getElementById('caption').value") == ""
+
+
+def test_the_address_is_a_link_to_filters_sample_and_view(page):
+    page.filter("split", "train")
+    page.filter("family", "Uniform")
+    page.script(
+        "document.getElementById('baseline-low').value = '10';"
+        "document.getElementById('filters').dispatchEvent(new Event('input'));"
+    )
+    page.until(lambda: "baseline_cm=(10, " in page.text("selection-line"))
+    page.until(lambda: page.text("key") in page.text("sample-line"))
+    first = page.text("key")
+    page.press("j", "4")
+    page.until(lambda: page.text("key") != first)
+    page.until(lambda: page.text("key") in page.text("sample-line"))
+    page.until(
+        lambda: (
+            f"key={page.text('key')}&pair=" in page.script("return location.hash")
+            and "view=disparity" in page.script("return location.hash")
+        )
+    )
+    link = page.script("return location.hash.slice(1)")
+    names = ("key", "count", "selection-line", "sample-line", "frame-number")
+    told = {name: page.text(name) for name in names}
+
+    page.open()
+    assert page.text("count") == "160 scenes, 2,400 pairs"
+    page.open(link)
+
+    assert {name: page.text(name) for name in names} == told
+    assert page.script("return document.getElementById('baseline-low').value") == "10"
+    assert page.script(
+        "return [...document.querySelectorAll('.facet :checked')].map((box) => box.value)"
+    ) == ["train", "Uniform"]
+    assert page.script("return location.hash.slice(1)") == link
+
+
+def test_a_link_that_is_pasted_into_the_open_page_changes_it(page):
+    page.filter("split", "train")
+    page.until(lambda: "split=train" in page.script("return location.hash"))
+    key = next(
+        each for each in page.script(
+            "return fetch('/api/scenes?split=eval&first=0&count=9').then((found) => found.json())"
+            ".then((found) => found.rows.map((row) => row.key))"
+        ) if each != page.text("key")
+    )  # fmt: skip
+    page.script("location.hash = arguments[0]", f"key={key}&pair=0-3&frame=4&view=left")
+    page.until(lambda: page.text("key") == key and page.text("frame-number") == "4 / 6")
+    page.until(lambda: page.text("count") == "160 scenes, 2,400 pairs")
+
+    page.until(lambda: "pairs=[(0, 3)], frames=4" in page.text("sample-line"))
+    assert page.script("return document.querySelectorAll('[data-pane]').length") == 1
+    page.script("location.hash = 'split=eval'")
+    page.until(lambda: page.text("count") == "40 scenes, 600 pairs")
+
+
+def test_a_link_to_a_scene_that_is_not_there_says_so(page):
+    page.open("key=train/Uniform/SynthStage/scene_777777")
+
+    assert "'train/Uniform/SynthStage/scene_777777' is not a key of 160 scenes" in page.text(
+        "notice"
+    )
+    assert visible(page, "#notice", "#stage") == [True, True]
+    shown = page.text("key")
+    page.script("location.hash = 'key=train/Nowhere/scene_000001'")
+    page.until(lambda: "train/Nowhere" in page.text("notice"))
+    page.settle()
+    assert page.text("key") == shown
+
+    page.press("j")
+    page.until(lambda: not visible(page, "#notice")[0])
+
+
+def test_a_part_of_a_key_is_enough_for_a_link(page):
+    page.open("key=scene_000133&pair=0-1")
+
+    assert page.text("key").endswith("/scene_000133")
+    assert not visible(page, "#notice")[0]
+
+
+def test_a_link_with_a_filter_that_is_none_says_so_and_can_be_reset(page):
+    page.script("location.hash = 'pairs=sweep'")
+    page.until(lambda: "no choice 'sweep'" in page.text("nothing-reason"))
+    reset(page)
+
+    page.script("location.hash = 'family=Nope'")
+    page.until(lambda: "family Nope matches none" in page.text("nothing-reason"))
+    reset(page)
+
+
+def test_a_long_key_breaks_after_its_slashes(page):
+    parts = page.script(
+        "return [...document.getElementById('key').childNodes].map((node) =>"
+        " node.nodeName === 'WBR' ? '|' : node.textContent).join('')"
+    )
+
+    assert parts == page.text("key").replace("/", "/|") + "|"
+
+
+@pytest.fixture
+def screen(page):
+    """Return a function that gives the page a screen: its width, its scheme, touch on a phone."""
+    tell = page.browser.execute_cdp_cmd
+
+    def open_on(width, scheme):
+        is_phone = width < 700
+        size = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": is_phone}
+        tell("Emulation.setDeviceMetricsOverride", size)
+        tell("Emulation.setTouchEmulationEnabled", {"enabled": is_phone})
+        scheme = {"name": "prefers-color-scheme", "value": scheme}
+        tell("Emulation.setEmulatedMedia", {"features": [scheme]})
+        page.open()
+        return page
+
+    yield open_on
+    tell("Emulation.clearDeviceMetricsOverride", {})
+    tell("Emulation.setTouchEmulationEnabled", {"enabled": False})
+    tell("Emulation.setEmulatedMedia", {"features": []})
+
+
+LUMINANCE = """
+const linear = (part) => part <= 0.03928 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4;
+const of = (colour) => {
+  const [r, g, b] = colour.match(/[0-9.]+/g).map((each) => linear(each / 255));
+  return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+};
+return [...document.querySelectorAll(arguments[0])].map((box) => {
+  let behind = box;
+  while (behind.parentElement && getComputedStyle(behind).backgroundColor === 'rgba(0, 0, 0, 0)') {
+    behind = behind.parentElement;
+  }
+  const [a, b] = [of(getComputedStyle(box).color), of(getComputedStyle(behind).backgroundColor)];
+  return (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+});
+"""
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1440])
+def test_a_phone_and_a_desktop_show_pictures_first_and_nothing_beyond_the_edge(
+    screen, width, scheme
+):
+    page = screen(width, scheme)
+    beyond = "return document.documentElement.scrollWidth - innerWidth"
+    left, right, pairs, heading = (
+        page.script(
+            "const box = document.querySelector(arguments[0]).getBoundingClientRect();"
+            "return [box.left, box.top, box.right, box.bottom];", place,
+        )
+        for place in ("[data-pane=left] canvas", "[data-pane=right] canvas", "#pairs", ".heading")
+    )  # fmt: skip
+    contrasts = page.script(LUMINANCE, "#key, #facts, button, #readout dt, .facet b, .code pre")
+
+    assert page.script(beyond) <= 0
+    assert left[0] >= 0
+    assert right[2] <= width
+    assert right[3] <= 844
+    assert min(contrasts) > 4.5
+    if width == 390:
+        assert left[1] < 120
+        assert left[2] - left[0] > 150
+        assert left[3] < pairs[1] < heading[1]
+        assert visible(page, "#open-drawer", "#drawer", "#steps") == [True, False, True]
+        assert page.text("at") == "touch a picture"
+        assert visible(page, "#help-button .for-touch", "#help-button .for-keys") == [True, False]
+    else:
+        assert visible(page, "#open-drawer", "#drawer", "#steps") == [False, True, False]
+        assert page.text("at") == "point at a picture"
+
+
+def test_on_a_phone_filters_and_list_are_in_a_drawer(screen):
+    page = screen(390, "light")
+    assert page.text("open-drawer") == "☰ 160 scenes"
+    page.script("document.getElementById('open-drawer').click()")
+    page.until(lambda: visible(page, "#drawer", "#backdrop") == [True, True])
+    page.filter("family", "Uniform")
+    page.until(lambda: "scenes, 1 filter" in page.text("open-drawer"))
+    page.script("document.querySelector('.row:nth-child(2)').click()")
+    page.until(lambda: visible(page, "#drawer", "#backdrop") == [False, False])
+    page.until(lambda: page.text("key") in keys_listed(page))
+
+    before = page.text("key")
+    page.script("document.getElementById('after').click()")
+    page.until(lambda: page.text("key") != before)
+    page.script("document.getElementById('before').click()")
+    page.until(lambda: page.text("key") == before)
+    page.script("document.getElementById('open-drawer').click()")
+    page.until(lambda: visible(page, "#drawer") == [True])
+    page.script("document.getElementById('backdrop').click()")
+    page.until(lambda: visible(page, "#drawer") == [False])
+
+
+def test_long_lists_of_maps_scroll_alone(page):
+    styles = page.script(
+        "const box = document.getElementById('facet-map');"
+        "box.closest('details').open = true; box.classList.add('long');"
+        "return [getComputedStyle(box).overflowY, getComputedStyle(box).overscrollBehaviorY,"
+        " getComputedStyle(document.getElementById('list')).overscrollBehaviorY]"
+    )
+
+    assert styles == ["auto", "contain", "contain"]
+
+
 def test_the_page_runs_without_a_word_on_the_console_and_loads_from_itself_alone(page, address):
+    page.browser.get_log("browser")  # what was said before
+    page.open()
     page.press("2")
     page.settle()
     loaded = page.script("return performance.getEntriesByType('resource').map((each) => each.name)")

@@ -102,7 +102,7 @@ def test_nothing_left_says_why_and_what_there_is(catalogue):
     told = catalogue.summary(parse_choice({"caption": ["submarine"]}))
 
     assert (told["scenes"], told["pairs"]) == (0, 0)
-    assert "caption='submarine' matches none of 4 scenes" in told["reason"]
+    assert "caption submarine matches none of 4 scenes" in told["reason"]
     assert (
         catalogue.listed(parse_choice({"caption": ["submarine"]}), first=0, count=9)["rows"] == []
     )

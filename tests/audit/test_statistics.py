@@ -30,6 +30,7 @@ from stereogenbench_data.schema.release import (
     UNSEEN_MAPS,
 )
 from tests.audit.release_counts import paper_scenes
+from tests.cli.command import invoke
 
 PLACES_CM = (0.0, 10.0, 25.0, 31.0, 61.0, 211.0)
 
@@ -103,7 +104,7 @@ def test_baselines_bins_and_focal_lengths_of_three_scenes(three):
 
 def test_filters_choose_what_is_counted(three):
     assert statistics(three, focal_mm=(15, 30)).scenes == 1
-    with pytest.raises(SelectionError, match="split='eval' matches none of 3 scenes"):
+    with pytest.raises(SelectionError, match="split eval matches none of 3 scenes"):
         statistics(three, split="eval")
 
 
@@ -208,6 +209,19 @@ def test_plots_without_matplotlib_name_the_extra(three, tmp_path, monkeypatch):
 
     with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[plots\]'"):
         write_plots(three, tmp_path / "plots")
+    assert not (tmp_path / "plots").exists()
+
+
+def test_the_command_prints_the_statistics_where_matplotlib_is_missing(
+    small_shards, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    shown = invoke("stats", small_shards, "--plots", tmp_path / "plots", "-o", tmp_path / "s.md")
+
+    assert shown.exit_code == 2
+    assert "| train | - | Uniform | 2 |" in shown.stdout
+    assert (tmp_path / "s.md").read_text() == shown.stdout
+    assert "the extra 'plots' is not installed" in shown.stderr
 
 
 @pytest.fixture

@@ -100,7 +100,7 @@ def test_offline_mode_is_kept(folder, upload_hub, tmp_path):
     done = uploaded(folder, upload_hub, tmp_path / "home", HF_HUB_OFFLINE="1")
 
     assert done.returncode == 2
-    assert "the Hub refused the upload" in done.stderr
+    assert "the Hub cannot be reached (OfflineModeIsEnabled). Check" in done.stderr
     assert not (upload_hub.folder / ".commits").exists()
 
 

@@ -116,7 +116,7 @@ def test_a_sample_without_a_key_is_refused():
 
 def test_an_unknown_option_is_named():
     with pytest.raises(
-        SelectionError, match=r"unknown option 'split'; the options are pairs, frames"
+        SelectionError, match=r"decode has no option 'split'; it is an option of an earlier stage"
     ):
         decode(("left",), split="train")
 

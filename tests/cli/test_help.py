@@ -1,6 +1,7 @@
 """Help, examples and completion: what a newcomer meets first."""
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -24,7 +25,7 @@ def shown(*arguments):
 def test_help_groups_the_commands_in_the_order_of_use():
     text = shown("--help")
     panels = ("Have scenes", "Look at them", "Pack them", "Check them", "Score with them")
-    places = [text.index(f" {panel} ") for panel in panels]
+    places = [text.index(f"{panel}:") for panel in panels]
 
     assert places == sorted(places)
     assert text.index("synth scenes/") < text.index("show scenes/") < text.index("browse scenes/")
@@ -45,6 +46,56 @@ def test_the_help_of_every_command_has_an_example_that_parses(name):
 
     assert words[0] == name
     COMMANDS[name].make_context(name, words[1:], resilient_parsing=False)
+
+
+PATHS = [(name,) for name in COMMANDS] + [("export", name) for name in COMMANDS["export"].commands]
+
+
+@pytest.mark.parametrize("path", PATHS, ids=" ".join)
+def test_help_at_80_columns_cuts_no_option_and_fits_the_screen(path):
+    page = invoke(*path, "--help", env={"COLUMNS": "80"}).stdout
+    command = COMMANDS[path[0]] if len(path) == 1 else COMMANDS["export"].commands[path[1]]
+    lines = page.rstrip().splitlines()
+
+    assert max(map(len, lines)) <= 80
+    assert len(lines) <= 62
+    assert "…" not in page
+    assert "<" not in page
+    for parameter in command.params:
+        if parameter.param_type_name == "option":
+            assert re.search(rf"^  (-.*, )?{parameter.opts[0]}\b", page, re.MULTILINE), (
+                parameter.opts
+            )
+
+
+def test_help_shows_a_flag_without_a_value_and_a_range_as_it_is_typed():
+    page = invoke("evaluate", "--help", env={"COLUMNS": "80"}).stdout
+
+    assert "\n  --json         " in page
+    assert "--plots/--no-plots  " in page
+    assert "--focal-mm MIN MAX  " in page
+    assert "--baseline-cm MIN MAX  " in page
+
+
+def test_the_usage_line_has_what_must_be_given():
+    page = invoke("export-inputs", "--help", env={"COLUMNS": "80"}).stdout
+
+    assert page.startswith("Usage: stereogenbench export-inputs DATA OUT --tier G0|G1|G2 [OPTIONS]")
+
+
+def test_help_lists_rarely_used_options_last():
+    page = invoke("audit", "--help", env={"COLUMNS": "80"}).stdout
+    panels = ("Options:", "Which scenes:", "Rarely needed:", "--engine")
+    places = [page.index(f"\n{'  ' * each.startswith('--')}{each}") for each in panels]
+
+    assert places == sorted(places)
+
+
+def test_help_shows_defaults_and_choices():
+    page = one_line(invoke("synth", "--help", env={"COLUMNS": "80"}).stdout)
+
+    assert "--split train|eval" in page
+    assert "One of rotator, quaternion_xyzw, quaternion_wxyz, matrix. [rotator]" in page
 
 
 @pytest.mark.parametrize("name", COMMANDS)

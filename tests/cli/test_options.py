@@ -73,6 +73,9 @@ def refused(*words):
         (["evaluate", "d", "p", "--tier", "G1"], "--by", "focal_mm:wide", "18,35"),
         (["audit", "d"], "--frames", "0", "'all'"),
         (["show", "d"], "--pair", "left", "0-5"),
+        (["show", "d"], "--pair", "5-0", "write it as 0-5"),
+        (["show", "d"], "--pair", "2-2", "two different cameras"),
+        (["controls", "d"], "--pairs", "5-2", "write it as 2-5"),
         (["download", "d", "--dest", "o"], "--cameras", "6", "0 to 5"),
         (["pack", "d", "o"], "--part", "first", "I/N"),
     ],
@@ -81,6 +84,21 @@ def test_a_refused_option_is_named_with_its_value_and_what_it_may_be(words, opti
     message = refused(*words, option, value)
 
     assert all(word in message for word in (option, value, cure)), message
+
+
+@pytest.mark.parametrize("command", ["card", "upload"])
+@pytest.mark.parametrize("repository", ["name", "a/b/c", "https://huggingface.co/a/b", ""])
+def test_card_and_upload_take_a_repository_alike(command, repository, small_shards):
+    message = refused(command, small_shards, repository)
+
+    assert f"{repository!r} is not a repository: write ORG/NAME" in message
+
+
+def test_the_card_of_shards_names_the_repository(small_shards):
+    shown = invoke("card", small_shards, "my-lab/stereo.scenes")
+
+    assert shown.exit_code == 0
+    assert "my-lab/stereo.scenes" in shown.stdout
 
 
 def test_synth_takes_one_number_for_width_and_height_and_names_the_option_of_another():

@@ -184,8 +184,67 @@ def test_a_narrow_terminal_has_no_room_for_a_bar(printed_progress):
     assert narrow.startswith("packing 3/3 MB")
 
 
-def test_before_the_first_report_there_is_neither_a_count_nor_a_rate(printed_progress):
-    (line,) = printed_progress(width=80, every_s=60, done_mb=())
+def test_a_bar_that_counted_nothing_leaves_no_line(printed_progress):
+    assert printed_progress(width=80, every_s=60, done_mb=()) == []
 
-    assert line.startswith("packing")
-    assert "MB" not in line
+
+def test_a_bar_that_counted_nothing_is_taken_off_the_terminal(monkeypatch, capsys):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("TERM", "xterm")
+    with pytest.raises(KeyError), progress_bar("packing", unit="MB"):
+        raise KeyError
+    up_and_erased = "\x1b[1A\x1b[2K"
+
+    assert capsys.readouterr().err.endswith(up_and_erased)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "index nowhere -o out/index.parquet",
+        "pack nowhere out",
+        "verify nowhere",
+        "croissant nowhere -o out/croissant.json",
+        "card nowhere a/b -o out",
+        "upload nowhere a/b",
+        "download nowhere --dest out",
+        "show nowhere -o out/sheet.png",
+        "browse nowhere --no-open",
+        "stats nowhere -o out/stats.md --plots plots",
+        "audit nowhere -o out/audit.md",
+        "doctor nowhere -o out/doctor.png",
+        "export-inputs nowhere out --tier G1",
+        "evaluate nowhere nothing --tier G1 -o out",
+        "controls nowhere -o out",
+        "export clips nowhere out --layout musubi",
+        "export ply nowhere out",
+    ],
+)
+def test_a_mistyped_path_is_reported_and_makes_no_folder(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shown = invoke(*words.split())
+
+    assert shown.exit_code == 2
+    assert "nowhere: does not exist" in str(shown.exception or "") + shown.output
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "index nowhere",
+        "unpack nowhere out",
+        "audit nowhere",
+        "evaluate SHARDS nowhere --tier G1",
+        "export-inputs SHARDS out --tier G1 --scene nowhere",
+        "audit SHARDS --family Pairwise_Uniform --map Nowhere",
+    ],
+)
+def test_a_command_that_fails_at_once_prints_its_error_and_nothing_else(
+    words, small_shards, tmp_path
+):
+    ended = run(*words.replace("SHARDS", str(small_shards)).split(), cwd=tmp_path)
+
+    assert ended.returncode == 2
+    assert len(ended.stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []

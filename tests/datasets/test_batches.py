@@ -224,7 +224,7 @@ def test_something_else_than_a_position_is_refused(keyed):
         ({"rank": 2, "world_size": 2}, "got rank=2, world_size=2"),
         ({"rank": 1}, "got rank=1, world_size=None"),
         ({"tail": "keep"}, "tail must be"),
-        ({"drop": True}, "there is no option 'drop'; there are seed, rank"),
+        ({"drop": True}, "EpochBatches has no option 'drop'; did you mean 'drop_last'"),
         ({"drop_last": 1}, "drop_last must be True or False, got 1"),
         ({"shuffle": "yes"}, "shuffle must be True or False, got 'yes'"),
         ({"shuffle": True, "order": "shuffled"}, "shuffle=True and order= say the same"),

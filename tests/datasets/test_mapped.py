@@ -272,7 +272,7 @@ def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():
         (
             {"split": "test"},
             SelectionError,
-            "split='test' matches none of 4 scenes; found 'eval', 'train'",
+            "split test matches none of 4 scenes; found eval, train",
         ),
         ({"pairs": [(0, 7)]}, SelectionError, "no pair"),
         ({"frames": 7}, SelectionError, "scene with 7 frames"),

@@ -329,5 +329,5 @@ def test_where_no_cluster_runs_none_is_started(monkeypatch):
 def test_without_ray_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
 
-    with pytest.raises(ExtraError, match=r"install `stereogenbench-data\[ray\]`, or choose"):
+    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[ray\]'"):
         list(RayCluster().map(pid, [1], name=called))

@@ -106,7 +106,7 @@ def test_a_filter_that_matches_nothing_says_that_the_index_is_old(tree):
     with pytest.warns(StaleIndexWarning, match=OLD):
         index = SceneIndex.open(tree)
 
-    told = rf"matches none of 4 scenes; .*'Uniform'\. /.*{OLD}.*New_Family.*{CURE}"
+    told = rf"matches none of 4 scenes; .*Uniform\. /.*{OLD}.*New_Family.*{CURE}"
     with pytest.raises(SelectionError, match=told):
         filter_scenes(index, {"family": "New_Family"})
     with pytest.raises(SelectionError, match=rf"is not a key of 4 scenes.*{OLD}"):

@@ -42,18 +42,18 @@ def test_a_filter_keeps_the_scenes_that_match(index, filters, expected):
 
 
 def test_the_filter_that_empties_a_selection_is_named_with_what_there_is(index):
-    what, place, found = "map='Town'", "4 scenes .*split='train', family='IPD_Gaussian'", "'Egypt'"
+    what, place, found = "map Town", "4 scenes .*split train, family IPD_Gaussian", "Egypt"
     with pytest.raises(SelectionError, match=f"{what} .*{place}.* found {found}"):
         keys(index, split="train", family="IPD_Gaussian", map="Town")
 
 
 def test_a_misspelt_value_is_answered_with_the_nearest_one(index):
-    with pytest.raises(SelectionError, match="found 'Uniform', 'IPD_Gaussian'"):
+    with pytest.raises(SelectionError, match="found Uniform, IPD_Gaussian"):
         keys(index, family="Unifrom")
 
 
 def test_a_value_that_no_scene_has_is_not_passed_over_beside_one_that_some_have(index):
-    with pytest.raises(SelectionError, match="family='Nope' matches none of 9 scenes of the index"):
+    with pytest.raises(SelectionError, match="family Nope matches none of 9 scenes of the index"):
         keys(index, family=["Uniform", "Nope"])
 
 
@@ -64,12 +64,12 @@ def test_a_text_filter_that_is_no_text_is_refused(index, family):
 
 
 def test_a_misspelt_filter_is_answered_with_the_nearest_one(index):
-    with pytest.raises(SelectionError, match="no filter 'famly'; did you mean 'family'"):
+    with pytest.raises(SelectionError, match="no filter 'famly'; there are family, "):
         filter_scenes(index, {"famly": "Uniform"})
 
 
 def test_a_range_that_nothing_meets_says_what_the_numbers_span(index):
-    with pytest.raises(SelectionError, match=r"focal_mm=.* found 20 to 35"):
+    with pytest.raises(SelectionError, match=r"focal_mm 80 to 90 .* found 20 to 35"):
         keys(index, focal_mm=(80, 90))
 
 
@@ -91,5 +91,29 @@ def test_a_search_for_no_words_is_refused(index, caption):
 
 
 def test_words_that_no_caption_holds_say_how_many_captions_there_are(index):
-    with pytest.raises(SelectionError, match="captions of 7 scenes"):
+    with pytest.raises(SelectionError, match=r"captions of 7 scenes, none with submarine\."):
         keys(index, caption="submarine")
+    with pytest.raises(SelectionError, match=r"caption 'red car' .*none with all of red, car\."):
+        keys(index, caption="red car")
+
+
+def test_filters_read_as_they_are_typed(index):
+    with pytest.raises(SelectionError, match="family Uniform or IPD_Gaussian, focal_mm 20 to 21;"):
+        keys(index, family=["Uniform", "IPD_Gaussian"], focal_mm=(20, 21), map="Town", split="eval")
+
+
+def test_a_part_of_a_key_that_one_scene_has_is_enough(index):
+    whole = "train/Uniform/Town/scene_000001"
+
+    assert keys(index, scenes="Uniform/Town/scene_000001", split="train") == [whole]
+    assert keys(index, scenes=[whole, "train/uniform/town/scene_000000"])[1] == whole
+
+
+def test_a_part_of_several_keys_says_which(index):
+    with pytest.raises(SelectionError, match=r"'scene_000001' is a part of \d keys: .*Give more"):
+        keys(index, scenes="scene_000001")
+
+
+def test_a_key_that_no_scene_has_is_answered_with_the_nearest(index):
+    with pytest.raises(SelectionError, match=r"'scene_00099' is not a key of 9 .*Did you mean"):
+        keys(index, scenes="scene_00099")

@@ -10,7 +10,7 @@ from typing import ClassVar
 import fsspec
 import pytest
 
-from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.errors import ExtraError, ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
@@ -239,6 +239,6 @@ def test_a_file_system_that_is_not_installed_is_named(monkeypatch):
     monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, "s3", raising=False)
 
     with pytest.raises(
-        StorageError, match=r"s3://a/b: needs .*: pip install 'stereogenbench-data\[s3\]'"
+        ExtraError, match=r"s3://a/b: the extra 's3' .*pip install 'stereogenbench-data\[s3\]'"
     ):
         read_range("s3://a/b", 0, 9)

@@ -15,7 +15,7 @@ from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
-from stereogenbench_data.selection.filters import filter_scenes
+from stereogenbench_data.selection.filters import filter_scenes, find_scene
 from stereogenbench_data.selection.pairs import PairList, baselines_cm, choose_pairs, in_bin
 
 MOST_ROWS: Final = 200
@@ -209,8 +209,17 @@ class Catalogue:
         return place if place < len(rows) and rows[place] == row else -1
 
     def scene(self, key: str, choice: Choice) -> dict[str, Any]:
-        """Return a scene's facts, and its pairs from the narrowest to the widest."""
-        row = self.row(key)
+        """Return a scene's facts, and its pairs from the narrowest to the widest.
+
+        Args:
+            key: A key, or a part of one that only one scene has.
+            choice: Whose pairs are marked as chosen.
+
+        Raises:
+            SelectionError: If there is no such scene, naming those that are close.
+        """
+        row = self._row_of[key] if key in self._row_of else find_scene(self.index, key)
+        key = str(self.index.column("key")[row])
         scene, pairs = self.index.scene(row), self.choose(choice).pairs
         mine = pairs.row == row
         selected = set(

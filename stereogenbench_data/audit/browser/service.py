@@ -20,7 +20,8 @@ from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED
 Query = Mapping[str, list[str]]
 
 _SCRIPTS: Final = (
-    "choosing", "copying", "keys", "moment", "page", "panes", "pixel", "reading", "state", "views",
+    "choosing", "copying", "drawer", "keys", "moment", "page", "panes", "pixel", "reading", "state",
+    "views",
 )  # fmt: skip
 STATIC: Final = {
     "/": ("index.html", "text/html; charset=utf-8"),

@@ -3,7 +3,7 @@
 import hashlib
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, Unpack
@@ -34,6 +34,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
+from stereogenbench_data.selection.options import require_options
 from stereogenbench_data.sources.filesystems import MissingObject
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.remote import RemoteObject
@@ -160,6 +161,7 @@ def audit(
     Source: the StereoGenBench paper, section on geometry conventions and sanity checks, and on
     quality control.
     """
+    require_options(audit, filters)
     request = request or AuditRequest()
     if isinstance(data, SceneIndex):
         index = data
@@ -230,7 +232,15 @@ class _KeyFilter:
 
     def matches(self, scene: SceneId) -> bool:
         """Tell whether a scene's path passes the filters."""
-        return all(getattr(scene, name) in (*values, None) for name, values in self.wanted.items())
+        return all(
+            _is_in(scene.key, values) if name == "key" else getattr(scene, name) in (*values, None)
+            for name, values in self.wanted.items()
+        )
+
+
+def _is_in(key: str, parts: Sequence[str]) -> bool:
+    """Tell whether a key has one of the parts, as `find_scene` understands them."""
+    return any(part.strip("/").lower() in key.lower() for part in parts)
 
 
 def _chosen(

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from PIL import Image, ImageDraw, ImageFont
 
-from stereogenbench_data.errors import ExtraError
+from stereogenbench_data.errors import missing_extra
 from stereogenbench_data.samples.picture import NOT_MEASURED, Picture, coloured
 
 
@@ -23,9 +23,7 @@ def figure_class() -> Any:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ExtraError(
-            "plots need matplotlib: pip install 'stereogenbench-data[plots]'."
-        ) from error
+        raise missing_extra("plots", "plots", error) from error
     return Figure
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Int64
 
-from stereogenbench_data.errors import ExtraError
+from stereogenbench_data.errors import ExtraError, missing_extra
 from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
 from stereogenbench_data.evaluation.models.interfaces import (
     Keypoints,
@@ -53,7 +53,7 @@ class DeDoDeMatcher(NamedModel):
             kornia = importlib.import_module("kornia")
         except ImportError as error:
             raise ExtraError(
-                f"DeDoDe needs kornia: {DETECTOR.how_to_install}; and its weights: "
+                f"{missing_extra('DeDoDe', DETECTOR.extra, error)} Its weights: "
                 f"{DETECTOR.how_to_fetch(weights)}; {DESCRIPTOR.how_to_fetch(weights)}; or name "
                 f"the folder that they are in (--weights)."
             ) from error

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from torch import nn
 from torch.nn import functional
 
-from stereogenbench_data.errors import EvaluationError, ExtraError
+from stereogenbench_data.errors import EvaluationError, ExtraError, missing_extra
 from stereogenbench_data.evaluation.models.interfaces import (
     NamedModel,
     Pictures,
@@ -62,7 +62,7 @@ class Lpips(NamedModel):
         package = find_spec("lpips")
         if package is None or package.origin is None:
             raise ExtraError(
-                f"LPIPS needs the package lpips: {TRUNK.how_to_install}; and the weights of "
+                f"{missing_extra('LPIPS', TRUNK.extra, 'No module named lpips')} The weights of "
                 f"AlexNet: {TRUNK.how_to_fetch(weights)}, or name the folder that it is in "
                 f"(--weights)."
             )

@@ -6,7 +6,7 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from stereogenbench_data.errors import EvaluationError, ExtraError
+from stereogenbench_data.errors import EvaluationError, missing_extra
 from stereogenbench_data.evaluation.metrics.matching import KEYPOINTS, RATIO, mutual_matches
 from stereogenbench_data.evaluation.models.interfaces import (
     Keypoints,
@@ -28,9 +28,7 @@ def require_opencv() -> ModuleType:
     try:
         import cv2
     except ImportError as error:
-        raise ExtraError(
-            "SSIM, SIFT and SGBM need OpenCV: pip install 'stereogenbench-data[evaluation]'"
-        ) from error
+        raise missing_extra("SSIM, SIFT and SGBM", "evaluation", error) from error
     return cv2
 
 

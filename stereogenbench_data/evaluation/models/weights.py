@@ -40,8 +40,8 @@ class Weights:
 
     @property
     def how_to_install(self) -> str:
-        """The command that installs what the network needs."""
-        return f"pip install 'stereogenbench-data[{self.extra}]'"
+        """The command that installs the extra that the network needs."""
+        return f"`pip install 'stereogenbench-data[{self.extra}]'`"
 
 
 def weights_path(weights: Weights, *, folder: Path | None) -> Path:
@@ -54,7 +54,7 @@ def weights_path(weights: Weights, *, folder: Path | None) -> Path:
     if not path.is_file():
         raise ExtraError(
             f"the weights of {weights.what} are not at {path}: {weights.how_to_fetch(folder)}, or "
-            f"name the folder that it is in (--weights). The packages it needs: "
+            f"name the folder that it is in (--weights). It needs the extra {weights.extra!r}: "
             f"{weights.how_to_install}."
         )
     return path

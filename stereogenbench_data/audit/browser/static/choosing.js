@@ -1,11 +1,13 @@
 /** Which scenes: the form, the counts, the list, and the one that is selected. */
 
-import { refresh, showPairs } from "/moment.js";
+import { closeDrawer, showDrawerButton } from "/drawer.js";
+import { refresh, remember, showPairs, stop } from "/moment.js";
 import { ask } from "/reading.js";
-import { $, plural, state, tell } from "/state.js";
+import { $, plural, state, tell, writePath } from "/state.js";
 
 const ROW_PX = 46;
 const PAGE_ROWS = 100;
+const LONG = 8;
 const FACETS = ["split", "subset", "family", "map", "bin"];
 
 export function choiceQuery() {
@@ -27,20 +29,40 @@ export function choiceQuery() {
   return query.toString();
 }
 
+/** Set the form to a query of filters, as `choiceQuery` gives it. */
+function fillForm(query) {
+  const filters = new URLSearchParams(query);
+  $("filters").reset();
+  for (const name of FACETS) {
+    for (const box of $(`facet-${name}`).querySelectorAll("input")) {
+      box.checked = filters.getAll(name).includes(box.value);
+      if (box.checked) box.closest("details").open = true;
+    }
+  }
+  for (const name of ["focal", "baseline"]) {
+    for (const end of ["low", "high"]) $(`${name}-${end}`).value = filters.get(`${name}_${end}`) ?? "";
+    if (filters.has(`${name}_low`)) $(`${name}-low`).closest("details").open = true;
+  }
+  $("caption").value = filters.get("caption") ?? "";
+  $("pair-kind").value = filters.get("pairs") ?? "all";
+}
+
 let choosing = 0;
 
-/** Counts, list and lines for what the form says. */
-export async function choose() {
+/** Counts, list and lines for what the form says, or for the filters of a link. */
+export async function choose(linked = null) {
   const turn = ++choosing;
-  state.choice = choiceQuery();
+  state.choice = linked ?? choiceQuery();
   try {
     const found = await ask(`/api/choice?${state.choice}`);
     if (turn !== choosing) return;
     showCounts(found.counts);
+    if (linked !== null) fillForm(linked);
     state.total = found.scenes;
     state.pages.clear();
     $("count").textContent = `${plural(found.scenes, "scene")}, ${plural(found.pairs, "pair")}`;
     tell($("reason"), found.reason);
+    showNothing(found);
     $("selection-line").textContent = found.scenes ? found.line : "";
     $("copy-selection").disabled = !found.scenes;
     $("rows").style.height = `${found.scenes * ROW_PX}px`;
@@ -48,9 +70,31 @@ export async function choose() {
     await showRows();
     if (state.scene) await selectScene(state.scene.key, { keep: true });
     if (found.scenes && !(state.scene?.place >= 0)) await selectPlace(0);
+    remember();
   } catch (error) {
-    if (turn === choosing) tell($("reason"), error.message);
+    if (turn === choosing) showRefused(error.message);
   }
+}
+
+/** Show why no scene is left in place of pictures that no filter selects. */
+function showNothing({ scenes, reason }) {
+  const isNothing = scenes === 0;
+  if (isNothing) stop();
+  document.body.classList.toggle("nothing", isNothing);
+  $("nothing").hidden = !isNothing;
+  $("nothing-reason").textContent = reason;
+  const filters = new URLSearchParams(state.choice);
+  filters.delete("pairs");
+  showDrawerButton(scenes, new Set([...filters.keys()].map((name) => name.split("_")[0])).size);
+}
+
+/** Show that the filters of a link cannot be understood. */
+function showRefused(message) {
+  tell($("reason"), message);
+  $("count").textContent = "";
+  $("rows").replaceChildren();
+  state.total = 0;
+  showNothing({ scenes: 0, reason: message });
 }
 
 function showCounts(counts) {
@@ -59,6 +103,7 @@ function showCounts(counts) {
     if (!box.childElementCount) {
       for (const value of Object.keys(counts[name])) box.append(facetRow(name, value));
       box.parentElement.hidden = !Object.keys(counts[name]).length;
+      box.classList.toggle("long", box.childElementCount > LONG);
     }
     for (const row of box.children) {
       const count = counts[name][row.dataset.value] ?? 0;
@@ -129,7 +174,10 @@ function listRow(row, place) {
   const part = [split, row.subset.replace("_map", "")].filter(Boolean).join(" ");
   facts.textContent = `${part}, ${family}, ${range} cm`;
   element.append(title, map, facts);
-  element.addEventListener("click", () => selectScene(row.key));
+  element.addEventListener("click", () => {
+    selectScene(row.key);
+    closeDrawer();
+  });
   return element;
 }
 
@@ -144,8 +192,10 @@ export async function selectScene(key, { keep = false, pair = null, frame = 0 } 
   try {
     scene = await ask(`/api/scene?key=${encodeURIComponent(key)}&${state.choice}`);
   } catch (error) {
-    return tell($("error"), error.message);
+    tell($("error"), error.message);
+    return false;
   }
+  if (!keep) tell($("notice"), "");
   const cameras = keep && state.scene ? state.scene.pairs[state.pair].cameras : pair;
   state.scene = scene;
   if (!keep) state.frame = Math.min(frame, scene.frames - 1);
@@ -156,7 +206,7 @@ export async function selectScene(key, { keep = false, pair = null, frame = 0 } 
   state.pair = fits ? asked : primary >= 0 && (scene.pairs[primary].chosen || chosen < 0)
     ? primary : Math.max(chosen, 0);
   if (!keep) state.point = null;
-  $("key").textContent = scene.key;
+  writePath($("key"), scene.key);
   $("scene-caption").textContent = scene.caption;
   $("facts").textContent = [
     `${scene.width_px} x ${scene.height_px} px`,
@@ -168,9 +218,12 @@ export async function selectScene(key, { keep = false, pair = null, frame = 0 } 
   ].join("; ");
   $("frame").max = scene.frames - 1;
   showPairs();
+  $("before").disabled = scene.place <= 0;
+  $("after").disabled = scene.place + 1 >= state.total;
   keepInSight(scene.place);
   await showRows();
   refresh();
+  return true;
 }
 
 function keepInSight(place) {

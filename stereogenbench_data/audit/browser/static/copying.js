@@ -1,6 +1,6 @@
 /** Copies a line of Python. */
 
-import { $ } from "/state.js";
+import { $, isTouched } from "/state.js";
 
 export async function copy(id, button) {
   const before = [...button.childNodes];
@@ -9,7 +9,7 @@ export async function copy(id, button) {
     button.textContent = "Copied";
   } catch {
     getSelection().selectAllChildren($(id));
-    button.textContent = "Selected: press Ctrl+C";
+    button.textContent = isTouched() ? "Selected" : "Selected: press Ctrl+C";
   }
   setTimeout(() => button.replaceChildren(...before), 1200);
 }

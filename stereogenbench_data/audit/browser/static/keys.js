@@ -2,6 +2,7 @@
 
 import { selectPlace } from "/choosing.js";
 import { copy } from "/copying.js";
+import { openDrawer } from "/drawer.js";
 import { play, selectFrame, selectPair, selectView } from "/moment.js";
 import { movePoint } from "/pixel.js";
 import { $, VIEWS, state } from "/state.js";
@@ -20,7 +21,7 @@ const KEYS = {
   s: (event) => movePoint(0, event.shiftKey ? 10 : 1),
   d: (event) => movePoint(event.shiftKey ? 10 : 1, 0),
   c: () => copy("sample-line", $("copy-sample")),
-  "/": () => $("caption").focus(),
+  "/": () => openDrawer($("caption")),
   "?": () => $("help").showModal(),
   " ": () => play(),
 };
@@ -38,6 +39,7 @@ export function pressed(event) {
   const at = event.target;
   const types = at.matches("select, textarea, input:not([type=range], [type=checkbox])");
   if (types || !state.scene) return;
+  if (document.body.classList.contains("nothing") && event.key !== "/" && event.key !== "?") return;
   if (event.key === " " && at.matches("button, summary, input[type=checkbox]")) return;
   const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
   const views = Object.keys(VIEWS);

@@ -3,7 +3,7 @@
 import { buildPanes, drawPanes } from "/panes.js";
 import { showPoint } from "/pixel.js";
 import { ask, read } from "/reading.js";
-import { $, NEEDS, VIEWS, state, tell } from "/state.js";
+import { $, NEEDS, VIEWS, state, tell, writePath } from "/state.js";
 import { scaleOf } from "/views.js";
 
 const MAPS = ["disparity", "depth", "visible"];
@@ -30,6 +30,15 @@ export function showPairs() {
     button.addEventListener("click", () => selectPair(number));
     return button;
   }));
+  scrollToChosen($("pairs"));
+}
+
+/** Where a strip of buttons is too narrow for all, bring the chosen one into sight. */
+function scrollToChosen(strip) {
+  const chosen = strip.querySelector("[aria-checked=true], [aria-pressed=true]");
+  if (!chosen || strip.scrollWidth <= strip.clientWidth) return;
+  const { left, width } = chosen.getBoundingClientRect(), box = strip.getBoundingClientRect();
+  strip.scrollLeft += left + width / 2 - box.left - box.width / 2;
 }
 
 export function selectPair(number) {
@@ -41,6 +50,7 @@ export function selectPair(number) {
     button.tabIndex = place === state.pair ? 0 : -1;
     if (hadFocus && place === state.pair) button.focus();
   }
+  scrollToChosen($("pairs"));
   refresh();
 }
 
@@ -55,8 +65,9 @@ export function selectView(name) {
   for (const button of $("views").children) {
     button.ariaPressed = String(button.dataset.view === name);
   }
+  scrollToChosen($("views"));
   buildPanes();
-  refresh();
+  if (state.scene) refresh();
 }
 
 const moment = () => {
@@ -104,7 +115,7 @@ async function showLatest() {
 async function showLine(what, turn) {
   if (state.playing) return;
   const told = await ask(`/api/line?${what}`).catch(() => null);
-  if (told && turn === wanted) $("sample-line").textContent = told.line;
+  if (told && turn === wanted) writePath($("sample-line"), told.line);
 }
 
 /** One scale for all frames of a pair, taken from the first that is seen. */
@@ -140,10 +151,18 @@ function legend(id, scale, text) {
   }));
 }
 
+function setPlaying(playing) {
+  state.playing = playing;
+  $("play").ariaPressed = String(playing);
+  $("play").textContent = playing ? "Stop" : "Play";
+}
+
+export function stop() {
+  if (state.playing) setPlaying(false);
+}
+
 export async function play() {
-  state.playing = !state.playing;
-  $("play").ariaPressed = String(state.playing);
-  $("play").textContent = state.playing ? "Stop" : "Play";
+  setPlaying(!state.playing);
   while (state.playing) {
     const start = performance.now();
     state.frame = (state.frame + 1) % state.scene.frames;
@@ -154,10 +173,15 @@ export async function play() {
   refresh();
 }
 
-function remember() {
-  const place = new URLSearchParams({
-    key: state.scene.key, pair: state.scene.pairs[state.pair].cameras.join("-"),
-    frame: state.frame, view: state.view,
-  });
-  history.replaceState(null, "", `#${place}`);
+/** Put filters, sample and view into the address, which is a link to them. */
+export function remember() {
+  const place = new URLSearchParams(state.choice);
+  if (place.get("pairs") === "all") place.delete("pairs");
+  if (state.scene && state.total) {
+    place.set("key", state.scene.key);
+    place.set("pair", state.scene.pairs[state.pair].cameras.join("-"));
+    place.set("frame", state.frame);
+  }
+  place.set("view", state.view);
+  history.replaceState(null, "", `#${String(place).replaceAll("%2F", "/")}`);
 }

@@ -1,19 +1,25 @@
 /** Starts the page: what it is about, and what its controls do. */
 
-import { choiceQuery, choose, selectScene, showRows } from "/choosing.js";
+import { choose, selectPlace, selectScene, showRows } from "/choosing.js";
 import { copy } from "/copying.js";
+import { closeDrawer, openDrawer } from "/drawer.js";
 import { pressed } from "/keys.js";
 import { play, selectFrame, selectView } from "/moment.js";
 import { buildPanes, fitPanes } from "/panes.js";
 import { ask } from "/reading.js";
-import { $, VIEWS, plural, state, tell } from "/state.js";
+import { $, SHOWN, VIEWS, plural, state, tell, writePath } from "/state.js";
 import { palette } from "/views.js";
+
+function reset() {
+  $("filters").reset();
+  choose();
+}
 
 function listen() {
   let waiting = 0;
   $("filters").addEventListener("input", () => {
     clearTimeout(waiting);
-    waiting = setTimeout(choose, 150);
+    waiting = setTimeout(() => choose(), 150);
   });
   $("filters").addEventListener("change", (event) => {
     if (event.target.name === "bin") ["low", "high"].forEach((end) => { $(`baseline-${end}`).value = ""; });
@@ -22,10 +28,13 @@ function listen() {
     }
   });
   $("filters").addEventListener("submit", (event) => event.preventDefault());
-  $("reset").addEventListener("click", () => {
-    $("filters").reset();
-    choose();
-  });
+  $("reset").addEventListener("click", reset);
+  $("reset-all").addEventListener("click", reset);
+  $("open-drawer").addEventListener("click", openDrawer);
+  $("close-drawer").addEventListener("click", closeDrawer);
+  $("backdrop").addEventListener("click", closeDrawer);
+  $("before").addEventListener("click", () => selectPlace(state.scene.place - 1));
+  $("after").addEventListener("click", () => selectPlace(state.scene.place + 1));
   $("list").addEventListener("scroll", () => showRows());
   $("frame").addEventListener("input", () => selectFrame(Number($("frame").value)));
   $("play").addEventListener("click", play);
@@ -35,6 +44,7 @@ function listen() {
   $("left-out").addEventListener("click", () => $("left-out-list").showModal());
   document.addEventListener("keydown", pressed);
   window.addEventListener("unhandledrejection", (event) => tell($("error"), event.reason.message));
+  window.addEventListener("hashchange", follow);
   window.addEventListener("resize", () => { fitPanes(); showRows(); });
 }
 
@@ -69,19 +79,33 @@ function showAbout() {
   }
 }
 
+/** Show what the address names: filters, sample and view. */
+async function follow() {
+  const place = new URLSearchParams(location.hash.slice(1));
+  const filters = new URLSearchParams(place);
+  SHOWN.forEach((name) => filters.delete(name));
+  if (!filters.has("pairs")) filters.set("pairs", "all");
+  if (place.get("view") in VIEWS) selectView(place.get("view"));
+  state.choice = filters.toString();
+  let refused = "";
+  if (place.has("key")) {
+    const pair = (place.get("pair") ?? "").split("-").map(Number);
+    const frame = Math.max(0, Math.trunc(Number(place.get("frame")) || 0));
+    if (!await selectScene(place.get("key"), { pair, frame })) refused = $("error").textContent;
+  }
+  await choose(state.choice);
+  if (refused) {
+    writePath($("notice"), `${refused.split(/\.? Did you mean/)[0]}. Another scene is shown.`);
+    $("notice").hidden = false;
+  }
+}
+
 async function start() {
   state.about = await ask("/api/about");
-  const place = new URLSearchParams(location.hash.slice(1));
-  if (place.get("view") in VIEWS) state.view = place.get("view");
   showAbout();
   buildPanes();
   listen();
-  state.choice = choiceQuery();
-  if (place.has("key")) {
-    const pair = (place.get("pair") ?? "").split("-").map(Number);
-    await selectScene(place.get("key"), { pair, frame: Number(place.get("frame")) || 0 });
-  }
-  await choose();
+  await follow();
   document.body.dataset.ready = "yes";
 }
 

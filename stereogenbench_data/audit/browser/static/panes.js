@@ -33,8 +33,10 @@ export function fitPanes() {
   const { width_px: width, height_px: height } = state.scene;
   const stage = $("stage"), gap = 10, caption = 22;
   const beside = matchMedia("(min-width: 1101px)").matches;
-  const inside = $("stage").parentElement.clientWidth - (beside ? 20 + 290 : 0);
-  const top = stage.getBoundingClientRect().top + document.querySelector("main").scrollTop;
+  const main = document.querySelector("main"), { paddingLeft, paddingRight } = getComputedStyle(main);
+  const inside = main.clientWidth - parseFloat(paddingLeft) - parseFloat(paddingRight)
+    - (beside ? 20 + 290 : 0);
+  const top = stage.getBoundingClientRect().top + main.scrollTop + scrollY;
   const room = Math.max(beside ? 320 : 420, window.innerHeight - top - 18);
   const columns = state.panes.length > 1 ? (inside > 480 ? 3 : 2) : 1;
   const lines = Math.ceil(state.panes.length / columns);

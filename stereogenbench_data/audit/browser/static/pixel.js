@@ -1,6 +1,6 @@
 /** The pixel that is pointed at: what the maps say of it, and where the right view has it. */
 
-import { $, state } from "/state.js";
+import { $, isTouched, state } from "/state.js";
 
 export function pointAt(event, picture, name) {
   const box = picture.querySelector("canvas").getBoundingClientRect();
@@ -23,7 +23,7 @@ export function movePoint(dx, dy) {
 /** What the maps say of the pixel that is pointed at, and where the right view has it. */
 export function showPoint() {
   if (!state.point) {
-    $("at").textContent = "point at a picture";
+    $("at").textContent = `${isTouched() ? "touch" : "point at"} a picture`;
     for (const id of ["disparity-here", "depth-here", "seen-here"]) $(id).textContent = "-";
     state.panes.forEach(({ mark }) => { mark.hidden = true; });
     return;

@@ -20,9 +20,19 @@ export const state = {
   scales: {}, material: {}, total: 0, pages: new Map(), choice: "", panes: [],
 };
 
+/** The names in a link that say what is shown; all other names are filters. */
+export const SHOWN = ["key", "pair", "frame", "view"];
+
 export const $ = (id) => document.getElementById(id);
 
 export const plural = (number, word) => `${number.toLocaleString("en")} ${word}${number === 1 ? "" : "s"}`;
+
+export const isTouched = () => matchMedia("(pointer: coarse)").matches;
+
+/** Text that a narrow page breaks after a slash rather than within a name. */
+export function writePath(element, text) {
+  element.replaceChildren(...text.split(/(?<=\/)/).flatMap((part) => [part, document.createElement("wbr")]));
+}
 
 export function tell(element, text) {
   element.textContent = text || "";
