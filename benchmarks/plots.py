@@ -80,10 +80,13 @@ def _bars(axes: Any, names: list[str], spreads: list[Spread], *, form: str) -> N
     axes.errorbar(middle, places, xerr=errors, fmt="none", ecolor=_INK, elinewidth=1)
     for place, spread in zip(places, spreads, strict=True):
         axes.annotate(
-            f" {spread.median:{form}}", (spread.high, place), va="center", fontsize=8, color=_INK
-        )
+            f"{spread.median:{form}}", (spread.high, place), xytext=(4, 0),
+            textcoords="offset points", va="center", fontsize=8, color=_INK, zorder=5,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
+        )  # fmt: skip
     axes.set_yticks(places, [title(name) for name in names], fontsize=8)
     axes.margins(x=0.15)
+    axes.set_xlim(left=0)
 
 
 def _contestants(races: dict[str, Any], workloads: list[Workload]) -> Any:

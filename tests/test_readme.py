@@ -1,4 +1,4 @@
-"""README and documentation: their Python runs, their table of fields is the code's."""
+"""README and documentation: their Python runs."""
 
 import gc
 import re
@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from stereogenbench_data import PAIR_FIELDS
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
@@ -27,9 +26,11 @@ def folder_with_scenes(tmp_path_factory):
     """A folder with ``scenes/``, as a reader of the README makes it."""
     folder = tmp_path_factory.mktemp("readme")
     (folder / "shards").symlink_to(README.parent / "shards")
-    synthesise(
-        folder / "scenes", SynthRequest(family="Uniform", scenes=3, size_px=64, frames=5, seed=6)
-    )
+    for split, scenes in (("train", 3), ("eval", 1)):
+        request = SynthRequest(
+            family="Uniform", split=split, scenes=scenes, size_px=96, frames=5, seed=6
+        )
+        synthesise(folder / "scenes", request)
     return folder
 
 
@@ -60,14 +61,3 @@ def test_a_block_of_the_documentation_runs_by_itself(folder_with_scenes, monkeyp
 def test_there_are_blocks_to_run():
     assert len(BLOCKS) >= 3
     assert len(DOCUMENTED) >= 10
-
-
-def test_the_table_of_fields_is_the_codes():
-    table = README.read_text().split("<!-- fields -->")[1].split("<!-- /fields -->")[0]
-    rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \|$", table, flags=re.MULTILINE)
-
-    assert rows == [
-        (name, f"{field.dtype} {field.shape}".strip() if field.dtype != "str" else "str",
-         field.meaning)
-        for name, field in PAIR_FIELDS.items()
-    ]  # fmt: skip
