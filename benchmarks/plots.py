@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.field import CONTESTANTS, LIMIT, NO_DEPTH, OURS, title
 from benchmarks.material import DRAWN_CRF, OTHER_CRFS
+from benchmarks.network import network_plot
 from benchmarks.results import Spread, entry, rates, ratios, sent_mb, shares
 from benchmarks.tables import rgb_mbit_s
 from benchmarks.workloads import RATED, RATES, WORKLOADS, Workload
@@ -43,6 +44,7 @@ def plot_all(sections: dict[str, Any], folder: Path) -> list[Path]:
         ("workers", "all-frames" in races, lambda: _workers(races["all-frames"])),
         ("rates", any(w.name in races for w in RATES), lambda: _by_rate(sections)),
         ("web", web, lambda: _web(races, web)),
+        ("network", "network" in sections, lambda: network_plot(sections["network"])),
         ("accuracy", "accuracy" in sections, lambda: _accuracy(sections["accuracy"])),
         ("profile", "profile" in sections, lambda: _profile(sections["profile"])),
         ("memory", "memory" in sections, lambda: _memory(sections["memory"])),
