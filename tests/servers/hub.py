@@ -121,7 +121,7 @@ class HubHandler(FileHandler):
         facts.setdefault("signatures", {})[signature] = time.time() + signed_for_s
         now = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
         signed = f"X-Amz-Date={now}&X-Amz-Expires={signed_for_s}&X-Amz-Signature={signature}"
-        content_network = self.server.url.replace("127.0.0.1", "localhost")
+        content_network = f"http://{self.headers['Host'].replace('127.0.0.1', 'localhost')}"
         self.send_response(302)
         self.send_header("Location", f"{content_network}/files/{name}?{signed}")
         self.send_header("X-Repo-Commit", COMMIT)
