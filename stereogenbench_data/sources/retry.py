@@ -120,8 +120,8 @@ class RetryPolicy:
         clock: Returns the time in seconds.
     """
 
-    attempts: int = 8
-    first_wait_s: float | int = 0.1
+    attempts: int = 10
+    first_wait_s: float | int = 0.02
     longest_wait_s: float | int = 10.0
     longest_retry_after_s: float | int = 300.0
     timeout_s: float | int = 20.0

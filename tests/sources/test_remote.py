@@ -60,7 +60,7 @@ def test_an_answer_cut_short_is_gone_on_with_where_it_ended(served, clock):
     assert remote.read(500, 200_500) == DATA[500:200_500]
     assert ranges(served) == [(500, 200_500), (30_500, 200_500), (130_500, 200_500)]
     assert served.sent == 200_000
-    assert clock.waits_s == [0.1, 0.1]
+    assert clock.waits_s == [0.02, 0.02]
 
 
 def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, clock):
@@ -69,10 +69,10 @@ def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, clock):
 
     with pytest.raises(
         StorageError,
-        match=r"x.tar: .* byte 0 of 9 \(the server answers 503 .*; 8 tries\). Check the network",
+        match=r"x.tar: .* byte 0 of 9 \(the server answers 503 .*; 10 tries\). Check the network",
     ):
         remote.read(0, 9)
-    assert clock.waits_s == [0.1, 0.2, 0.4, 0.8, 1.6, 3.0, 3.0]
+    assert clock.waits_s == [0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56, 3.0]
 
 
 @pytest.mark.parametrize("status", [429, 503])
@@ -93,13 +93,13 @@ def test_the_server_may_say_until_when_to_wait(served, clock):
 
     with pytest.raises(StorageError, match=r"503 Service Unavailable, which asks to wait \d{9,} s"):
         remote.read(0, 9)
-    assert clock.waits_s == [0.1, 0.2]
+    assert clock.waits_s == [0.02, 0.04]
 
 
 def test_jitter_shortens_a_wait_by_up_to_a_half_and_lengthens_one_that_is_asked_for():
     policies = [RetryPolicy(chance=lambda chance=chance: chance) for chance in (0.0, 0.5, 1.0)]
 
-    assert [each.backoff_s(3) for each in policies] == pytest.approx([0.4, 0.3, 0.2])
+    assert [each.backoff_s(3) for each in policies] == pytest.approx([0.08, 0.06, 0.04])
     assert [each.spread_s(5.0) for each in policies] == pytest.approx([5.0, 5.25, 5.5])
 
 

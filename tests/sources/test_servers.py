@@ -188,7 +188,7 @@ def test_a_file_system_that_fails_is_requested_again(monkeypatch):
     )
 
     assert remote.read(2, 6) == b"2345"
-    assert waits_s == [0.1, 0.2]
+    assert waits_s == [0.02, 0.04]
     files.rm("/shard.tar")
 
 
