@@ -22,6 +22,7 @@ from stereogenbench_data.sources.transport import (
     busy,
     replaced,
     require_expected_size,
+    require_no_pause,
     retry_after_s,
 )
 
@@ -66,6 +67,7 @@ class FilesystemTransport:
         self._url = url
         self._expected_size = expected_size
         self._where = shown(url)
+        self._server = "/".join(self._where.split("/")[:3])
         self._opened: tuple[int, Any, str] | None = None
         self._seen: dict[str, dict[str, str]] = {}
 
@@ -183,6 +185,7 @@ class FilesystemTransport:
 
     def _call(self, attempt: Attempt, operation: Callable[[], _T]) -> _T:
         """Return what an operation of a file system returns, within the time that is left."""
+        require_no_pause(self._server, attempt)
         with self._named_errors(attempt):
             return _within(attempt, operation)
 
@@ -190,6 +193,7 @@ class FilesystemTransport:
         self, attempt: Attempt, files: Any, begin: Callable[[], Coroutine[Any, Any, _T]]
     ) -> _T:
         """Return what an asynchronous operation returns, within the limits of the attempt."""
+        require_no_pause(self._server, attempt)
         with self._named_errors(attempt):
             try:
                 allowed_s = attempt.next_wait_s()
@@ -253,8 +257,7 @@ class FilesystemTransport:
         if status in _REFUSED:
             return StorageError(f"{self._where}: {_reason(error)}. {MISSING}")
         if wait_s > 0 and attempt is not None:
-            server = "/".join(self._url.split("/")[:3])
-            return busy(_reason(error), server=server, wait_s=wait_s, attempt=attempt)
+            return busy(_reason(error), server=self._server, wait_s=wait_s, attempt=attempt)
         return TransientError(_reason(error))
 
 

@@ -35,16 +35,17 @@ from urllib3.exceptions import (
     NameResolutionError,
     NewConnectionError,
 )
+from urllib3.util.connection import allowed_gai_family
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.location import WEB_SCHEMES, is_inside, shown, split_url
-from stereogenbench_data.sources.pauses import pause_end_s
 from stereogenbench_data.sources.retry import Attempt, TooSlow, TransientError, shut_down
 from stereogenbench_data.sources.transport import (
     MISSING,
     busy,
     replaced,
     require_expected_size,
+    require_no_pause,
     retry_after_s,
 )
 
@@ -305,12 +306,7 @@ class WebTransport:
         self, url: str, headers: Mapping[str, str], attempt: Attempt
     ) -> urllib3.BaseHTTPResponse:
         """Return a server's response, which may be a redirect."""
-        until_s = pause_end_s(server_of(url))
-        if until_s > attempt.waited_for_s:
-            raise TransientError(
-                "the server asked this machine to wait",
-                wait_s=max(0.0, until_s - time.time()), pause_until_s=until_s, was_sent=False,
-            )  # fmt: skip
+        require_no_pause(server_of(url), attempt)
         token = _current_attempt.set(attempt)
         try:
             allowed_s = attempt.next_wait_s()
@@ -532,7 +528,7 @@ class _TimedConnection(urllib3.connection.HTTPConnection):
         except OSError as error:
             raise NewConnectionError(self, "no connection") from error
         # TLS takes the socket over: a copy can be shut down meanwhile.
-        self._during_handshake = socket.socket(fileno=os.dup(connection.fileno()))
+        self._during_handshake = connection.dup()
         self._handshake_from_s = attempt.clock()
         attempt.on_cancel(partial(shut_down, self._during_handshake))
         connection.settimeout(allowed_s)
@@ -542,7 +538,9 @@ class _TimedConnection(urllib3.connection.HTTPConnection):
         """Return a connection to the first of the host's addresses that accepts one."""
         refused: OSError | None = None
         began_s = attempt.clock()
-        found = socket.getaddrinfo(self._dns_host, self.port, type=socket.SOCK_STREAM)
+        found = socket.getaddrinfo(
+            self._dns_host.strip("[]"), self.port, allowed_gai_family(), socket.SOCK_STREAM
+        )
         attempt.add(attempt.clock() - began_s, 0)
         for family, kind, protocol, _, address in found:
             connection = socket.socket(family, kind, protocol)

@@ -21,7 +21,6 @@ from stereogenbench_data.errors import StorageError, explain_os_errors
 from stereogenbench_data.sources.filesystems import FilesystemTransport, require_installed
 from stereogenbench_data.sources.http import WebTransport, server_of
 from stereogenbench_data.sources.location import shown
-from stereogenbench_data.sources.ranged_file import LARGEST_BLOCK
 from stereogenbench_data.sources.retry import Attempt
 from stereogenbench_data.sources.transport import MISSING, MissingObject, require_expected_size
 
@@ -31,6 +30,7 @@ _ADDRESS: Final = re.compile(
     re.ASCII,
 )
 _COMMIT: Final = re.compile(r"[0-9a-f]{40}")
+_CHUNK: Final = 1024 * 1024
 _LARGEST_IN_GIT: Final = 16 * 2**20
 """Bytes of the largest file that the Hub keeps in git, whole and without ranges."""
 
@@ -114,7 +114,7 @@ class HubTransport:
                     f"short: remove it, and it is fetched from the Hub."
                 )
             file.seek(start)
-            while start < stop and (data := file.read(min(LARGEST_BLOCK, stop - start))):
+            while start < stop and (data := file.read(min(_CHUNK, stop - start))):
                 start += len(data)
                 yield data
 

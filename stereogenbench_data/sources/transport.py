@@ -1,13 +1,14 @@
 """What the protocols have in common: the requests they make, and what they say of an object."""
 
 import re
+import time
 from collections.abc import Generator
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from typing import Final, Protocol
 
 from stereogenbench_data.errors import ShardError, StorageError
-from stereogenbench_data.sources.pauses import begin_pause
+from stereogenbench_data.sources.pauses import begin_pause, pause_end_s
 from stereogenbench_data.sources.retry import Attempt, TransientError
 
 MISSING: Final = "Check the URL, and that the index and its shards lie in one folder."
@@ -65,6 +66,20 @@ def busy(reason: str, *, server: str, wait_s: float, attempt: Attempt) -> Transi
     if 0 < wait_s <= attempt.policy.longest_retry_after_s:
         until_s = begin_pause(server, wait_s=wait_s)
     return TransientError(reason, wait_s=wait_s, pause_until_s=until_s)
+
+
+def require_no_pause(server: str, attempt: Attempt) -> None:
+    """Refuse to ask a server that asked this machine to wait, unless this read has waited for it.
+
+    Raises:
+        TransientError: It says how long is left.
+    """
+    until_s = pause_end_s(server)
+    if until_s > attempt.waited_for_s:
+        raise TransientError(
+            "the server asked this machine to wait",
+            wait_s=max(0.0, until_s - time.time()), pause_until_s=until_s, was_sent=False,
+        )  # fmt: skip
 
 
 def retry_after_s(header: str) -> float:

@@ -5,6 +5,7 @@ import os
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import ClassVar
 
 import fsspec
@@ -190,6 +191,30 @@ def test_a_file_system_that_fails_is_requested_again(monkeypatch):
     assert remote.read(2, 6) == b"2345"
     assert waits_s == [0.02, 0.04]
     files.rm("/shard.tar")
+
+
+def test_a_wait_that_a_store_asks_for_holds_for_all_its_objects(monkeypatch):
+    files = fsspec.filesystem("memory")
+    files.pipe_file("/busy/shard.tar", b"0123456789")
+
+    class BusyError(OSError):
+        response = SimpleNamespace(status_code=503, headers={"retry-after": "2"})
+
+    failures = [BusyError()]
+
+    def opened(*args, **how):
+        if failures:
+            raise failures.pop()
+        return type(files).open(files, *args, **how)
+
+    monkeypatch.setattr(files, "open", opened)
+    for _ in range(2):
+        waits_s: list[float] = []
+        retry = RetryPolicy(sleep=waits_s.append, chance=lambda: 0.0)
+        remote = RemoteObject("memory://busy/shard.tar", retry=retry)
+        assert remote.read(2, 6) == b"2345"
+        assert waits_s == [pytest.approx(2.0, abs=1.1)]
+    files.rm("/busy", recursive=True)
 
 
 def test_a_url_that_no_file_system_opens_is_reported():
