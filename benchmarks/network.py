@@ -188,8 +188,11 @@ def link_shards(material: Material, job: Job) -> None:
     if (job.shards / INDEX_NAME).exists():
         return
     index = SceneIndex.open(material.shards)
-    found = [_scene(index, row) for row in range(len(index))]
-    drawn = list({scene.members["baseline.json"].path: scene for scene in found[::-1]}.values())
+    firsts: dict[str, Scene] = {}
+    for row in range(len(index)):
+        scene = _scene(index, row)
+        firsts.setdefault(scene.members["baseline.json"].path, scene)
+    drawn = list(firsts.values())
     job.shards.mkdir(parents=True, exist_ok=True)
     scenes, facts = [], {}
     for number in range(job.scenes):

@@ -97,6 +97,9 @@ class MosaicScenes(IterableDataset[dict[str, Any]]):
         self._scenes = streaming.StreamingDataset(
             remote=remote, local=str(local), shuffle=False, batch_size=1
         )
+        for stream in self._scenes.streams:
+            # Forked workers would share the connection over which this process read the index.
+            stream._downloader.clean_up()
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         """Yield samples."""
