@@ -39,6 +39,7 @@ from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import Scene, SceneId
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.sources.members import open_local
 
 LOCAL: Final = "ours, local"
@@ -448,8 +449,9 @@ def network_tables(section: dict[str, Any]) -> str:
         scenes = next(r["scenes"] for r in section["races"] if r["workload"] == workload.name)
         rounds = max(len(group.rounds) for group in groups)
         rows = [row for group in groups for row in _rows(group)]
+        first = f"{workload.title}, {scenes} scenes, {counted(rounds, 'round')}"
         head = (
-            f"{workload.title}, {scenes} scenes, {rounds} rounds", "contestant", "samples/s",
+            first, "contestant", "samples/s",
             "to local", "(after the first batch)", "first batch, s", "the same, delays more than "
             "local", "requests a sample", "MB a sample", "peak MB of a worker",
         )  # fmt: skip
@@ -527,9 +529,10 @@ def network_plot(section: dict[str, Any]) -> Any:
                 )  # fmt: skip
             limit = f"{mb_s:g} MB/s a connection" if mb_s else "unlimited bandwidth"
             axes.set_title(f"{workload.title}, {limit}", fontsize=9)
-            axes.set_ylim(bottom=0)
             axes.set_xlabel("delay of each response, ms")
+        line[0].set_ylim(bottom=0)
         line[0].set_ylabel("samples a second")
-    grid[0][0].legend(frameon=False, fontsize=8)
-    figure.tight_layout()
+    named = grid[0][0].get_legend_handles_labels()
+    figure.legend(*named, frameon=False, fontsize=8, ncol=len(named[1]), loc="upper left")
+    figure.tight_layout(rect=(0, 0, 1, 1 - 0.1 / len(shown)))
     return figure
