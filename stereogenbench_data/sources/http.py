@@ -12,11 +12,10 @@ import logging
 import os
 import re
 import socket
-import threading
 import time
 import weakref
-from collections.abc import Generator, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Generator, Mapping
+from contextlib import ExitStack, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -39,7 +38,13 @@ from urllib3.util.connection import allowed_gai_family
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.location import WEB_SCHEMES, is_inside, shown, split_url
-from stereogenbench_data.sources.retry import Attempt, TooSlow, TransientError, shut_down
+from stereogenbench_data.sources.retry import (
+    Attempt,
+    ProcessLock,
+    TooSlow,
+    TransientError,
+    shut_down,
+)
 from stereogenbench_data.sources.transport import (
     MISSING,
     busy,
@@ -160,11 +165,11 @@ class WebTransport:
         self._tags: dict[tuple[str, str], _Version] = {}
         self._signed: _Signed | None = None
         self._was_signed = False
-        self._resolving: tuple[int, threading.Lock] | None = None
+        self._resolving = ProcessLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, without signed URLs."""
-        return self.__dict__ | {"_signed": None, "_resolving": None}
+        return self.__dict__ | {"_signed": None}
 
     def size(self, attempt: Attempt) -> int:
         """Return how many bytes the object has, as the response for its first byte states."""
@@ -224,7 +229,7 @@ class WebTransport:
         with ExitStack() as turn:
             if self._was_signed:
                 # One thread resolves, and the others use what it found.
-                turn.enter_context(self._alone(attempt))
+                turn.enter_context(self._resolving.held(attempt))
                 if (signed := self._valid_signed()) is not None:
                     turn.close()
                     url, linked_etag = signed.url, signed.linked_etag
@@ -282,25 +287,6 @@ class WebTransport:
     def _drop(self, signed: _Signed) -> None:
         if self._signed is signed:
             self._signed = None
-
-    @contextmanager
-    def _alone(self, attempt: Attempt) -> Iterator[None]:
-        """Wait until no other thread resolves the object's URL."""
-        if self._resolving is None or self._resolving[0] != os.getpid():
-            self._resolving = (os.getpid(), threading.Lock())  # a fork may have left it locked
-        _, lock = self._resolving
-        began_s = attempt.clock()
-        try:
-            has_turn = lock.acquire(timeout=attempt.next_wait_s())
-        except TooSlow as error:
-            raise TransientError(str(error)) from None
-        attempt.add(attempt.clock() - began_s, 0)
-        if not has_turn:
-            raise TransientError(str(attempt.too_slow()))
-        try:
-            yield
-        finally:
-            lock.release()
 
     def _ask(
         self, url: str, headers: Mapping[str, str], attempt: Attempt

@@ -21,7 +21,7 @@ from stereogenbench_data.errors import StorageError, explain_os_errors
 from stereogenbench_data.sources.filesystems import FilesystemTransport, require_installed
 from stereogenbench_data.sources.http import WebTransport, server_of
 from stereogenbench_data.sources.location import shown
-from stereogenbench_data.sources.retry import Attempt
+from stereogenbench_data.sources.retry import Attempt, ProcessLock
 from stereogenbench_data.sources.transport import MISSING, MissingObject, require_expected_size
 
 _ADDRESS: Final = re.compile(
@@ -88,6 +88,7 @@ class HubTransport:
         self._where = shown(url)
         self._expected_size = expected_size
         self._opened: tuple[int, WebTransport | Path] | None = None
+        self._opening = ProcessLock()
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, without logins and signed URLs."""
@@ -132,7 +133,9 @@ class HubTransport:
 
     def _open(self, attempt: Attempt) -> WebTransport | Path:
         """Return the file in the Hub's cache, or else where it is on the Hub."""
-        if self._opened is None or self._opened[0] != os.getpid():
+        with self._opening.held(attempt):
+            if self._opened is not None and self._opened[0] == os.getpid():
+                return self._opened[1]
             with require_installed(self._where, extra="hub"):
                 from huggingface_hub import constants, try_to_load_from_cache
             if re.search(r"(?:^|/)\.{1,2}(?:/|$)", self._file.path):
@@ -187,6 +190,7 @@ class _HubWeb(WebTransport):
         super().__init__(url, expected_size=expected_size, headers=headers)
         self._where = where
         self._revision = revision
+        self._was_signed = True  # so that threads do not all ask the Hub at first
 
     def commit(self, attempt: Attempt) -> str:
         """Return the commit that a branch is at; the branch itself where the Hub does not say."""

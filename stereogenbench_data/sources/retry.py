@@ -1,6 +1,7 @@
 """Retries: what is tried again, after which wait, and when reading from a server gives up."""
 
 import math
+import os
 import random
 import socket
 import threading
@@ -263,6 +264,40 @@ class Attempt:
     def _end(self) -> None:
         for end in list(self._ends):
             end()
+
+
+class ProcessLock:
+    """A lock for the threads of one process: after a fork, or in a pickled copy, it is free."""
+
+    def __init__(self) -> None:
+        """Begin free."""
+        self._process, self._lock = os.getpid(), threading.Lock()
+
+    def __reduce__(self) -> tuple[type["ProcessLock"], tuple[()]]:
+        """Return how a copy is made: free."""
+        return ProcessLock, ()
+
+    @contextmanager
+    def held(self, attempt: Attempt) -> Iterator[None]:
+        """Hold the lock; wait for it within the limits of an attempt.
+
+        Raises:
+            TransientError: If that takes longer.
+        """
+        if self._process != os.getpid():  # a thread that does not exist here may hold it
+            self._process, self._lock = os.getpid(), threading.Lock()
+        lock, began_s = self._lock, attempt.clock()
+        try:
+            has_turn = lock.acquire(timeout=attempt.next_wait_s())
+        except TooSlow as error:
+            raise TransientError(str(error)) from None
+        attempt.add(attempt.clock() - began_s, 0)
+        if not has_turn:
+            raise TransientError(str(attempt.too_slow()))
+        try:
+            yield
+        finally:
+            lock.release()
 
 
 def shut_down(connection: socket.socket) -> None:

@@ -491,9 +491,8 @@ def test_a_retry_policy_with_a_negative_limit_is_refused(name):
 )
 def test_a_retry_after_that_is_none_is_no_error_of_its_own(clock, told):
     def busy(start, stop):
-        yield f"HTTP/1.1 503 x\r\nRetry-After: {told}\r\nContent-Length: 0\r\n\r\n".encode(
-            "latin-1"
-        )
+        lines = ["HTTP/1.1 503 x", f"Retry-After: {told}", "Content-Length: 0", "Connection: close"]
+        yield "\r\n".join([*lines, "", ""]).encode("latin-1")
 
     with raw_serving(busy) as url, pytest.raises(StorageError, match=r"the server answers 503 x"):
         RemoteObject(f"{url}/x.tar", retry=clock.policy(attempts=2)).read(0, 9)
