@@ -17,6 +17,8 @@ from benchmarks.equality import differences
 from benchmarks.evaluation import measure_evaluation
 from benchmarks.ffmpeg_links import link_libraries
 from benchmarks.material import Material, facts, prepared
+from benchmarks.network import DELAYS_MS, network_tables, run_network
+from benchmarks.network import Plan as NetworkPlan
 from benchmarks.plots import plot_all
 from benchmarks.profile import measure_profile
 from benchmarks.race import Plan, run_races
@@ -45,7 +47,7 @@ QUICK: Final = ("first", "all-frames", "random", "accuracy", "profile")
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command line."""
-    known = [workload.name for workload in WORKLOADS] + ["rates", *OTHERS]
+    known = [workload.name for workload in WORKLOADS] + ["rates", "network", *OTHERS]
     parser = argparse.ArgumentParser(prog="stereogenbench bench", description=__doc__)
     parser.add_argument(
         "--only", action="append", choices=known, help="measure only this; may be repeated"
@@ -54,6 +56,8 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--rounds", type=int, default=5, help="rounds of every race [5]")
     parser.add_argument("--workers", help="worker processes of every race, such as 2,0,1,4")
     parser.add_argument("--whole", action="store_true", help="race over all frames, not a window")
+    parser.add_argument("--delays", help="of the races over a network, in ms, such as 0,60")
+    parser.add_argument("--scenes", type=int, default=0, help="of the races over a network")
     parser.add_argument("--batches", type=int, default=2000, help="of the memory run [2000]")
     parser.add_argument("--resume", action="store_true", help="keep the rounds that exist")
     parser.add_argument("--draw", action="store_true", help="only draw and pack the data")
@@ -105,10 +109,23 @@ def measure(options: argparse.Namespace, *, report: Callable[[str], None]) -> li
         workloads, others = chosen(options)
         plan = Plan(rounds=rounds, resume=options.resume)
         failed += run_races(workloads, material, results, plan=plan, report=report)
+        if "network" in (options.only or ()) or not (options.only or options.quick):
+            plan_over_network = network_plan(options, rounds=rounds)
+            failed += run_network(material, results, plan=plan_over_network, report=report)
         failed += measure_others(others, material, results, options=options, report=report)
     write_pages(results, options.out)
     report(f"results are in {options.out}")
     return failed
+
+
+def network_plan(options: argparse.Namespace, *, rounds: int) -> NetworkPlan:
+    """Return the settings of the races over a network."""
+    delays = options.delays.split(",") if options.delays else DELAYS_MS
+    return NetworkPlan(
+        rounds=min(rounds, 3), scenes=options.scenes, resume=options.resume,
+        workers=int((options.workers or "2").split(",")[0]),
+        delays_ms=tuple(float(delay) for delay in delays),
+    )  # fmt: skip
 
 
 def measure_others(
@@ -151,7 +168,10 @@ def measure_others(
 
 def write_pages(results: Results, out: Path) -> None:
     """Write tables and plots of the results."""
-    (out / "tables.md").write_text(tables(results.sections))
+    text = tables(results.sections)
+    if "network" in results.sections:
+        text += "\n" + network_tables(results.sections["network"])
+    (out / "tables.md").write_text(text)
     plot_all(results.sections, out)
 
 

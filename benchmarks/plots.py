@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.field import CONTESTANTS, LIMIT, NO_DEPTH, OURS, title
 from benchmarks.material import DRAWN_CRF, OTHER_CRFS
+from benchmarks.network import network_plot
 from benchmarks.results import Spread, entry, rates, ratios, sent_mb, shares
 from benchmarks.tables import rgb_mbit_s
 from benchmarks.workloads import RATED, RATES, WORKLOADS, Workload
@@ -43,6 +44,7 @@ def plot_all(sections: dict[str, Any], folder: Path) -> list[Path]:
         ("workers", "all-frames" in races, lambda: _workers(races["all-frames"])),
         ("rates", any(w.name in races for w in RATES), lambda: _by_rate(sections)),
         ("web", web, lambda: _web(races, web)),
+        ("network", "network" in sections, lambda: network_plot(sections["network"])),
         ("accuracy", "accuracy" in sections, lambda: _accuracy(sections["accuracy"])),
         ("profile", "profile" in sections, lambda: _profile(sections["profile"])),
         ("memory", "memory" in sections, lambda: _memory(sections["memory"])),
@@ -106,6 +108,7 @@ def _contestants(races: dict[str, Any], workloads: list[Workload]) -> Any:
         names = sorted(shown, key=lambda name: -shown[name].median)
         _bars(axes, names, [shown[name] for name in names], form=".2f")
         axes.axvline(1, color=_INK, linewidth=1)
+        axes.set_xlim(right=max(1.05, axes.get_xlim()[1]))
         if workload.target is not None:
             axes.axvline(workload.target.limit, color=_TARGET, linewidth=1, linestyle="--")
         axes.set_title(workload.title)

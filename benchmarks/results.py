@@ -140,7 +140,7 @@ def spread_of(values: Iterable[float]) -> dict[str, float]:
 
 _PACKAGES: Final = (
     "stereogenbench-data", "av", "numpy", "torch", "pyarrow", "webdataset", "datasets",
-    "torchcodec", "decord", "blosc2",
+    "torchcodec", "decord", "blosc2", "mosaicml-streaming",
 )  # fmt: skip
 
 

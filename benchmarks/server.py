@@ -1,20 +1,33 @@
-"""A web server on this machine that answers ranges and counts the bytes it sends.
+"""Web servers on this machine that answer ranges and count: nginx, or one like a network far away.
 
-It is nginx if that is installed, else a small server in its own process.
+``python -m benchmarks.server FOLDER --delay-ms 60 --mb-s 20`` serves a folder until it is stopped;
+with ``--to URL`` it stands before another server of this machine, which it delays.
+
+The delayed server waits before the first byte of each response, limits the bandwidth of each
+connection and of all together, cuts connections and answers 503. It does not imitate handshakes
+(unless asked to), TCP's slow start or lost packets. It runs in one process, and the kernel copies
+the bytes of files, so it takes little of a processor that contestants need.
 """
 
+import argparse
+import asyncio
 import contextlib
+import json
+import os
+import random
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from collections.abc import Iterator
-from dataclasses import dataclass
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
+from urllib.parse import unquote, urlsplit
 
 _NGINX: Final = """
 daemon off;
@@ -36,6 +49,49 @@ http {{
 }}
 """
 
+_COUNTS: Final = "/-/counts"
+"""The path at which the delayed server tells what it counted."""
+
+_PIECE_S: Final = 0.01
+"""Where the bandwidth is limited, bytes are sent in pieces of so many seconds."""
+
+_LARGEST_HEAD: Final = 64 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """What lies between a server and its clients.
+
+    Attributes:
+        delay_s: Seconds before the first byte of each response.
+        handshakes: Further delays before the first response of each connection.
+        connection_mb_s: Megabytes a second of each connection; 0 is unlimited.
+        total_mb_s: Megabytes a second of all connections together; 0 is unlimited.
+        lost: The share of responses that are cut, some before their first byte.
+        refused: The share of requests that are answered 503.
+    """
+
+    delay_s: float = 0.0
+    handshakes: int = 0
+    connection_mb_s: float = 0.0
+    total_mb_s: float = 0.0
+    lost: float = 0.0
+    refused: float = 0.0
+
+    def words(self) -> list[str]:
+        """Return the options of the command."""
+        return [f"--{name.replace('_', '-')}={value}" for name, value in asdict(self).items()]
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """What a server has counted: requests, bytes of bodies, connections, cut or refused ones."""
+
+    requests: int
+    sent_bytes: int
+    connections: int = 0
+    failures: int = 0
+
 
 @dataclass(frozen=True, slots=True)
 class WebServer:
@@ -44,42 +100,74 @@ class WebServer:
     Attributes:
         url: The URL of its folder.
         kind: "nginx" or "python".
-        log: A file with one line of bytes sent for every answer.
+        log: A file with one line of bytes sent for every answer, of nginx.
     """
 
     url: str
     kind: str
     log: Path
 
+    def counts(self) -> Counts:
+        """Return what it has counted so far."""
+        if self.kind == "nginx":
+            time.sleep(0.1)  # it writes its log just after it has answered
+            sent = self.log.read_text().split() if self.log.exists() else []
+            return Counts(len(sent), sum(map(int, sent)))
+        with urllib.request.urlopen(self.url + _COUNTS, timeout=10) as response:
+            return Counts(**json.load(response))
+
     def sent_bytes(self) -> int:
         """Return the number of bytes of bodies sent so far."""
-        time.sleep(0.1)
-        return sum(int(line) for line in self.log.read_text().split()) if self.log.exists() else 0
+        return self.counts().sent_bytes
 
 
 @contextlib.contextmanager
-def serving(folder: Path, *, home: Path) -> Iterator[WebServer]:
-    """Serve a folder on a free port of this machine; ``home`` takes logs and settings."""
+def serving(
+    folder: Path, *, home: Path, network: Network | None = None, to: str = ""
+) -> Iterator[WebServer]:
+    """Serve a folder on a free port of this machine.
+
+    Args:
+        folder: What to serve.
+        home: Takes logs and settings.
+        network: What lies between; None serves by nginx where that is installed.
+        to: The URL of a server of this machine to stand before, in place of a folder.
+    """
+    home.mkdir(parents=True, exist_ok=True)
+    program = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin:/usr/local/sbin")
+    if network is None and program:
+        with _nginx(program, folder, home) as server:
+            yield server
+        return
+    command = [sys.executable, "-m", "benchmarks.server", str(folder)]
+    words = [*(network or Network()).words(), *([f"--to={to}"] if to else [])]
+    place = Path(__file__).parents[1]
+    with subprocess.Popen([*command, *words], stdout=subprocess.PIPE, cwd=place) as running:
+        try:
+            assert running.stdout is not None
+            url = running.stdout.readline().decode().strip()
+            if not url:
+                raise RuntimeError("the web server on this machine did not start")
+            yield WebServer(url, "python", home / "sent.log")
+        finally:
+            running.terminate()
+
+
+@contextlib.contextmanager
+def _nginx(program: str, folder: Path, home: Path) -> Iterator[WebServer]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    home.mkdir(parents=True, exist_ok=True)
     log = home / "sent.log"
     log.unlink(missing_ok=True)
-    program = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin:/usr/local/sbin")
-    if program:
-        text = _NGINX.format(port=port, folder=folder.resolve())
-        (home / "nginx.conf").write_text(text)
-        command = [program, "-p", str(home.resolve()), "-c", "nginx.conf", "-e", "error.log"]
-    else:
-        command = [sys.executable, "-m", "benchmarks.server", str(folder), str(port), str(log)]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as server:
+    (home / "nginx.conf").write_text(_NGINX.format(port=port, folder=folder.resolve()))
+    command = [program, "-p", str(home.resolve()), "-c", "nginx.conf", "-e", "error.log"]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as running:
         try:
-            _wait_for(port, server)
-            kind = "nginx" if program else "python"
-            yield WebServer(f"http://127.0.0.1:{port}", kind, log)
+            _wait_for(port, running)
+            yield WebServer(f"http://127.0.0.1:{port}", "nginx", log)
         finally:
-            server.terminate()
+            running.terminate()
 
 
 def _wait_for(port: int, server: "subprocess.Popen[bytes]") -> None:
@@ -93,46 +181,234 @@ def _wait_for(port: int, server: "subprocess.Popen[bytes]") -> None:
     raise RuntimeError("the web server on this machine did not start")
 
 
-class _Ranges(SimpleHTTPRequestHandler):
-    """Files by range, counted."""
+class _Line:
+    """A line of limited bandwidth: who sends reserves the time that the bytes take."""
 
-    protocol_version = "HTTP/1.1"
-    log_file: Any = None
+    def __init__(self, mb_s: float) -> None:
+        self._bytes_s = mb_s * 1e6
+        self._free_s = 0.0
 
-    def do_GET(self) -> None:
-        """Answer with a file or a part of it."""
-        path = Path(self.translate_path(self.path))
-        if not path.is_file():
-            self.send_error(404)
-            return
-        size = path.stat().st_size
-        found = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
-        start = int(found[1]) if found else 0
-        stop = min(int(found[2]) + 1 if found and found[2] else size, size)
-        self.send_response(206 if found else 200)
-        self.send_header("Content-Length", str(stop - start))
-        self.send_header("Accept-Ranges", "bytes")
-        if found:
-            self.send_header("Content-Range", f"bytes {start}-{stop - 1}/{size}")
-        self.end_headers()
-        sent = 0
-        with path.open("rb") as file, contextlib.suppress(ConnectionError):
-            file.seek(start)
-            while sent < stop - start:
-                self.wfile.write(piece := file.read(min(1 << 18, stop - start - sent)))
-                sent += len(piece)
-        self.log_file.write(f"{sent}\n")
-        self.log_file.flush()
+    def reserve(self, count: int) -> float:
+        """Return for how many seconds to wait before so many bytes have gone through."""
+        if not self._bytes_s:
+            return 0.0
+        now_s = time.monotonic()
+        self._free_s = max(self._free_s, now_s) + count / self._bytes_s
+        return self._free_s - now_s
 
-    def log_message(self, format: str, *values: object) -> None:
-        """Report nothing."""
+    def piece(self, count: int) -> int:
+        """Return how many of some bytes to send at once."""
+        return min(count, max(16_384, int(self._bytes_s * _PIECE_S))) if self._bytes_s else count
 
 
-def _serve(folder: str, port: str, log: str) -> None:
-    with Path(log).open("a") as _Ranges.log_file:
-        handler = lambda *values: _Ranges(*values, directory=folder)  # noqa: E731
-        ThreadingHTTPServer(("127.0.0.1", int(port)), handler).serve_forever()
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """A request's path, and its range: the first and the last byte, None where it has none."""
+
+    method: str
+    path: str
+    range: tuple[str, str] | None
+    condition: str
+    keeps: bool
+
+
+class _Server:
+    """Answers requests for files of a folder, as if they came through a network."""
+
+    def __init__(self, folder: Path, network: Network) -> None:
+        self._folder = folder.resolve()
+        self._network = network
+        self._total = _Line(network.total_mb_s)
+        self._chance = random.Random(7)
+        self._counts = {"requests": 0, "sent_bytes": 0, "connections": 0, "failures": 0}
+
+    async def answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer the requests of a connection."""
+        line, delays = _Line(self._network.connection_mb_s), 1 + self._network.handshakes
+        self._counts["connections"] += 1
+        with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
+            keeps = True
+            while keeps and (asked := await _next_request(reader)) is not None:
+                if asked.path == _COUNTS:
+                    self._counts["connections"] -= 1
+                    text = json.dumps(self._counts).encode()
+                    writer.write(_head(200, "OK", len(text), "") + text)
+                    break
+                self._counts["requests"] += 1
+                await asyncio.sleep(delays * self._network.delay_s)
+                delays, keeps = 1, asked.keeps
+                if not await self._send(asked, writer, line):
+                    break
+        writer.close()
+
+    async def _send(self, asked: _Asked, writer: asyncio.StreamWriter, line: _Line) -> bool:
+        """Send a response; return whether the connection is to be kept."""
+        fault = self._chance.random()
+        if fault < self._network.refused:
+            self._counts["failures"] += 1
+            writer.write(_head(503, "Service Unavailable", 0, ""))
+            return True
+        path = self._folder / unquote(urlsplit(asked.path).path).lstrip("/")
+        if not path.resolve().is_relative_to(self._folder) or not path.is_file():
+            writer.write(_head(404, "Not Found", 0, ""))
+            return True
+        status = path.stat()
+        tag = f'"{status.st_size:x}-{status.st_mtime_ns:x}"'
+        is_part = asked.range is not None and asked.condition in ("", tag)
+        start, stop = _bounds(asked.range, status.st_size) if is_part else (0, status.st_size)
+        if start >= stop and is_part:
+            whole = f"Content-Range: bytes */{status.st_size}\r\n"
+            writer.write(_head(416, "Range Not Satisfiable", 0, whole))
+            return True
+        more = f"ETag: {tag}\r\nAccept-Ranges: bytes\r\n"
+        if is_part:
+            more += f"Content-Range: bytes {start}-{stop - 1}/{status.st_size}\r\n"
+        names = (206, "Partial Content") if is_part else (200, "OK")
+        cut = stop
+        if fault < self._network.refused + self._network.lost:
+            self._counts["failures"] += 1
+            if self._chance.random() < 0.5:
+                writer.transport.abort()
+                return False
+            cut = start + int(self._chance.random() * (stop - start))
+        writer.write(_head(*names, stop - start, more))
+        if asked.method == "GET":
+            await self._send_bytes(path, start, cut, writer, line)
+        if cut < stop:
+            writer.transport.abort()
+            return False
+        return True
+
+    async def _send_bytes(
+        self, path: Path, start: int, stop: int, writer: asyncio.StreamWriter, line: _Line
+    ) -> None:
+        loop = asyncio.get_running_loop()
+        with path.open("rb") as file:
+            while start < stop:
+                count = self._total.piece(line.piece(stop - start))
+                wait_s = max(line.reserve(count), self._total.reserve(count))
+                if wait_s > 0:
+                    await asyncio.sleep(wait_s)
+                await writer.drain()
+                await loop.sendfile(writer.transport, file, start, count)
+                self._counts["sent_bytes"] += count
+                start += count
+
+
+class _Proxy:
+    """Passes connections on to another server, as if through a network."""
+
+    def __init__(self, url: str, network: Network) -> None:
+        parts = urlsplit(url)
+        self._host, self._port = str(parts.hostname), parts.port or 80
+        self._network = network
+        self._total = _Line(network.total_mb_s)
+        self._chance = random.Random(7)
+
+    async def answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Pass on a connection."""
+        there = await asyncio.open_connection(self._host, self._port)
+        ways = (
+            asyncio.create_task(self._pass_on(reader, there[1], _Line(0), delayed=True)),
+            asyncio.create_task(
+                self._pass_on(there[0], writer, _Line(self._network.connection_mb_s), delayed=False)
+            ),
+        )
+        try:
+            await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for way in ways:
+                way.cancel()
+            for end in (writer, there[1]):
+                end.close()
+
+    async def _pass_on(
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        line: _Line,
+        *,
+        delayed: bool,
+    ) -> None:
+        while data := await reader.read(65_536):
+            if delayed:
+                await asyncio.sleep(self._network.delay_s)
+                if self._chance.random() < self._network.lost:
+                    return
+            else:
+                wait_s = max(line.reserve(len(data)), self._total.reserve(len(data)))
+                await asyncio.sleep(wait_s)
+            writer.write(data)
+            await writer.drain()
+
+
+async def _next_request(reader: asyncio.StreamReader) -> _Asked | None:
+    """Return the next request of a connection, None at its end."""
+    try:
+        text = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+    except (asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+        return None
+    first, *lines = text.split("\r\n")
+    method, _, rest = first.partition(" ")
+    headers = {
+        name.strip().lower(): value.strip() for name, _, value in (x.partition(":") for x in lines)
+    }
+    found = re.fullmatch(r"bytes=(\d*)-(\d*)", headers.get("range", ""))
+    return _Asked(
+        method, rest.partition(" ")[0], (found[1], found[2]) if found else None,
+        headers.get("if-range", ""), headers.get("connection", "").lower() != "close",
+    )  # fmt: skip
+
+
+def _bounds(asked: tuple[str, str] | None, size: int) -> tuple[int, int]:
+    """Return the first byte of a range and the one behind its last."""
+    first, last = asked or ("", "")
+    if not first:
+        return (max(0, size - int(last)), size) if last else (0, size)
+    return int(first), min(size, int(last) + 1 if last else size)
+
+
+def _head(status: int, reason: str, length: int, more: str) -> bytes:
+    return f"HTTP/1.1 {status} {reason}\r\nContent-Length: {length}\r\n{more}\r\n".encode()
+
+
+async def _serve(options: argparse.Namespace, network: Network) -> None:
+    server = _Proxy(options.to, network) if options.to else _Server(options.folder, network)
+    listening = await asyncio.start_server(
+        server.answer, "127.0.0.1", options.port, limit=_LARGEST_HEAD, backlog=512
+    )
+    host, port = listening.sockets[0].getsockname()[:2]
+    print(f"http://{host}:{port}", flush=True)  # noqa: T201 - whoever started it reads this
+    stopped = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stopped.set)
+    await stopped.wait()
+    os._exit(0)  # clients may hold connections as long as they like
+
+
+def main() -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.server", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("folder", type=Path, help="what to serve")
+    parser.add_argument("--port", type=int, default=0, help="0 is a free one [0]")
+    parser.add_argument("--to", default="", help="the URL of a server to stand before")
+    parser.add_argument("--delay-s", type=float, default=0.0, help=argparse.SUPPRESS)
+    parser.add_argument("--delay-ms", type=float, default=0.0, help="before each first byte")
+    parser.add_argument("--handshakes", type=int, default=0, help="delays of a new connection")
+    parser.add_argument("--connection-mb-s", type=float, default=0.0, help="0 is unlimited [0]")
+    parser.add_argument("--total-mb-s", type=float, default=0.0, help="0 is unlimited [0]")
+    parser.add_argument("--lost", type=float, default=0.0, help="share of responses cut [0]")
+    parser.add_argument("--refused", type=float, default=0.0, help="share answered 503 [0]")
+    options = parser.parse_args()
+    network = Network(
+        options.delay_s + options.delay_ms / 1e3, options.handshakes, options.connection_mb_s,
+        options.total_mb_s, options.lost, options.refused,
+    )  # fmt: skip
+    asyncio.run(_serve(options, network))
 
 
 if __name__ == "__main__":
-    _serve(*sys.argv[1:])
+    main()

@@ -264,6 +264,14 @@ class Job:
     def _pairs(self) -> StereoPairs:
         return StereoPairs(self.tree, **self.selection)
 
+    @property
+    def files(self) -> list[str]:
+        """The names of the files that the samples need."""
+        # Imported here: the module of the rig needs `Wanted`.
+        from benchmarks.contestants.rig import camera_files
+
+        return ["baseline.json", *camera_files(self.wanted, both_ways=self.workload.both_ways)]
+
     @cached_property
     def of_scene(self) -> dict[str, list[Wanted]]:
         """The samples of each scene."""

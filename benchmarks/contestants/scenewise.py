@@ -8,7 +8,7 @@ shuffling them over scenes would need a buffer of many scenes' samples.
 import io
 import json
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Protocol
 
 import av
 import numpy as np
@@ -21,7 +21,7 @@ from benchmarks.contestants.rig import (
     sample_of,
     unit_m_of,
 )
-from benchmarks.workloads import Job, Wanted
+from benchmarks.workloads import Job, Wanted, Workload
 from stereogenbench_data.index.table import SceneIndex
 
 
@@ -40,7 +40,23 @@ def urls(job: Job) -> list[str]:
     return [f"{folder}/{name}" for name in names]
 
 
-def decoded(job: Job, key: str, files: dict[str, bytes]) -> Iterator[dict[str, Any]]:
+class DecodedJob(Protocol):
+    """What the decode step needs of a job."""
+
+    @property
+    def workload(self) -> Workload:
+        """The workload."""
+
+    @property
+    def of_scene(self) -> dict[str, list[Wanted]]:
+        """The samples of each scene, by its key in the shards."""
+
+    @property
+    def files(self) -> list[str]:
+        """The names of the files that the samples need."""
+
+
+def decoded(job: DecodedJob, key: str, files: dict[str, bytes]) -> Iterator[dict[str, Any]]:
     """Yield a scene's samples: the decode step."""
     workload = job.workload
     wanted = job.of_scene.get(key)
@@ -83,7 +99,7 @@ def _arrays(frames: dict[str, Any], size: tuple[int, int] | None) -> dict[str, n
 
 
 def _sample(
-    job: Job,
+    job: DecodedJob,
     wanted: Wanted,
     arrays: dict[int, dict[str, np.ndarray]],
     document: dict[str, Any],
@@ -110,7 +126,7 @@ def _sample(
 class DecodedScenes(IterableDataset[dict[str, Any]]):
     """A stream of scenes' files, decoded."""
 
-    def __init__(self, job: Job, scenes: Callable[[], Any]) -> None:
+    def __init__(self, job: DecodedJob, scenes: Callable[[], Any]) -> None:
         """Take a function that makes an iterable of scenes; torch's workers share its shards."""
         self._job = job
         self._scenes = scenes()
@@ -123,9 +139,14 @@ class DecodedScenes(IterableDataset[dict[str, Any]]):
 
 def webdataset_samples(job: Job) -> IterableDataset[dict[str, Any]]:
     """Return samples through plain webdataset."""
+    return webdataset_stream(job, urls(job))
+
+
+def webdataset_stream(job: DecodedJob, shards: list[str]) -> IterableDataset[dict[str, Any]]:
+    """Return the samples of some shards through plain webdataset."""
     import webdataset
 
-    names = {"baseline.json", *camera_files(job.wanted, both_ways=job.workload.both_ways)}
+    names = set(job.files)
 
     def is_needed(member: str) -> bool:
         return member.rsplit("/", 1)[-1].partition(".")[2] in names
@@ -133,23 +154,27 @@ def webdataset_samples(job: Job) -> IterableDataset[dict[str, Any]]:
     return DecodedScenes(
         job,
         lambda: webdataset.WebDataset(
-            urls(job), shardshuffle=False, select_files=is_needed, empty_check=False
+            shards, shardshuffle=False, select_files=is_needed, empty_check=False
         ),
     )
 
 
 def hugging_face_samples(job: Job) -> IterableDataset[dict[str, Any]]:
     """Return samples through Hugging Face datasets, streaming."""
+    return hugging_face_stream(job, urls(job))
+
+
+def hugging_face_stream(job: DecodedJob, shards: list[str]) -> IterableDataset[dict[str, Any]]:
+    """Return the samples of some shards through Hugging Face datasets, streaming."""
     from datasets import Features, Value, load_dataset
 
-    needed = camera_files(job.wanted, both_ways=job.workload.both_ways)
-    columns = {name: Value("binary") for name in ("baseline.json", *needed)}
+    columns = {name: Value("binary") for name in job.files}
     features = Features({**columns, "__key__": Value("string"), "__url__": Value("string")})
     return DecodedScenes(
         job,
         lambda: load_dataset(
             "webdataset",
-            data_files={"train": urls(job)},
+            data_files={"train": shards},
             split="train",
             streaming=True,
             features=features,

@@ -30,7 +30,6 @@ from stereogenbench_data.index.parquet import (
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
 from stereogenbench_data.index.tree import find_remote_scenes
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.sources.filesystems import MissingObject
 from stereogenbench_data.sources.location import (
     is_remote,
     joined,
@@ -41,6 +40,7 @@ from stereogenbench_data.sources.location import (
 )
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
+from stereogenbench_data.sources.transport import MissingObject
 
 MAX_INDEX_BYTES: Final = 256 * 2**20
 """The largest index that is fetched. One of 8,493 scenes has a few megabytes."""

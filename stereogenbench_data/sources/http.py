@@ -4,51 +4,91 @@ Errors do not chain urllib3's own, whose messages hold the whole URL with its se
 """
 
 import atexit
+import base64
 import http.client
 import io
+import json
+import logging
 import os
 import re
 import socket
+import time
+import weakref
 from collections.abc import Generator, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
+from functools import partial
 from typing import Any, Final
-from urllib.parse import unquote, urljoin, urlunsplit
+from urllib.parse import parse_qs, unquote, urljoin, urlunsplit
 from urllib.request import getproxies, proxy_bypass
 
 import urllib3
 import urllib3.connection
-from urllib3.exceptions import HTTPError, LocationValueError
+from urllib3.exceptions import (
+    ConnectTimeoutError,
+    HTTPError,
+    LocationValueError,
+    NameResolutionError,
+    NewConnectionError,
+)
+from urllib3.util.connection import allowed_gai_family
 
-from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.location import WEB_SCHEMES, is_inside, shown, split_url
-from stereogenbench_data.sources.retry import Attempt, TooSlow, TransientError
+from stereogenbench_data.sources.retry import (
+    Attempt,
+    ProcessLock,
+    TooSlow,
+    TransientError,
+    shut_down,
+)
+from stereogenbench_data.sources.transport import (
+    MISSING,
+    busy,
+    replaced,
+    require_expected_size,
+    require_no_pause,
+    retry_after_s,
+)
 
 _REDIRECTS: Final = frozenset({301, 302, 303, 307, 308})
 _MOST_REDIRECTS: Final = 5
 _PASSING: Final = frozenset({408, 425, 429, 500, 502, 503, 504})
 """Status codes of failures that may pass."""
 
+_NO_LONGER_VALID: Final = frozenset({400, 401, 403, 404, 410})
+"""Status codes of a signed URL that has expired or was withdrawn."""
+
 _FETCH: Final = "or fetch the data and pass the folder"
-_MISSING: Final = "Check the URL, and that the index and its shards lie in one folder."
 _CURES: Final = {
     401: f"It asks for a login: use hf:// or s3://, which know yours, {_FETCH}.",
     403: f"It may not be read with what the URL says: check access, {_FETCH}.",
-    404: _MISSING,
-    410: _MISSING,
+    404: MISSING,
+    410: MISSING,
 }
 _NUMBER: Final = re.compile(r"[0-9]{1,18}")
 _PART: Final = re.compile(r"bytes (?:([0-9]{1,18})-([0-9]{1,18})|\*)/([0-9]{1,18}|\*)")
 _STRONG_TAG: Final = re.compile(r'"[!#-~]{0,256}"')
 _DATE: Final = re.compile(r"[A-Za-z0-9,: +-]{1,64}")
+_RATE_LIMIT: Final = re.compile(r";r=0;t=([0-9]{1,6})(?:[;,]|$)")
 _CHUNK: Final = 64 * 1024
+_MOST_CONNECTIONS: Final = 64
+"""Connections to one server that a process keeps for later requests."""
+
+_MARGIN_S: Final = 60.0
+"""Seconds before a signed URL expires from which on it is not used; at most a tenth of its time."""
+
+_LONGEST_KEPT_S: Final = 86_400.0
 
 _pools: Final[dict[tuple[int, str], urllib3.PoolManager]] = {}
 """Connections by process and proxy. Those inherited over a fork are not used: their sockets belong
 to the parent."""
+
+_sockets: Final[weakref.WeakSet[socket.socket]] = weakref.WeakSet()
+"""The open connections of this process."""
 
 _current_attempt: Final[ContextVar[Attempt | None]] = ContextVar("_current_attempt", default=None)
 """The attempt that this thread's request belongs to."""
@@ -75,11 +115,40 @@ class _Version:
         )
 
 
-class WebTransport:
-    """One object of a web server."""
+@dataclass(frozen=True, slots=True, repr=False)
+class _Signed:
+    """A signed URL that a server redirected to. Whoever has it may read: it is never shown.
 
-    def __init__(self, url: str) -> None:
+    Attributes:
+        url: The URL.
+        until_s: Until when it is used, on the monotonic clock.
+        linked_etag: The ETag of the object to which it leads, as the redirect stated it.
+    """
+
+    url: str
+    until_s: float
+    linked_etag: str
+
+
+class WebTransport:
+    """One object of a web server. Where it redirects to a signed URL, that is kept for a while."""
+
+    longest_whole_bytes = 0
+    """The size up to which a whole object is accepted where a part was requested."""
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        expected_size: int | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
         """Name an object; user and password of its URL are sent as a login, and never shown.
+
+        Args:
+            url: Where it is.
+            expected_size: The size in bytes that the index records; None if it is not known.
+            headers: Further headers. "authorization" goes to the URL's own server alone.
 
         Raises:
             StorageError: If it is not a URL.
@@ -88,22 +157,25 @@ class WebTransport:
         login, _, host = parts.netloc.rpartition("@")
         self._where = shown(url)
         self._url = urlunsplit(parts._replace(netloc=host, fragment=""))
-        self._headers = {"Accept-Encoding": "identity"}
+        self._expected_size = expected_size
+        self._headers = {"Accept-Encoding": "identity", **(headers or {})}
         if login:
             self._headers |= urllib3.make_headers(basic_auth=unquote(login))
         self._seen: dict[str, _Version] = {}
+        self._tags: dict[tuple[str, str], _Version] = {}
+        self._signed: _Signed | None = None
+        self._was_signed = False
+        self._resolving = ProcessLock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state for a copy in another process, without signed URLs."""
+        return self.__dict__ | {"_signed": None}
 
     def size(self, attempt: Attempt) -> int:
         """Return how many bytes the object has, as the response for its first byte states."""
         response = self._get(0, 1, attempt)
         response.close()
-        stated = self._stated_size(response)
-        if not _NUMBER.fullmatch(stated):
-            raise StorageError(
-                f"{self._where}: its server does not state its size ({stated[:80]!r}): fetch the "
-                f"data and pass the folder."
-            )
-        return int(stated)
+        return self._require_stated(self._stated_size(response))
 
     def entries(self, attempt: Attempt) -> dict[str, int | None]:
         """Refuse to list a folder: plain web servers have no listings."""
@@ -116,10 +188,19 @@ class WebTransport:
         """Yield the bytes from start to stop, or the first of them."""
         response = self._get(start, stop, attempt)
         try:
-            self._require_part(response, start, stop)
+            skipped = self._require_part(response, start, stop)
+            wanted = stop - start
             attempt.begin_body()
             while data := response.read1(_CHUNK):
-                yield data
+                if skipped:
+                    skipped, data = max(0, skipped - len(data)), data[skipped:]
+                if response.status == 200 and len(data) >= wanted:
+                    if wanted:
+                        yield data[:wanted]
+                    return
+                wanted -= len(data)
+                if data:
+                    yield data
         except HTTPError as error:
             raise TransientError(_reason(error)) from None
         finally:
@@ -127,38 +208,98 @@ class WebTransport:
             response.close()
 
     def _get(self, start: int, stop: int, attempt: Attempt) -> urllib3.BaseHTTPResponse:
-        headers = self._headers | {"Range": f"bytes={start}-{stop - 1}"} | self._condition()
-        url = self._url
-        for _ in range(_MOST_REDIRECTS + 1):
-            response = self._ask(url, headers, attempt)
-            if response.status not in _REDIRECTS:
-                break
-            there = self._redirected(url, response)
-            if split_url(there)[:2] != split_url(url)[:2]:
-                headers.pop("authorization", None)
-            url = there
-        else:
-            raise StorageError(
-                f"{self._where}: is redirected more than {_MOST_REDIRECTS} times: check the URL."
-            )
+        """Return the response for a part of the object, from where it is now."""
+        headers = {"Range": f"bytes={start}-{stop - 1}"}
+        signed = self._valid_signed()
+        if signed is not None:
+            try:
+                response = self._ask(signed.url, headers, attempt)
+            except TransientError:
+                self._drop(signed)  # its server may be gone; another one may not
+                raise
+            if response.status not in _NO_LONGER_VALID | _REDIRECTS:
+                return self._accepted(response, signed.url, signed.linked_etag, attempt)
+            self._drop(signed)
+            _use_up(response)
+        return self._resolved(headers, attempt)
+
+    def _resolved(self, headers: Mapping[str, str], attempt: Attempt) -> urllib3.BaseHTTPResponse:
+        """Return the response for a part of the object, having followed redirects to it."""
+        url, linked_etag = self._url, ""
+        with ExitStack() as turn:
+            if self._was_signed:
+                # One thread resolves, and the others use what it found.
+                turn.enter_context(self._resolving.held(attempt))
+                if (signed := self._valid_signed()) is not None:
+                    turn.close()
+                    url, linked_etag = signed.url, signed.linked_etag
+            login = dict(self._headers)
+            for _ in range(_MOST_REDIRECTS + 1):
+                if _origin(url) != _origin(self._url):
+                    login.pop("authorization", None)
+                response = self._ask(url, {**login, **headers}, attempt)
+                if response.status not in _REDIRECTS:
+                    break
+                url = self._redirected(url, response)
+                linked_etag = response.headers.get("X-Linked-ETag", "").strip() or linked_etag
+                if self._keep(url, response, linked_etag):
+                    turn.close()
+            else:
+                raise StorageError(
+                    f"{self._where}: is redirected more than {_MOST_REDIRECTS} times: check the "
+                    f"URL."
+                )
+        return self._accepted(response, url, linked_etag, attempt)
+
+    def _accepted(
+        self, response: urllib3.BaseHTTPResponse, url: str, linked_etag: str, attempt: Attempt
+    ) -> urllib3.BaseHTTPResponse:
+        """Return a response that has content of the object that was read before."""
         if response.status not in (200, 206, 416):
+            _use_up(response)
+            raise self._refusal(response, server=server_of(url), attempt=attempt)
+        try:
+            size = self._stated_size(response)
+            if response.status != 416:
+                self._require_same(response, size, url, linked_etag)
+            if self._expected_size is not None:
+                found = self._require_stated(size)
+                require_expected_size(found, expected=self._expected_size, where=self._where)
+        except StorageError:
             response.close()
-            self._refuse(response)
-        if response.status != 416:
-            self._require_same(response)
+            raise
         return response
+
+    def _valid_signed(self) -> _Signed | None:
+        signed = self._signed
+        return signed if signed is not None and time.monotonic() < signed.until_s else None
+
+    def _keep(self, url: str, response: urllib3.BaseHTTPResponse, linked_etag: str) -> bool:
+        """Keep a URL that a response redirects to if it says when it expires; return whether so."""
+        left_s = signed_for_s(url, response.headers.get("Date", ""))
+        if left_s <= 0:
+            return False
+        usable_s = min(left_s - min(_MARGIN_S, left_s / 10), _LONGEST_KEPT_S)
+        self._signed = _Signed(url, time.monotonic() + usable_s, linked_etag)
+        self._was_signed = True
+        return True
+
+    def _drop(self, signed: _Signed) -> None:
+        if self._signed is signed:
+            self._signed = None
 
     def _ask(
         self, url: str, headers: Mapping[str, str], attempt: Attempt
     ) -> urllib3.BaseHTTPResponse:
         """Return a server's response, which may be a redirect."""
+        require_no_pause(server_of(url), attempt)
         token = _current_attempt.set(attempt)
         try:
             allowed_s = attempt.next_wait_s()
             return _pool(url).request(
                 "GET",
                 url,
-                headers=headers,
+                headers={**headers, **self._condition(url)},
                 timeout=urllib3.Timeout(connect=allowed_s, read=allowed_s),
                 retries=False,
                 redirect=False,
@@ -177,10 +318,7 @@ class WebTransport:
     def _redirected(self, url: str, response: urllib3.BaseHTTPResponse) -> str:
         """Return where a response redirects to, if that may be followed."""
         stated = response.headers.get("Location", "").strip()
-        length = response.headers.get("Content-Length", "")
-        if _NUMBER.fullmatch(length) and int(length) <= _CHUNK:
-            response.drain_conn()  # so that the connection can be used again
-        response.close()
+        _use_up(response)
         there, parts, reason = stated, split_url(""), ""
         with suppress(ValueError, StorageError):
             there = urljoin(url, stated)
@@ -203,47 +341,57 @@ class WebTransport:
         host = parts.netloc.rpartition("@")[2]
         return urlunsplit(parts._replace(netloc=host, fragment=""))
 
-    def _condition(self) -> dict[str, str]:
-        """Return the header that asks for a part only if the object is unchanged."""
-        seen = self._seen.get("first")
+    def _condition(self, url: str) -> dict[str, str]:
+        """Return the header that asks a server for a part only if the object is unchanged there."""
+        seen = self._tags.get(_origin(url))
         if seen is not None and _STRONG_TAG.fullmatch(seen.etag):
             return {"If-Range": seen.etag}
         if seen is not None and not seen.etag and _DATE.fullmatch(seen.modified):
             return {"If-Range": seen.modified}
         return {}
 
-    def _require_same(self, response: urllib3.BaseHTTPResponse) -> None:
+    def _require_same(
+        self, response: urllib3.BaseHTTPResponse, size: str, url: str, linked_etag: str
+    ) -> None:
         """Refuse a response of an object that was replaced since the first read."""
-        size = self._stated_size(response)
         now = _Version(
             etag=response.headers.get("ETag", "").strip(),
             modified=response.headers.get("Last-Modified", "").strip(),
             size=size if _NUMBER.fullmatch(size) else "",
         )
+        self._tags.setdefault(_origin(url), now)
+        if linked_etag:  # a content network's own ETags and dates may differ between its servers
+            now = _Version(etag=linked_etag, modified="", size=now.size)
         changes = self._seen.setdefault("first", now).changes(now)
         if changes:
-            response.close()
-            raise ShardError(
-                f"{self._where}: was replaced on its server while it was read: {changes}. What was "
-                f"read before is of the old file: open the data again, with the index that was "
-                f"made with the new one."
-            )
+            raise replaced(self._where, "on its server", changes)
 
-    def _refuse(self, response: urllib3.BaseHTTPResponse) -> None:
+    def _refusal(
+        self, response: urllib3.BaseHTTPResponse, *, server: str, attempt: Attempt
+    ) -> Exception:
+        """Return the error of a response without content."""
         reason = re.sub(r"[^ -~]", "?", response.reason or "")[:60]
         answer = f"{response.status} {reason}".rstrip()
         if response.status in _PASSING:
-            wait_s = _retry_after_s(response.headers.get("Retry-After", ""))
-            raise TransientError(f"the server answers {answer}", wait_s=wait_s)
+            return busy(
+                f"the server answers {answer}",
+                server=server, wait_s=_asked_wait_s(response), attempt=attempt,
+            )  # fmt: skip
         cure = _CURES.get(response.status, f"Check the URL and the server, {_FETCH}.")
-        raise StorageError(f"{self._where}: the server answers {answer}. {cure}")
+        return StorageError(f"{self._where}: the server answers {answer}. {cure}")
 
-    def _require_part(self, response: urllib3.BaseHTTPResponse, start: int, stop: int) -> None:
-        """Refuse a response that is neither the requested part nor its beginning."""
+    def _require_part(self, response: urllib3.BaseHTTPResponse, start: int, stop: int) -> int:
+        """Refuse a response that is neither the requested part nor its beginning.
+
+        Returns:
+            The number of bytes to skip, which precede the part in a whole object.
+        """
         if response.status == 200:
             size = response.headers.get("Content-Length", "")[:20]
             if start == 0 and size == str(stop):
-                return
+                return 0
+            if _NUMBER.fullmatch(size) and stop <= int(size) <= self.longest_whole_bytes:
+                return start
             raise StorageError(
                 f"{self._where}: the server sends the whole file ({size or 'unknown'} bytes) when "
                 f"asked for bytes {start} to {stop}. Members are read in parts: use a server that "
@@ -260,6 +408,15 @@ class WebTransport:
                 f"{self._where}: the server sends bytes {first} to {last} when asked for {start} "
                 f"to {stop - 1}. It does not honour ranges: use another, {_FETCH}."
             )
+        return 0
+
+    def _require_stated(self, size: str) -> int:
+        if not _NUMBER.fullmatch(size):
+            raise StorageError(
+                f"{self._where}: its server does not state its size ({size[:80]!r}): fetch the "
+                f"data and pass the folder."
+            )
+        return int(size)
 
     def _stated_size(self, response: urllib3.BaseHTTPResponse) -> str:
         """Return the whole object's size as a response states it, which may not be a number."""
@@ -318,15 +475,84 @@ class _TimedResponse(http.client.HTTPResponse):
         super().__init__(sock, *args, **how)
         attempt = _current_attempt.get()
         if attempt is not None:
+            _sockets.add(sock)
+            attempt.on_cancel(partial(shut_down, sock))
             self.fp = io.BufferedReader(_TimedStream(self.fp.detach(), sock, attempt))
 
 
-class _Connection(urllib3.connection.HTTPConnection):
+class _TimedConnection(urllib3.connection.HTTPConnection):
+    """A connection that is made within the limits of the attempt, all its addresses together."""
+
     response_class = _TimedResponse
+    _during_handshake: socket.socket | None = None
+    _handshake_from_s = 0.0
+
+    def connect(self) -> None:
+        """Connect, and make the connection secure where it is to be."""
+        try:
+            super().connect()
+        finally:
+            attempt = _current_attempt.get()
+            if self._during_handshake is not None and attempt is not None:
+                attempt.add(attempt.clock() - self._handshake_from_s, 0)
+                self._during_handshake.close()
+                self._during_handshake = None
+
+    def _new_conn(self) -> socket.socket:
+        attempt = _current_attempt.get()
+        if attempt is None:
+            return super()._new_conn()
+        try:
+            connection = self._connected(attempt)
+            allowed_s = attempt.next_wait_s()
+        except socket.gaierror as error:
+            raise NameResolutionError(self.host, self, error) from error
+        except TooSlow as error:
+            raise ConnectTimeoutError(self, str(error)) from error
+        except TimeoutError as error:
+            raise ConnectTimeoutError(self, "timed out") from error
+        except OSError as error:
+            raise NewConnectionError(self, "no connection") from error
+        # TLS takes the socket over: a copy can be shut down meanwhile.
+        self._during_handshake = connection.dup()
+        self._handshake_from_s = attempt.clock()
+        attempt.on_cancel(partial(shut_down, self._during_handshake))
+        connection.settimeout(allowed_s)
+        return connection
+
+    def _connected(self, attempt: Attempt) -> socket.socket:
+        """Return a connection to the first of the host's addresses that accepts one."""
+        refused: OSError | None = None
+        began_s = attempt.clock()
+        found = socket.getaddrinfo(
+            self._dns_host.strip("[]"), self.port, allowed_gai_family(), socket.SOCK_STREAM
+        )
+        attempt.add(attempt.clock() - began_s, 0)
+        for family, kind, protocol, _, address in found:
+            connection = socket.socket(family, kind, protocol)
+            began_s = attempt.clock()
+            try:
+                for option in self.socket_options or ():
+                    connection.setsockopt(*option)
+                attempt.on_cancel(partial(shut_down, connection))
+                connection.settimeout(attempt.next_wait_s())
+                connection.connect(address)
+            except OSError as error:
+                connection.close()
+                refused = error
+            else:
+                return connection
+            finally:
+                attempt.add(attempt.clock() - began_s, 0)
+        raise refused or OSError("the host has no address")
 
 
-class _SecureConnection(urllib3.connection.HTTPSConnection):
-    response_class = _TimedResponse
+class _Connection(_TimedConnection):
+    pass
+
+
+class _SecureConnection(_TimedConnection, urllib3.connection.HTTPSConnection):
+    pass
 
 
 class _Pool(urllib3.HTTPConnectionPool):
@@ -343,7 +569,11 @@ def _pool(url: str) -> urllib3.PoolManager:
     proxy = "" if proxy_bypass(parts.netloc) else getproxies().get(parts.scheme, "")
     key = (os.getpid(), proxy)
     if key not in _pools:
-        pool = urllib3.ProxyManager(proxy) if proxy else urllib3.PoolManager(maxsize=16)
+        pool = (
+            urllib3.ProxyManager(proxy, maxsize=_MOST_CONNECTIONS)
+            if proxy
+            else urllib3.PoolManager(maxsize=_MOST_CONNECTIONS)
+        )
         pool.pool_classes_by_scheme = {"http": _Pool, "https": _SecurePool}
         _pools.setdefault(key, pool)
     return _pools[key]
@@ -368,13 +598,89 @@ def _reason(error: BaseException) -> str:
     return type(inner).__name__
 
 
-def _retry_after_s(header: str) -> float:
-    """Return how many seconds a Retry-After header asks to wait, 0 if it is not valid."""
-    if re.fullmatch("[0-9]+", header):
-        return float(header)
+def _leave_connections() -> None:
+    """Close this process's copies of the connections of the process that it was forked from.
+
+    Locks may be held there by threads that do not exist here, so none is used.
+    """
+    for connection in list(_sockets):
+        number = connection.detach()
+        if number >= 0:
+            os.close(number)
+    _sockets.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_connections)
+
+
+class _WithoutQueries(logging.Filter):
+    """Removes the queries of this module's URLs from what urllib3 logs: they may be signed."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Keep every record, changed where it is of a request of this module."""
+        if _current_attempt.get() is not None and isinstance(record.args, tuple):
+            record.args = tuple(
+                each.partition("?")[0] if isinstance(each, str) else each for each in record.args
+            )
+        return True
+
+
+logging.getLogger("urllib3.connectionpool").addFilter(_WithoutQueries())
+
+
+def _use_up(response: urllib3.BaseHTTPResponse) -> None:
+    """Finish a response whose content is not needed; its connection is kept if that is short."""
+    length = response.headers.get("Content-Length", "")
+    if _NUMBER.fullmatch(length) and int(length) <= _CHUNK:
+        response.drain_conn()
+    response.close()
+
+
+def _asked_wait_s(response: urllib3.BaseHTTPResponse) -> float:
+    """Return how many seconds a busy server asks to wait, 0 if it does not."""
+    limit = _RATE_LIMIT.search(response.headers.get("RateLimit", "")[:200])
+    if response.status == 429 and limit is not None:
+        return float(limit[1]) + 1  # the end of the Hub's window, rounded
+    return retry_after_s(response.headers.get("Retry-After", ""))
+
+
+def server_of(url: str) -> str:
+    """Return the host of a URL with its port, by which pauses are kept."""
+    return split_url(url).netloc
+
+
+def _origin(url: str) -> tuple[str, str]:
+    parts = split_url(url)
+    return parts.scheme, parts.netloc
+
+
+def signed_for_s(url: str, date: str) -> float:
+    """Return for how many seconds a signed URL is valid, 0 if it does not say.
+
+    Args:
+        url: The URL, signed as S3, Google, CloudFront or Azure do.
+        date: The time of the server that signed it (Date), as this machine's may be wrong.
+    """
     try:
-        until = parsedate_to_datetime(header)
-        until = until if until.tzinfo else until.replace(tzinfo=UTC)
-        return max(0.0, (until - datetime.now(UTC)).total_seconds())
-    except (ValueError, TypeError, IndexError, OverflowError):
+        query = parse_qs(split_url(url).query, max_num_fields=64)
+        now_s = parsedate_to_datetime(date).timestamp() if date else time.time()
+    except (ValueError, TypeError, IndexError, OverflowError, StorageError):
         return 0.0
+    ends_s = []
+    with suppress(ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError):
+        for signer in ("X-Amz", "X-Goog"):
+            if f"{signer}-Date" in query:
+                signed = datetime.strptime(query[f"{signer}-Date"][0], "%Y%m%dT%H%M%S%z")
+                ends_s.append(signed.timestamp() + float(query[f"{signer}-Expires"][0]))
+        if "Expires" in query:
+            ends_s.append(float(query["Expires"][0]))
+        if "se" in query and "sig" in query:
+            until = datetime.fromisoformat(query["se"][0])
+            ends_s.append((until if until.tzinfo else until.replace(tzinfo=UTC)).timestamp())
+        if "Policy" in query:
+            text = query["Policy"][0][:8192].translate(str.maketrans("-_~", "+=/"))
+            (statement,) = json.loads(base64.b64decode(text))["Statement"]
+            ends_s.append(float(statement["Condition"]["DateLessThan"]["AWS:EpochTime"]))
+    left_s = min(ends_s, default=0.0) - now_s
+    return left_s if left_s > 0 else 0.0  # nan is not

@@ -1,35 +1,28 @@
 """Files behind URLs: any range of their bytes, resumed where a connection broke off.
 
-A `Transport` makes the requests: that of `http` for http and https, that of `filesystems` for
-everything else.
+A `Transport` makes the requests: that of `http` for http and https, that of `hub` for
+repositories of the Hub, that of `filesystems` for everything else.
 """
 
-from collections.abc import Callable, Generator, Iterator
-from typing import Protocol, TypeVar
+from collections.abc import Callable, Iterator
+from typing import TypeVar
 
-from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.errors import StorageError
 from stereogenbench_data.sources.filesystems import FilesystemTransport
 from stereogenbench_data.sources.http import WebTransport
+from stereogenbench_data.sources.hub import HubTransport, is_hub_file
 from stereogenbench_data.sources.location import is_web, shown
-from stereogenbench_data.sources.retry import Attempt, RetryPolicy, RetryState, TransientError
+from stereogenbench_data.sources.retry import (
+    Attempt,
+    Cancellation,
+    ReadCancelled,
+    RetryPolicy,
+    RetryState,
+    TransientError,
+)
+from stereogenbench_data.sources.transport import Transport
 
 _T = TypeVar("_T")
-
-
-class Transport(Protocol):
-    """The requests for one object of one protocol, each in one attempt.
-
-    A method raises `TransientError` where another attempt may help, else `StorageError`.
-    """
-
-    def size(self, attempt: Attempt) -> int:
-        """Return the size of the object in bytes."""
-
-    def part(self, start: int, stop: int, attempt: Attempt) -> Generator[bytes, None, None]:
-        """Yield the bytes from start to stop, or the first of them."""
-
-    def entries(self, attempt: Attempt) -> dict[str, int | None]:
-        """List a folder: name to size in bytes, None for a folder."""
 
 
 class RemoteObject:
@@ -53,10 +46,13 @@ class RemoteObject:
             StorageError: If it is not a URL.
         """
         self.where = shown(url)
-        self._expected_size = expected_size
-        self._is_checked = expected_size is None
         self._policy = retry or RetryPolicy()
-        self._transport: Transport = WebTransport(url) if is_web(url) else FilesystemTransport(url)
+        make: type[WebTransport] | type[HubTransport] | type[FilesystemTransport]
+        if is_web(url):
+            make = WebTransport
+        else:
+            make = HubTransport if is_hub_file(url) else FilesystemTransport
+        self._transport: Transport = make(url, expected_size=expected_size)
 
     def __repr__(self) -> str:
         """Return the URL, without login and query."""
@@ -70,46 +66,61 @@ class RemoteObject:
         """
         return self._retried(self._transport.size, doing="requesting its size")
 
-    def read(self, start: int, stop: int) -> bytes:
+    def read(self, start: int, stop: int, *, cancellation: Cancellation | None = None) -> bytes:
         """Return the bytes from start to stop.
 
-        Raises:
-            StorageError: If they cannot be fetched.
-        """
-        return b"".join(self.chunks(start, stop))
-
-    def chunks(self, start: int, stop: int) -> Iterator[bytes]:
-        """Yield the bytes from start to stop in pieces; each byte comes once.
+        Args:
+            start: The first byte.
+            stop: The byte behind the last one.
+            cancellation: Ends the read at once when another thread cancels it.
 
         Raises:
             ShardError: If the file does not have the expected size, or was replaced meanwhile.
+            ReadCancelled: If it was cancelled.
             StorageError: If they cannot be fetched.
         """
-        self._require_expected_size()
-        state = RetryState(self._policy)
+        return b"".join(self.chunks(start, stop, cancellation=cancellation))
+
+    def chunks(
+        self, start: int, stop: int, *, cancellation: Cancellation | None = None
+    ) -> Iterator[bytes]:
+        """Yield the bytes from start to stop in pieces; each byte comes once.
+
+        Args:
+            start: The first byte.
+            stop: The byte behind the last one.
+            cancellation: Ends the read at once when another thread cancels it.
+
+        Raises:
+            ShardError: If the file does not have the expected size, or was replaced meanwhile.
+            ReadCancelled: If it was cancelled.
+            StorageError: If they cannot be fetched.
+        """
+        state = RetryState(self._policy, cancellation=cancellation)
         while start < stop:
             begin = start
             error = TransientError("the answer ended early")
-            pieces = self._transport.part(start, stop, state.attempt())
-            try:
-                while True:
-                    with state.timed():
-                        data = next(pieces, None)
-                    if data is None:
-                        break
-                    start += len(data)
-                    state.add(len(data))
-                    if start > stop:
-                        raise StorageError(
-                            f"{self.where}: sent more than the {stop - begin} bytes requested from "
-                            f"byte {begin} on. Its server does not honour ranges: fetch the data "
-                            f"and pass the folder."
-                        )
-                    yield data
-            except TransientError as found:
-                error = found
-            finally:
-                pieces.close()
+            with state.attempt() as attempt:
+                pieces = self._transport.part(start, stop, attempt)
+                try:
+                    while True:
+                        with state.timed():
+                            data = next(pieces, None)
+                        if data is None:
+                            break
+                        start += len(data)
+                        state.add(len(data))
+                        if start > stop:
+                            raise StorageError(
+                                f"{self.where}: sent more than the {stop - begin} bytes requested "
+                                f"from byte {begin} on. Its server does not honour ranges: fetch "
+                                f"the data and pass the folder."
+                            )
+                        yield data
+                except TransientError as found:
+                    error = found
+                finally:
+                    pieces.close()
             if start < stop:
                 doing = f"at byte {start} of {stop}"
                 self._wait(state, error, received=start - begin, doing=doing)
@@ -122,35 +133,27 @@ class RemoteObject:
         """
         return self._retried(self._transport.entries, doing="requesting its entries")
 
-    def _require_expected_size(self) -> None:
-        if self._is_checked:
-            return
-        found = self.size()
-        if found != self._expected_size:
-            raise ShardError(
-                f"{self.where}: has {found} bytes, and the index says {self._expected_size}. The "
-                f"index is of another pack, or the file was replaced or cut short: use the index "
-                f"that was made with it."
-            )
-        self._is_checked = True
-
     def _retried(self, request: Callable[[Attempt], _T], *, doing: str) -> _T:
         state = RetryState(self._policy)
         while True:
             try:
-                with state.timed():
-                    return request(state.attempt())
+                with state.timed(), state.attempt() as attempt:
+                    return request(attempt)
             except TransientError as error:
                 self._wait(state, error, received=0, doing=doing)
 
     def _wait(self, state: RetryState, error: TransientError, *, received: int, doing: str) -> None:
         policy = self._policy
-        if not state.wait(error, received=received):
+        may_go_on = not state.is_cancelled and state.wait(error, received=received)
+        if state.is_cancelled:
+            raise ReadCancelled(f"{self.where}: reading was cancelled, {doing}.")
+        if not may_go_on:
             raise StorageError(
                 f"{self.where}: cannot be read, {doing} ({state.describe(error)}). Check the "
                 f"network and the server, then try again; or fetch the data and pass the folder; "
                 f"or allow a slower server: SceneIndex.open(..., retry=RetryPolicy(...)), which "
                 f"has least_rate_bytes_s={policy.least_rate_bytes_s:.10g} over "
                 f"window_s={policy.window_s:g}, timeout_s={policy.timeout_s:g}, "
+                f"longest_outage_s={policy.longest_outage_s:g}, "
                 f"longest_read_s={policy.longest_read_s:g} now."
             ) from error

@@ -177,7 +177,7 @@ def test_a_server_that_dies_in_the_middle_is_reported(large_shards, impatient):
     with pytest.raises(
         StorageError,
         match=rf"scene_000000, frames \(6,\): {web.url}/train-Uniform-000000.tar: cannot be read, "
-        r"at byte \d+ of \d+ \(.*Connection refused; 6 tries\). Check the network",
+        r"at byte \d+ of \d+ \(.*Connection refused; 10 tries\). Check the network",
     ):
         pairs[6]
     pairs.close()

@@ -47,7 +47,7 @@ class FailingServer(ThreadingHTTPServer):
 
     ``always`` is used for every request whose path it is given for. ``validators`` are sent with
     every file; a request whose If-Range is none of them is answered with the whole file, as long as
-    ``honours_if_range``.
+    ``honours_if_range``. ``facts`` is for handlers that know more.
     """
 
     daemon_threads = True
@@ -60,6 +60,7 @@ class FailingServer(ThreadingHTTPServer):
         self.always: dict[str, Answer] = {}
         self.validators: dict[str, str] = {}
         self.honours_if_range = True
+        self.facts: dict[str, Any] = {}
         self.connections = 0
         self.alive: set[Any] = set()
         self.lock = threading.Lock()
@@ -99,6 +100,7 @@ class FileHandler(BaseHTTPRequestHandler):
     """Answers with files of the server's folder."""
 
     protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True  # or a body waits for the acknowledgement of its head
     server: FailingServer
 
     def log_message(self, format: str, *args: Any) -> None:

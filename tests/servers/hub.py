@@ -1,18 +1,23 @@
 """What huggingface_hub's client asks of the Hub to read a data set, answered from a folder.
 
-One data set, `REPOSITORY`, with the branch main and one commit; files are redirected to another
-path, as the Hub sends large ones to its content network. What is asked for with the token
-``expired`` is refused, as private data sets are.
+One data set, `REPOSITORY`, with the branch main and one commit. Files are redirected to a signed
+URL of another host, as the Hub sends large ones to its content network: it expires after
+``signed_for_s`` of the server's ``facts``, may be withdrawn by clearing ``signatures``, and refuses
+logins. ``in_git`` names files that the Hub sends itself, whole. What is asked for with the token
+``expired`` is refused, as private data sets are; what is ``gated``, without any token.
 """
 
+import itertools
 import json
 import re
+import time
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
-from urllib.parse import unquote, urlsplit
+from urllib.parse import parse_qs, unquote, urlsplit
 
 import fsspec
 import pytest
@@ -23,13 +28,14 @@ from tests.servers.tools import require_module
 REPOSITORY: Final = "some-group/some-data"
 COMMIT: Final = "0123456789abcdef0123456789abcdef01234567"
 _REVISIONS: Final = ("main", COMMIT)
+_numbers = itertools.count()
 
 
 class HubHandler(FileHandler):
     """Answers as the Hub does, below the server's folder."""
 
     def do_HEAD(self) -> None:
-        """Answer a question for a file's facts."""
+        """Answer a question for a file's facts, which need no signature."""
         path = self.server.folder / unquote(urlsplit(self.path).path).removeprefix("/files/")
         if self.path.startswith("/files/") and path.is_file():
             self.send_response(200)
@@ -57,8 +63,7 @@ class HubHandler(FileHandler):
         if "expired" in self.headers.get("Authorization", ""):
             self._refuse(401, "RepoNotFound")
         elif path.startswith("/files/"):
-            self.path = path.removeprefix("/files")
-            super().do_GET()
+            self._send_signed(path.removeprefix("/files"))
         elif found := re.fullmatch(rf"/api/datasets/{REPOSITORY}(?:/revision/(.+))?", path):
             self._known(found[1], lambda: {"id": REPOSITORY, "sha": COMMIT, "siblings": []})
         elif found := re.fullmatch(rf"/api/datasets/{REPOSITORY}/tree/([^/]+)/?(.*)", path):
@@ -67,7 +72,7 @@ class HubHandler(FileHandler):
             else:
                 self._refuse(404, "EntryNotFound")
         elif found := re.fullmatch(rf"/datasets/{REPOSITORY}/resolve/([^/]+)/(.+)", path):
-            self._redirect(found[2])
+            self._resolve(found[1], found[2])
         else:
             self._refuse(404, "RepoNotFound")
 
@@ -86,22 +91,62 @@ class HubHandler(FileHandler):
         else:
             self._refuse(404, "RevisionNotFound")
 
-    def _redirect(self, name: str) -> None:
+    def _resolve(self, revision: str, name: str) -> None:
         path: Path = self.server.folder / name
+        facts = self.server.facts
+        facts.setdefault("resolved", []).append((revision, name, dict(self.headers.items())))
+        if refusal := next(iter(facts.get("refusals", ())), None):
+            facts["refusals"].pop(0)
+            self._empty(*refusal, name)
+            return
+        if revision not in _REVISIONS:
+            self._refuse(404, "RevisionNotFound")
+            return
         if not path.is_file():
             self._refuse(404, "EntryNotFound")
             return
+        if facts.get("gated") and "Authorization" not in self.headers:
+            self._refuse(403, "GatedRepo")
+            return
+        if name in facts.get("in_git", ()):
+            whole = path.read_bytes()
+            self.send_response(200)
+            self.send_header("ETag", '"git"')
+            self.send_header("X-Repo-Commit", COMMIT)
+            self.send_header("Content-Length", str(len(whole)))
+            self.end_headers()
+            self.wfile.write(whole)
+            return
+        signature, signed_for_s = f"secret{next(_numbers)}", facts.get("signed_for_s", 3600)
+        facts.setdefault("signatures", {})[signature] = time.time() + signed_for_s
+        now = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+        signed = f"X-Amz-Date={now}&X-Amz-Expires={signed_for_s}&X-Amz-Signature={signature}"
+        content_network = f"http://{self.headers['Host'].replace('127.0.0.1', 'localhost')}"
         self.send_response(302)
-        self.send_header("Location", f"{self.server.url}/files/{name}?Signature=secret")
+        self.send_header("Location", f"{content_network}/files/{name}?{signed}")
         self.send_header("X-Repo-Commit", COMMIT)
         self.send_header("X-Linked-Size", str(path.stat().st_size))
-        self.send_header("X-Linked-ETag", '"0"')
+        self.send_header("X-Linked-ETag", f'"{zlib.crc32(path.read_bytes()):08x}"')
         self.send_header("Content-Length", "0")
         self.end_headers()
+
+    def _send_signed(self, path: str) -> None:
+        """Send a file to who knows a signature that is valid now."""
+        found = parse_qs(urlsplit(self.path).query).get("X-Amz-Signature", [""])[0]
+        until_s = self.server.facts.get("signatures", {}).get(found, 0.0)
+        if "Authorization" in self.headers:
+            self._empty(400, {}, path)
+        elif time.time() >= until_s:
+            self._empty(403, {}, path)
+        else:
+            self.path = path
+            super().do_GET()
 
     def _refuse(self, status: int, code: str) -> None:
         self.send_response(status)
         self.send_header("X-Error-Code", code)
+        if code == "EntryNotFound":
+            self.send_header("X-Repo-Commit", COMMIT)
         self.send_header("Content-Length", "0")
         self.end_headers()
 

@@ -11,10 +11,11 @@ Answering = Callable[[int, int], Iterator[bytes | float]]
 
 
 @contextmanager
-def raw_serving(answering: Answering) -> Iterator[str]:
+def raw_serving(answering: Answering, *, host: str = "127.0.0.1") -> Iterator[str]:
     """Answer on a free port of this machine; yields the address."""
     stopped = threading.Event()
-    listening = socket.create_server(("127.0.0.1", 0))
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listening = socket.create_server((host, 0), family=family)
     threads: list[threading.Thread] = []
 
     def answer(connection: socket.socket) -> None:
@@ -44,7 +45,8 @@ def raw_serving(answering: Answering) -> Iterator[str]:
     accepting = threading.Thread(target=accept, daemon=True)
     accepting.start()
     try:
-        yield f"http://127.0.0.1:{listening.getsockname()[1]}"
+        shown = f"[{host}]" if ":" in host else host
+        yield f"http://{shown}:{listening.getsockname()[1]}"
     finally:
         stopped.set()
         with suppress(OSError):

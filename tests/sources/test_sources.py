@@ -43,7 +43,8 @@ class TestHttp(SourceTests):
         member = scene.members[BASELINE_JSON]
         make_source().read(scene, BASELINE_JSON)
 
-        assert server.sent == 1 + member.size
+        assert server.sent == member.size
+        assert len(server.asked) == 1
 
 
 class TestReleasedFolderOverHttp(TestReleasedFolder):

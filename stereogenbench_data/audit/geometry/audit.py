@@ -35,9 +35,9 @@ from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.selection.filters import SceneFilters, filter_scenes
 from stereogenbench_data.selection.options import require_options
-from stereogenbench_data.sources.filesystems import MissingObject
 from stereogenbench_data.sources.location import is_remote, joined, local_path
 from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.transport import MissingObject
 
 DEFAULT_FRAMES: Final = 5
 _FORMAT: Final = 3

@@ -1,0 +1,112 @@
+"""Mosaic's Streaming: whole scenes from MDS shards, downloaded to a local disk, with a decode step.
+
+A scene is one sample of its shards, as in the tar files, and a shard holds one scene. Streaming
+downloads shards ahead of what is read (``predownload``, its default), by the S3 API, which the
+server of the benchmark answers for plain reading.
+"""
+
+import contextlib
+import importlib.machinery
+import json
+import os
+import sys
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from torch.utils.data import IterableDataset
+
+from benchmarks.contestants.scenewise import DecodedJob, decoded
+
+
+def streaming_module() -> Any:
+    """Return the module ``streaming``.
+
+    It imports torchvision for picture datasets that nothing here uses. Where torchvision is missing
+    or made for another build of torch, empty modules stand in for it.
+
+    Raises:
+        ImportError: If it is not installed.
+    """
+    try:
+        import torchvision  # noqa: F401
+    except (ImportError, RuntimeError):
+        for name in [name for name in sys.modules if name.partition(".")[0] == "torchvision"]:
+            del sys.modules[name]
+        for name, held in (
+            ("torchvision", {}), ("torchvision.datasets", {"VisionDataset": object}),
+            ("torchvision.transforms", {}), ("torchvision.transforms.functional", {"to_tensor": 0}),
+        ):  # fmt: skip
+            module = types.ModuleType(name)
+            module.__spec__ = importlib.machinery.ModuleSpec(name, None, is_package=True)
+            module.__path__ = []
+            module.__dict__.update(held)
+            sys.modules[name] = module
+    import streaming
+
+    return streaming
+
+
+def write_shards(scenes: dict[str, dict[str, bytes]], out: Path) -> None:
+    """Write scenes, the bytes of their files by name, as MDS shards of one scene each."""
+    writer = streaming_module().MDSWriter
+    names = sorted(next(iter(scenes.values())))
+    columns = {"__key__": "str", **{name.replace(".", "_"): "bytes" for name in names}}
+    with writer(out=str(out), columns=columns, size_limit=1 << 16) as target:
+        for key, files in scenes.items():
+            row = {name.replace(".", "_"): content for name, content in files.items()}
+            target.write({"__key__": key, **row})
+
+
+def repeat_shards(distinct: Path, out: Path, *, count: int) -> None:
+    """Write so many shards that are links to a few in turn, with their index."""
+    index = json.loads((distinct / "index.json").read_text())
+    shards = [shard for shard in index["shards"] if shard["samples"]]
+    repeated = []
+    for number in range(count):
+        shard = json.loads(json.dumps(shards[number % len(shards)]))
+        name = f"shard.{number:05d}.mds"
+        if not (out / name).exists():
+            os.link(distinct / shard["raw_data"]["basename"], out / name)
+        shard["raw_data"]["basename"] = name
+        repeated.append(shard)
+    (out / "index.json").write_text(json.dumps(index | {"shards": repeated}))
+
+
+class MosaicScenes(IterableDataset[dict[str, Any]]):
+    """The samples of scenes that Streaming streams."""
+
+    def __init__(self, job: DecodedJob, *, server: str, remote: str, local: Path) -> None:
+        """Open a stream.
+
+        Args:
+            job: The samples of each scene.
+            server: The URL of a server that answers the S3 API.
+            remote: The place of the shards, ``s3://...``.
+            local: An empty folder that it downloads to.
+        """
+        os.environ |= {
+            "S3_ENDPOINT_URL": server, "AWS_ACCESS_KEY_ID": "key", "AWS_SECRET_ACCESS_KEY": "word",
+            "AWS_EC2_METADATA_DISABLED": "true", "AWS_DEFAULT_REGION": "us-east-1",
+        }  # fmt: skip
+        streaming = streaming_module()
+        with contextlib.suppress(OSError):
+            streaming.base.util.clean_stale_shared_memory()
+        self._job = job
+        self._scenes = streaming.StreamingDataset(
+            remote=remote, local=str(local), shuffle=False, batch_size=1
+        )
+        for stream in self._scenes.streams:
+            # Forked workers would share the connection over which this process read the index.
+            stream._downloader.clean_up()
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """Yield samples."""
+        for scene in self._scenes:
+            files = {
+                name: scene[name.replace(".", "_")]
+                for name in self._job.files
+                if name.replace(".", "_") in scene
+            }
+            yield from decoded(self._job, scene["__key__"], files)

@@ -1,0 +1,538 @@
+"""Races over a network: shards behind a server that delays, limits, cuts and refuses.
+
+Every contestant reads the same scenes from the same server of this machine, as its documentation
+advises: ours with the defaults, webdataset and Hugging Face `datasets` stream whole tar files,
+Mosaic's Streaming downloads its own shards. Beside them ours reads the same shards from the local
+disk: the ratio to it says how much of the network is hidden. Scenes beyond the few drawn ones are
+hard links to their shards under other names, so what a machine reads stays in its page cache.
+
+The server counts requests and bytes. Time runs as in the other races; the time until the first
+batch is kept too, so that the rate after it is known.
+"""
+
+import itertools
+import os
+import resource
+import shutil
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, IterableDataset
+
+from benchmarks.clock import MeasurementError, in_a_fork
+from benchmarks.contestants import mosaic, scenewise
+from benchmarks.contestants.rig import camera_files
+from benchmarks.material import Material
+from benchmarks.results import Report, Results, Spread
+from benchmarks.server import Network, WebServer, serving
+from benchmarks.tables import rate_text, spread_text, table
+from benchmarks.workloads import SEED, Wanted, Workload
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.records import Scene, SceneId
+from stereogenbench_data.schema.text import counted
+from stereogenbench_data.sources.members import open_local
+
+LOCAL: Final = "ours, local"
+OURS: Final = "ours"
+RIVALS: Final = ("webdataset", "HF datasets", "Mosaic Streaming")
+
+DELAYS_MS: Final = (0.0, 20.0, 60.0, 150.0)
+BANDWIDTHS_MB_S: Final = (0.0, 20.0)
+FAULTS: Final = (Network(0.06, refused=0.05), Network(0.06, lost=0.05))
+"""Networks with faults, in which ours alone races."""
+
+WORKLOADS: Final = (
+    Workload("all-frames", "all frames", 16, "all", "all"),
+    Workload("random", "random frames, 4 a scene", 16, ("random", 4), ("random", 4)),
+    Workload("first", "first frames", 200, "first", "first"),
+    Workload("clips", "16-frame clips", 16, ("clips", 16, 1, 16), ("clips", 16, 1, 16), batch=1),
+)
+
+LONGEST_S: Final = 1800.0
+
+_LINKED: Final = "scene_{:06d}"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """The settings of the races.
+
+    Attributes:
+        rounds: The number of rounds.
+        workers: Worker processes.
+        delays_ms: Delays of the networks.
+        bandwidths_mb_s: Bandwidths of a connection; 0 is unlimited.
+        faults: Networks with faults, in which ours alone races.
+        scenes: The number of scenes of every workload; 0 is the workload's own.
+        workloads: The names of the workloads.
+        resume: Whether rounds in the results count.
+    """
+
+    rounds: int = 3
+    workers: int = 2
+    delays_ms: tuple[float, ...] = DELAYS_MS
+    bandwidths_mb_s: tuple[float, ...] = BANDWIDTHS_MB_S
+    faults: tuple[Network, ...] = FAULTS
+    scenes: int = 0
+    workloads: tuple[str, ...] = tuple(workload.name for workload in WORKLOADS)
+    resume: bool = False
+
+    def networks(self) -> list[tuple[Network, tuple[str, ...]]]:
+        """Return every network with those that race in it; the local one always does."""
+        plain = [
+            Network(delay_ms / 1e3, connection_mb_s=mb_s)
+            for mb_s, delay_ms in itertools.product(self.bandwidths_mb_s, self.delays_ms)
+        ]
+        return [(each, (LOCAL, OURS, *RIVALS)) for each in plain] + [
+            (each, (LOCAL, OURS)) for each in self.faults
+        ]
+
+
+@dataclass(frozen=True)
+class Job:
+    """A workload on its linked shards.
+
+    Attributes:
+        workload: The workload.
+        root: The folder that the server serves.
+        scenes: The number of scenes.
+    """
+
+    workload: Workload
+    root: Path
+    scenes: int
+
+    @property
+    def shards(self) -> Path:
+        """The shards and their index."""
+        return self.root / f"shards-{self.scenes}"
+
+    @property
+    def mds(self) -> Path:
+        """Mosaic's shards of the same scenes."""
+        return self.root / f"mds-{self.scenes}"
+
+    def pairs(self, data: str | Path) -> StereoPairs:
+        """Return the samples of the workload from a place of the shards."""
+        workload = self.workload
+        return StereoPairs(
+            data, pairs="primary", frames=workload.frames, fields=workload.fields, seed=SEED
+        )
+
+    @cached_property
+    def of_scene(self) -> dict[str, list[Wanted]]:
+        """The samples of each drawn scene, by its key in the shards.
+
+        Scenes that are links to one shard have the frames of the first of them.
+        """
+        pairs, found = self.pairs(self.shards), {}
+        keys = pairs.index.column("key").tolist()
+        drawn = (self.shards / "keys.txt").read_text().split()
+        for number in range(len(pairs)):
+            address = pairs.plan.locate(number, epoch=0)
+            place = int(str(keys[address.row]).rpartition("_")[2])
+            if place < len(drawn):
+                (right,) = address.targets
+                wanted = Wanted(drawn[place], address.source, right, address.frames)
+                found.setdefault(drawn[place], []).append(wanted)
+        return found
+
+    @cached_property
+    def files(self) -> list[str]:
+        """The names of the files that the samples need."""
+        wanted = itertools.chain(*self.of_scene.values())
+        return ["baseline.json", *camera_files(wanted, both_ways=self.workload.both_ways)]
+
+
+@dataclass(slots=True)
+class Turn:
+    """One contestant's turn.
+
+    Attributes:
+        samples: The number of samples.
+        seconds: From the start of the workers to the last batch.
+        first_s: From the start of the workers to the first batch.
+        first_samples: The samples of the first batch.
+        cpu_s: Processor time of all processes.
+        peak_mb: The most memory that a worker held, shared memory included.
+        requests: Requests that the server counted.
+        sent_mb: Megabytes of bodies that it counted.
+        failures: Responses that it cut or refused on purpose.
+    """
+
+    samples: int
+    seconds: float
+    first_s: float
+    first_samples: int
+    cpu_s: float
+    peak_mb: float
+    requests: int = 0
+    sent_mb: float = 0.0
+    failures: int = 0
+
+
+def link_shards(material: Material, job: Job) -> None:
+    """Make as many shards as a job has scenes: links to the packed ones in turn, with an index.
+
+    Of a shard that holds several scenes, as in tests, the first counts.
+    """
+    if (job.shards / INDEX_NAME).exists():
+        return
+    index = SceneIndex.open(material.shards)
+    firsts: dict[str, Scene] = {}
+    for row in range(len(index)):
+        scene = _scene(index, row)
+        firsts.setdefault(scene.members["baseline.json"].path, scene)
+    drawn = list(firsts.values())
+    job.shards.mkdir(parents=True, exist_ok=True)
+    scenes, facts = [], {}
+    for number in range(job.scenes):
+        scene = drawn[number % len(drawn)]
+        (path,) = {member.path for member in scene.members.values()}
+        name = f"net-{number:06d}.tar"
+        if not (job.shards / name).exists():
+            os.link(material.shards / path, job.shards / name)
+        facts[name] = index.shards[path]
+        family = scene.id.family
+        key = f"train/{family}/SynthStage/{_LINKED.format(number)}"
+        members = {file: replace(member, path=name) for file, member in scene.members.items()}
+        identity = SceneId(key, "train", None, family, scene.id.map_name)
+        scenes.append(replace(scene, id=identity, members=members))
+    keys = "\n".join(scene.id.key for scene in drawn[: job.scenes])
+    (job.shards / "keys.txt").write_text(keys)
+    SceneIndex.from_scenes(scenes, job.shards, shards=facts).write(job.shards / INDEX_NAME)
+
+
+def _scene(index: SceneIndex, row: int) -> Scene:
+    """Return a scene with where its packets lie, if the index has that."""
+    scene = index.scene(row)
+    if hasattr(index, "load_seek_tables") and index.load_seek_tables():
+        scene = replace(scene, seek_tables=index.seek_tables(row))
+    return scene
+
+
+def link_mds(material: Material, job: Job) -> None:
+    """Make Mosaic's shards of the same scenes, whole like the tar files."""
+    if (job.mds / "index.json").exists():
+        return
+    index = SceneIndex.open(material.shards)
+    distinct = job.root / "mds"
+    if not (distinct / "index.json").exists():
+        shutil.rmtree(distinct, ignore_errors=True)
+        drawn, scenes = (job.shards / "keys.txt").read_text().split(), {}
+        for row in np.flatnonzero(np.isin(index.column("key").astype(str), drawn)):
+            scene, files = index.scene(int(row)), {}
+            for name, member in scene.members.items():
+                opened = open_local(index.root, member, shard=index.shards.get(member.path))
+                with opened.open("rb") if isinstance(opened, Path) else opened as file:
+                    files[name] = file.read()
+            scenes[scene.id.key] = files
+        mosaic.write_shards({key: scenes[key] for key in drawn}, distinct)
+    job.mds.mkdir(parents=True, exist_ok=True)
+    mosaic.repeat_shards(distinct, job.mds, count=job.scenes)
+
+
+def why_not(name: str) -> str | None:
+    """Return why a contestant cannot race here, None where it can."""
+    try:
+        if name == "webdataset":
+            import webdataset  # noqa: F401
+        elif name == "HF datasets":
+            import aiohttp  # noqa: F401
+            import datasets  # noqa: F401
+        elif name == "Mosaic Streaming":
+            mosaic.streaming_module()
+    except (ImportError, RuntimeError, OSError) as error:
+        return f"cannot be imported: {str(error).splitlines()[0]}"
+    return None
+
+
+def run_network(material: Material, results: Results, *, plan: Plan, report: Report) -> list[str]:
+    """Run the races; results are written after every network.
+
+    Returns:
+        A message for each failure.
+    """
+    reasons = {name: why for name in RIVALS if (why := why_not(name)) is not None}
+    section = results.sections.get("network", {}) if plan.resume else {}
+    section = {"failed": reasons, "workers": plan.workers, "races": section.get("races", [])}
+    failed = []
+    for workload in (each for each in WORKLOADS if each.name in plan.workloads):
+        scenes = plan.scenes or workload.scenes
+        job = Job(workload, material.root / "network", scenes)
+        link_shards(material, job)
+        if "Mosaic Streaming" not in reasons:
+            in_a_fork(lambda job=job: link_mds(material, job))
+        for number, (network, names) in itertools.product(range(plan.rounds), plan.networks()):
+            place = {
+                "workload": workload.name, "scenes": scenes, "round": number, **asdict(network)
+            }  # fmt: skip
+            if any(place.items() <= race.items() for race in section["races"]):
+                continue
+            report(f"network, {workload.title}, {_named(network)}: round {number + 1}")
+            field = [name for name in names if name not in reasons]
+            turns = field if number % 2 == 0 else field[::-1]
+            found = {}
+            for name in turns:
+                try:
+                    found[name] = asdict(measured(name, job, network, workers=plan.workers))
+                except MeasurementError as error:
+                    failed.append(f"network: {workload.name}: {name}: {error}")
+                    report(failed[-1][:400])
+            section["races"].append({**place, "found": found})
+            results.put("network", section)
+    return failed
+
+
+def measured(name: str, job: Job, network: Network, *, workers: int) -> Turn:
+    """Return what one contestant's turn took, over a network.
+
+    Raises:
+        MeasurementError: If it fails.
+    """
+    if name == LOCAL:
+        found: Turn = in_a_fork(lambda: _run(name, job, "", workers=workers), longest_s=LONGEST_S)
+        return found
+    with serving(job.root, home=job.root.parent / "server", network=network) as server:
+        found = in_a_fork(lambda: _run(name, job, server.url, workers=workers), longest_s=LONGEST_S)
+        return _counted(found, server)
+
+
+def _counted(turn: Turn, server: WebServer) -> Turn:
+    counts = server.counts()
+    turn.requests, turn.sent_mb = counts.requests, round(counts.sent_bytes / 1e6, 3)
+    turn.failures = counts.failures
+    return turn
+
+
+def _run(name: str, job: Job, url: str, *, workers: int) -> Turn:
+    torch.set_num_threads(1)
+    list(job.of_scene)  # computed before the clock starts
+    with tempfile.TemporaryDirectory() as local:
+        make = _loaders()[name]
+        started = torch.zeros(max(1, workers), dtype=torch.float64).share_memory_()
+
+        def note_start(worker: int) -> None:
+            torch.set_num_threads(1)
+            started[worker] = time.perf_counter()
+
+        warnings.filterwarnings("ignore", message="This DataLoader will create")
+        before_s = _cpu_s()
+        loader = make(job, url, Path(local), num_workers=workers, worker_init_fn=note_start)
+        samples = first_samples = 0
+        first_s = last_s = 0.0
+        note_start(0)
+        for batch in loader:
+            samples += len(batch["scene"])
+            last_s = time.perf_counter()
+            if not first_samples:
+                first_samples, first_s = samples, last_s
+        began_s = float(started.mean())
+        del batch, loader
+    peak_kb = resource.getrusage(
+        resource.RUSAGE_CHILDREN if workers else resource.RUSAGE_SELF
+    ).ru_maxrss
+    return Turn(
+        samples, round(last_s - began_s, 4), round(first_s - began_s, 4), first_samples,
+        round(_cpu_s() - before_s, 3), round(peak_kb / 1e3, 1),
+    )  # fmt: skip
+
+
+def _cpu_s() -> float:
+    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in spent)
+
+
+def _loaders() -> dict[str, Callable[..., Any]]:
+    def ours(job: Job, data: str | Path, **options: Any) -> Any:
+        return job.pairs(data).loader(job.workload.batch, tail="uneven", seed=SEED, **options)
+
+    def theirs(job: Job, dataset: IterableDataset[Any], **options: Any) -> DataLoader[Any]:
+        return DataLoader(dataset, batch_size=job.workload.batch, **options)
+
+    def tars(job: Job, url: str) -> list[str]:
+        return [f"{url}/{job.shards.name}/{path.name}" for path in sorted(job.shards.glob("*.tar"))]
+
+    return {
+        LOCAL: lambda job, url, local, **o: ours(job, job.shards, **o),
+        OURS: lambda job, url, local, **o: ours(job, f"{url}/{job.shards.name}", **o),
+        "webdataset": lambda job, url, local, **o: theirs(
+            job, scenewise.webdataset_stream(job, tars(job, url)), **o
+        ),
+        "HF datasets": lambda job, url, local, **o: theirs(
+            job, scenewise.hugging_face_stream(job, tars(job, url)), **o
+        ),
+        "Mosaic Streaming": lambda job, url, local, **o: theirs(
+            job,
+            mosaic.MosaicScenes(job, server=url, remote=f"s3://{job.mds.name}", local=local),
+            **o,
+        ),
+    }
+
+
+def _named(network: Network) -> str:
+    """Return a network in words."""
+    words = [f"{network.delay_s * 1e3:g} ms"]
+    words += [f"{network.connection_mb_s:g} MB/s a connection"] if network.connection_mb_s else []
+    words += [f"{network.refused:.0%} of requests refused"] if network.refused else []
+    words += [f"{network.lost:.0%} of responses cut"] if network.lost else []
+    return ", ".join(words)
+
+
+@dataclass(slots=True)
+class _Group:
+    """The rounds of one workload over one network."""
+
+    network: Network
+    rounds: list[dict[str, Any]] = field(default_factory=list)
+
+    def spread(
+        self, name: str, value: Callable[[dict[str, Any], dict[str, Any]], float]
+    ) -> Spread | None:
+        """Return the spread of a value of a contestant, given its turn and the local one's."""
+        return Spread.of(
+            value(found[name], found[LOCAL])
+            for found in self.rounds
+            if name in found and LOCAL in found
+        )
+
+    def a_sample(self, name: str, what: str) -> Spread | None:
+        """Return what the server counted of a contestant, by samples."""
+        return self.spread(name, lambda turn, _: turn[what] / turn["samples"])
+
+    def rate(self, name: str) -> Spread | None:
+        """Return a contestant's samples a second."""
+        return self.spread(name, lambda turn, _: _rate(turn))
+
+
+def _rate(turn: dict[str, Any]) -> float:
+    return float(turn["samples"] / turn["seconds"])
+
+
+def _later_rate(turn: dict[str, Any]) -> float:
+    """Return the samples a second after the first batch."""
+    seconds = turn["seconds"] - turn["first_s"]
+    return float((turn["samples"] - turn["first_samples"]) / seconds) if seconds > 0 else 0.0
+
+
+def _groups(section: dict[str, Any], workload: str) -> list[_Group]:
+    groups: dict[Network, _Group] = {}
+    for race in section["races"]:
+        if race["workload"] == workload:
+            network = Network(**{name: race[name] for name in asdict(Network())})
+            groups.setdefault(network, _Group(network)).rounds.append(race["found"])
+    return list(groups.values())
+
+
+def network_tables(section: dict[str, Any]) -> str:
+    """Return the tables of the races over a network."""
+    parts = [
+        "## Over a network\n",
+        f"{section['workers']} workers; primary pair with disparity; without a cache. The ratio is "
+        "to ours from the local disk in the same round; that in brackets leaves the first batch "
+        "out. Requests and bytes are the server's own count.\n",
+    ]
+    for workload in WORKLOADS:
+        groups = _groups(section, workload.name)
+        if not groups:
+            continue
+        scenes = next(r["scenes"] for r in section["races"] if r["workload"] == workload.name)
+        rounds = max(len(group.rounds) for group in groups)
+        rows = [row for group in groups for row in _rows(group)]
+        first = f"{workload.title}, {scenes} scenes, {counted(rounds, 'round')}"
+        head = (
+            first, "contestant", "samples/s",
+            "to local", "(after the first batch)", "first batch, s", "the same, delays more than "
+            "local", "requests a sample", "MB a sample", "peak MB of a worker",
+        )  # fmt: skip
+        parts.append(table(head, rows))
+    failed = [f"- {name}: {why}" for name, why in section["failed"].items()]
+    if failed:
+        parts.append("Did not race:\n" + "\n".join(failed) + "\n")
+    return "\n".join([*parts, "![Speed over a network](network.png)\n"])
+
+
+def _rows(group: _Group) -> list[list[str]]:
+    rows = []
+    delay_s = group.network.delay_s
+    for name in (LOCAL, OURS, *RIVALS):
+        if group.rate(name) is None:
+            continue
+        later = group.spread(
+            name, lambda turn, own: _later_rate(turn) / max(_later_rate(own), 1e-9)
+        )
+        ahead = group.spread(
+            name, lambda turn, own: (turn["first_s"] - own["first_s"]) / max(delay_s, 1e-9)
+        )
+        is_local = name == LOCAL
+        rows.append(
+            [
+                _named(group.network), name, rate_text(group.rate(name)),
+                "" if is_local else spread_text(
+                    group.spread(name, lambda turn, own: _rate(turn) / _rate(own))
+                ),
+                "" if is_local else spread_text(later),
+                rate_text(group.spread(name, lambda turn, _: turn["first_s"])),
+                "" if is_local or not delay_s else rate_text(ahead),
+                "" if is_local else rate_text(group.a_sample(name, "requests")),
+                "" if is_local else rate_text(group.a_sample(name, "sent_mb")),
+                rate_text(group.spread(name, lambda turn, _: turn["peak_mb"])),
+            ]
+        )  # fmt: skip
+    return rows
+
+
+_COLOURS: Final = {
+    LOCAL: "#222222", OURS: "#0b6e99", "webdataset": "#b8b8b8", "HF datasets": "#c9a66b",
+    "Mosaic Streaming": "#8fb08c",
+}  # fmt: skip
+
+
+def network_plot(section: dict[str, Any]) -> Any:
+    """Return a figure: the speed of each contestant against the delay, for each workload."""
+    import matplotlib.pyplot as plt
+
+    shown = [each for each in WORKLOADS if _groups(section, each.name)]
+    limits = sorted({race["connection_mb_s"] for race in section["races"]})
+    figure, grid = plt.subplots(
+        len(shown), len(limits), squeeze=False, sharey="row",
+        figsize=(5.5 * len(limits), 3.0 * len(shown)),
+    )  # fmt: skip
+    for line, workload in zip(grid, shown, strict=True):
+        for axes, mb_s in zip(line, limits, strict=True):
+            groups = [
+                group
+                for group in _groups(section, workload.name)
+                if group.network == Network(group.network.delay_s, connection_mb_s=mb_s)
+            ]
+            for name in (LOCAL, OURS, *RIVALS):
+                found = {group.network.delay_s * 1e3: group.rate(name) for group in groups}
+                points = sorted((ms, each) for ms, each in found.items() if each is not None)
+                axes.errorbar(
+                    [ms for ms, _ in points], [each.median for _, each in points],
+                    yerr=[
+                        [each.median - each.low for _, each in points],
+                        [each.high - each.median for _, each in points],
+                    ],
+                    color=_COLOURS[name], marker="o", capsize=3, label=name,
+                    linestyle="--" if name == LOCAL else "-",
+                )  # fmt: skip
+            limit = f"{mb_s:g} MB/s a connection" if mb_s else "unlimited bandwidth"
+            axes.set_title(f"{workload.title}, {limit}", fontsize=9)
+            axes.set_xlabel("delay of each response, ms")
+        line[0].set_ylim(bottom=0)
+        line[0].set_ylabel("samples a second")
+    named = grid[0][0].get_legend_handles_labels()
+    figure.legend(*named, frameon=False, fontsize=8, ncol=len(named[1]), loc="upper left")
+    figure.tight_layout(rect=(0, 0, 1, 1 - 0.1 / len(shown)))
+    return figure

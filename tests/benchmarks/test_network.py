@@ -1,0 +1,164 @@
+"""The server for measuring and the races over a network, run once on tiny data."""
+
+import time
+import urllib.error
+import urllib.request
+
+import pytest
+
+from benchmarks.network import LOCAL, OURS, Job, Plan, measured, network_tables, run_network
+from benchmarks.network import WORKLOADS as NETWORK_WORKLOADS
+from benchmarks.plots import plot_all
+from benchmarks.results import Results
+from benchmarks.server import Network, serving
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import RetryPolicy
+
+DATA = bytes(range(256)) * 4000
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "web").mkdir()
+    (tmp_path / "web" / "x.tar").write_bytes(DATA)
+    return tmp_path / "web"
+
+
+@pytest.fixture
+def started(folder, tmp_path):
+    """Start a server with a network before it."""
+
+    def start(**how):
+        return serving(folder, home=tmp_path / "home", network=Network(**how))
+
+    return start
+
+
+def test_the_delayed_server_counts_what_it_sends(started):
+    with started(delay_s=0.05) as server:
+        remote, began_s = RemoteObject(f"{server.url}/x.tar"), time.monotonic()
+        assert remote.read(0, 100) + remote.read(500, 900) == DATA[:100] + DATA[500:900]
+        took_s = time.monotonic() - began_s
+        counts = server.counts()
+
+    assert took_s >= 0.1
+    assert (counts.requests, counts.sent_bytes, counts.connections) == (2, 500, 1)
+
+
+def test_the_delayed_server_answers_as_web_servers_do(started):
+    def answer(url, **headers):
+        try:
+            with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as found:
+                return found.status, found.read()
+        except urllib.error.HTTPError as error:
+            return error.code, b""
+
+    with started() as server:
+        url = f"{server.url}/x.tar"
+        assert answer(url) == (200, DATA)
+        assert answer(url, Range="bytes=-10") == (206, DATA[-10:])
+        assert answer(url, Range="bytes=1023990-") == (206, DATA[-10:])
+        assert answer(url, Range="bytes=1024000-1024009") == (416, b"")
+        assert answer(url, **{"Range": "bytes=0-9", "If-Range": '"other"'}) == (200, DATA)
+        assert answer(f"{server.url}/%2e%2e/home") == (404, b"")
+        assert answer(f"{server.url}/none") == (404, b"")
+
+
+@pytest.mark.parametrize("line", ["connection_mb_s", "total_mb_s"])
+def test_the_delayed_server_limits_the_bandwidth(started, line):
+    with started(**{line: 4.0}) as server:
+        began_s = time.monotonic()
+        assert RemoteObject(f"{server.url}/x.tar").read(0, len(DATA)) == DATA
+
+    assert 0.24 <= time.monotonic() - began_s < 1.5
+
+
+def test_a_server_that_fails_costs_no_byte(started):
+    with started(refused=0.1, lost=0.1) as server:
+        remote = RemoteObject(f"{server.url}/x.tar", retry=RetryPolicy(first_wait_s=0.001))
+        for start in range(0, 200_000, 2000):
+            assert remote.read(start, start + 2000) == DATA[start : start + 2000]
+        counts = server.counts()
+
+    assert counts.failures > 5
+    assert counts.requests > 100
+
+
+def test_a_server_may_stand_before_another(started, tmp_path, folder):
+    with (
+        started() as behind,
+        serving(folder, home=tmp_path / "home", network=Network(0.05), to=behind.url) as server,
+    ):
+        remote, began_s = RemoteObject(f"{server.url}/x.tar"), time.monotonic()
+        assert remote.read(0, 100) + remote.read(500, 900) == DATA[:100] + DATA[500:900]
+
+        assert time.monotonic() - began_s >= 0.1
+        assert behind.counts().requests == 2
+
+
+@pytest.fixture(scope="module")
+def results(material, tmp_path_factory):
+    """Return the results of one round of a race over two networks."""
+    found = Results(tmp_path_factory.mktemp("out") / "results.json")
+    plan = Plan(
+        rounds=1, workers=1, delays_ms=(1.0,), bandwidths_mb_s=(20.0,),
+        faults=(Network(0.001, refused=0.05),), scenes=10, workloads=("first",),
+    )  # fmt: skip
+    assert run_network(material, found, plan=plan, report=str) == []
+    return found
+
+
+def test_every_contestant_loads_as_many_samples(results):
+    races = results.sections["network"]["races"]
+
+    assert [race["refused"] for race in races] == [0.0, 0.05]
+    for race in races:
+        samples = {name: turn["samples"] for name, turn in race["found"].items()}
+        assert set(samples.values()) == {10}
+        assert {LOCAL, OURS} <= samples.keys()
+        if not race["refused"]:
+            failed = results.sections["network"]["failed"].keys()
+            assert {"webdataset", "HF datasets", "Mosaic Streaming"} == (
+                samples.keys() - {LOCAL, OURS}
+            ) | failed
+
+
+def test_a_server_counts_less_for_ours_than_for_those_that_read_whole_shards(results):
+    for race in results.sections["network"]["races"]:
+        found = race["found"]
+        if not race["refused"]:
+            assert 0 < found[OURS]["sent_mb"] < found["webdataset"]["sent_mb"]
+            assert found["webdataset"]["requests"] == 10
+            assert found[LOCAL]["requests"] == 0
+
+
+def test_the_races_are_tabled_and_drawn(results, tmp_path):
+    text = network_tables(results.sections["network"])
+    made = plot_all(results.sections, tmp_path)
+
+    assert "| 1 ms, 20 MB/s a connection | ours |" in text
+    assert "| 1 ms, 5% of requests refused | ours |" in text
+    assert [path.name for path in made] == ["network.png"]
+
+
+def test_races_that_are_there_are_not_run_again_when_resumed(results, material):
+    before = list(results.sections["network"]["races"])
+    plan = Plan(
+        rounds=1, workers=1, delays_ms=(1.0,), bandwidths_mb_s=(20.0,), faults=(), scenes=10,
+        workloads=("first",), resume=True,
+    )  # fmt: skip
+    reported = []
+    run_network(material, results, plan=plan, report=reported.append)
+
+    assert reported == []
+    assert results.sections["network"]["races"] == before
+
+
+def test_ours_gives_every_sample_where_requests_fail(material):
+    (first,) = [workload for workload in NETWORK_WORKLOADS if workload.name == "first"]
+    job = Job(first, material.root / "network", 10)
+
+    turn = measured(OURS, job, Network(0.001, refused=0.2, lost=0.1), workers=0)
+
+    assert turn.samples == 10
+    assert turn.failures > 0

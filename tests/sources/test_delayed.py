@@ -1,0 +1,150 @@
+"""The Hub and S3, each by its real client or protocol, behind a network that delays and fails."""
+
+import threading
+import time
+
+import fsspec
+import pytest
+
+from benchmarks.server import Network
+from benchmarks.server import serving as delayed_serving
+from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import Cancellation, ReadCancelled, RetryPolicy
+from tests.servers.hub import COMMIT, REPOSITORY
+from tests.servers.raw import raw_serving
+
+DELAY_S = 0.1
+
+
+@pytest.fixture
+def before(tmp_path):
+    """Put a network before a server of this machine."""
+
+    def begin(url, **how):
+        return delayed_serving(tmp_path, home=tmp_path / "home", network=Network(**how), to=url)
+
+    return begin
+
+
+@pytest.fixture
+def shard(small_shards):
+    return min(small_shards.glob("*.tar"))
+
+
+@pytest.fixture(params=["hub", "s3"])
+def store(request, monkeypatch, s3_endpoint):
+    """A store of `small_shards`: its server, and how to point its URLs to another address."""
+    if request.param == "hub":
+        hub = request.getfixturevalue("hub")
+
+        def point(url):
+            conf = {"endpoint": url, "token": False}
+            monkeypatch.setitem(fsspec.config.conf, "hf", conf)
+            return f"hf://datasets/{REPOSITORY}@{COMMIT}"
+
+        return hub.url, point
+    root = request.getfixturevalue("s3")
+
+    def point(url):
+        conf = fsspec.config.conf["s3"] | {"endpoint_url": url}
+        monkeypatch.setitem(fsspec.config.conf, "s3", conf)
+        return root
+
+    return s3_endpoint, point
+
+
+def test_a_range_costs_one_delay_once_the_object_is_known(store, before, shard):
+    url, point = store
+    with before(url, delay_s=DELAY_S) as server:
+        remote = RemoteObject(f"{point(server.url)}/{shard.name}")
+        remote.read(0, 9)
+        began_s = time.monotonic()
+
+        assert remote.read(1000, 3000) == shard.read_bytes()[1000:3000]
+        assert DELAY_S <= time.monotonic() - began_s < 1.9 * DELAY_S
+
+
+def test_threads_wait_for_a_delay_together(store, before, shard):
+    url, point = store
+    wrong = []
+    with before(url, delay_s=DELAY_S) as server:
+        remote = RemoteObject(f"{point(server.url)}/{shard.name}")
+        remote.read(0, 9)
+
+        def read(start):
+            if remote.read(start, start + 500) != shard.read_bytes()[start : start + 500]:
+                wrong.append(start)
+
+        threads = [threading.Thread(target=read, args=(500 * each,)) for each in range(8)]
+        began_s = time.monotonic()
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+
+        assert time.monotonic() - began_s < 6 * DELAY_S
+    assert wrong == []
+
+
+def test_lost_connections_cost_no_byte(store, before, shard):
+    url, point = store
+    with before(url, lost=0.1) as server:
+        retry = RetryPolicy(first_wait_s=0.001)
+        remote = RemoteObject(f"{point(server.url)}/{shard.name}", retry=retry)
+        whole = shard.read_bytes()
+
+        for start in range(0, 30_000, 1000):
+            assert remote.read(start, start + 1000) == whole[start : start + 1000]
+
+
+def test_an_index_opens_through_a_network(store, before, small_shards):
+    url, point = store
+    with before(url, delay_s=0.01, connection_mb_s=20.0) as server:
+        index = SceneIndex.open(point(server.url))
+
+        assert index.digest == SceneIndex.open(small_shards).digest
+
+
+@pytest.mark.parametrize("how", ["refusing", "never answering"])
+def test_a_dead_store_is_a_named_error_within_the_longest_outage(store, how):
+    def never(start, stop):
+        yield 60.0
+
+    _, point = store
+    policy = RetryPolicy(attempts=999, timeout_s=0.5, longest_outage_s=1.5)
+    with raw_serving(never) as silent:
+        root = point("http://127.0.0.1:1" if how == "refusing" else silent)
+        began_s = time.monotonic()
+
+        with pytest.raises(StorageError, match=rf"{root}/x.tar: cannot be read, at byte 0 of 9 "):
+            RemoteObject(f"{root}/x.tar", retry=policy).read(0, 9)
+        assert time.monotonic() - began_s < 6
+
+
+def test_a_read_of_a_store_is_cancelled_at_once(store):
+    def never(start, stop):
+        yield 60.0
+
+    _, point = store
+    cancellation = Cancellation()
+    with raw_serving(never) as silent:
+        root = point(silent)
+        threading.Timer(0.5, cancellation.cancel).start()
+        began_s = time.monotonic()
+
+        with pytest.raises(ReadCancelled, match=rf"{root}/x.tar: reading was cancelled"):
+            RemoteObject(f"{root}/x.tar").read(0, 9, cancellation=cancellation)
+        assert time.monotonic() - began_s < 4
+
+
+def test_the_size_that_the_index_records_is_compared_with_the_first_bytes(store, shard):
+    url, point = store
+    root, size = point(url), shard.stat().st_size
+    assert RemoteObject(f"{root}/{shard.name}", expected_size=size).read(0, 9)
+
+    for start in (0, size + 10):
+        remote = RemoteObject(f"{root}/{shard.name}", expected_size=size + 99)
+        with pytest.raises(ShardError, match=f"has {size} bytes, and the index says {size + 99}"):
+            remote.read(start, start + 9)

@@ -1,0 +1,267 @@
+"""The Hub's files: signed URLs kept and never shown, one commit, its cache, offline, its limits."""
+
+import logging
+import pickle
+import threading
+import time
+
+import fsspec
+import pytest
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.sources import hub as hub_transport
+from stereogenbench_data.sources.remote import RemoteObject
+from stereogenbench_data.sources.retry import RetryPolicy
+from tests.servers.failing_server import Answer
+from tests.servers.hub import COMMIT, REPOSITORY, hub_serving
+from tests.servers.tools import require_module
+
+DATA = bytes(range(256)) * 100
+BRANCH = f"hf://datasets/{REPOSITORY}/x.tar"
+PINNED = f"hf://datasets/{REPOSITORY}@{COMMIT}/x.tar"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "hub").mkdir()
+    (tmp_path / "hub" / "x.tar").write_bytes(DATA)
+    return tmp_path / "hub"
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path, monkeypatch):
+    """Let huggingface_hub's cache be one of the test."""
+    constants = require_module("huggingface_hub.constants")
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def hub(folder, monkeypatch):
+    with hub_serving(folder, monkeypatch) as server:
+        yield server
+
+
+def quick(**how):
+    return RetryPolicy(first_wait_s=0.001, **how)
+
+
+def resolved(server):
+    return [(revision, name) for revision, name, _ in server.facts.get("resolved", [])]
+
+
+def keep_in_cache(cache, *, commit=COMMIT, name="x.tar", content=DATA):
+    """Write a file as huggingface_hub keeps it, and the branch main at its commit."""
+    place = cache / f"datasets--{REPOSITORY.replace('/', '--')}"
+    file = place / "snapshots" / commit / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(content)
+    (place / "refs").mkdir(exist_ok=True)
+    (place / "refs" / "main").write_text(commit)
+    return file
+
+
+def test_a_signed_url_is_kept_for_later_reads(hub):
+    remote = RemoteObject(PINNED)
+    for start in range(5):
+        assert remote.read(start, start + 9) == DATA[start : start + 9]
+
+    assert resolved(hub) == [(COMMIT, "x.tar")]
+
+
+def test_a_signed_url_is_not_used_after_it_has_expired(hub):
+    hub.facts["signed_for_s"] = 1
+    remote = RemoteObject(PINNED, retry=RetryPolicy(attempts=1))
+    for _ in range(3):
+        assert remote.read(5, 9) == DATA[5:9]
+        time.sleep(0.6)
+
+    assert 2 <= len(resolved(hub)) <= 3
+    assert all("403" not in str(asked) for asked in hub.asked)
+
+
+def test_a_signed_url_that_is_refused_is_resolved_again_within_the_attempt(hub):
+    remote = RemoteObject(PINNED, retry=RetryPolicy(attempts=1))
+    remote.read(0, 9)
+    hub.facts["signatures"].clear()
+
+    assert remote.read(9, 18) == DATA[9:18]
+    assert len(resolved(hub)) == 2
+
+
+def test_a_signed_url_that_is_refused_at_once_is_an_error_that_does_not_show_it(hub):
+    hub.facts["signed_for_s"] = 0
+    remote = RemoteObject(PINNED, retry=RetryPolicy(attempts=1))
+
+    with pytest.raises(
+        StorageError, match=r"x.tar: the server answers 403 .*check access"
+    ) as error:
+        remote.read(0, 9)
+    assert "secret" not in str(error.value)
+
+
+@pytest.mark.parametrize("when", ["at first", "after it was refused"])
+def test_threads_resolve_a_signed_url_once(hub, when):
+    remote, wrong = RemoteObject(PINNED), []
+    if when == "after it was refused":
+        remote.read(0, 9)
+        hub.facts["signatures"].clear()
+        hub.facts["resolved"].clear()
+
+    def read(start):
+        if remote.read(start, start + 9) != DATA[start : start + 9]:
+            wrong.append(start)
+
+    threads = [threading.Thread(target=read, args=(start,)) for start in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert wrong == []
+    assert len(resolved(hub)) == 1
+
+
+def test_the_login_goes_to_the_hub_and_not_to_its_content_network(hub, monkeypatch):
+    conf = fsspec.config.conf["hf"] | {"token": "hf_mine"}
+    monkeypatch.setitem(fsspec.config.conf, "hf", conf)
+    RemoteObject(PINNED).read(0, 9)
+
+    ((_, _, headers),) = hub.facts["resolved"]
+    assert headers["authorization"] == "Bearer hf_mine"
+    assert all("authorization" not in asked.headers for asked in hub.asked)
+
+
+def test_the_login_and_the_hub_are_those_of_the_environment(hub, monkeypatch):
+    constants = require_module("huggingface_hub.constants")
+    monkeypatch.setitem(fsspec.config.conf, "hf", {})
+    monkeypatch.setattr(constants, "ENDPOINT", hub.url)
+    monkeypatch.setenv("HF_TOKEN", "hf_environment")
+
+    assert RemoteObject(PINNED).read(0, 9) == DATA[:9]
+    ((_, _, headers),) = hub.facts["resolved"]
+    assert headers["authorization"] == "Bearer hf_environment"
+
+
+def test_nothing_that_is_logged_shown_or_sent_to_a_process_holds_a_signature(
+    hub, caplog, monkeypatch
+):
+    conf = fsspec.config.conf["hf"] | {"token": "hf_mine"}
+    monkeypatch.setitem(fsspec.config.conf, "hf", conf)
+    remote = RemoteObject(PINNED, retry=quick(attempts=2))
+    with caplog.at_level(logging.DEBUG):
+        remote.read(0, 9)
+    state = pickle.dumps(remote)
+    hub.always["x.tar"] = Answer(status=500)
+    with pytest.raises(StorageError, match="500") as error:
+        remote.read(0, 9)
+
+    for text in (caplog.text, repr(remote), repr(vars(remote)), str(error.value), repr(state)):
+        assert "secret" not in text
+        assert "hf_mine" not in text
+    hub.always.clear()
+    assert pickle.loads(state).read(9, 18) == DATA[9:18]
+
+
+def test_what_is_read_of_a_branch_is_of_one_commit(hub):
+    first, second = RemoteObject(BRANCH), RemoteObject(BRANCH)
+    assert first.read(0, 9) + second.read(9, 18) == DATA[:18]
+
+    # The branch is asked for once in a process, and only for its commit.
+    assert resolved(hub) == [("main", "x.tar"), (COMMIT, "x.tar"), (COMMIT, "x.tar")]
+
+
+def test_a_small_file_that_the_hub_sends_whole_is_read_in_parts(hub):
+    hub.facts["in_git"] = ["x.tar"]
+    remote = RemoteObject(PINNED, expected_size=len(DATA))
+
+    assert remote.read(0, 9) + remote.read(300, 700) == DATA[:9] + DATA[300:700]
+    assert remote.read(0, len(DATA)) == DATA
+    assert remote.size() == len(DATA)
+
+
+def test_a_repository_that_asks_for_consent_says_so(hub):
+    hub.facts["gated"] = True
+
+    with pytest.raises(StorageError, match=r"x.tar: its repository asks for consent. .*hf auth lo"):
+        RemoteObject(PINNED).read(0, 9)
+
+
+@pytest.mark.parametrize(
+    ("headers", "wait_s"),
+    [({"Retry-After": "3"}, 3.0), ({"RateLimit": '"resolvers";r=0;t=2', "Retry-After": "9"}, 3.0)],
+)
+def test_a_limit_of_the_hub_is_waited_for(hub, headers, wait_s):
+    waits_s = []
+    hub.facts["refusals"] = [(429, headers)]
+    retry = RetryPolicy(sleep=waits_s.append, chance=lambda: 0.0)
+
+    assert RemoteObject(PINNED, retry=retry).read(0, 9) == DATA[:9]
+    assert waits_s == [wait_s]
+
+
+def test_a_file_in_the_hubs_own_cache_is_read_from_there(hub, own_cache):
+    file = keep_in_cache(own_cache, content=DATA[::-1])
+
+    assert RemoteObject(PINNED, expected_size=len(DATA)).read(5, 9) == DATA[::-1][5:9]
+    assert RemoteObject(PINNED).size() == len(DATA)
+    assert hub.asked == []
+    file.write_bytes(DATA[:100])
+    with pytest.raises(StorageError, match=rf"{file}: has 100 bytes, .* index says {len(DATA)}"):
+        RemoteObject(PINNED, expected_size=len(DATA)).read(5, 9)
+    with pytest.raises(StorageError, match=rf"{file}: has 100 bytes, and byte 108 .* remove it"):
+        RemoteObject(PINNED).read(100, 109)
+
+
+def test_a_cache_of_another_commit_is_not_that_of_the_branch(hub, own_cache):
+    keep_in_cache(own_cache, commit="f" * 40, content=DATA[::-1])
+
+    assert RemoteObject(BRANCH).read(5, 9) == DATA[5:9]
+
+
+def test_offline_the_cache_is_read_and_nothing_is_requested(hub, own_cache, monkeypatch):
+    keep_in_cache(own_cache)
+    monkeypatch.setattr(hub_transport, "is_offline", lambda: True)
+
+    assert RemoteObject(BRANCH).read(5, 9) == DATA[5:9]
+    with pytest.raises(StorageError, match=r"y.tar: HF_HUB_OFFLINE is set, and the file is not in"):
+        RemoteObject(BRANCH.replace("x.tar", "y.tar")).read(0, 9)
+    with pytest.raises(StorageError, match=r"HF_HUB_OFFLINE is set, and the Hub's cache does not"):
+        RemoteObject(BRANCH).entries()
+    assert resolved(hub) == []
+
+
+def test_the_switch_of_offline_mode_is_huggingface_hubs(monkeypatch):
+    constants = require_module("huggingface_hub.constants")
+    assert not hub_transport.is_offline()
+    if hasattr(constants, "is_offline_mode"):
+        monkeypatch.setattr(constants, "is_offline_mode", lambda: True)
+    else:
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    assert hub_transport.is_offline()
+
+
+def test_a_path_out_of_the_repository_is_refused(hub):
+    with pytest.raises(StorageError, match=r"a path holds no '\.' or '\.\.': correct the URL"):
+        RemoteObject(f"hf://datasets/{REPOSITORY}@{COMMIT}/../x.tar").read(0, 9)
+
+
+@pytest.mark.parametrize(
+    ("url", "found"),
+    [
+        ("hf://datasets/a/b/c/d.tar", ("datasets", "a/b", "main", "c/d.tar")),
+        ("hf://datasets/a/b@refs%2Fpr%2F1/d", ("datasets", "a/b", "refs/pr/1", "d")),
+        ("hf://datasets/a/b@refs/convert/x/d", ("datasets", "a/b", "refs/convert/x", "d")),
+        ("hf://a/b@v1/d", ("models", "a/b", "v1", "d")),
+        ("hf://datasets/a/b", ("datasets", "a/b", "main", "")),
+    ],
+)  # fmt: skip
+def test_a_url_of_the_hub_names_repository_revision_and_path(url, found):
+    file = hub_transport.HubFile.of_url(url)
+
+    assert (file.kind, file.repository, file.revision, file.path) == found
+
+
+@pytest.mark.parametrize("url", ["hf://buckets/a/b/c", "hf://datasets/a", "s3://a/b/c"])
+def test_what_is_no_repository_is_left_to_its_file_system(url):
+    assert not hub_transport.is_hub_file(url)
