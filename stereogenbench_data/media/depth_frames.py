@@ -363,6 +363,11 @@ class DepthFrames(FrameReader):
         """Facts of the depth video that was packed."""
         return self._header.clip
 
+    @property
+    def chunk_bounds(self) -> tuple[int, ...]:
+        """Where each frame's bytes begin, and where the last one's end."""
+        return (*self._header.offsets, self._header.offsets[-1] + self._header.sizes[-1])
+
     def chunk(self, index: int) -> bytes:
         """Return the compressed bytes of a frame, empty for a frame of zeros.
 
@@ -374,7 +379,7 @@ class DepthFrames(FrameReader):
         if size == 0:
             return b""
         self._file.seek(self._header.offsets[index])
-        chunk = self._file.read(size)
+        chunk = self._read(size)
         require_chunk(
             chunk,
             clip=self.clip,
@@ -408,6 +413,13 @@ class DepthFrames(FrameReader):
         if self._own is not None:
             self._own.close()
 
+    def _read(self, size: int) -> bytes:
+        """Return the next bytes, fewer only at the end: a file may give them in pieces."""
+        data = self._file.read(size)
+        while 0 < len(data) < size and (more := self._file.read(size - len(data))):
+            data += more
+        return data
+
     def _read_header(self, frames: int | Literal["any"]) -> FrameHeader:
         file_bytes = self._file.seek(0, 2)
         self._file.seek(0)
@@ -416,7 +428,7 @@ class DepthFrames(FrameReader):
             start, frames=MOST_FRAMES if frames == "any" else frames, name=self.name
         )
         if size > len(start):
-            start += self._file.read(size - len(start))
+            start += self._read(size - len(start))
         if len(start) < size:
             raise MediaError(
                 f"{self.name}: is cut short: its header has {size} bytes, and only {len(start)} "
