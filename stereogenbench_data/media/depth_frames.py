@@ -365,8 +365,8 @@ class DepthFrames(FrameReader):
 
     @property
     def chunk_bounds(self) -> tuple[int, ...]:
-        """Where each frame's bytes begin, and where the last one's end."""
-        return (*self._header.offsets, self._header.offsets[-1] + self._header.sizes[-1])
+        """Where each frame's bytes begin, and the end of the file, which belongs to the last."""
+        return (*self._header.offsets, self._file_bytes)
 
     def chunk(self, index: int) -> bytes:
         """Return the compressed bytes of a frame, empty for a frame of zeros.
@@ -421,7 +421,7 @@ class DepthFrames(FrameReader):
         return data
 
     def _read_header(self, frames: int | Literal["any"]) -> FrameHeader:
-        file_bytes = self._file.seek(0, 2)
+        file_bytes = self._file_bytes = self._file.seek(0, 2)
         self._file.seek(0)
         start = self._file.read(FIXED_BYTES)
         size = header_bytes(

@@ -43,6 +43,9 @@ _LENGTH: Final = struct.Struct(">I")
 _LONGEST_SPAN: Final = 2**32 - 1
 _CUES: Final = b"\x1c\x53\xbb\x6b"
 """What Matroska's list of key frames begins with."""
+_LOOKED_BEHIND: Final = 64
+_BLOCK_HEADER_BYTES: Final = 4
+"""What Matroska writes between where FFmpeg finds a packet and the packet's own bytes."""
 _LOOKED_THROUGH: Final = 64 * 1024
 """Bytes at a file's end in which Matroska's list of key frames is looked for."""
 
@@ -120,18 +123,19 @@ class Position:
         opened = 0 if self._is_open else table.opening
         self._end = max(self._end, opened)
         start, stop = self._end, min(frame + table.delay + 1, table.packets)
+        looked_through = 0
         if self._must_seek(frame):
             start = table.key_before(max(0, frame - 1) if table.has_neighbours else frame)
             if frame == 0 and table.has_neighbours:
                 stop = min(2, table.packets)
             if table.blind_jump and start == table.keys[-1]:
-                stop = table.packets  # FFmpeg looks for a further key frame up to the end
+                looked_through = table.packets  # FFmpeg looks for a further key frame
             self._knows_key_frames = True
         gap = table.bounds[start] - table.bounds[self._end]
         if self._end and 0 < gap <= READ_THROUGH:
             start = self._end
         self._is_open, self._next, self._end = True, frame + 1, max(start, stop)
-        parts = [(0, min(opened, start)), (start, stop)]
+        parts = [(0, min(opened, start)), (start, max(stop, looked_through))]
         return [(table.bounds[a], table.bounds[b]) for a, b in parts if a < b]
 
     def _must_seek(self, frame: int) -> bool:
@@ -251,32 +255,28 @@ def _listed(container: InputContainer) -> SeekTable | None:
 def _gone_through(container: InputContainer, file: VideoFile) -> SeekTable | None:
     """Return the table of a Matroska file, all of whose packets are read."""
     stream = container.streams.video[0]
-    starts: list[int] = []
+    ends: list[int] = []
     keys: list[int] = []
     times: list[int] = []
-    ahead = last_bytes = 0
+    ahead = 0
     for packet in container.demux(stream):
         if packet.size == 0:
             continue
         if packet.pos is None or packet.pts is None:
             return None
         if packet.is_keyframe:
-            keys.append(len(starts))
-        starts.append(packet.pos)
-        last_bytes = packet.size
+            keys.append(len(ends))
+        ends.append(packet.pos + _BLOCK_HEADER_BYTES + packet.size)
         ahead = max(ahead, sum(time > packet.pts for time in times[-32:]))
         times.append(packet.pts)
-    if not starts:
+    entries = stream.index_entries
+    if not ends or not len(entries):
         return None
-    end = _element_end(_read(file, starts[-1], starts[-1] + 16), at=starts[-1])
-    end = end if end is not None else starts[-1] + last_bytes
-    clusters = {entry.timestamp: entry.pos for entry in stream.index_entries}
-    for key in keys:
-        found = clusters.get(times[key], -1)
-        if (starts[key - 1] if key else 0) < found < starts[key]:
-            starts[key] = found
+    # A cluster begins before its first packet, and the list of key frames follows the last one.
+    cues = _read(file, ends[-1], ends[-1] + _LOOKED_BEHIND).find(_CUES)
+    ends[-1] += max(0, cues)
     return SeekTable(
-        (*starts, end),
+        (entries[0].pos, *ends),
         tuple(keys),
         delay=ahead,
         has_neighbours=_is_intra_only(container),
@@ -322,15 +322,6 @@ def _by_clusters(container: InputContainer, file: VideoFile) -> SeekTable | None
 def _is_intra_only(container: InputContainer) -> bool:
     codec = container.streams.video[0].codec_context.codec
     return codec.canonical_name in INTRA_ONLY
-
-
-def _element_end(start: bytes, *, at: int) -> int | None:
-    """Return where the Matroska element ends that begins with these bytes; None if it is none."""
-    if start[:1] not in (b"\xa3", b"\xa0") or len(start) < 9 or start[1] == 0:
-        return None
-    length = 9 - start[1].bit_length()
-    size = int.from_bytes(start[1 : 1 + length], "big") & ((1 << 7 * length) - 1)
-    return at + 1 + length + size
 
 
 def _read(file: VideoFile, start: int, stop: int) -> bytes:

@@ -20,6 +20,7 @@ from stereogenbench_data.media.seek_table import (
     read_seek_table,
 )
 from stereogenbench_data.media.video import VideoReader
+from stereogenbench_data.sources.ranged_file import PacketFile
 from tests.servers.tools import require_tool
 
 FRAMES = 30
@@ -61,26 +62,21 @@ def videos(tmp_path_factory):
 KINDS = ("rgb.mp4", "fast.mp4", "jpeg.mp4", "depth.mkv")
 
 
-class Sparse(io.BytesIO):
-    """A file of which only some ranges are there, and which tells what else is read."""
+class Ahead:
+    """What was fetched ahead of a file for one frame, and where else it was read."""
 
-    def __init__(self, content, ranges):
-        super().__init__(content)
-        self.ranges, self.missed = ranges, []
-        self.hides_packets = False
+    def __init__(self, content):
+        self.content, self.ranges, self.missed = content, [], []
 
-    def read(self, size=-1):
-        at = self.tell()
-        stops = [stop for start, stop in self.ranges if start <= at < stop]
-        if self.hides_packets and not stops:
-            return b""
-        if not stops and at < len(self.getvalue()):
-            self.missed.append(at)
-        return super().read(min(size, max(stops) - at) if stops and size >= 0 else size)
+    def read(self, at):
+        for start, stop in self.ranges:
+            if start <= at < stop:
+                return start, self.content[start:stop]
+        return None
 
-
-def header_ranges(table, size):
-    return [(0, table.bounds[0]), (table.bounds[-1], size)]
+    def fetch(self, start, stop):
+        self.missed.append((start, stop))
+        return self.content[start:stop]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -104,32 +100,34 @@ def test_packets_lie_where_ffprobe_finds_them(videos, kind):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     "frames",
-    [[0], [13], [29], [9, 10], [3, 4, 5, 25], [17, 2, 2, 3], list(range(FRAMES))],
+    [[0], [13], [29], [9, 10], [3, 4, 5, 25], [17, 2, 2, 3], [22, 24, 27], list(range(FRAMES))],
     ids=str,
 )
-def test_a_reader_reads_no_byte_beyond_those_that_are_needed(videos, kind, frames):
+def test_each_frame_is_read_from_the_bytes_that_it_needs_alone(videos, kind, frames):
     path = videos[kind]
     content = path.read_bytes()
     table = read_seek_table(path, name=kind)
-    position = Position(table)
-    ranges = header_ranges(table, len(content))
-    file = Sparse(content, ranges)
-    file.opens_by_header = table.opening == 0
+    position, ahead = Position(table), Ahead(content)
+    file = PacketFile(
+        ahead.fetch,
+        table=table,
+        ahead=ahead.read,
+        size=len(content),
+        crc32=zlib.crc32(content),
+    )
     needed = 0
 
     with VideoReader(path, name=kind, frames=FRAMES) as expected:
         reader = None
         for frame in frames:
-            parts = position.needed(frame)
-            ranges += parts
-            needed += sum(stop - start for start, stop in parts)
-            if reader is None:
-                reader = VideoReader(file, name=kind, frames=FRAMES)
+            ahead.ranges = position.needed(frame)
+            needed += sum(stop - start for start, stop in ahead.ranges)
+            reader = reader or VideoReader(file, name=kind, frames=FRAMES)
             found = reader.frame(frame).to_ndarray()
             np.testing.assert_array_equal(found, expected.frame(frame).to_ndarray())
         reader.close()
 
-    assert file.missed == []
+    assert ahead.missed == []
     if frames == list(range(FRAMES)):
         assert needed == table.bounds[-1] - table.bounds[0]
 
