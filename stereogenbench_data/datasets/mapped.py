@@ -5,7 +5,7 @@ import operator
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal, Self, Unpack, get_args
+from typing import Any, Final, Literal, Self, Unpack, get_args
 
 import numpy as np
 import torch
@@ -51,6 +51,10 @@ Check = Literal["read", "opened", "metadata"]
 """Which videos are compared with their checksums: see `StereoPairs`."""
 
 
+_OF_CACHE: Final = 16
+"""The part of a cache that a process may fill ahead."""
+
+
 class SeekTableWarning(UserWarning):
     """The index of data behind a URL is of an earlier version, so reading is slow."""
 
@@ -76,6 +80,9 @@ class _MappedScenes(Dataset[Sample]):
         self.request = request
         opened = _opens_checked(check, plan)
         ahead = FetchAhead(limit_bytes=fetch_ahead_bytes, connections=connections)
+        if cache is not None:
+            # Several processes fill it: what one fetches ahead must not evict what another needs.
+            ahead.limit_bytes = min(fetch_ahead_bytes, cache.limit_bytes // _OF_CACHE)
         if is_remote(index.root) and not index.load_seek_tables() and cache is None:
             warnings.warn(
                 f"{index.where}: its index does not say where the packets of videos lie, so a "

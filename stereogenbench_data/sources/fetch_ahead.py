@@ -120,12 +120,13 @@ class FetchAhead:
         self.connections = connections
         self.most_bytes = 0
         self._own: _State | None = None
+        self._finalizer: Callable[[], object] | None = None
 
     @property
     def _state(self) -> _State:
         if self._own is None or self._own.pid != os.getpid():
             self._own = _State(self.connections)
-            weakref.finalize(self, _end, self._own)
+            self._finalizer = weakref.finalize(self, _end, self._own)
         return self._own
 
     @property
@@ -152,8 +153,8 @@ class FetchAhead:
                 thread = threading.Thread(
                     target=_work, args=(state,), name="fetch-ahead", daemon=True
                 )
+                thread.start()  # it waits until this block is left
                 state.threads.add(thread)
-                thread.start()
 
     def read(self, place: Hashable, at: int) -> tuple[int, bytes] | None:
         """Return the fetched range that holds a byte, and where it begins; None if none is planned.
@@ -187,13 +188,13 @@ class FetchAhead:
 
     def close(self) -> None:
         """Forget everything, and end all threads; it can be used again."""
-        state, self._own = self._own, None
-        if state is not None:
-            _end(state)
+        self._own = None
+        if self._finalizer is not None:
+            self._finalizer()
 
     def __getstate__(self) -> dict[str, object]:
         """Return the state for a copy in another process."""
-        return self.__dict__ | {"_own": None}
+        return self.__dict__ | {"_own": None, "_finalizer": None}
 
 
 def _uncovered(state: _State, wanted: Wanted, sample: int) -> list[tuple[int, int]]:
