@@ -103,6 +103,7 @@ class EpochBatch(list[int]):
         is_padding: For each sample whether it fills up after the epoch's end; None where no sample
             ever does (all tails but "wrap").
         ends_of_runs: The samples after which their videos are wanted no more for now.
+        number: Its number among the batches of all ranks; None where it is none of an epoch's.
     """
 
     def __init__(
@@ -112,12 +113,14 @@ class EpochBatch(list[int]):
         epoch: int,
         is_padding: list[bool] | None = None,
         ends_of_runs: Collection[int] = (),
+        number: int | None = None,
     ) -> None:
         """Hold the numbers."""
         super().__init__(numbers)
         self.epoch = epoch
         self.is_padding = is_padding
         self.ends_of_runs = ends_of_runs
+        self.number = number
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what a worker process makes the same batch from."""
@@ -125,7 +128,7 @@ class EpochBatch(list[int]):
         return partial(EpochBatch, **options), (list(self),)
 
 
-_BATCH_OPTIONS: Final = ("epoch", "is_padding", "ends_of_runs")
+_BATCH_OPTIONS: Final = ("epoch", "is_padding", "ends_of_runs", "number")
 
 
 class EpochBatches(Sampler[list[int]]):
@@ -345,16 +348,11 @@ class EpochBatches(Sampler[list[int]]):
 
     def batch(self, number: int, *, epoch: int) -> EpochBatch:
         """Return the samples of a global batch."""
-        order = self.order(epoch)
-        samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
-        ends = samples[order.ends_run(number)].tolist() if len(samples) else []
-        if self.tail != "wrap":
-            return EpochBatch(samples.tolist(), epoch=epoch, ends_of_runs=ends)
+        is_wrapped = self.tail == "wrap"
+        samples, ends = batch_samples(self.order(epoch), number, tail=self.tail)
+        is_padding = self.is_padding(number).tolist() if is_wrapped else None
         return EpochBatch(
-            order.full_batch(number).tolist(),
-            epoch=epoch,
-            is_padding=self.is_padding(number).tolist(),
-            ends_of_runs=ends,
+            samples, epoch=epoch, is_padding=is_padding, ends_of_runs=ends, number=number
         )
 
     def is_padding(self, number: int) -> np.ndarray:
@@ -438,6 +436,13 @@ class EpochBatches(Sampler[list[int]]):
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs; it computes the order itself."""
         return self.__dict__ | {"_order": None, "_latest": None}
+
+
+def batch_samples(order: EpochOrder, number: int, *, tail: Tail) -> tuple[list[int], list[int]]:
+    """Return the samples of a global batch, and those of them that end a run."""
+    samples = order.batch(number) if number < order.batches else np.empty(0, dtype=np.int64)
+    ends: list[int] = samples[order.ends_run(number)].tolist() if len(samples) else []
+    return (order.full_batch(number) if tail == "wrap" else samples).tolist(), ends
 
 
 class BatchPass(Iterator[list[int]]):

@@ -20,6 +20,7 @@ from stereogenbench_data.datasets.batches import (
     State,
 )
 from stereogenbench_data.datasets.frameworks import AcceleratedLoader, ShareSampler
+from stereogenbench_data.datasets.shared_epoch import FetchedCounts
 from stereogenbench_data.datasets.workers import WorkerContext
 from stereogenbench_data.errors import (
     PassError,
@@ -64,6 +65,13 @@ class Loadable(Numbered, Protocol):
     def _keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Keep videos open for the scenes that one of so many processes reads at a time."""
 
+    def _stop_fetching(self) -> None:
+        """End the requests of this process for coming samples."""
+
+    @property
+    def _fetched(self) -> FetchedCounts:
+        """What its processes have fetched."""
+
     def stats(self) -> StreamStats:
         """Return how many videos this process has open."""
 
@@ -82,6 +90,9 @@ class LoaderStats(NamedTuple):
         videos_limit: How many videos a process opens for it at most.
         batches_held: How many batches of its workers are open in shared slots: the loop holds a
             part of them, or they arrived early.
+        requests: How many ranges its processes have fetched from a URL, as far as their batches
+            have arrived; what went into a cache is not counted.
+        bytes_fetched: How many bytes these had.
         shows: What a batch shows, beside one of a fully shuffled sampler, in one line: scenes,
             moments, the spread of frame numbers (of the first batches of epoch 0).
     """
@@ -92,6 +103,8 @@ class LoaderStats(NamedTuple):
     videos_open: int
     videos_limit: int
     batches_held: int
+    requests: int
+    bytes_fetched: int
     shows: str
 
 
@@ -218,6 +231,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         pids = {pid for each in self._workers for pid in each.pids}
         videos = self._loadable.stats()
         epoch, taken = self._position
+        requests, bytes_fetched = self._loadable._fetched.total
         return LoaderStats(
             epoch=self.epoch,
             batches_taken=taken if epoch == self.epoch else 0,
@@ -225,6 +239,8 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             videos_open=videos.videos_open,
             videos_limit=videos.videos_limit,
             batches_held=held_batches(pids),
+            requests=requests,
+            bytes_fetched=bytes_fetched,
             shows=self._shows,
         )
 
@@ -440,6 +456,8 @@ class LoaderPass(Iterator[Any]):
             return
         self._loaded = iter(())
         self._loader._ended(self)
+        if self._pid == os.getpid() and self._loader.num_workers == 0:
+            self._loader._loadable._stop_fetching()
         if workers is not self._loader._persistent:
             workers.end()
 

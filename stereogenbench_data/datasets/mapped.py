@@ -2,16 +2,17 @@
 
 import copy
 import operator
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Literal, Self, Unpack, get_args
+from typing import Any, Final, Literal, Self, Unpack, get_args
 
 import numpy as np
 import torch
 from torch.utils.data import Dataset
 
 from stereogenbench_data.datasets.batch_buffers import BatchArrays, BatchBuffers, Buffers
-from stereogenbench_data.datasets.batches import EpochBatch, EpochBatches
+from stereogenbench_data.datasets.batches import EpochBatch, EpochBatches, batch_samples
 from stereogenbench_data.datasets.frameworks import accelerates_epoch
 from stereogenbench_data.datasets.loader import (
     LoaderOptions,
@@ -20,11 +21,12 @@ from stereogenbench_data.datasets.loader import (
     split_options,
 )
 from stereogenbench_data.datasets.open_videos import videos_to_keep
-from stereogenbench_data.datasets.shared_epoch import SharedEpoch
+from stereogenbench_data.datasets.shared_epoch import FetchedCounts, SharedEpoch
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import check_samples
+from stereogenbench_data.samples.coming import Step
 from stereogenbench_data.samples.fields import (
     DEFAULT_PAIR_FIELDS,
     DEFAULT_VIEW_FIELDS,
@@ -37,9 +39,12 @@ from stereogenbench_data.samples.writer import Allocate, new_array
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import options_of, require_options
-from stereogenbench_data.selection.plan import Plan, Selection, plan_pairs, plan_views
+from stereogenbench_data.selection.order import EpochOrder, OrderRule, Runs, Tail
+from stereogenbench_data.selection.plan import Address, Plan, Selection, plan_pairs, plan_views
 from stereogenbench_data.selection.windows import FramesSpec
 from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.fetch_ahead import CONNECTIONS, FETCH_AHEAD_BYTES, FetchAhead
+from stereogenbench_data.sources.location import is_remote
 
 Data = str | Path | SceneIndex
 
@@ -47,10 +52,18 @@ Check = Literal["read", "opened", "metadata"]
 """Which videos are compared with their checksums: see `StereoPairs`."""
 
 
+_OF_CACHE: Final = 16
+"""The part of a cache that a process may fill ahead."""
+
+
+class SeekTableWarning(UserWarning):
+    """The index of data behind a URL is of an earlier version, so reading is slow."""
+
+
 class _MappedScenes(Dataset[Sample]):
     """Samples of a plan by number, loaded in the calling process."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - what its subclasses take
         self,
         index: SceneIndex,
         plan: Plan,
@@ -59,23 +72,42 @@ class _MappedScenes(Dataset[Sample]):
         cache: ShardCache | None,
         check: Check,
         buffers: Buffers,
+        fetch_ahead_bytes: int,
+        connections: int,
     ) -> None:
         check_samples(index, plan, request)
         self.index = index
         self.plan = plan
         self.request = request
         opened = _opens_checked(check, plan)
+        ahead = FetchAhead(limit_bytes=fetch_ahead_bytes, connections=connections)
+        if cache is not None:
+            # Several processes fill it: what one fetches ahead must not evict what another needs.
+            ahead.limit_bytes = min(fetch_ahead_bytes, cache.limit_bytes // _OF_CACHE)
+        if is_remote(index.root) and not index.load_seek_tables() and cache is None:
+            warnings.warn(
+                f"{index.where}: its index does not say where the packets of videos lie, so a "
+                f"frame takes several requests, one after another, and nothing is fetched ahead. "
+                f"Make the index again: `stereogenbench index`, or `stereogenbench pack` in the "
+                f"folder of the shards, which keeps them.",
+                SeekTableWarning,
+                stacklevel=3,
+            )
         self._loader = SampleLoader(
             index,
             request,
             cache=cache,
             check="opened" if opened else "metadata",
             frames="shared" if (np.diff(plan.first_pair) > 1).any() else "used once",
+            ahead=ahead if is_remote(index.root) else None,
         )
         self._buffers = BatchBuffers(buffers)
         self._streams = request.streams
         self._access: Literal["random", "in order"] = "random"
         self._epoch = SharedEpoch()
+        self._known_order: KnownOrder | None = None
+        self._next_batch: tuple[int, int] | None = None
+        self._fetched = FetchedCounts()
 
     @property
     def epoch(self) -> int:
@@ -131,9 +163,43 @@ class _MappedScenes(Dataset[Sample]):
         reading = list(enumerate(numbers))
         if not isinstance(numbers, EpochBatch):
             reading.sort(key=operator.itemgetter(1))
+        self._expect(
+            batch, read="as they come" if isinstance(numbers, EpochBatch) else "by number"
+        )
         for place, number in reading:
             loaded[place] = self._load_into(arrays, place, number, batch=batch)
+        self._fetched.publish(self._loader.fetched)
         return [loaded[place] for place in range(len(numbers))]
+
+    def _expect(self, batch: EpochBatch, *, read: Literal["by number", "as they come"]) -> None:
+        """Let the bytes of a batch's samples, and of the batches after it, be fetched ahead."""
+        this = (batch.epoch, batch.number)
+        if batch.number is None or this != self._next_batch or not self._loader.has_order:
+            self._loader.expect(self._steps(batch, read=read))
+        self._next_batch = None
+        if batch.number is not None and self._known_order is not None:
+            self._next_batch = (batch.epoch, batch.number + self._known_order.step)
+
+    def _steps(
+        self, batch: EpochBatch, *, read: Literal["by number", "as they come"]
+    ) -> Iterator[Step]:
+        """Yield the samples of a batch, and of those that this process gets after it."""
+        known, number = self._known_order, batch.number
+        samples: Sequence[int] = batch
+        ends: Collection[int] = batch.ends_of_runs
+        while True:
+            for each in sorted(samples) if read == "by number" else samples:
+                if -len(self.plan) <= each < len(self.plan):
+                    yield Step(self._address(each, batch.epoch), each in ends)
+            if number is None or known is None or number + known.step >= known.stop:
+                return
+            number += known.step
+            order = known.order(self.plan.runs, batch.epoch)
+            samples, ends = batch_samples(order, number, tail=known.tail)
+
+    def _address(self, number: int, epoch: int) -> Address:
+        address = self.plan.locate(number % len(self.plan), epoch=epoch)
+        return address._replace(run=0) if self._access == "random" else address
 
     def _load_into(
         self, arrays: BatchArrays | None, place: int, number: int, *, batch: EpochBatch
@@ -158,9 +224,7 @@ class _MappedScenes(Dataset[Sample]):
         if not -count <= number < count:
             raise IndexError(f"no sample {number}: there are {count}")
         number %= count
-        address = self.plan.locate(number, epoch=batch.epoch)
-        if self._access == "random":
-            address = address._replace(run=0)
+        address = self._address(number, batch.epoch)
         seeds = np.random.SeedSequence((self.plan.seed, batch.epoch, number))
         sample = self._loader.load(
             address,
@@ -204,6 +268,8 @@ class _MappedScenes(Dataset[Sample]):
         twin = copy.copy(self)
         twin._loader, twin._buffers = self._loader.copy(), BatchBuffers(self._buffers.kind)
         twin._epoch = SharedEpoch(self._epoch)
+        twin._known_order = twin._next_batch = None
+        twin._fetched = FetchedCounts()
         return twin
 
     def _keep_open(self, batches: EpochBatches, *, processes: int) -> None:
@@ -218,6 +284,15 @@ class _MappedScenes(Dataset[Sample]):
             )
             self._loader.keep_open(videos, frames=batches.rule.open_frames)
         self._access = "in order"
+        self._known_order = KnownOrder(
+            batches.rule, batches.tail, step=processes, stop=batches._end()
+        )
+        self._next_batch = None
+
+    def _stop_fetching(self) -> None:
+        """End the requests of this process for coming samples."""
+        self._next_batch = None
+        self._loader.stop_fetching()
 
     def stats(self) -> StreamStats:
         """Return how many videos this process has open for this dataset, and may have.
@@ -231,6 +306,7 @@ class _MappedScenes(Dataset[Sample]):
 
         A loader has its own videos, which its ``close()`` closes.
         """
+        self._next_batch = None
         self._loader.close()
 
     def __repr__(self) -> str:
@@ -239,6 +315,28 @@ class _MappedScenes(Dataset[Sample]):
         return (
             f"<{type(self).__name__}: {len(self)} samples of {scenes} scenes, {self.index.where}>"
         )
+
+
+class KnownOrder:
+    """The batches that a process gets after one of them, without the dataset that they are of."""
+
+    def __init__(self, rule: OrderRule, tail: Tail, *, step: int, stop: int) -> None:
+        """Take every ``step``-th batch up to ``stop``."""
+        self.tail = tail
+        self.step = step
+        self.stop = stop
+        self._rule = rule
+        self._order: EpochOrder | None = None
+
+    def order(self, runs: Runs, epoch: int) -> EpochOrder:
+        """Return the order of an epoch; the last one is kept."""
+        if self._order is None or self._order.epoch != epoch:
+            self._order = EpochOrder(runs, self._rule, epoch=epoch)
+        return self._order
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy in another process needs."""
+        return self.__dict__ | {"_order": None}
 
 
 class StereoPairs(_MappedScenes):
@@ -265,6 +363,8 @@ class StereoPairs(_MappedScenes):
         cache: ShardCache | None = None,
         check: Check = "read",
         buffers: Buffers = "reused",
+        fetch_ahead_bytes: int = FETCH_AHEAD_BYTES,
+        connections: int = CONNECTIONS,
         **selection: Unpack[Selection],
     ) -> None:
         """Select the samples; no video is opened before the first sample is read.
@@ -289,6 +389,10 @@ class StereoPairs(_MappedScenes):
                 always compared; the files of a released folder have no checksums.
             buffers: "reused": the memory of a batch is used for a later one once nobody holds any
                 part of it. "fresh": each batch has memory of its own, which costs speed.
+            fetch_ahead_bytes: How many bytes each process fetches from a URL before they are
+                needed, 256 MB by default; 0 fetches only what the current sample needs. With a
+                cache, what is fetched ahead fills it.
+            connections: How many requests each process makes to a URL at a time.
             **selection: Filters on scenes (`SceneFilters`), pairs, direction, baseline_cm,
                 balance and limit (`PairOptions`), and frames (`parse_frames`).
 
@@ -312,7 +416,16 @@ class StereoPairs(_MappedScenes):
             depth=depth,
             transform=transform,
         )
-        super().__init__(index, plan, request, cache=cache, check=check, buffers=buffers)
+        super().__init__(
+            index,
+            plan,
+            request,
+            cache=cache,
+            check=check,
+            buffers=buffers,
+            fetch_ahead_bytes=fetch_ahead_bytes,
+            connections=connections,
+        )
 
 
 class SceneViews(_MappedScenes):
@@ -338,6 +451,8 @@ class SceneViews(_MappedScenes):
         cache: ShardCache | None = None,
         check: Check = "read",
         buffers: Buffers = "reused",
+        fetch_ahead_bytes: int = FETCH_AHEAD_BYTES,
+        connections: int = CONNECTIONS,
         **filters: Unpack[SceneFilters],
     ) -> None:
         """Select the samples; no video is opened before the first sample is read.
@@ -354,6 +469,8 @@ class SceneViews(_MappedScenes):
             cache: As for `StereoPairs`.
             check: As for `StereoPairs`.
             buffers: As for `StereoPairs`.
+            fetch_ahead_bytes: As for `StereoPairs`.
+            connections: As for `StereoPairs`.
             **filters: Filters on scenes (`SceneFilters`).
 
         Raises:
@@ -374,7 +491,16 @@ class SceneViews(_MappedScenes):
         )
         index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
         plan = plan_views(index, cameras=cameras, frames=frames, seed=seed, filters=filters)
-        super().__init__(index, plan, request, cache=cache, check=check, buffers=buffers)
+        super().__init__(
+            index,
+            plan,
+            request,
+            cache=cache,
+            check=check,
+            buffers=buffers,
+            fetch_ahead_bytes=fetch_ahead_bytes,
+            connections=connections,
+        )
 
 
 def _opens_checked(check: Check, plan: Plan) -> bool:

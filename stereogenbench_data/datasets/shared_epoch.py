@@ -4,6 +4,7 @@ Forked workers see the rows of an index anyway. Workers that are spawned get the
 which is freed when the last of them ends.
 """
 
+import os
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, Final
 from weakref import WeakKeyDictionary
@@ -11,12 +12,16 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import pyarrow as pa
 import torch
+from torch.utils.data import get_worker_info
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 
 _FOLLOWS: Final = -1
 """Stands for the epoch that is followed."""
+
+_COUNTED: Final = 255
+"""Workers with a place of their own in `FetchedCounts`."""
 
 _rows: Final[WeakKeyDictionary[SceneIndex, torch.Tensor]] = WeakKeyDictionary()
 """The rows of each index that was sent to other processes, laid out once."""
@@ -73,6 +78,31 @@ class SharedEpoch:
         """Go to an epoch because a pass is over: until `set` is called, here or on the followed."""
         self._own[0] = epoch
         self._advanced_from = int(self._followed[1])
+
+
+class FetchedCounts:
+    """How many requests the processes of a loader made, and how many bytes they fetched."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self._of_worker = shared_full((_COUNTED + 1, 2), 0)
+        self._before: tuple[int, torch.Tensor] | None = None
+
+    def publish(self, fetched: tuple[int, int]) -> None:
+        """Take what this process has fetched since it began."""
+        if fetched == (0, 0):
+            return
+        info = get_worker_info()
+        row = 0 if info is None else 1 + info.id % _COUNTED
+        if self._before is None or self._before[0] != os.getpid():
+            self._before = os.getpid(), self._of_worker[row].clone()
+        self._of_worker[row] = self._before[1] + torch.tensor(fetched)
+
+    @property
+    def total(self) -> tuple[int, int]:
+        """Requests and bytes of all processes, after the last batch that each has made."""
+        requests, count = self._of_worker.sum(dim=0).tolist()
+        return requests, count
 
 
 def _parted(index: SceneIndex) -> tuple[Any, ...]:

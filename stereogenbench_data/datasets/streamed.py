@@ -37,6 +37,8 @@ class StreamOptions(Selection, EpochOptions, total=False):
     cache: ShardCache | None
     check: Check
     buffers: Buffers
+    fetch_ahead_bytes: int
+    connections: int
 
 
 class StereoPairStream(IterableDataset[Sample]):
@@ -261,3 +263,5 @@ class SamplePass(Iterator[Sample]):
         self._at = 0
         buffers = self._stream.pairs._buffers
         self._arrays = buffers.allocate(len(self._batch)) if buffers.makes_batches else None
+        self._stream.pairs._fetched.publish(self._stream.pairs._loader.fetched)
+        self._stream.pairs._expect(self._batch, read="as they come")

@@ -3,12 +3,13 @@
 A `Journal` keeps the described scenes, so a killed run continues where it stopped.
 """
 
+import base64
 from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, require_workers
 from stereogenbench_data.errors import (
@@ -17,7 +18,7 @@ from stereogenbench_data.errors import (
     StorageError,
 )
 from stereogenbench_data.index.journal import Journal
-from stereogenbench_data.index.rows import SCHEMA, row_of, scene_of
+from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, row_of, scene_of
 from stereogenbench_data.index.scene_folder import (
     IncompleteScene,
     SceneFolder,
@@ -72,7 +73,7 @@ class _Outcome:
 
 def scene_journal(path: Path, *, walk: str) -> Journal:
     """Return the journal of the scenes that a walk has described; see `Journal`."""
-    return Journal(path, work={"walk": walk, "columns": SCHEMA.names})
+    return Journal(path, work={"walk": walk, "columns": [*SCHEMA.names, SEEK_COLUMN]})
 
 
 def walk(  # noqa: PLR0913 - each is an option of the command
@@ -117,7 +118,7 @@ def walk(  # noqa: PLR0913 - each is an option of the command
     for outcome in engine.map(task, pending, name=str, workers=workers):
         outcomes[outcome.key] = outcome
         if journal is not None and outcome.scene is not None:
-            journal.record(outcome.key, row_of(outcome.scene), stamp=outcome.stamp)
+            journal.record(outcome.key, _journalled(outcome.scene), stamp=outcome.stamp)
         if progress is not None:
             progress(len(outcomes), total)
     in_order = [outcomes[key] for key in folders.keys]
@@ -167,8 +168,15 @@ def _reused(root: str | Path, keys: Iterable[str], journal: Journal | None) -> d
             stamp = stamp_of(SceneFolder(root, key).stamps())
             row = None if journal is None else journal.value(key, stamp=stamp)
             if row is not None:
-                outcomes[key] = _Outcome(key, "whole", scene_of(row), stamp)
+                tables = base64.b64decode(row.pop("seek_tables"))
+                scene = replace(scene_of(row), seek_tables=tables)
+                outcomes[key] = _Outcome(key, "whole", scene, stamp)
     return outcomes
+
+
+def _journalled(scene: Scene) -> dict[str, Any]:
+    """Return a scene as JSON."""
+    return row_of(scene) | {"seek_tables": base64.b64encode(scene.seek_tables or b"").decode()}
 
 
 def _report(

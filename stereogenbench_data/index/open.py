@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple, TypeAlias
 
 import pyarrow as pa
 
@@ -25,6 +25,8 @@ from stereogenbench_data.index.parquet import (
     IndexHead,
     made_again,
     read_index_file,
+    read_seek_tables,
+    seek_tables_of,
     table_of_scenes,
 )
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
@@ -56,9 +58,25 @@ class IncompleteSceneWarning(UserWarning):
     """Some scenes of the data cannot be used; the message names them and the reasons."""
 
 
-Opened = tuple[pa.Table, IndexHead, str]
-"""A checked table with one row per scene; what is known besides, with the root where the data are;
-and how the root differs from the index, with the cure, "" if it does not."""
+SeekTables: TypeAlias = pa.BinaryArray | Path | None
+"""The packed seek tables of scenes, a row each, or the index file that holds them; None where there
+are none."""
+
+
+class Opened(NamedTuple):
+    """An index that was opened.
+
+    Attributes:
+        table: A checked table with one row per scene.
+        head: What is known besides, with the root where the data are.
+        stale: How the root differs from the index, with the cure; "" if it does not.
+        seek_tables: Where the packets of the videos lie.
+    """
+
+    table: pa.Table
+    head: IndexHead
+    stale: str = ""
+    seek_tables: SeekTables = None
 
 
 def open_table(data: str | Path, *, root: str | Path | None, retry: RetryPolicy | None) -> Opened:
@@ -70,26 +88,26 @@ def open_table(data: str | Path, *, root: str | Path | None, retry: RetryPolicy 
     named_root = None if root is None else _require_root(root)
     if is_remote(data):
         where = shown(data)
-        table, head, stale = _open_url(str(data), root=named_root, retry=retry)
+        opened = _open_url(str(data), root=named_root, retry=retry)
     else:
         path = local_path(data)
         where = str(path)
         if path.is_dir() and not (path / INDEX_NAME).is_file():
             _require_no_root(path, named_root)
-            table, head, stale = _open_tree(path)
+            opened = _open_tree(path)
         elif path.is_dir() or path.is_file():
             file = path / INDEX_NAME if path.is_dir() else path
-            table, head, stale = _open_file(file, root=named_root)
+            opened = _open_file(file, root=named_root)
         else:
             raise StorageError(
                 f"{path}: does not exist; expected an index file, a folder with {INDEX_NAME} or "
                 f"a folder in the released layout."
             )
-    if left_out := head.incomplete | head.broken:
+    if left_out := opened.head.incomplete | opened.head.broken:
         warnings.warn(f"{where}: {_listed(left_out)}", IncompleteSceneWarning, stacklevel=3)
-    if stale:
-        warnings.warn(stale, StaleIndexWarning, stacklevel=3)
-    return table, head, stale
+    if opened.stale:
+        warnings.warn(opened.stale, StaleIndexWarning, stacklevel=3)
+    return opened
 
 
 def _open_file(path: Path, *, root: str | None) -> Opened:
@@ -102,9 +120,8 @@ def _open_file(path: Path, *, root: str | None) -> Opened:
     table, head = read_index_file(path, where=str(path))
     head = replace(head, root=_recorded_root(path, head, table) if root is None else root)
     _require_digest(table, head, where=str(path))
-    if is_remote(head.root):
-        return table, head, ""
-    return table, head, stale_message(table, head, index_file=path)
+    stale = "" if is_remote(head.root) else stale_message(table, head, index_file=path)
+    return Opened(table, head, stale, path)
 
 
 def warn_if_stale(root: str | Path) -> None:
@@ -113,7 +130,7 @@ def warn_if_stale(root: str | Path) -> None:
     if not path.is_file():
         return
     try:
-        _, _, stale = _open_file(path, root=None)
+        stale = _open_file(path, root=None).stale
     except StorageError:
         return  # opening an index that cannot be read raises the error
     if stale:
@@ -150,7 +167,8 @@ def _open_url(url: str, *, root: str | None, retry: RetryPolicy | None) -> Opene
     table, head = read_index_file(content, where=remote.where)
     head = replace(head, root=root or beside)
     _require_digest(table, head, where=remote.where)
-    return table, head, ""
+    content.seek(0)
+    return Opened(table, head, seek_tables=read_seek_tables(content))
 
 
 def _open_tree(root: str | Path) -> Opened:
@@ -165,7 +183,8 @@ def _open_tree(root: str | Path) -> Opened:
     if not report.scenes:
         raise StorageError(f"{where}: no scene is complete: {_listed(report.incomplete)}")
     head = IndexHead(root=report.root, incomplete=report.incomplete, is_part=report.is_part)
-    return table_of_scenes(report.scenes, where=where), head, ""
+    table = table_of_scenes(report.scenes, where=where)
+    return Opened(table, head, seek_tables=seek_tables_of(report.scenes))
 
 
 def _require_digest(table: pa.Table, head: IndexHead, *, where: str) -> None:

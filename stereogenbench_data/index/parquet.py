@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 
 from stereogenbench_data.errors import StorageError, cure_of, describe_os_error, explain_os_errors
 from stereogenbench_data.index.arrow import as_numpy, one_array
-from stereogenbench_data.index.rows import ADDED, SCHEMA, TRAINING_COLUMNS, row_of
+from stereogenbench_data.index.rows import ADDED, SCHEMA, SEEK_COLUMN, TRAINING_COLUMNS, row_of
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.training import MOST_PSNR_DB
@@ -77,7 +77,9 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
         with pq.ParquetFile(file) as parquet:
             metadata = (parquet.schema_arrow.metadata or {}).get(_METADATA_KEY)
             head = _parse_head(metadata, where=where)
-            table = _with_added(parquet.read().replace_schema_metadata()).combine_chunks()
+            names = [name for name in parquet.schema_arrow.names if name != SEEK_COLUMN]
+            table = parquet.read(columns=names).replace_schema_metadata()
+            table = _with_added(table).combine_chunks()
         table.validate(full=True)
     except StorageError:
         raise
@@ -93,6 +95,21 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
     return table, head
 
 
+def read_seek_tables(file: Path | pa.BufferReader) -> pa.BinaryArray | None:
+    """Return the packed seek tables of an index file, a row each; None if it has none.
+
+    They only speed up reading, so a column that is something else is as good as none.
+    """
+    try:
+        with pq.ParquetFile(file) as parquet:
+            if SEEK_COLUMN not in parquet.schema_arrow.names:
+                return None
+            found = one_array(parquet.read(columns=[SEEK_COLUMN]).column(SEEK_COLUMN))
+    except (pa.ArrowException, OSError):
+        return None
+    return found if pa.types.is_binary(found.type) else None
+
+
 def _with_added(table: pa.Table) -> pa.Table:
     """Return a table of an earlier version with the columns that came later, which say nothing."""
     missing = [SCHEMA.field(name) for name in ADDED if name not in table.column_names]
@@ -102,7 +119,9 @@ def _with_added(table: pa.Table) -> pa.Table:
     return table.select(SCHEMA.names) if missing and is_whole else table
 
 
-def write_index_file(path: Path, table: pa.Table, head: IndexHead) -> None:
+def write_index_file(
+    path: Path, table: pa.Table, head: IndexHead, *, seek_tables: pa.BinaryArray | None = None
+) -> None:
     """Write an index file, whole or not at all; it records its root as `recorded_root` says.
 
     Raises:
@@ -118,6 +137,8 @@ def write_index_file(path: Path, table: pa.Table, head: IndexHead) -> None:
         "passed_over": list(head.passed_over),
         "shards": {name: asdict(facts) for name, facts in sorted(head.shards.items())},
     }
+    if seek_tables is not None and seek_tables.null_count < len(seek_tables):
+        table = table.append_column(pa.field(SEEK_COLUMN, pa.binary()), seek_tables)
     described = table.replace_schema_metadata({_METADATA_KEY: json.dumps(description)})
     what = f"{path}: the index cannot be written"
     with explain_os_errors(what, "Choose another place with --out."):
@@ -156,6 +177,12 @@ def table_of_scenes(scenes: Iterable[Scene], *, where: str) -> pa.Table:
         raise StorageError(f"{where}: a scene does not fit the index: {error}.") from error
     require_sound(table, where=where)
     return table
+
+
+def seek_tables_of(scenes: Iterable[Scene]) -> pa.BinaryArray:
+    """Return the packed seek tables of scenes, in the order of `table_of_scenes`."""
+    tables = {scene.id.key: scene.seek_tables for scene in scenes}
+    return pa.array([tables[key] for key in sorted(tables)], type=pa.binary())
 
 
 def _parse_head(metadata: bytes | None, *, where: str) -> IndexHead:

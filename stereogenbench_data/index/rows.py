@@ -106,6 +106,11 @@ SCHEMA: Final = pa.schema(
 """The columns of an index; those at the end may be null."""
 
 
+SEEK_COLUMN: Final = "seek_tables"
+"""A further column of an index file, which is read only where it is needed: `Scene.seek_tables`. It
+is no part of the digest, so that data indexed again are the same data."""
+
+
 def row_of(scene: Scene) -> dict[str, Any]:
     """Return a scene as plain values, one for each column."""
     row: dict[str, Any] = {}

@@ -35,6 +35,7 @@ from stereogenbench_data.media.depth import (
     resolve_encoding,
 )
 from stereogenbench_data.media.depth_frames import CODEC_NAME
+from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
 from stereogenbench_data.schema.document import parse_text, require_text_size
 from stereogenbench_data.schema.parse import (
@@ -195,7 +196,12 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     trajectory = parse_trajectory(folder.read(TRAJECTORY_JSON), where=f"{key}/{TRAJECTORY_JSON}")
     texts: dict[str, bytes] = {name: folder.read(name) for name in _DESCRIPTIONS if name in files}
     caption = _caption(texts, key=key)
-    facts = {name: _probed(folder, key, _held(files, name)) for name in videos}
+    facts, tables = {}, {}
+    for name in videos:
+        held = _held(files, name)
+        facts[name], table = _probed(folder, key, held)
+        if table is not None:
+            tables[held] = table
     counts = {name: fact.frames for name, fact in facts.items()}
     counts[TRAJECTORY_JSON] = trajectory.frame_count
     frames = _common(key, counts, what="number of frames", unit="frames")
@@ -225,6 +231,7 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
         valid_depth_ratio=ratio,
         key_frames=_common_key_frames(facts, frames=frames),
         members={name: Member(f"{key}/{name}", 0, size) for name, (size, _) in files.items()},
+        seek_tables=packed_tables(tables),
     )
     if document is None:
         return scene
@@ -262,14 +269,16 @@ def _held(files: Mapping[str, object], name: str) -> str:
     return name if name in files else PACKED_DEPTH_NAMES.get(name, name)
 
 
-def _probed(folder: SceneFolder, key: str, name: str) -> StreamFacts:
+def _probed(folder: SceneFolder, key: str, name: str) -> tuple[StreamFacts, SeekTable | None]:
+    """Return what a video is, and where its packets lie."""
     video, where = folder.video(name), f"{key}/{name}"
     try:
-        if name.endswith(".mp4"):
-            facts = probe(video, name=where, pixel_format="later")
-            if facts.is_colour is not None:
-                return facts
-        return probe(video, name=where)
+        is_later: Literal["later", "needed"] = "later" if name.endswith(".mp4") else "needed"
+        facts = probe(video, name=where, pixel_format=is_later)
+        if is_later == "later" and facts.is_colour is None:
+            facts = probe(video, name=where)
+        is_near = isinstance(video, Path)
+        return facts, read_seek_table(video, name=where, reads="all" if is_near else "little")
     finally:
         if isinstance(video, MemberFile):
             video.close()

@@ -15,9 +15,15 @@ import pyarrow.compute as pc
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.arrow import as_numpy, one_array, table_digest
 from stereogenbench_data.index.build import TreeReport
-from stereogenbench_data.index.open import open_table
-from stereogenbench_data.index.parquet import IndexHead, table_of_scenes, write_index_file
-from stereogenbench_data.index.rows import SCHEMA, scene_of
+from stereogenbench_data.index.open import SeekTables, open_table
+from stereogenbench_data.index.parquet import (
+    IndexHead,
+    read_seek_tables,
+    seek_tables_of,
+    table_of_scenes,
+    write_index_file,
+)
+from stereogenbench_data.index.rows import SCHEMA, SEEK_COLUMN, scene_of
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.sources.location import shown
 from stereogenbench_data.sources.retry import RetryPolicy
@@ -42,7 +48,13 @@ class SceneIndex:
     """
 
     def __init__(
-        self, table: pa.Table, head: IndexHead, *, retry: RetryPolicy | None = None, stale: str = ""
+        self,
+        table: pa.Table,
+        head: IndexHead,
+        *,
+        retry: RetryPolicy | None = None,
+        stale: str = "",
+        seek_tables: SeekTables = None,
     ) -> None:
         """Take a checked table; use `open` or `from_scenes` to make an index."""
         self.root = head.root
@@ -56,6 +68,7 @@ class SceneIndex:
         self._table = table
         self._columns: dict[str, np.ndarray] = {}
         self._digest = head.digest
+        self._seek_tables = seek_tables
 
     @classmethod
     def open(
@@ -87,8 +100,8 @@ class SceneIndex:
                 another version, only you may name the place of its data, or scenes of a tree are
                 broken.
         """
-        table, head, stale = open_table(data, root=root, retry=retry)
-        return cls(table, head, retry=retry, stale=stale)
+        table, head, stale, seek_tables = open_table(data, root=root, retry=retry)
+        return cls(table, head, retry=retry, stale=stale, seek_tables=seek_tables)
 
     @classmethod
     def from_scenes(
@@ -110,8 +123,10 @@ class SceneIndex:
         Raises:
             StorageError: If two scenes have one key, or a path leaves the root.
         """
+        scenes = tuple(scenes)
         table = table_of_scenes(scenes, where=shown(root))
-        return cls(table, IndexHead(str(root), shards=dict(shards or {})), retry=retry)
+        head = IndexHead(str(root), shards=dict(shards or {}))
+        return cls(table, head, retry=retry, seek_tables=seek_tables_of(scenes))
 
     @classmethod
     def from_report(cls, report: TreeReport) -> "SceneIndex":
@@ -119,7 +134,8 @@ class SceneIndex:
         head = IndexHead(
             report.root, incomplete=report.incomplete, broken=report.broken, is_part=report.is_part
         )
-        return cls(table_of_scenes(report.scenes, where=shown(report.root)), head)
+        table = table_of_scenes(report.scenes, where=shown(report.root))
+        return cls(table, head, seek_tables=seek_tables_of(report.scenes))
 
     def __repr__(self) -> str:
         """Return the root without secrets, and the number of scenes and shards."""
@@ -144,7 +160,9 @@ class SceneIndex:
             is_part=self.is_part,
             passed_over=self.passed_over,
         )
-        write_index_file(Path(path), self._table, head)
+        self.load_seek_tables()
+        tables = None if isinstance(self._seek_tables, Path) else self._seek_tables
+        write_index_file(Path(path), self._table, head, seek_tables=tables)
 
     @property
     def where(self) -> str:
@@ -164,6 +182,26 @@ class SceneIndex:
         if not 0 <= row < len(self):
             raise StorageError(f"{self.where}: there is no row {row}; the index has {len(self)}.")
         return scene_of(self._table.slice(int(row), 1).to_pylist()[0])
+
+    def load_seek_tables(self) -> bool:
+        """Read where packets lie, if the index file has that; return whether scenes have it.
+
+        An index of data on this machine is opened without it.
+        """
+        if isinstance(self._seek_tables, Path):
+            found = read_seek_tables(self._seek_tables)
+            self._seek_tables = found if found is not None and len(found) == len(self) else None
+        return self._seek_tables is not None and self._seek_tables.null_count < len(self)
+
+    def seek_tables(self, row: int) -> bytes | None:
+        """Return where the packets of a scene's videos lie, as `Scene.seek_tables`.
+
+        None where that is not known, or before `load_seek_tables`.
+        """
+        if self._seek_tables is None or isinstance(self._seek_tables, Path):
+            return None
+        packed: bytes | None = self._seek_tables[row].as_py()
+        return packed
 
     def column(self, name: str) -> np.ndarray:
         """Return a column as a read-only array; `rows.SCHEMA` names them.
@@ -260,13 +298,20 @@ class SceneIndex:
     def parted(self) -> tuple[pa.Table, dict[str, Any]]:
         """Return the rows, and the rest that `of_parts` needs, to share the rows."""
         rest = self.__getstate__()
-        return rest.pop("_table"), rest
+        table = rest.pop("_table")
+        if isinstance(self._seek_tables, pa.Array):
+            table = table.append_column(SEEK_COLUMN, rest.pop("_seek_tables"))
+        return table, rest
 
     @classmethod
     def of_parts(cls, table: pa.Table, rest: Mapping[str, Any]) -> "SceneIndex":
         """Return the index that was `parted`, over the same rows wherever they are."""
         index = cls.__new__(cls)
-        index.__dict__.update(rest, _table=table)
+        index.__dict__.update(rest)
+        if SEEK_COLUMN in table.column_names:
+            index._seek_tables = one_array(table.column(SEEK_COLUMN))
+            table = table.drop_columns([SEEK_COLUMN])
+        index._table = table
         return index
 
     def __getstate__(self) -> dict[str, Any]:

@@ -33,6 +33,19 @@ class BinaryFile(Protocol):
         """Return the current offset."""
 
 
+@runtime_checkable
+class HeaderFirstFile(BinaryFile, Protocol):
+    """A binary file that is opened by its header, so that no packet is fetched for that.
+
+    Attributes:
+        opens_by_header: Whether its header is enough to open it.
+        hides_packets: While it is set, the file seems to end where packets lie.
+    """
+
+    opens_by_header: bool
+    hides_packets: bool
+
+
 VideoFile = str | Path | BinaryFile
 
 
@@ -182,6 +195,34 @@ def open_container(
             f"{name}: its video codec is unknown to this FFmpeg: store it with another codec."
         )
     return container
+
+
+Placed = Literal["at the first packet", "anywhere"]
+"""Where an open container stands: it is read on from the first packet, or has to seek first."""
+
+
+def open_by_header(file: VideoFile, *, name: str) -> tuple[InputContainer, Placed]:
+    """Open a video as `open_container` does, without a packet where its file allows that.
+
+    The pixel format may be missing until a picture is decoded.
+
+    Raises:
+        StorageError: If a path is missing, not a file or not readable.
+        MediaError: If the content is not an MP4 or Matroska file with at least one video stream.
+    """
+    if isinstance(file, HeaderFirstFile) and file.opens_by_header:
+        file.hides_packets = True
+        try:
+            container = _open(file, options=_UNDECODED)
+            video = container.streams.video
+            if video and video[0].start_time is not None and video[0].codec_context is not None:
+                return container, "anywhere"
+            container.close()
+        except av.FFmpegError:
+            pass  # the whole file says what is wrong with it
+        finally:
+            file.hides_packets = False
+    return open_container(file, name=name, pixel_format="later"), "at the first packet"
 
 
 def _open(file: VideoFile, *, options: dict[str, str]) -> InputContainer:

@@ -21,6 +21,7 @@ from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
 from stereogenbench_data.media.clock import INTRA_ONLY, Clock
+from stereogenbench_data.media.container import Placed
 
 if TYPE_CHECKING:
     VideoPacket = Packet[VideoStream]
@@ -30,7 +31,7 @@ else:
 _SKIPS_EXACTLY: Final = frozenset({"h264", "hevc", "mpeg4"})
 """Codecs whose decoders drop, on NONREF, only pictures that no other is predicted from."""
 
-_BLIND_JUMP: Final = 8
+BLIND_JUMP: Final = 8
 """Frames to decode through rather than to seek, while a file's key frames are not known."""
 
 _SIZE_BYTES: Final = 3
@@ -59,9 +60,16 @@ class Decoder:
         codec: FFmpeg's name of the codec.
     """
 
-    def __init__(self, container: InputContainer, *, clock: Clock) -> None:
+    def __init__(
+        self,
+        container: InputContainer,
+        *,
+        clock: Clock,
+        placed: Placed = "at the first packet",
+    ) -> None:
         """Take over a container that was just opened."""
         self._container = container
+        self._is_placed = placed == "at the first packet"
         self._clock = clock
         self._stream: VideoStream = container.streams.video[0]
         self._context = self._stream.codec_context
@@ -124,9 +132,11 @@ class Decoder:
         return frame
 
     def _must_seek(self, index: int) -> bool:
+        if not self._is_placed:
+            return True
         if index <= self._next:
             return index < self._next
-        if not self._knows_key_frames and index - self._next > _BLIND_JUMP:
+        if not self._knows_key_frames and index - self._next > BLIND_JUMP:
             return True
         entries = self._stream.index_entries
         key = entries.search_timestamp(self._clock.latest(index))
@@ -147,7 +157,7 @@ class Decoder:
         self._fed.clear()
         self._next = self._index(found[0])
         self._newest = 0
-        self._knows_key_frames = True
+        self._knows_key_frames = self._is_placed = True
 
     def _in_file_order(self, first: VideoPacket, index: int) -> list[VideoPacket]:
         """Return the packets to decode first for a frame of an intra-only codec.

@@ -360,6 +360,11 @@ class DepthFrames(FrameReader):
         """Facts of the depth video that was packed."""
         return self._header.clip
 
+    @property
+    def chunk_bounds(self) -> tuple[int, ...]:
+        """Where each frame's bytes begin, and the end of the file, which belongs to the last."""
+        return (*self._header.offsets, self._file_bytes)
+
     def chunk(self, index: int) -> bytes:
         """Return the compressed bytes of a frame, empty for a frame of zeros.
 
@@ -371,7 +376,7 @@ class DepthFrames(FrameReader):
         if size == 0:
             return b""
         self._file.seek(self._header.offsets[index])
-        chunk = self._file.read(size)
+        chunk = self._read(size)
         require_chunk(
             chunk,
             clip=self.clip,
@@ -405,15 +410,22 @@ class DepthFrames(FrameReader):
         if self._own is not None:
             self._own.close()
 
+    def _read(self, size: int) -> bytes:
+        """Return the next bytes, fewer only at the end: a file may give them in pieces."""
+        data = self._file.read(size)
+        while 0 < len(data) < size and (more := self._file.read(size - len(data))):
+            data += more
+        return data
+
     def _read_header(self, frames: int | Literal["any"]) -> FrameHeader:
-        file_bytes = self._file.seek(0, 2)
+        file_bytes = self._file_bytes = self._file.seek(0, 2)
         self._file.seek(0)
         start = self._file.read(FIXED_BYTES)
         size = header_bytes(
             start, frames=MOST_FRAMES if frames == "any" else frames, name=self.name
         )
         if size > len(start):
-            start += self._file.read(size - len(start))
+            start += self._read(size - len(start))
         if len(start) < size:
             raise MediaError(
                 f"{self.name}: is cut short: its header has {size} bytes, and only {len(start)} "

@@ -31,6 +31,7 @@ from stereogenbench_data.media.container import (
     exact,
     frames_by_duration,
     is_colour_format,
+    open_by_header,
     open_container,
     require_whole_payload,
     stream_facts,
@@ -158,7 +159,7 @@ class VideoReader(FrameReader):
         self._facts: StreamFacts | None = None
         self._decoder: Decoder | None = None
         self._is_seen = False
-        container = open_container(file, name=name, pixel_format="later")
+        container, placed = open_by_header(file, name=name)
         try:
             require_whole_payload(container, name=name)
             context = container.streams.video[0].codec_context
@@ -172,6 +173,9 @@ class VideoReader(FrameReader):
             if context.pix_fmt is not None:
                 self._facts = stream_facts(container, name=name, frames=frames)
             steady = steady_clock(container, frames=frames)
+            if steady is None and placed == "anywhere":
+                container.close()
+                container = open_container(file, name=name, pixel_format="later")
             self._clock: Clock = steady or self._survey(container)
         except MediaError:
             container.close()
@@ -179,7 +183,7 @@ class VideoReader(FrameReader):
         if steady is None:
             container.close()
         else:
-            self._decoder = Decoder(container, clock=steady)
+            self._decoder = Decoder(container, clock=steady, placed=placed)
 
     @property
     def facts(self) -> StreamFacts:
@@ -237,7 +241,8 @@ class VideoReader(FrameReader):
 
     def _reach(self, index: int) -> VideoFrame:
         if self._decoder is None:
-            self._decoder = self._opened(pixel_format="later")
+            container, placed = open_by_header(self._file, name=self.name)
+            self._decoder = Decoder(container, clock=self._clock, placed=placed)
         try:
             return self._decoder.reach(index)
         except (UnexpectedPicture, av.FFmpegError):
@@ -249,7 +254,8 @@ class VideoReader(FrameReader):
         if not isinstance(self._clock, TableClock):
             with open_container(self._file, name=self.name) as container:
                 self._clock = self._survey(container)
-        self._decoder = self._opened(pixel_format="needed")
+        container = open_container(self._file, name=self.name)
+        self._decoder = Decoder(container, clock=self._clock)
         try:
             return self._decoder.decode_to(index)
         except (UnexpectedPicture, av.FFmpegError) as error:
@@ -259,10 +265,6 @@ class VideoReader(FrameReader):
                 f"{self.name}: frame {index} cannot be decoded ({reason}). The file is damaged: "
                 f"compare it with its checksum, or fetch it again."
             ) from error
-
-    def _opened(self, *, pixel_format: Literal["needed", "later"]) -> Decoder:
-        container = open_container(self._file, name=self.name, pixel_format=pixel_format)
-        return Decoder(container, clock=self._clock)
 
     def _survey(self, container: InputContainer) -> TableClock:
         steady = steady_clock(container, frames=self.frames)

@@ -2,7 +2,8 @@
 
 import copy
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final, Literal, Self
 
@@ -13,6 +14,7 @@ from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import depth_frame_index
+from stereogenbench_data.samples.coming import ComingSamples, NeededFiles, Step
 from stereogenbench_data.samples.derive import RECTIFIED_PX, SceneFacts
 from stereogenbench_data.samples.request import Request
 from stereogenbench_data.samples.streams import OPEN_STREAMS, Streams, StreamStats
@@ -26,6 +28,7 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.schema.trajectory import parse_trajectory
 from stereogenbench_data.selection.plan import Address
 from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.fetch_ahead import FetchAhead
 from stereogenbench_data.sources.members import MemberSource
 
 KEPT_POSES: Final = 32
@@ -50,6 +53,7 @@ class SampleDecoder:
         cache: ShardCache | None = None,
         check: Literal["opened", "metadata"] = "metadata",
         frames: Literal["shared", "used once"] = "shared",
+        ahead: FetchAhead | None = None,
     ) -> None:
         """Prepare to decode; nothing is opened yet.
 
@@ -59,6 +63,7 @@ class SampleDecoder:
             cache: Where to keep what comes from a URL, or None.
             check: What is compared with its checksum, as `MemberSource` says.
             frames: Whether several samples may show a frame of a camera, which is kept for them.
+            ahead: What fetches the bytes of samples from a URL; None fetches each as it is read.
         """
         self._index = index
         self._request = request
@@ -69,7 +74,9 @@ class SampleDecoder:
             cache=cache,
             check=check,
             retry=index.retry,
+            ahead=ahead,
         )
+        self._ahead = ahead
         self._frames = frames
         self._needs = request.streams
         poses = {request.known[name].needs_poses for name in request.fields}
@@ -80,6 +87,9 @@ class SampleDecoder:
         self._is_changed = request.transform is not None
         self._most_depths, self._kept_frames = OPEN_STREAMS, 1
         self._streams = Streams(self._source)
+        self._coming = self._new_coming()
+        if self._coming is not None:
+            self._coming.keep(OPEN_STREAMS, frames=1)
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
         self._depths: OrderedDict[tuple[int, ...], StoredDepth] = OrderedDict()
@@ -97,7 +107,14 @@ class SampleDecoder:
     def copy(self) -> Self:
         """Return a decoder of the same samples with open videos of its own."""
         twin = copy.copy(self)
-        twin._streams = Streams(self._source)
+        if self._ahead is not None:
+            limit_bytes, connections = self._ahead.limit_bytes, self._ahead.connections
+            twin._ahead = FetchAhead(limit_bytes=limit_bytes, connections=connections)
+            twin._source = self._source.fetching_by(twin._ahead)
+        twin._streams = Streams(twin._source)
+        twin._coming = twin._new_coming()
+        if twin._coming is not None:
+            twin._coming.keep(OPEN_STREAMS, frames=1)
         twin._scenes, twin._depths, twin._poses = OrderedDict(), OrderedDict(), OrderedDict()
         return twin
 
@@ -110,6 +127,33 @@ class SampleDecoder:
         kinds = {stream.partition("_")[2] for stream in self._needs}
         self._most_depths = videos // len(kinds | {"depth"}) * frames
         self._kept_frames = frames
+        if self._coming is not None:
+            self._coming.keep(videos, frames=frames)
+
+    @property
+    def fetched(self) -> tuple[int, int]:
+        """How many ranges this process has fetched, and how many bytes."""
+        return self._source.fetched.requests, self._source.fetched.bytes
+
+    @property
+    def has_order(self) -> bool:
+        """Whether samples were decoded as they were expected; True where none is fetched."""
+        return self._coming is None or self._coming.has_order
+
+    def expect(self, steps: Iterable[Step]) -> None:
+        """Take the samples that will be decoded next, so that their bytes are fetched ahead."""
+        if self._coming is not None:
+            self._coming.expect(steps)
+
+    def begin(self, address: Address) -> None:
+        """Fetch what a sample needs, which is decoded next, and what those after it need."""
+        if self._coming is not None:
+            self._coming.begin(address, self._needed_files)
+
+    def end(self, address: Address) -> None:
+        """Forget the bytes that a sample needed, which was decoded."""
+        if self._coming is not None:
+            self._coming.end(address)
 
     def release(self, address: Address) -> None:
         """Close the videos of a run that has been read to its end."""
@@ -117,8 +161,14 @@ class SampleDecoder:
         for key in [key for key in self._depths if key[:2] == (address.row, address.run)]:
             del self._depths[key]
 
+    def stop_fetching(self) -> None:
+        """End requests, and expect no sample."""
+        if self._coming is not None:
+            self._coming.close()
+
     def close(self) -> None:
-        """Close the videos that are open in this process."""
+        """Close the videos that are open in this process, and end its requests."""
+        self.stop_fetching()
         self._streams.close()
         self._scenes.clear()
         self._depths.clear()
@@ -127,7 +177,10 @@ class SampleDecoder:
         """Return a scene of the index; those of the last rows asked for are kept."""
         scene = self._scenes.get(row)
         if scene is None:
-            scene = self._scenes[row] = self._index.scene(row)
+            scene = self._index.scene(row)
+            if self._coming is not None:
+                scene = replace(scene, seek_tables=self._index.seek_tables(row))
+            self._scenes[row] = scene
             if len(self._scenes) > KEPT_SCENES:
                 self._scenes.popitem(last=False)
         return scene
@@ -199,6 +252,40 @@ class SampleDecoder:
             self._camera_poses(scene),
             url=self._source.url(scene, rgb_name(address.source)),
             frames=address.frames,
+        )
+
+    def _new_coming(self) -> ComingSamples | None:
+        return None if self._ahead is None else ComingSamples(self._source, self._ahead)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what a copy in another process needs."""
+        return self.__dict__ | {"_coming": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become a copy."""
+        self.__dict__.update(state)
+        self._coming = self._new_coming()
+        if self._coming is not None:
+            self._coming.keep(self._streams.stats.videos_limit, frames=self._kept_frames)
+
+    def _needed_files(self, address: Address) -> NeededFiles:
+        """Return what a sample is read from."""
+        scene = self.scene(address.row)
+        frames = {rgb_name(camera): [*address.frames] for camera in self._cameras(address, "rgb")}
+        for camera in self._cameras(address, "depth"):
+            encoding = self._encoding(scene, camera)
+            lagged = [
+                depth_frame_index(frame, encoding=encoding, frames=scene.frames)
+                for frame in address.frames
+            ]
+            frames[depth_name(camera)] = [frame for frame in lagged if frame is not None]
+        texts = (TRAJECTORY_JSON,) if self._needs_poses(scene) else ()
+        return NeededFiles(scene, frames, texts)
+
+    def _needs_poses(self, scene: Scene) -> bool:
+        rectified = scene.rig_residual_px <= RECTIFIED_PX
+        return self._poses_needed == "always" or (
+            self._poses_needed == "unless rectified" and not rectified
         )
 
     def _cameras(self, address: Address, suffix: Literal["rgb", "depth"]) -> list[int]:
@@ -292,8 +379,7 @@ class SampleDecoder:
         return StoredDepth(stored.units[None], stored.measured[None])
 
     def _camera_poses(self, scene: Scene) -> CameraPoses | None:
-        rectified = scene.rig_residual_px <= RECTIFIED_PX
-        if self._poses_needed == "never" or (rectified and self._poses_needed != "always"):
+        if not self._needs_poses(scene):
             return None
         poses = self._poses.get(scene.id.key)
         if poses is None:

@@ -39,6 +39,7 @@ class SampleLoader(SampleDecoder):
         writer = SampleWriter(request, address, clip=clip, allocate=allocate)
         # One frame at a time, or all that a transform treats alike.
         step = 1 if request.transform is None else len(address.frames)
+        self.begin(address)
         try:
             for start in range(0, len(address.frames), step):
                 frames = slice(start, start + step)
@@ -49,4 +50,6 @@ class SampleLoader(SampleDecoder):
                 writer.write(views, facts, frames)
         except (StorageError, MediaError, SchemaError) as error:
             raise type(error)(f"{scene.id.key}, frames {address.frames}: {error}") from error
+        finally:
+            self.end(address)
         return {name: writer.sample[name] for name in request.fields}

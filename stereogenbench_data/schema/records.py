@@ -267,6 +267,8 @@ class Scene:
         training: What is known of a scene of training shards; None for released scenes.
         members: File name to the place of its bytes. Depth packed by blosc2 has a name of its own,
             which `held_name` returns.
+        seek_tables: Where the packets of its videos lie, as `media.seek_table` packs it; None where
+            that is not known. Scenes that differ in it alone are equal.
     """
 
     id: SceneId
@@ -285,6 +287,7 @@ class Scene:
     members: Mapping[str, Member] = field(hash=False)
     key_frames: tuple[int, ...] = (0,)
     training: TrainingFacts | None = None
+    seek_tables: bytes | None = field(default=None, compare=False, repr=False)
 
     def held_name(self, name: str) -> str:
         """Return the name in ``members`` of one of the release's files: depth may be packed."""

@@ -4,6 +4,7 @@ Any number of processes on any number of machines may pack parts of one plan int
 share nothing but the plan, which is a function of the release and the target size.
 """
 
+import base64
 import json
 import os
 import shutil
@@ -48,6 +49,7 @@ from stereogenbench_data.shards.writer import (
     readable,
     require_indexed_metadata,
     row_digest,
+    seek_tables_of,
 )
 from stereogenbench_data.sources.files import copy_with_crc32, write_atomic
 from stereogenbench_data.sources.location import is_remote
@@ -296,7 +298,11 @@ def _scenes_in(task: ShardTask, shard: ShardManifest) -> Iterator[Scene]:
     for member, crc32 in zip(shard.tar_members, shard.crc32s, strict=True):
         key, _, name = member.name.partition(".")
         places[key][name] = Member(shard.name, member.offset, member.size, crc32)
-    for scene in task.shard.scenes:
+    tables = {key: base64.b64decode(text) for key, text in shard.seek_tables.items()}
+    if not tables:  # packed by a version that did not know them
+        tables = seek_tables_of(task.target, shard)
+    for each in task.shard.scenes:
+        scene = replace(each, seek_tables=tables.get(each.id.key))
         members = places[scene.id.key]
         if task.derivation is not None:
             place = members[TRAINING_JSON]

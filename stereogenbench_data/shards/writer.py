@@ -5,6 +5,7 @@ whose manifest fits it is finished, and later runs keep it. Source files must be
 the plan was made, and must not change while they are read.
 """
 
+import base64
 import hashlib
 import io
 import json
@@ -14,7 +15,7 @@ import stat
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from io import FileIO
 from itertools import groupby
 from pathlib import Path
@@ -25,8 +26,9 @@ from stereogenbench_data.errors import DISK_FULL, MediaError, ShardError, descri
 from stereogenbench_data.index.rows import ADDED, row_of
 from stereogenbench_data.index.scene_folder import derived_scene, metadata_differences
 from stereogenbench_data.media.depth_packing import packed_depth
-from stereogenbench_data.schema.records import Scene
-from stereogenbench_data.schema.release import TRAINING_JSON
+from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
+from stereogenbench_data.schema.records import Member, Scene
+from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES, TRAINING_JSON, VIDEO_FILES
 from stereogenbench_data.schema.training import parse_training
 from stereogenbench_data.shards.plan import SCENE_TEXTS, PlannedMember, PlannedShard
 from stereogenbench_data.shards.tar import (
@@ -42,8 +44,12 @@ from stereogenbench_data.shards.tar import (
 )
 from stereogenbench_data.shards.training import Derivation, derive_scene, derived_names
 from stereogenbench_data.sources.files import copy_with_crc32, try_locked, write_atomic
+from stereogenbench_data.sources.ranged_file import FileSlice
 
 TEMPORARY_SUFFIX: Final = ".tmp"
+
+SEEKABLE: Final = frozenset({*VIDEO_FILES, *PACKED_DEPTH_NAMES.values()})
+"""The files of a scene of which single frames are read."""
 
 PARTS: Final = ".parts"
 """The folder beside the shards that holds their manifests and locks."""
@@ -96,6 +102,7 @@ class ShardManifest:
         plan: The digest of its plan.
         modified_ns: The shard's modification time.
         rows: Each scene's key, with the digest of its row in the index.
+        seek_tables: Each scene's key, with its `Scene.seek_tables` as base64.
     """
 
     name: str
@@ -109,6 +116,7 @@ class ShardManifest:
     members: tuple[str, ...]
     sources: tuple[SourceStamp, ...]
     rows: dict[str, str]
+    seek_tables: dict[str, str] = field(default_factory=dict)
 
     @property
     def tar_members(self) -> list[TarMember]:
@@ -133,6 +141,7 @@ def read_manifest(task: ShardTask) -> ShardManifest | None:
         found |= {name: tuple(found[name]) for name in ("offsets", "sizes", "crc32s", "members")}
         found["sources"] = tuple(SourceStamp(*stamp) for stamp in found["sources"])
         found["rows"] = dict(found["rows"])
+        found["seek_tables"] = dict(found.get("seek_tables", {}))  # none in those of older versions
         manifest = ShardManifest(**{each.name: found[each.name] for each in fields(ShardManifest)})
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -312,6 +321,13 @@ def _pack(
     is_unknown = read_manifest(task) is None and task.target.exists()
     manifest = _write_shard(task, file, after_bytes)
     _require_read_back(task, file, manifest)
+    manifest = replace(
+        manifest,
+        seek_tables={
+            key: base64.b64encode(packed).decode()
+            for key, packed in seek_tables_of(task.temporary, manifest).items()
+        },
+    )
     if is_unknown:
         same = _with_bytes_of(task.target, manifest, after_bytes)
         if same is None:
@@ -423,6 +439,24 @@ def _write_scene(
                 source, member.size, frames=scene.frames, after_bytes=after_bytes
             )
             output.write_member(member.name, content, stamp)
+
+
+def seek_tables_of(path: Path, manifest: ShardManifest) -> dict[str, bytes]:
+    """Return each scene's `Scene.seek_tables`, from the shard that holds its videos.
+
+    A video that cannot be read has none; whoever reads it is told why.
+    """
+    tables: dict[str, dict[str, SeekTable]] = {key: {} for key in manifest.rows}
+    for member in manifest.tar_members:
+        key, _, name = member.name.partition(".")
+        if key not in tables or name not in SEEKABLE:
+            continue
+        place = Member(path.name, member.offset, member.size)
+        with suppress(MediaError), FileSlice(path, place) as video:
+            table = read_seek_table(video, name=name)
+            if table is not None:
+                tables[key][name] = table
+    return {key: packed_tables(found) for key, found in tables.items()}
 
 
 def _require_read_back(task: ShardTask, file: FileIO, manifest: ShardManifest) -> None:

@@ -106,6 +106,10 @@ class ShardCache:
                 # Another process may have fetched it meanwhile.
                 return self._find(key, member) or self._fill(key, member, remote=remote)
 
+    def holds(self, member: Member, *, where: str, revision: str) -> bool:
+        """Return whether a member seems to be stored; `open` compares it."""
+        return self._place(_key(member, where=where, revision=revision)).is_file()
+
     def drop_damaged(self, member: Member, *, where: str, revision: str) -> bool:
         """Drop a member if its bytes have changed since they were stored; return whether so."""
         key = _key(member, where=where, revision=revision)

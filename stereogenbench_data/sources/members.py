@@ -1,21 +1,27 @@
 """Where a scene's bytes are, and how they are opened: files, members of shards, URLs, the cache."""
 
+import copy
 import os
 import re
 import stat
+import threading
 import zlib
+from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import ShardError, StorageError, explain_os_errors
+from stereogenbench_data.media.seek_table import Position, SeekTable, parse_tables
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
 from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
 from stereogenbench_data.sources.location import is_remote, joined, local_path, shown
 from stereogenbench_data.sources.ranged_file import (
     FileSlice,
     MemberFile,
+    PacketFile,
     RangedFile,
     require_crc32,
 )
@@ -26,6 +32,39 @@ UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
 """What a member's path may not hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
 
 
+_KEPT_TABLES: Final = 256
+"""Of how many scenes the seek tables are kept."""
+
+
+class Fetched:
+    """What a source has fetched from its URL, without what went into a cache."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        # Each thread counts for itself: a fork cannot copy a lock that is held.
+        self._of_thread: dict[int, tuple[int, int]] = {}
+
+    def add(self, count: int) -> None:
+        """Count one more range of so many bytes; any thread may do that."""
+        thread = threading.get_ident()
+        requests, total = self._of_thread.get(thread, (0, 0))
+        self._of_thread[thread] = requests + 1, total + count
+
+    @property
+    def requests(self) -> int:
+        """How many ranges."""
+        return sum(requests for requests, _ in [*self._of_thread.values()])
+
+    @property
+    def bytes(self) -> int:
+        """How many bytes."""
+        return sum(count for _, count in [*self._of_thread.values()])
+
+    def __reduce__(self) -> tuple[type["Fetched"], tuple[()]]:
+        """Return what another process begins with."""
+        return Fetched, ()
+
+
 class MemberSource:
     """Opens the files of an index's scenes, wherever they lie.
 
@@ -34,7 +73,7 @@ class MemberSource:
     cache it is fetched whole, once.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - what reading depends on
         self,
         root: str | Path,
         *,
@@ -43,6 +82,7 @@ class MemberSource:
         cache: ShardCache | None = None,
         check: Literal["opened", "metadata"] = "metadata",
         retry: RetryPolicy | None = None,
+        ahead: FetchAhead | None = None,
     ) -> None:
         """Prepare to read; nothing is opened yet.
 
@@ -55,6 +95,7 @@ class MemberSource:
                 cache when this process first opens it, and each member from a URL when its last
                 byte arrives. "metadata": metadata files only.
             retry: How reading from a server is retried; None for the defaults.
+            ahead: Where `wanted` ranges are fetched ahead; None fetches each when it is read.
         """
         self._root = str(root)
         self._shards = shards
@@ -62,8 +103,11 @@ class MemberSource:
         self._cache = cache
         self._check = check
         self._policy = retry
+        self._ahead = ahead
+        self._tables: OrderedDict[str, dict[str, SeekTable]] = OrderedDict()
         self._sound: set[tuple[str, int]] = set()
         self._objects: dict[str, RemoteObject] = {}
+        self.fetched = Fetched()
 
     def __repr__(self) -> str:
         """Return the root without secrets, and what is compared with its checksum."""
@@ -82,15 +126,95 @@ class MemberSource:
         _require_safe(member)
         remote = self._object(member)
         if self._cache is not None:
+            if self._ahead is not None:
+                self._ahead.read(_cached(member), 0)  # waits, if it is on its way
             stored = self._cache.open(member, remote=remote, revision=self._revision)
             return self._checked(stored, scene, name)
-        offset = member.offset
-        return RangedFile(
-            lambda start, stop: remote.read(offset + start, offset + stop),
-            size=member.size,
-            name=self.label(scene, name),
-            crc32=member.crc32 if self._check == "opened" else None,
+        ahead, offset = self._ahead, member.offset
+
+        def fetch(start: int, stop: int) -> bytes:
+            found = None if ahead is None else ahead.read(member.path, offset + start)
+            if found is not None and found[0] + len(found[1]) >= offset + stop:
+                begin = offset + start - found[0]
+                return found[1][begin : begin + stop - start]
+            self.fetched.add(stop - start)
+            return remote.read(offset + start, offset + stop)
+
+        def fetched(at: int) -> tuple[int, bytes] | None:
+            found = None if ahead is None else ahead.read(member.path, offset + at)
+            return None if found is None else (found[0] - offset, found[1])
+
+        crc32 = member.crc32 if self._check == "opened" else None
+        label, table = self.label(scene, name), self._table(scene, name)
+        if table is None:
+            return RangedFile(fetch, size=member.size, name=label, crc32=crc32)
+        return PacketFile(
+            fetch, table=table, ahead=fetched, size=member.size, name=label, crc32=crc32
         )
+
+    def fetching_by(self, ahead: FetchAhead) -> "MemberSource":
+        """Return the same source, for another reader."""
+        twin = copy.copy(self)
+        twin._ahead, twin.fetched = ahead, Fetched()
+        return twin
+
+    @property
+    def is_cached(self) -> bool:
+        """Whether whole files are fetched, and kept on disk."""
+        return self._cache is not None
+
+    def position(self, scene: Scene, name: str) -> Position | None:
+        """Return where a reader of one of a scene's videos stands that is not open.
+
+        None if it is not known which bytes a frame needs, or all of them are fetched.
+        """
+        if self._cache is not None:
+            return None
+        table = self._table(scene, scene.held_name(name))
+        return None if table is None else Position(table)
+
+    def wanted(
+        self, scene: Scene, name: str, ranges: Iterable[tuple[int, int]] | None = None
+    ) -> list[Wanted]:
+        """Return what to fetch ahead for ranges of one of a scene's files, or all of it.
+
+        With a cache that is the whole file, which is put there unless the cache has it.
+        """
+        member = scene.member(name)
+        _require_safe(member)
+        remote, offset = self._object(member), member.offset
+        cache = self._cache
+        if cache is not None:
+
+            def fill(start: int, stop: int) -> bytes:
+                cache.open(member, remote=remote, revision=self._revision).close()
+                return b""
+
+            if cache.holds(member, where=remote.where, revision=self._revision):
+                return []
+            return [Wanted(_cached(member), 0, 1, fill, member.size)]
+
+        def fetch(start: int, stop: int) -> bytes:
+            self.fetched.add(stop - start)
+            return remote.read(start, stop)
+
+        parts = [(0, member.size)] if ranges is None else ranges
+        return [Wanted(member.path, offset + a, offset + b, fetch) for a, b in parts]
+
+    def _table(self, scene: Scene, name: str) -> SeekTable | None:
+        """Return the seek table of one of a scene's videos, if there is one that fits it."""
+        if scene.seek_tables is None:
+            return None
+        key = scene.id.key
+        if key not in self._tables:
+            self._tables[key] = {
+                each: table
+                for each, table in parse_tables(scene.seek_tables).items()
+                if each in scene.members and table.fits(file_bytes=scene.members[each].size)
+            }
+            if len(self._tables) > _KEPT_TABLES:
+                self._tables.popitem(last=False)
+        return self._tables[key].get(name)
 
     def _checked(self, file: FileSlice, scene: Scene, name: str) -> FileSlice:
         """Return an open file after its first checksum comparison, where `check` asks for one."""
@@ -166,7 +290,12 @@ class MemberSource:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, which checks sizes for itself."""
-        return self.__dict__ | {"_objects": {}}
+        return self.__dict__ | {"_objects": {}, "_tables": OrderedDict()}
+
+
+def _cached(member: Member) -> tuple[str, int]:
+    """Return what stands for a whole member that is put into a cache."""
+    return member.path, member.offset
 
 
 def open_local(

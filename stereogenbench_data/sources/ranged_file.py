@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from stereogenbench_data.errors import ShardError, StorageError
+from stereogenbench_data.media.seek_table import SeekTable
 from stereogenbench_data.schema.records import Member
 
 FIRST_BLOCK: Final = 64 * 1024
@@ -24,12 +25,17 @@ KEPT_BYTES: Final = 2 * LARGEST_BLOCK
 
 
 class MemberFile(io.RawIOBase):
-    """A file of the bytes of one member; subclasses read them."""
+    """A file of the bytes of one member; subclasses read them.
+
+    Attributes:
+        failure: The error of the first fetch that failed, of a file that fetches.
+    """
 
     def __init__(self, size: int) -> None:
         """Begin at the start of so many bytes."""
         super().__init__()
         self.size = size
+        self.failure: StorageError | None = None
         self._position = 0
 
     def readable(self) -> bool:
@@ -156,7 +162,6 @@ class RangedFile(MemberFile):
         self._fetch = fetch
         self._blocks: list[tuple[int, bytes]] = []
         self._checksum = None if crc32 is None else _Checksum(crc32, size=size, name=name)
-        self.failure: StorageError | None = None
 
     def close(self) -> None:
         """Free what was fetched."""
@@ -195,6 +200,80 @@ class RangedFile(MemberFile):
         while sum(len(data) for _, data in self._blocks) > KEPT_BYTES and len(self._blocks) > 1:
             self._blocks.pop(0)
         return block
+
+
+class PacketFile(RangedFile):
+    """A video whose seek table is known: it is opened by the table's header, and read by packets.
+
+    Bytes that were fetched ahead come from there. Others are fetched when they are read, up to the
+    end of their packet. Fewer bytes than asked for are returned at the end of what is there.
+
+    Attributes:
+        opens_by_header: Whether the header is enough to open the video.
+        hides_packets: While it is set, the file seems to end where packets lie.
+    """
+
+    def __init__(
+        self,
+        fetch: Callable[[int, int], bytes],
+        *,
+        table: SeekTable,
+        ahead: Callable[[int], tuple[int, bytes] | None],
+        size: int,
+        name: str = "",
+        crc32: int | None = None,
+    ) -> None:
+        """Prepare to read; nothing is fetched yet.
+
+        Args:
+            fetch: Returns the bytes of the member from a start to a stop.
+            table: Where its packets lie.
+            ahead: Returns what was fetched ahead around a byte, and where that begins, which may
+                be before the member, and end behind it; None if nothing was.
+            size: The size of the member in bytes.
+            name: What messages call it.
+            crc32: Its checksum; None compares nothing.
+        """
+        super().__init__(fetch, size=size, name=name, crc32=crc32)
+        self.opens_by_header = table.opening == 0
+        self.hides_packets = False
+        self._table = table
+        self._ahead = ahead
+        self._has_fed_header = False
+        self._fed_from: int | None = None
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next bytes: at least one, unless this is the end."""
+        at = self._position
+        size = self.size if size is None or size < 0 else size
+        if at >= self.size or size == 0:
+            return b""
+        data = self._table.header_bytes(at, size)
+        if not data and not self.hides_packets:
+            data = self._packet_bytes(at, min(size, self.size - at))
+        self._position += len(data)
+        return data
+
+    def _packet_bytes(self, at: int, size: int) -> bytes:
+        if self.failure is not None:
+            raise self.failure
+        try:
+            if self._checksum is not None and not self._has_fed_header:
+                self._has_fed_header = True
+                self._checksum.add(0, self._table.head)
+                self._checksum.add(self._table.bounds[-1], self._table.tail)
+            found = self._ahead(at)
+            if found is None:
+                start, block = self._block(at, min(self._table.packet_end(at), self.size))
+                return block[at - start : at - start + size]
+            start, block = found
+            if self._checksum is not None and start != self._fed_from:
+                self._fed_from, own = start, max(0, start)
+                self._checksum.add(own, block[own - start : max(0, self.size - start)])
+        except StorageError as error:
+            self.failure = error
+            raise
+        return block[at - start : at - start + size]
 
 
 class _Checksum:

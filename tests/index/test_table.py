@@ -640,3 +640,44 @@ def test_an_index_shows_its_root_and_how_many_scenes_it_holds(small_release):
     index = SceneIndex.open(small_release)
 
     assert repr(index) == f"<SceneIndex of {str(small_release)!r}: {len(index)} scenes>"
+
+
+def test_seek_tables_are_kept_apart_and_change_no_digest(tmp_path):
+    plain = [scene_of(number) for number in range(3)]
+    tabled = [dataclasses.replace(each, seek_tables=b"seek") for each in plain]
+    index = SceneIndex.from_scenes(tabled, tmp_path)
+    index.write(tmp_path / "with.parquet")
+    SceneIndex.from_scenes(plain, tmp_path).write(tmp_path / "without.parquet")
+
+    opened = SceneIndex.open(tmp_path / "with.parquet", root=tmp_path)
+    other = SceneIndex.open(tmp_path / "without.parquet", root=tmp_path)
+
+    assert opened.digest == other.digest == index.digest
+    assert opened.seek_tables(1) is None
+    assert opened.load_seek_tables()
+    assert opened.seek_tables(1) == b"seek"
+    assert not other.load_seek_tables()
+    assert other.seek_tables(1) is None
+    assert opened.scene(1) == tabled[1] == plain[1]
+
+
+def test_an_index_that_is_written_again_keeps_its_seek_tables(tmp_path):
+    scenes = [dataclasses.replace(scene_of(n), seek_tables=bytes([n])) for n in range(3)]
+    SceneIndex.from_scenes(scenes[::-1], tmp_path).write(tmp_path / "one.parquet")
+    SceneIndex.open(tmp_path / "one.parquet", root=tmp_path).write(tmp_path / "two.parquet")
+    again = SceneIndex.open(tmp_path / "two.parquet", root=tmp_path)
+
+    assert again.load_seek_tables()
+    assert [again.seek_tables(row) for row in range(3)] == [b"\0", b"\1", b"\2"]
+    shared, rest = again.parted()
+    assert SceneIndex.of_parts(shared, rest).seek_tables(2) == b"\2"
+    assert pickle.loads(pickle.dumps(again)).seek_tables(2) == b"\2"
+
+
+@pytest.mark.parametrize("column", [pa.array(["a", "b"]), pa.array([1, 2])])
+def test_seek_tables_of_another_kind_are_as_good_as_none(column, tmp_path):
+    SceneIndex.from_scenes([scene_of(0), scene_of(1)], tmp_path).write(tmp_path / "i.parquet")
+    table = pq.read_table(tmp_path / "i.parquet").append_column("seek_tables", column)
+    pq.write_table(table, tmp_path / "i.parquet")
+
+    assert not SceneIndex.open(tmp_path / "i.parquet", root=tmp_path).load_seek_tables()

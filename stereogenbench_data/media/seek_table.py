@@ -1,0 +1,437 @@
+"""Seek tables: where the packets of a video lie, so that one request fetches any frame of it.
+
+A table parts a file at the ends of its packets. What lies before the first packet and behind the
+last one is the header, which the table holds; so a video that is far away is opened without a
+request. What a container writes in front of a packet belongs to the packet.
+
+A table only says which bytes to fetch. Frames are still found by the times in the file, so a wrong
+table costs time and never gives another frame. Tables may come from strangers, and are checked.
+"""
+
+import io
+import json
+import struct
+import zlib
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import av
+import numpy as np
+from av.container import InputContainer
+
+from stereogenbench_data.errors import MediaError
+from stereogenbench_data.media.clock import INTRA_ONLY, steady_clock
+from stereogenbench_data.media.container import VideoFile, frames_by_duration, open_container
+from stereogenbench_data.media.decoder import BLIND_JUMP
+from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
+
+LARGEST_HEADER: Final = 256 * 1024
+"""Bytes of a video's header that a table holds; a video with a longer one has no table."""
+
+READ_THROUGH: Final = 64 * 1024
+"""FFmpeg reads on rather than to seek where what it wants is no further away."""
+
+_MOST_PACKETS: Final = 2**17
+_LARGEST_TABLES: Final = 64 * 2**20
+_MAGIC: Final = b"seek1"
+_LENGTH: Final = struct.Struct(">I")
+_LONGEST_SPAN: Final = 2**32 - 1
+_CUES: Final = b"\x1c\x53\xbb\x6b"
+"""What Matroska's list of key frames begins with."""
+_LOOKED_BEHIND: Final = 64
+_BLOCK_HEADER_BYTES: Final = 4
+"""What Matroska writes between where FFmpeg finds a packet and the packet's own bytes."""
+_LOOKED_THROUGH: Final = 64 * 1024
+"""Bytes at a file's end in which Matroska's list of key frames is looked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeekTable:
+    """Where the packets of a video lie, in the order in which they are decoded.
+
+    Attributes:
+        bounds: The bytes of packet i are those from bounds[i] to bounds[i + 1].
+        keys: The packets, ascending from 0, at which decoding can begin. Each has the number of its
+            frame.
+        delay: How many more packets the decoder takes before it gives a frame.
+        has_neighbours: Whether the packets around a frame are read too, to compare their times.
+        opening: How many packets are read when the file is opened.
+        blind_jump: How many frames the reader decodes through rather than to seek, before it knows
+            the key frames; 0 where the header lists them.
+        head: The bytes before the first packet.
+        tail: The bytes behind the last one; empty where they are never read.
+    """
+
+    bounds: tuple[int, ...]
+    keys: tuple[int, ...]
+    delay: int = 0
+    has_neighbours: bool = False
+    opening: int = 0
+    blind_jump: int = 0
+    head: bytes = b""
+    tail: bytes = b""
+
+    @property
+    def packets(self) -> int:
+        """How many packets there are."""
+        return len(self.bounds) - 1
+
+    def key_before(self, packet: int) -> int:
+        """Return the last packet, at or before one, at which decoding can begin."""
+        return self.keys[bisect_right(self.keys, packet) - 1]
+
+    def packet_end(self, byte: int) -> int:
+        """Return where the packet ends that holds a byte."""
+        return self.bounds[min(bisect_right(self.bounds, byte), self.packets)]
+
+    def header_bytes(self, start: int, size: int | None) -> bytes:
+        """Return so many bytes of the header from a place on, none where packets lie."""
+        size = LARGEST_HEADER if size is None or size < 0 else size
+        after = start - self.bounds[-1]
+        return self.head[start : start + size] if after < 0 else self.tail[after : after + size]
+
+    def fits(self, *, file_bytes: int) -> bool:
+        """Return whether it can be the table of a file of so many bytes."""
+        end = self.bounds[-1]
+        return end + len(self.tail) == file_bytes if self.tail else end <= file_bytes
+
+
+class Position:
+    """Where a reader of a video is: it tells which bytes each next frame needs.
+
+    It does what `decoder.Decoder` does with the file. Where they differ, bytes are fetched one
+    request later.
+    """
+
+    def __init__(self, table: SeekTable) -> None:
+        """Begin with a video that is not open."""
+        self._table = table
+        self._is_open = False
+        self._next = self._end = 0
+        self._knows_key_frames = table.blind_jump == 0
+
+    def needed(self, frame: int) -> list[tuple[int, int]]:
+        """Return the ranges of bytes that reading a frame needs, and go on behind it."""
+        table = self._table
+        if not 0 <= frame < table.packets or (self._is_open and frame == self._next - 1):
+            return []
+        opened = 0 if self._is_open else table.opening
+        self._end = max(self._end, opened)
+        start, stop = self._end, min(frame + table.delay + 1, table.packets)
+        looked_through = 0
+        if self._must_seek(frame):
+            start = table.key_before(max(0, frame - 1) if table.has_neighbours else frame)
+            if frame == 0 and table.has_neighbours:
+                stop = min(2, table.packets)
+            if table.blind_jump and start == table.keys[-1]:
+                looked_through = table.packets  # FFmpeg looks for a further key frame
+            self._knows_key_frames = True
+        gap = table.bounds[start] - table.bounds[self._end]
+        if self._end and 0 < gap <= READ_THROUGH:
+            start = self._end
+        self._is_open, self._next, self._end = True, frame + 1, max(start, stop)
+        parts = [(0, min(opened, start)), (start, max(stop, looked_through))]
+        return [(table.bounds[a], table.bounds[b]) for a, b in parts if a < b]
+
+    def _must_seek(self, frame: int) -> bool:
+        if not self._is_open and self._table.opening == 0:
+            return True
+        if frame <= self._next:
+            return frame < self._next
+        if not self._knows_key_frames:
+            return frame - self._next > self._table.blind_jump
+        return self._table.key_before(frame) >= self._end
+
+
+class HeaderFile(io.RawIOBase):
+    """A video without its packets: where these are, the file seems to end."""
+
+    def __init__(self, table: SeekTable) -> None:
+        """Begin at the start."""
+        self._table = table
+        self._at = 0
+
+    def readable(self) -> bool:
+        """Return that it can be read."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return that positions can be set."""
+        return True
+
+    def tell(self) -> int:
+        """Return the position of the next byte."""
+        return self._at
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        """Set the position, relative to the start, to itself or to the end; return it."""
+        end = self._table.bounds[-1] + len(self._table.tail)
+        self._at = offset + (0, self._at, end)[whence]
+        return self._at
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next bytes of the header, none at a packet."""
+        data = self._table.header_bytes(self._at, size)
+        self._at += len(data)
+        return data
+
+
+def read_seek_table(
+    file: VideoFile, *, name: str, reads: Literal["all", "little"] = "all"
+) -> SeekTable | None:
+    """Return a video's seek table; None if it cannot have one.
+
+    Packets must lie in the order in which they are decoded, and the header must not be large.
+
+    Args:
+        file: A path, or a seekable binary file; the latter stays the caller's to close.
+        name: What messages call the file.
+        reads: A Matroska file has no list of its packets: "all" goes through them. With "little",
+            for a file that is far away, those from one key frame to the next count as one.
+
+    Raises:
+        StorageError: If the file cannot be read.
+        MediaError: If it is not a video.
+    """
+    if name.endswith(PACKED_SUFFIX):
+        with DepthFrames(file, name=name, frames="any") as depth:
+            bounds, count = depth.chunk_bounds, depth.frames
+        table = SeekTable(bounds, tuple(range(count)), blind_jump=0)
+        return _with_header(table, file, file_bytes=bounds[-1])
+    with open_container(file, name=name, pixel_format="later") as container:
+        file_bytes, begins = container.size, container.streams.video[0].start_time
+        try:
+            if container.streams.video[0].frames:
+                table_found = _listed(container)
+            elif reads == "all":
+                table_found = _gone_through(container, file)
+            else:
+                table_found = _by_clusters(container, file)
+        except av.FFmpegError as error:
+            raise MediaError(
+                f"{name}: its packets cannot be read ({error.strerror}): fetch it again."
+            ) from error
+    if table_found is None or not _is_sound(table_found):
+        return None
+    table_found = _with_header(table_found, file, file_bytes=file_bytes)
+    if table_found is None or table_found.opening:
+        return table_found
+    behind_first = table_found.bounds[0] + READ_THROUGH
+    if any(table_found.bounds[key] <= behind_first for key in table_found.keys[1:]):
+        return replace(table_found, opening=1)  # FFmpeg would read on where the file seemed to end
+    is_enough = False
+    with (
+        suppress(MediaError),
+        open_container(HeaderFile(table_found), name=name, pixel_format="later") as container,
+    ):
+        # So an MP4 file can be opened without a packet, unless it is tiny.
+        is_enough = container.streams.video[0].start_time == begins
+    return table_found if is_enough else replace(table_found, opening=1)
+
+
+def _listed(container: InputContainer) -> SeekTable | None:
+    """Return the table by an MP4 header, which lists all packets."""
+    stream = container.streams.video[0]
+    entries = list(stream.index_entries)
+    begins = stream.start_time or 0
+    before = sum(entry.timestamp < begins for entry in entries)
+    if not entries or any(entry.is_discard for entry in entries):
+        return None
+    if any(a.pos + a.size > b.pos for a, b in pairwise(entries)):
+        return None
+    return SeekTable(
+        (*(entry.pos for entry in entries), entries[-1].pos + entries[-1].size),
+        tuple(number for number, each in enumerate(entries) if each.is_keyframe),
+        delay=min(max(before, stream.codec_context.reorder_depth), len(entries)),
+        has_neighbours=_is_intra_only(container),
+    )
+
+
+def _gone_through(container: InputContainer, file: VideoFile) -> SeekTable | None:
+    """Return the table of a Matroska file, all of whose packets are read."""
+    stream = container.streams.video[0]
+    ends: list[int] = []
+    keys: list[int] = []
+    times: list[int] = []
+    ahead = 0
+    for packet in container.demux(stream):
+        if packet.size == 0:
+            continue
+        if packet.pos is None or packet.pts is None:
+            return None
+        if packet.is_keyframe:
+            keys.append(len(ends))
+        ends.append(packet.pos + _BLOCK_HEADER_BYTES + packet.size)
+        ahead = max(ahead, sum(time > packet.pts for time in times[-32:]))
+        times.append(packet.pts)
+    entries = stream.index_entries
+    if not ends or not len(entries):
+        return None
+    # A cluster begins before its first packet, and the list of key frames follows the last one.
+    cues = _read(file, ends[-1], ends[-1] + _LOOKED_BEHIND).find(_CUES)
+    ends[-1] += max(0, cues)
+    return SeekTable(
+        (entries[0].pos, *ends),
+        tuple(keys),
+        delay=ahead,
+        has_neighbours=_is_intra_only(container),
+        opening=1,
+        blind_jump=BLIND_JUMP,
+    )
+
+
+def _by_clusters(container: InputContainer, file: VideoFile) -> SeekTable | None:
+    """Return the table of a Matroska file by its list of key frames, of which each begins a part.
+
+    The frames behind a key frame lie somewhere in its part.
+    """
+    stream = container.streams.video[0]
+    frames = frames_by_duration(container) or 0
+    clock = steady_clock(container, frames=frames)
+    if clock is None:
+        return None
+    container.seek(clock.latest(frames - 1), stream=stream)
+    parts = [(clock.index(entry.timestamp), entry.pos) for entry in stream.index_entries]
+    keys = [key for key, _ in parts if key is not None]
+    end_bytes = container.size
+    last = _read(file, max(0, end_bytes - _LOOKED_THROUGH), end_bytes)
+    cues = last.rfind(_CUES)
+    if len(keys) != len(parts) or keys[:1] != [0] or cues < 0:
+        return None
+    end = end_bytes - len(last) + cues
+    bounds = [0] * frames
+    ends = [*(pos for _, pos in parts[1:]), end]
+    stops = [*keys[1:], frames]
+    for (key, pos), stop, part_end in zip(parts, stops, ends, strict=True):
+        first = key or 0
+        bounds[first:stop] = [pos, *[part_end] * (stop - first - 1)]
+    return SeekTable(
+        (*bounds, end),
+        tuple(keys),
+        has_neighbours=_is_intra_only(container),
+        opening=1,
+        blind_jump=BLIND_JUMP,
+    )
+
+
+def _is_intra_only(container: InputContainer) -> bool:
+    codec = container.streams.video[0].codec_context.codec
+    return codec.canonical_name in INTRA_ONLY
+
+
+def _read(file: VideoFile, start: int, stop: int) -> bytes:
+    if isinstance(file, str | Path):
+        with Path(file).open("rb", buffering=0) as opened:
+            opened.seek(start)
+            return opened.read(stop - start)
+    file.seek(start)
+    return file.read(stop - start)
+
+
+def _with_header(table: SeekTable, file: VideoFile, *, file_bytes: int) -> SeekTable | None:
+    """Return a table with the header's bytes."""
+    first, last = table.bounds[0], table.bounds[-1]
+    if first + file_bytes - last > LARGEST_HEADER:
+        return None
+    return replace(table, head=_read(file, 0, first), tail=_read(file, last, file_bytes))
+
+
+def _is_sound(table: SeekTable) -> bool:
+    """Return whether packets follow each other, and decoding can begin at the first one."""
+    bounds, keys = table.bounds, table.keys
+    return (
+        2 <= len(bounds) <= _MOST_PACKETS
+        and keys[:1] == (0,)
+        and bounds[0] >= 0
+        and all(0 <= b - a <= _LONGEST_SPAN for a, b in pairwise(bounds))
+        and all(a < b for a, b in pairwise(keys))
+        and keys[-1] < table.packets
+        and 0 <= table.delay <= table.packets
+        and 0 <= table.opening <= table.packets
+        and table.blind_jump >= 0
+    )
+
+
+def packed_tables(tables: Mapping[str, SeekTable]) -> bytes:
+    """Return the tables of a scene's videos in few bytes."""
+    described = []
+    spans, headers = [], []
+    for name, table in sorted(tables.items()):
+        described.append(
+            [
+                name,
+                table.packets,
+                _differences(table.keys),
+                table.delay,
+                int(table.has_neighbours),
+                table.opening,
+                table.blind_jump,
+                len(table.head),
+                len(table.tail),
+                table.bounds[0],
+            ]
+        )
+        # As MP4 headers hold the sizes of packets, so that they are compressed to nothing.
+        spans.append(np.diff(table.bounds).astype(">u4").tobytes())
+        headers += [table.head, table.tail]
+    text = json.dumps(described, separators=(",", ":")).encode()
+    content = _LENGTH.pack(len(text)) + text + b"".join(headers) + b"".join(spans)
+    return _MAGIC + zlib.compress(content, 9)
+
+
+def parse_tables(packed: bytes) -> dict[str, SeekTable]:
+    """Return the tables that `packed_tables` packed; {} if these bytes are not such tables."""
+    if packed[: len(_MAGIC)] != _MAGIC:
+        return {}
+    try:
+        content = zlib.decompressobj().decompress(packed[len(_MAGIC) :], _LARGEST_TABLES)
+        (length,) = _LENGTH.unpack_from(content)
+        text = content[_LENGTH.size : _LENGTH.size + length]
+        return _parsed(json.loads(text), content[_LENGTH.size + length :])
+    except (
+        zlib.error,
+        struct.error,
+        ValueError,
+        LookupError,
+        TypeError,
+        RecursionError,
+        OverflowError,
+    ):
+        return {}
+
+
+def _parsed(described: Any, content: bytes) -> dict[str, SeekTable]:
+    rows = [(str(row[0]), row[2], *map(int, [row[1], *row[3:]])) for row in described]
+    spans_at = sum(row[7] + row[8] for row in rows)
+    at = 0
+    tables = {}
+    for name, keys, packets, delay, neighbours, opening, jump, head, tail, first in rows:
+        if min(packets, head, tail) < 0 or packets > _MOST_PACKETS:
+            return {}
+        spans = np.frombuffer(content, dtype=">u4", count=packets, offset=spans_at)
+        bounds = first + np.concatenate([[0], np.cumsum(spans, dtype=np.int64)])
+        table = SeekTable(
+            tuple(bounds.tolist()),
+            tuple(np.cumsum(np.array(keys, dtype=np.int64)).tolist()),
+            delay=delay,
+            has_neighbours=bool(neighbours),
+            opening=opening,
+            blind_jump=jump,
+            head=content[at : at + head],
+            tail=content[at + head : at + head + tail],
+        )
+        if not _is_sound(table) or len(table.head) != first or len(table.tail) != tail:
+            return {}
+        tables[name] = table
+        at += head + tail
+        spans_at += 4 * packets
+    return tables
+
+
+def _differences(keys: Sequence[int]) -> list[int]:
+    return np.diff(keys, prepend=0).tolist()

@@ -1,0 +1,214 @@
+"""Which bytes the coming samples need, from the order in which they will be read.
+
+A `Position` for each open video follows what the decoder will do, so that each byte is fetched once
+as long as its video stays open. Where the order turns out to be another one, planning starts anew.
+"""
+
+import os
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final, NamedTuple
+
+from stereogenbench_data.media.seek_table import Position
+from stereogenbench_data.schema.records import Scene
+from stereogenbench_data.selection.plan import Address
+from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
+from stereogenbench_data.sources.members import MemberSource
+
+_AT_ONCE: Final = 32
+"""So many samples are planned at most before the next one is read."""
+
+_SOON: Final = 16
+"""What so many samples after this one need is fetched at once."""
+
+_REFILLED_AT: Final = 0.5
+"""The share of the limit below which more is planned: many samples together need fewer requests."""
+
+
+class Step(NamedTuple):
+    """A sample that will be read, and whether its videos are wanted no more after it."""
+
+    address: Address
+    ends_run: bool
+
+
+class NeededFiles(NamedTuple):
+    """What a sample is read from.
+
+    Attributes:
+        scene: Its scene.
+        frames: Name of each video to the frames of it, in their order.
+        texts: Names of files that are read whole, once a scene.
+    """
+
+    scene: Scene
+    frames: dict[str, list[int]]
+    texts: tuple[str, ...]
+
+
+FilesOf = Callable[[Address], NeededFiles]
+
+
+class ComingSamples:
+    """Plans the bytes of coming samples, and of the one that is read now."""
+
+    def __init__(self, source: MemberSource, ahead: FetchAhead) -> None:
+        """Plan nothing yet.
+
+        Args:
+            source: Where the files are.
+            ahead: What fetches them.
+        """
+        self._source = source
+        self._ahead = ahead
+        self._open_videos = 0
+        self._kept_frames = 1
+        self._steps: Iterator[Step] = iter(())
+        self._due: deque[tuple[int, Address]] = deque()
+        self._number = self._begun = 0
+        self._positions: OrderedDict[tuple[str, int, int], _Video] = OrderedDict()
+        self._read_texts: set[str] = set()
+        self._is_filling = True
+        self._has_order = False
+        self._pid, self._lock = os.getpid(), threading.RLock()
+
+    def keep(self, videos: int, *, frames: int) -> None:
+        """Expect so many videos to stay open, and so many frames of each to be kept."""
+        self._open_videos, self._kept_frames = videos, frames
+
+    @property
+    def has_order(self) -> bool:
+        """Whether samples were read as they were expected, in this process."""
+        return self._has_order and self._pid == os.getpid()
+
+    def expect(self, steps: Iterable[Step]) -> None:
+        """Take the samples that will be read next; they replace those expected before."""
+        with self._own_lock():
+            if self._due:
+                self._begin_anew()
+            self._steps, self._has_order = iter(steps), True
+
+    def begin(self, address: Address, files: FilesOf) -> None:
+        """Plan a sample that is read now, unless it is planned, and some of those after it.
+
+        Args:
+            address: The sample.
+            files: Returns what a sample is read from.
+        """
+        with self._own_lock():
+            if not self._due:
+                self._plan_next(files)
+            if self._due and self._due[0][1] != address:
+                self._begin_anew()
+            if not self._due:
+                self._plan(Step(address, ends_run=False), files(address))
+            self._ahead.begin(max(self._due[0][0], self._begun))
+            if not self._is_filling:
+                low = _REFILLED_AT * self._ahead.limit_bytes
+                self._is_filling = self._ahead.planned_bytes < low
+            for _ in range(_AT_ONCE if self._is_filling else 0):
+                self._is_filling = self._ahead.planned_bytes < self._ahead.limit_bytes
+                self._is_filling = self._is_filling and self._plan_next(files)
+                if not self._is_filling:
+                    break
+            # While more is planned, requests for later samples wait: they may grow.
+            soon = self._due[0][0] + _SOON if self._is_filling else self._number
+            self._begun = max(self._begun, soon)
+            self._ahead.begin(self._begun)
+
+    def end(self, address: Address) -> None:
+        """Forget what a sample that was read needed alone."""
+        with self._own_lock():
+            if self._due and self._due[0][1] == address:
+                self._ahead.release(self._due.popleft()[0])
+
+    def close(self) -> None:
+        """End all requests, and expect no sample."""
+        with self._own_lock():
+            self._begin_anew()
+            self._ahead.close()
+
+    def _own_lock(self) -> threading.RLock:
+        """Return the lock of this process: a fork begins anew."""
+        if self._pid != os.getpid():
+            self._pid, self._lock = os.getpid(), threading.RLock()
+            self._due.clear()
+            self._begin_anew()
+        return self._lock
+
+    def _begin_anew(self) -> None:
+        for number, _ in self._due:
+            self._ahead.release(number)
+        self._due.clear()
+        self._steps = iter(())
+        self._positions.clear()
+        self._read_texts.clear()
+        self._is_filling = True
+        self._has_order = False
+
+    def _plan_next(self, files: FilesOf) -> bool:
+        step = next(self._steps, None)
+        if step is not None:
+            self._plan(step, files(step.address))
+        return step is not None
+
+    def _plan(self, step: Step, needed: NeededFiles) -> None:
+        self._number += 1
+        scene, wanted = needed.scene, list[Wanted]()
+        for name in needed.texts:
+            member = scene.members.get(name)
+            if member is not None and scene.id.key not in self._read_texts:
+                wanted += self._source.wanted(scene, name)
+                self._read_texts.add(scene.id.key)
+        for name, frames in needed.frames.items():
+            if scene.held_name(name) in scene.members:
+                wanted += self._of_video(scene, name, frames, run=step.address.run)
+        if step.ends_run:
+            for member in scene.members.values():
+                self._positions.pop((member.path, member.offset, step.address.run), None)
+        self._ahead.plan(self._number, wanted)
+        self._due.append((self._number, step.address))
+
+    def _of_video(self, scene: Scene, name: str, frames: list[int], *, run: int) -> list[Wanted]:
+        member = scene.member(name)
+        place = (member.path, member.offset, run)
+        if place not in self._positions:
+            while len(self._positions) >= self._open_videos > 0:
+                self._positions.popitem(last=False)
+            self._positions[place] = _Video(self._source.position(scene, name))
+            if self._source.is_cached:
+                return self._source.wanted(scene, name)
+        self._positions.move_to_end(place)
+        ranges = self._positions[place].needed(frames, kept=self._kept_frames)
+        return self._source.wanted(scene, name, ranges) if ranges else []
+
+
+class _Video:
+    """An open video, and which of its frames are kept."""
+
+    def __init__(self, position: Position | None) -> None:
+        self._position = position
+        self._kept: deque[int] = deque()
+
+    def needed(self, frames: list[int], *, kept: int) -> list[tuple[int, int]]:
+        ranges: list[tuple[int, int]] = []
+        for frame in frames if self._position is not None else ():
+            if frame in self._kept or self._position is None:
+                continue
+            ranges += self._position.needed(frame)
+            self._kept.append(frame)
+            while len(self._kept) > kept:
+                self._kept.popleft()
+        return _joined(ranges)
+
+
+def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Return the same bytes in as few ranges, ascending."""
+    joined: list[tuple[int, int]] = []
+    for start, stop in sorted(ranges):
+        if joined and start <= joined[-1][1]:
+            joined[-1] = (joined[-1][0], max(joined[-1][1], stop))
+        else:
+            joined.append((start, stop))
+    return joined

@@ -1,0 +1,305 @@
+"""Fetching ahead: the bytes that coming samples need are fetched while others are decoded.
+
+The caller plans samples in the order in which they will be read, and releases each after it was
+read. Ranges that lie beside each other are fetched in one request, as long as none of them has
+begun. Threads fetch the ranges in the order in which they are needed; a thread ends when there is
+nothing left to fetch. What could not be fetched raises its error where it is read.
+"""
+
+import heapq
+import os
+import sys
+import threading
+import weakref
+from bisect import bisect_right, insort
+from collections import defaultdict
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass, field
+from itertools import islice, takewhile
+from typing import Final, Literal, NamedTuple
+
+from stereogenbench_data.errors import SelectionError
+
+FETCH_AHEAD_BYTES: Final = 256_000_000
+"""Bytes that a process fetches ahead at the most, unless the user says otherwise."""
+
+CONNECTIONS: Final = 8
+"""Requests that a process makes at a time, unless the user says otherwise."""
+
+LARGEST_REQUEST: Final = 2 * 1024 * 1024
+"""Bytes to which ranges beside each other are merged."""
+
+LARGEST_GAP: Final = 2048
+"""Bytes that nobody needs between two ranges that are merged: the headers of a tar."""
+
+_END_S: Final = 2.0
+"""Seconds that closing waits for requests under way."""
+
+
+class Wanted(NamedTuple):
+    """A range of bytes that a sample needs.
+
+    Attributes:
+        place: What tells objects apart: ranges of one place are merged.
+        start: The first byte.
+        stop: The byte behind the last one.
+        fetch: Returns the bytes from a start to a stop.
+        held_bytes: How many bytes it counts for, where these are not those of the range.
+    """
+
+    place: Hashable
+    start: int
+    stop: int
+    fetch: Callable[[int, int], bytes]
+    held_bytes: int | None = None
+
+
+@dataclass(slots=True, eq=False)
+class _Part:
+    """A range that is fetched in one request.
+
+    Attributes:
+        first: The sample that needs it first.
+        last: The sample that needs it last.
+    """
+
+    place: Hashable
+    start: int
+    stop: int
+    fetch: Callable[[int, int], bytes]
+    first: int
+    last: int
+    held_bytes: int
+    state: Literal["queued", "under way", "here", "failed", "dropped"] = "queued"
+    data: bytes = b""
+    error: BaseException | None = None
+
+
+@dataclass(slots=True)
+class _State:
+    """What the threads of a process share."""
+
+    connections: int
+    pid: int = field(default_factory=os.getpid)
+    changed: threading.Condition = field(default_factory=threading.Condition)
+    queue: list[tuple[int, int, _Part]] = field(default_factory=list)
+    threads: set[threading.Thread] = field(default_factory=set)
+    parts: dict[Hashable, list[_Part]] = field(default_factory=lambda: defaultdict(list))
+    due: dict[int, list[_Part]] = field(default_factory=lambda: defaultdict(list))
+    planned_bytes: int = 0
+    up_to: int = -1
+    count: int = 0
+
+
+class FetchAhead:
+    """Fetches ranges ahead of their reader, which is one thread.
+
+    It belongs to the process that uses it: a fork begins with nothing planned.
+
+    Attributes:
+        limit_bytes: How many bytes may be planned and not yet released; 0 plans nothing ahead.
+        connections: How many requests are made at a time.
+        most_bytes: The most that `planned_bytes` ever was.
+    """
+
+    def __init__(
+        self, *, limit_bytes: int = FETCH_AHEAD_BYTES, connections: int = CONNECTIONS
+    ) -> None:
+        """Fetch nothing yet.
+
+        Raises:
+            SelectionError: If a number is out of its range.
+        """
+        for name, value, least in (
+            ("fetch_ahead_bytes", limit_bytes, 0),
+            ("connections", connections, 1),
+        ):
+            if type(value) is not int or value < least:
+                raise SelectionError(f"{name} must be a whole number from {least}, got {value!r}.")
+        self.limit_bytes = limit_bytes
+        self.connections = connections
+        self.most_bytes = 0
+        self._own: _State | None = None
+        self._finalizer: Callable[[], object] | None = None
+
+    @property
+    def _state(self) -> _State:
+        if self._own is None or self._own.pid != os.getpid():
+            self._own = _State(self.connections)
+            self._finalizer = weakref.finalize(self, _end, self._own)
+        return self._own
+
+    @property
+    def planned_bytes(self) -> int:
+        """How many bytes are planned, under way or here."""
+        return self._state.planned_bytes
+
+    def plan(self, sample: int, wanted: Iterable[Wanted]) -> None:
+        """Plan ranges for a sample, whose number is above those of all samples before."""
+        state = self._state
+        with state.changed:
+            for each in wanted:
+                for start, stop in _uncovered(state, each, sample):
+                    _add(state, each, start, stop, sample)
+            self.most_bytes = max(self.most_bytes, state.planned_bytes)
+
+    def begin(self, sample: int = sys.maxsize) -> None:
+        """Fetch what is planned for the samples up to one; what is planned for others may grow."""
+        state = self._state
+        with state.changed:
+            state.up_to = sample
+            waiting = sum(first <= sample for first, _, _ in state.queue)
+            for _ in range(min(waiting, state.connections - len(state.threads))):
+                thread = threading.Thread(
+                    target=_work, args=(state,), name="fetch-ahead", daemon=True
+                )
+                thread.start()  # it waits until this block is left
+                state.threads.add(thread)
+
+    def read(self, place: Hashable, at: int) -> tuple[int, bytes] | None:
+        """Return the fetched range that holds a byte, and where it begins; None if none is planned.
+
+        Raises:
+            StorageError: If it could not be fetched.
+        """
+        state = self._state
+        with state.changed:
+            found = _touching(state, place, at, at + 1)
+            if not found:
+                return None
+            part = found[0]
+            if part.first > state.up_to:
+                return None
+            state.changed.wait_for(lambda: part.state in ("here", "failed", "dropped"))
+            if part.state == "dropped":
+                return None
+            if part.error is not None:
+                _drop(state, part)  # who tries again fetches again
+                raise part.error
+            return part.start, part.data
+
+    def release(self, sample: int) -> None:
+        """Forget what no sample after this one needs."""
+        state = self._state
+        with state.changed:
+            for part in state.due.pop(sample, ()):
+                if part.last == sample:
+                    _drop(state, part)
+
+    def close(self) -> None:
+        """Forget everything, and end all threads; it can be used again."""
+        self._own = None
+        if self._finalizer is not None:
+            self._finalizer()
+
+    def __getstate__(self) -> dict[str, object]:
+        """Return the state for a copy in another process."""
+        return self.__dict__ | {"_own": None, "_finalizer": None}
+
+
+def _uncovered(state: _State, wanted: Wanted, sample: int) -> list[tuple[int, int]]:
+    """Return what is not planned of a range; what is planned is kept for the sample."""
+    left, start = [], wanted.start
+    for part in _touching(state, wanted.place, wanted.start, wanted.stop):
+        if part.last < sample:
+            part.last = sample
+            state.due[sample].append(part)
+        left.append((start, part.start))
+        start = part.stop
+    left.append((start, wanted.stop))
+    return [(begin, end) for begin, end in left if begin < end]
+
+
+def _touching(state: _State, place: Hashable, start: int, stop: int) -> list[_Part]:
+    """Return the parts that share a byte with a range; parts share none with each other."""
+    parts = state.parts.get(place, [])
+    first = bisect_right(parts, start, key=_start)
+    first -= first > 0 and parts[first - 1].stop > start
+    return list(takewhile(lambda part: part.start < stop, islice(parts, first, None)))
+
+
+def _start(part: _Part) -> int:
+    return part.start
+
+
+def _add(state: _State, wanted: Wanted, start: int, stop: int, sample: int) -> None:
+    """Plan a range: by a request that has not begun and ends just before it, else by its own."""
+    parts = state.parts[wanted.place]
+    place = bisect_right(parts, start, key=_start)
+    before = parts[place - 1] if place else None
+    if (
+        before is not None
+        and before.state == "queued"
+        and start - before.stop <= LARGEST_GAP
+        and stop - before.start <= LARGEST_REQUEST
+    ):
+        state.planned_bytes += stop - before.stop
+        before.held_bytes += stop - before.stop
+        before.stop = stop
+        if before.last < sample:
+            before.last = sample
+            state.due[sample].append(before)
+        return
+    for begin in range(start, stop, LARGEST_REQUEST):
+        end = min(begin + LARGEST_REQUEST, stop)
+        held_bytes = end - begin if wanted.held_bytes is None else wanted.held_bytes
+        part = _Part(wanted.place, begin, end, wanted.fetch, sample, sample, held_bytes)
+        insort(parts, part, key=_start)
+        state.due[sample].append(part)
+        state.planned_bytes += held_bytes
+        state.count += 1
+        heapq.heappush(state.queue, (sample, state.count, part))
+
+
+def _drop(state: _State, part: _Part) -> None:
+    if part.state == "dropped":
+        return
+    parts = state.parts[part.place]
+    parts.remove(part)
+    if not parts:
+        del state.parts[part.place]
+    state.planned_bytes -= part.held_bytes
+    part.state, part.data = "dropped", b""
+    state.changed.notify_all()
+
+
+def _work(state: _State) -> None:
+    """Fetch what is queued, in a thread of its own."""
+    while True:
+        with state.changed:
+            part = None
+            while (
+                state.queue
+                and state.queue[0][0] <= state.up_to
+                and (part is None or part.state == "dropped")
+            ):
+                part = heapq.heappop(state.queue)[2]
+            if part is None or part.state == "dropped":
+                state.threads.discard(threading.current_thread())
+                return
+            part.state = "under way"
+        data, error = b"", None
+        try:
+            data = part.fetch(part.start, part.stop)
+        except BaseException as found:  # noqa: BLE001 - raised again in the thread that reads
+            error = found
+        with state.changed:
+            if part in state.parts.get(part.place, ()):
+                part.data, part.error = data, error
+                part.state = "here" if error is None else "failed"
+            state.changed.notify_all()
+
+
+def _end(state: _State) -> None:
+    """End the threads of this process."""
+    if state.pid != os.getpid():
+        return
+    with state.changed:
+        for part in [part for parts in state.parts.values() for part in parts]:
+            _drop(state, part)
+        state.queue.clear()
+        state.due.clear()
+        threads = list(state.threads)
+    for thread in threads:
+        if thread is not threading.current_thread():
+            thread.join(_END_S / len(threads))

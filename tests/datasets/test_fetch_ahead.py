@@ -1,0 +1,360 @@
+"""Data behind a URL: few requests, fetched ahead, and nothing left of a broken pass."""
+
+import contextlib
+import gc
+import os
+import shutil
+import threading
+import time
+import warnings
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+
+from stereogenbench_data import SceneIndex, StereoPairs, StereoPairStream
+from stereogenbench_data.datasets.mapped import SeekTableWarning
+from stereogenbench_data.errors import SelectionError, StorageError
+from stereogenbench_data.media.seek_table import packed_tables, parse_tables
+from stereogenbench_data.schema.release import depth_name, rgb_name
+from stereogenbench_data.sources.cache import ShardCache
+from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
+from tests.servers.failing_server import Answer, serving
+
+FIELDS = ("left", "right", "disparity", "frame_index", "__key__")
+
+
+@pytest.fixture
+def served(large_shards):
+    """A server with `large_shards`, which counts."""
+    with serving(large_shards) as server:
+        yield server
+
+
+@pytest.fixture
+def alone():
+    """Require that the test leaves no thread that fetches, and no socket, in this process."""
+    gc.collect()
+    before = sockets()
+    yield
+    deadline = time.monotonic() + 5
+    while fetching() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert fetching() == []
+    remote_pools_closed()
+    while len(sockets()) > len(before) and time.monotonic() < deadline:
+        gc.collect()
+        time.sleep(0.01)  # the server's ends are closed by its own threads
+    assert len(sockets()) <= len(before)
+
+
+def fetching():
+    return [each.name for each in threading.enumerate() if each.name == "fetch-ahead"]
+
+
+def remote_pools_closed():
+    from stereogenbench_data.sources.http import close_connections
+
+    close_connections()
+
+
+def sockets():
+    folder = Path("/proc/self/fd")
+    if not folder.is_dir():
+        pytest.skip("needs /proc")
+    links = []
+    for each in folder.iterdir():
+        with contextlib.suppress(OSError):
+            links.append(str(each.readlink()))
+    return [link for link in links if link.startswith("socket:")]
+
+
+def parts_asked(server):
+    """The requests for shards, without those for a size."""
+    return [each for each in server.asked if each.path.endswith(".tar") and each.stop > 1]
+
+
+def same(one, other):
+    return all(
+        torch.equal(one[name], other[name])
+        if isinstance(one[name], torch.Tensor)
+        else one[name] == other[name]
+        for name in one
+    )
+
+
+def needed_bytes(folder, frame):
+    """The bytes of the packets of a primary pair with depth that a frame decodes from."""
+    index = SceneIndex.open(folder)
+    index.load_seek_tables()
+    scene = index.scene(0)
+    tables = parse_tables(index.seek_tables(0))
+    left, right = scene.rig.primary_pair
+    total = 0
+    for name in (rgb_name(left), rgb_name(right), depth_name(left)):
+        table = tables[name]
+        stop = min(frame + table.delay + 1, table.packets)
+        total += table.bounds[stop] - table.bounds[table.key_before(frame)]
+    return total
+
+
+def test_the_first_frame_of_a_pair_takes_a_request_a_stream(served, large_shards, alone):
+    pairs = StereoPairs(served.url, fields=FIELDS)
+    served.asked.clear()
+    sample = pairs[0]
+    asked = parts_asked(served)
+    pairs.close()
+
+    assert same(sample, StereoPairs(large_shards, fields=FIELDS)[0])
+    assert len(asked) <= 3
+    assert sum(each.sent for each in asked) <= 1.05 * needed_bytes(large_shards, 0)
+
+
+@pytest.mark.parametrize("frames", ["all", ("random", 3), ("clips", 3)], ids=str)
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_pass_gives_what_local_shards_give_in_few_requests(
+    frames, workers, served, large_shards, alone
+):
+    options = {"fields": FIELDS, "frames": frames}
+    expected = StereoPairs(large_shards, **options).loader(2, tail="uneven")
+    loader = StereoPairs(served.url, **options).loader(2, num_workers=workers, tail="uneven")
+    served.asked.clear()
+
+    for batch, other in zip(loader, expected, strict=True):
+        assert same(batch, other)
+    stats = loader.stats()
+    loader.close()
+
+    asked = parts_asked(served)
+    assert len(asked) <= 3 * 2 * len(loader.batches.dataset.plan.scene_rows) + 6
+    assert stats.requests == len(asked)
+    assert stats.bytes_fetched == sum(each.sent for each in asked)
+
+
+def test_a_stream_of_samples_is_fetched_ahead_too(served, large_shards, alone):
+    expected = [*StereoPairStream(large_shards, 2, fields=FIELDS, frames="all", tail="uneven")]
+    stream = StereoPairStream(served.url, 2, fields=FIELDS, frames="all", tail="uneven")
+    served.asked.clear()
+
+    assert all(same(*each) for each in zip(stream, expected, strict=True))
+    assert len(parts_asked(served)) <= 3 * 2 * len(stream.pairs.plan.scene_rows) + 6
+    stream.close()
+
+
+def test_the_streams_of_a_sample_are_fetched_at_the_same_time(served, alone):
+    pairs = StereoPairs(served.url, fields=FIELDS, frames="all")
+    pairs[6]
+    shards = {each.path for each in served.asked if each.path.endswith(".tar")}
+    served.always = {path: Answer(delay_s=0.5) for path in shards}
+    began = time.perf_counter()
+    pairs[0]
+    took_s = time.perf_counter() - began
+    pairs.close()
+
+    assert took_s < 2 * 0.5
+
+
+def test_what_is_planned_stays_within_the_bound(served, alone):
+    bound = 100_000
+    pairs = StereoPairs(served.url, fields=("left",), frames="all", fetch_ahead_bytes=bound)
+    loader = pairs.loader(1, tail="uneven", start="beginning")
+    assert len([*loader]) == len(pairs)
+    largest = loader.batches.dataset._loader._ahead.most_bytes
+    loader.close()
+
+    of_one_sample = pairs.index.scene(0).members[rgb_name(0)].size
+    assert bound < largest <= bound + of_one_sample
+
+
+def test_nothing_is_planned_ahead_with_a_bound_of_0(served, alone):
+    loader = StereoPairs(served.url, fields=("left",), fetch_ahead_bytes=0).loader(1)
+    served.asked.clear()
+    batches = iter(loader)
+    next(batches)
+    time.sleep(0.1)
+
+    assert len(parts_asked(served)) == 1
+    batches.close()
+    loader.close()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_broken_pass_leaves_nothing(workers, served, alone):
+    pairs = StereoPairs(served.url, fields=FIELDS, frames="all")
+    for _ in pairs.loader(1, num_workers=workers):
+        break
+    deadline = time.monotonic() + 5
+    while fetching() and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+    assert fetching() == []
+
+
+def test_a_dropped_dataset_leaves_nothing(served, alone):
+    pairs = StereoPairs(served.url, fields=FIELDS)
+    pairs[0]
+    del pairs
+
+
+def test_ctrl_c_within_the_loop_leaves_nothing(served, alone):
+    def train():
+        for _ in StereoPairs(served.url, fields=FIELDS, frames="all").loader(1):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train()
+
+
+def test_a_fork_in_the_middle_of_a_pass_reads_for_itself(served, large_shards, alone):
+    local = StereoPairs(large_shards, fields=("left",), frames="all")
+    expected = local[3]["left"].numpy()
+    pairs = StereoPairs(served.url, fields=("left",), frames="all")
+    loader = pairs.loader(1, tail="uneven")
+    batches = iter(loader)
+    next(batches)
+    pid = os.fork()
+    if pid == 0:
+        code = 1
+        try:
+            # In numpy: torch's own threads do not survive a fork.
+            code = 0 if (pairs[3]["left"].numpy() == expected).all() else 2
+        finally:
+            os._exit(code)
+    _, status = os.waitpid(pid, 0)
+
+    assert os.waitstatus_to_exitcode(status) == 0
+    assert len([*batches]) == len(loader) - 1
+    loader.close()
+    pairs.close()
+
+
+def test_an_error_comes_at_the_sample_that_needs_the_bytes(small_shards, tmp_path, alone):
+    folder = tmp_path / "shards"
+    shutil.copytree(small_shards, folder)
+    index = SceneIndex.open(folder)
+    scenes = [index.scene(row) for row in range(len(index))]
+    first, shard = scenes[0], scenes[-1].members[rgb_name(0)].path
+    last = next(scene for scene in scenes if scene.members[rgb_name(0)].path == shard)
+    assert shard != first.members[rgb_name(0)].path
+    with serving(folder) as server:
+        server.always = {shard: Answer(status=403)}
+        pairs = StereoPairs(server.url, fields=("left", "__key__"))
+        loader = pairs.loader(1, order="sequential", tail="uneven")
+        batches = iter(loader)
+        assert next(batches)["__key__"][0].startswith(first.id.key)
+        with pytest.raises(StorageError, match=rf"{last.id.key}.*frames \(0,\).*{shard}.*403"):
+            list(batches)
+        loader.close()
+
+
+def test_what_is_fetched_ahead_fills_a_cache(served, large_shards, tmp_path, alone):
+    cache = ShardCache(tmp_path / "cache", limit_bytes=10**9)
+    options = {"fields": FIELDS, "frames": "all", "check": "opened"}
+    for _ in range(2):
+        loader = StereoPairs(served.url, cache=cache, **options).loader(2, tail="uneven")
+        expected = StereoPairs(large_shards, **options).loader(2, tail="uneven")
+        assert all(same(*each) for each in zip(loader, expected, strict=True))
+        loader.close()
+        asked, served.asked[:] = parts_asked(served), []
+
+    assert asked == []
+    assert cache.used_bytes() > 0
+
+
+def index_with(folder, change):
+    """Replace the seek tables of an index file."""
+    path = folder / "index.parquet"
+    table = pq.read_table(path)
+    place = table.schema.get_field_index("seek_tables")
+    if change is None:
+        table = table.remove_column(place)
+    else:
+        packed = [change(each) for each in table.column("seek_tables").to_pylist()]
+        table = table.set_column(place, "seek_tables", pa.array(packed, type=pa.binary()))
+    pq.write_table(table, path)
+
+
+def shifted(packed):
+    """Tables whose packets lie elsewhere: in order, within the file, and wrong."""
+    tables = {}
+    for name, table in parse_tables(packed).items():
+        first, last = table.bounds[0], table.bounds[-1]
+        even = [first + (last - first) * n // table.packets for n in range(table.packets + 1)]
+        object.__setattr__(table, "bounds", tuple(even))
+        tables[name] = table
+    return packed_tables(tables)
+
+
+def swapped(packed):
+    """Tables that each stand for the next video."""
+    tables = parse_tables(packed)
+    names = sorted(tables)
+    return packed_tables(dict(zip(names, [tables[n] for n in names[1:] + names[:1]], strict=True)))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [shifted, swapped, lambda packed: packed[:-3], lambda packed: b"", lambda packed: None],
+    ids=["shifted", "swapped", "cut", "empty", "null"],
+)
+@pytest.mark.filterwarnings("ignore::stereogenbench_data.datasets.mapped.SeekTableWarning")
+def test_a_wrong_seek_table_gives_the_right_frames(change, large_shards, tmp_path, alone):
+    folder = tmp_path / "shards"
+    shutil.copytree(large_shards, folder)
+    index_with(folder, change)
+    options = {"fields": FIELDS, "frames": [0, 2, 4, 6], "check": "metadata"}
+    expected = StereoPairs(large_shards, **options)
+    with serving(folder) as server:
+        pairs = StereoPairs(server.url, **options)
+        assert all(same(pairs[number], expected[number]) for number in (3, 0, 1))
+        pairs.close()
+
+
+def test_an_index_of_an_earlier_version_reads_with_a_hint(large_shards, tmp_path, alone):
+    folder = tmp_path / "shards"
+    shutil.copytree(large_shards, folder)
+    index_with(folder, None)
+    with serving(folder) as server:
+        with pytest.warns(SeekTableWarning, match=rf"{server.url}.*stereogenbench index"):
+            pairs = StereoPairs(server.url, fields=("left",))
+        expected = StereoPairs(large_shards, fields=("left",))
+        assert same(pairs[0], expected[0])
+        pairs.close()
+
+
+def test_local_data_read_no_seek_tables(large_shards):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pairs = StereoPairs(large_shards, fields=("left",))
+
+    assert pairs.index.seek_tables(0) is None
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [({"fetch_ahead_bytes": -1}, "fetch_ahead_bytes"), ({"connections": 0}, "connections")],
+)
+def test_options_out_of_their_range_are_named(options, named, large_shards):
+    with pytest.raises(SelectionError, match=f"{named}.*{next(iter(options.values()))}"):
+        StereoPairs(large_shards, **options)
+
+
+def test_closing_ends_requests_that_hang_within_seconds(alone):
+    begun, over = threading.Event(), threading.Event()
+
+    def fetch(start, stop):
+        begun.set()
+        over.wait(20)
+        return bytes(stop - start)
+
+    ahead = FetchAhead()
+    ahead.plan(1, [Wanted("place", 0, 5, fetch)])
+    ahead.begin()
+    begun.wait(5)
+    began = time.perf_counter()
+    ahead.close()
+
+    assert time.perf_counter() - began < 4
+    over.set()

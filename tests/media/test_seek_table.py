@@ -1,0 +1,243 @@
+"""Seek tables: where packets lie, as ffprobe says; and what a reader needs of them."""
+
+import io
+import json
+import subprocess
+import zlib
+
+import av
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stereogenbench_data.media.depth_packing import packed_depth
+from stereogenbench_data.media.seek_table import (
+    Position,
+    SeekTable,
+    packed_tables,
+    parse_tables,
+    read_seek_table,
+)
+from stereogenbench_data.media.video import VideoReader
+from stereogenbench_data.sources.ranged_file import PacketFile
+from tests.servers.tools import require_tool
+
+FRAMES = 30
+
+
+def write(path, *, codec, faststart=False):
+    """A video of noise, whose packets are large enough to be skipped by seeking."""
+    rng = np.random.default_rng(7)
+    options = {"movflags": "faststart"} if faststart else {}
+    with av.open(str(path), "w", options=options) as container:
+        stream = container.add_stream(codec, rate=15, options={"g": "10"})
+        stream.height, stream.width = 64, 96
+        stream.pix_fmt = {"ffv1": "gray16le", "mjpeg": "yuvj420p"}.get(codec, "yuv420p")
+        for number in range(FRAMES):
+            if codec == "ffv1":
+                pixels = rng.integers(0, 2**16, (64, 96), dtype=np.uint16)
+                frame = av.VideoFrame.from_ndarray(pixels, format="gray16le")
+            else:
+                pixels = rng.integers(0, 256, (64, 96, 3), dtype=np.uint8)
+                frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            frame.pts = number
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory):
+    """One of each kind that the release and training shards have."""
+    folder = tmp_path_factory.mktemp("seek")
+    return {
+        "rgb.mp4": write(folder / "rgb.mp4", codec="libx264"),
+        "fast.mp4": write(folder / "fast.mp4", codec="libx264", faststart=True),
+        "jpeg.mp4": write(folder / "jpeg.mp4", codec="mjpeg"),
+        "depth.mkv": write(folder / "depth.mkv", codec="ffv1"),
+    }
+
+
+KINDS = ("rgb.mp4", "fast.mp4", "jpeg.mp4", "depth.mkv")
+
+
+class Ahead:
+    """What was fetched ahead of a file for one frame, and where else it was read."""
+
+    def __init__(self, content):
+        self.content, self.ranges, self.missed = content, [], []
+
+    def read(self, at):
+        for start, stop in self.ranges:
+            if start <= at < stop:
+                return start, self.content[start:stop]
+        return None
+
+    def fetch(self, start, stop):
+        self.missed.append((start, stop))
+        return self.content[start:stop]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_packets_lie_where_ffprobe_finds_them(videos, kind):
+    program = require_tool("ffprobe")
+    command = [program, "-v", "error", "-show_packets", "-of", "json", str(videos[kind])]
+    packets = json.loads(subprocess.run(command, check=True, capture_output=True).stdout)["packets"]
+
+    table = read_seek_table(videos[kind], name=kind)
+
+    assert table.packets == len(packets) == FRAMES
+    assert table.keys == tuple(n for n, packet in enumerate(packets) if "K" in packet["flags"])
+    for number, packet in enumerate(packets):
+        start, stop = table.bounds[number], table.bounds[number + 1]
+        assert start <= int(packet["pos"]) < int(packet["pos"]) + int(packet["size"]) <= stop
+    payload = sum(int(packet["size"]) for packet in packets)
+    assert table.bounds[-1] - table.bounds[0] <= payload + 40 * FRAMES
+    assert table.fits(file_bytes=videos[kind].stat().st_size)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "frames",
+    [[0], [13], [29], [9, 10], [3, 4, 5, 25], [17, 2, 2, 3], [22, 24, 27], list(range(FRAMES))],
+    ids=str,
+)
+def test_each_frame_is_read_from_the_bytes_that_it_needs_alone(videos, kind, frames):
+    path = videos[kind]
+    content = path.read_bytes()
+    table = read_seek_table(path, name=kind)
+    position, ahead = Position(table), Ahead(content)
+    file = PacketFile(
+        ahead.fetch,
+        table=table,
+        ahead=ahead.read,
+        size=len(content),
+        crc32=zlib.crc32(content),
+    )
+    needed = 0
+
+    with VideoReader(path, name=kind, frames=FRAMES) as expected:
+        reader = None
+        for frame in frames:
+            ahead.ranges = position.needed(frame)
+            needed += sum(stop - start for start, stop in ahead.ranges)
+            reader = reader or VideoReader(file, name=kind, frames=FRAMES)
+            found = reader.frame(frame).to_ndarray()
+            np.testing.assert_array_equal(found, expected.frame(frame).to_ndarray())
+        reader.close()
+
+    assert ahead.missed == []
+    if frames == list(range(FRAMES)):
+        assert needed == table.bounds[-1] - table.bounds[0]
+
+
+def test_packed_depth_has_a_table_of_its_chunks(videos):
+    pytest.importorskip("blosc2")
+    content = packed_depth(
+        io.BytesIO(videos["depth.mkv"].read_bytes()),
+        name="depth",
+        frames=FRAMES,
+        after_frame=lambda: None,
+    )
+
+    table = read_seek_table(io.BytesIO(content), name="cam_00_depth.b2frame")
+
+    assert table.packets == FRAMES
+    position = Position(table)
+    assert position.needed(7) == [(table.bounds[7], table.bounds[8])]
+    assert position.needed(7) == []
+    assert position.needed(3) == [(table.bounds[3], table.bounds[4])]
+
+
+def test_far_away_the_packets_of_a_cluster_count_as_one(videos):
+    whole = read_seek_table(videos["depth.mkv"], name="depth.mkv")
+    table = read_seek_table(videos["depth.mkv"], name="depth.mkv", reads="little")
+
+    assert table.keys == whole.keys
+    assert [table.bounds[key] for key in table.keys[1:]] == [
+        whole.bounds[key] for key in whole.keys[1:]
+    ]
+    assert abs(table.bounds[-1] - whole.bounds[-1]) <= 32
+    file_bytes = videos["depth.mkv"].stat().st_size
+    assert table.fits(file_bytes=file_bytes)
+
+
+def test_tables_come_back_as_they_were_packed(videos):
+    tables = {name: read_seek_table(path, name=name) for name, path in videos.items()}
+
+    assert parse_tables(packed_tables(tables)) == tables
+
+
+def repacked(change):
+    """Tables that a stranger altered."""
+    content = json.dumps(change).encode()
+    return b"seek1" + zlib.compress(len(content).to_bytes(4, "big") + content + bytes(64))
+
+
+@pytest.mark.parametrize(
+    "packed",
+    [
+        b"",
+        b"seek1",
+        b"seek1" + zlib.compress(b"\xff\xff\xff\xff"),
+        b"seek2" + zlib.compress(b""),
+        repacked({}),
+        repacked([["v", 10**12, [0], 0, 0, 0, 0, 0, 0, 0]]),
+        repacked([["v", -1, [0], 0, 0, 0, 0, 0, 0, 0]]),
+        repacked([["v", 2, [0, 9], 0, 0, 0, 0, 0, 0, 0]]),
+        repacked([["v", 2, [1], 0, 0, 0, 0, 0, 0, 0]]),
+        repacked([["v", 2, [0], 7, 0, 0, 0, 0, 0, 0]]),
+        repacked([["v", 2, [0], 0, 0, 3, 0, 0, 0, 0]]),
+        repacked([["v", 2, [0], 0, 0, 0, 0, 10**9, 0, 5]]),
+        repacked([["v", 2, [0], 0, 0, 0, 0, -4, 4, 0]]),
+        repacked([["v", 2, "x", 0, 0, 0, 0, 0, 0, 0]]),
+        repacked([["v"]]),
+    ],
+)
+def test_altered_tables_are_none(packed):
+    assert parse_tables(packed) == {}
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_give_tables_or_none(content):
+    parse_tables(b"seek1" + zlib.compress(content))
+    parse_tables(content)
+
+
+@given(
+    st.lists(st.integers(1, 50), min_size=1, max_size=40),
+    st.lists(st.integers(0, 39), max_size=6),
+    st.integers(0, 3),
+    st.booleans(),
+    st.sampled_from([(0, 0), (1, 0), (1, 8)]),
+    st.lists(st.integers(0, 39), min_size=1, max_size=20),
+)
+def test_what_is_needed_holds_each_frame_from_where_its_decoding_can_begin(
+    spans, keys, delay, has_neighbours, opening, frames
+):
+    count = len(spans)
+    table = SeekTable(
+        tuple(np.cumsum([10, *spans]).tolist()),
+        tuple(sorted({0, *(key % count for key in keys)})),
+        delay=delay % (count + 1),
+        has_neighbours=has_neighbours,
+        opening=opening[0],
+        blind_jump=opening[1],
+        head=bytes(10),
+    )
+    frames = [frame % count for frame in frames]
+    position = Position(table)
+    there, previous = set(), None
+    for frame in frames:
+        parts = position.needed(frame)
+        for start, stop in parts:
+            assert table.bounds[0] <= start < stop <= table.bounds[-1]
+            assert start in table.bounds
+            assert stop in table.bounds
+            there |= set(range(start, stop))
+        key = table.key_before(frame)
+        assert set(range(table.bounds[key], table.bounds[frame + 1])) <= there
+        if frame == previous:
+            assert not parts
+        previous = frame

@@ -1,0 +1,137 @@
+"""Ranges fetched ahead: exactly the bytes that are needed, in few requests, within a bound."""
+
+import threading
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from stereogenbench_data.errors import StorageError
+from stereogenbench_data.sources.fetch_ahead import LARGEST_GAP, FetchAhead, Wanted
+
+CONTENT = bytes(range(256)) * 40
+
+
+class Log:
+    """What was asked of a place."""
+
+    def __init__(self):
+        self.asked = []
+
+    def fetch(self, start, stop):
+        self.asked.append((start, stop))
+        return CONTENT[start:stop]
+
+    def wanted(self, *ranges):
+        return [Wanted("place", start, stop, self.fetch) for start, stop in ranges]
+
+
+def read(ahead, start, stop):
+    """All bytes of a range, from the parts that hold them."""
+    data = b""
+    while start < stop:
+        begin, part = ahead.read("place", start)
+        data += part[start - begin : stop - begin]
+        start = begin + len(part)
+    return data
+
+
+ranges = st.tuples(st.integers(0, 9000), st.integers(1, 1200)).map(lambda r: (r[0], r[0] + r[1]))
+
+
+@given(st.lists(st.lists(ranges, max_size=4), min_size=1, max_size=8))
+def test_every_byte_that_is_needed_is_fetched_once_and_no_other(samples):
+    ahead, log = FetchAhead(connections=1), Log()
+    for number, needed in enumerate(samples):
+        ahead.plan(number, log.wanted(*needed))
+    ahead.begin()
+    for number, needed in enumerate(samples):
+        for start, stop in needed:
+            assert read(ahead, start, stop) == CONTENT[start:stop]
+        ahead.release(number)
+
+    needed = {byte for sample in samples for start, stop in sample for byte in range(start, stop)}
+    fetched = [byte for start, stop in log.asked for byte in range(start, stop)]
+    assert len(fetched) == len(set(fetched))
+    assert needed <= set(fetched)
+    gaps = sorted(set(fetched) - needed)
+    for gap in gaps:  # between two ranges that one request takes
+        assert any(byte in needed for byte in range(gap - LARGEST_GAP, gap))
+        assert any(byte in needed for byte in range(gap, gap + LARGEST_GAP))
+    assert ahead.planned_bytes == 0
+    ahead.close()
+
+
+def test_ranges_beside_each_other_take_one_request():
+    ahead, log = FetchAhead(), Log()
+    for number in range(5):
+        ahead.plan(number, log.wanted((100 * number, 100 * (number + 1))))
+    ahead.begin()
+
+    assert read(ahead, 0, 500) == CONTENT[:500]
+    assert log.asked == [(0, 500)]
+    ahead.close()
+
+
+def test_ranges_of_later_samples_wait_and_grow():
+    ahead, log = FetchAhead(), Log()
+    ahead.plan(1, log.wanted((0, 10)))
+    ahead.plan(2, log.wanted((5000, 5010)))
+    ahead.begin(1)
+    assert read(ahead, 0, 10) == CONTENT[:10]
+    ahead.plan(3, log.wanted((5010, 5020)))
+    ahead.begin()
+
+    assert read(ahead, 5000, 5020) == CONTENT[5000:5020]
+    assert log.asked == [(0, 10), (5000, 5020)]
+    ahead.close()
+
+
+def test_requests_are_made_at_a_time_up_to_their_number():
+    running, most, lock = [0], [0], threading.Lock()
+
+    def fetch(start, stop):
+        with lock:
+            running[0] += 1
+            most[0] = max(most[0], running[0])
+        time.sleep(0.05)
+        with lock:
+            running[0] -= 1
+        return bytes(stop - start)
+
+    ahead = FetchAhead(connections=3)
+    ahead.plan(1, [Wanted(name, 0, 1, fetch) for name in "abcdef"])
+    ahead.begin()
+    for name in "abcdef":
+        ahead.read(name, 0)
+    ahead.close()
+
+    assert most[0] == 3
+
+
+def test_an_error_is_raised_where_the_bytes_are_read_and_not_before():
+    def fetch(start, stop):
+        raise StorageError("place: gone.")
+
+    ahead = FetchAhead()
+    ahead.plan(1, [Wanted("place", 0, 5, fetch)])
+    ahead.begin()
+    with pytest.raises(StorageError, match="place: gone"):
+        ahead.read("place", 3)
+
+    assert ahead.read("place", 3) is None
+    ahead.close()
+
+
+def test_threads_end_when_there_is_nothing_to_fetch():
+    ahead, log = FetchAhead(), Log()
+    ahead.plan(1, log.wanted((0, 10)))
+    ahead.begin()
+    assert read(ahead, 0, 10) == CONTENT[:10]
+    deadline = time.monotonic() + 5
+    while "fetch-ahead" in {each.name for each in threading.enumerate()}:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+    ahead.close()
