@@ -163,9 +163,7 @@ class _MappedScenes(Dataset[Sample]):
         reading = list(enumerate(numbers))
         if not isinstance(numbers, EpochBatch):
             reading.sort(key=operator.itemgetter(1))
-        self._expect(
-            batch, read="as they come" if isinstance(numbers, EpochBatch) else "by number"
-        )
+        self._expect(batch, read="as they come" if isinstance(numbers, EpochBatch) else "by number")
         for place, number in reading:
             loaded[place] = self._load_into(arrays, place, number, batch=batch)
         self._fetched.publish(self._loader.fetched)
