@@ -86,4 +86,5 @@ def synth(  # noqa: PLR0913 - one parameter an option
     if as_json:
         typer.echo(json.dumps({"root": str(out), "scenes": keys}, indent=2))
     else:
-        typer.echo(f"{out}: {counted(len(keys), 'scene')} in {request.folder}")
+        folders = sorted({key.rpartition("/")[0] for key in keys})
+        typer.echo(f"{out}: {counted(len(keys), 'scene')} in {', '.join(folders)}")

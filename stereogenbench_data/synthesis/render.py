@@ -4,6 +4,7 @@ Colours depend on the place on the surface and on the size of a pixel there, but
 direction. So a view that is warped into another view by its depth agrees with that view.
 """
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -43,9 +44,12 @@ class SceneState:
     """A scene at one moment: its shapes, its materials and the sunlight on its ground."""
 
     def __init__(
-        self, scene: SceneModel, *, moment_s: float, static_light: Float64[np.ndarray, "side side"]
+        self,
+        scene: SceneModel,
+        *,
+        walker: Sequence[Shape],
+        static_light: Float64[np.ndarray, "side side"],
     ) -> None:
-        walker = scene.walker(moment_s)
         self.scene = scene
         self.shapes = [*scene.static_shapes, *walker]
         self.light = static_light.copy()
@@ -61,9 +65,9 @@ class SceneState:
 
 
 def static_light(scene: SceneModel) -> Float64[np.ndarray, "side side"]:
-    """Return the map of sunlight on the ground, with the shadows of all static shapes."""
+    """Return the map of sunlight on the ground, with the shadows of things."""
     light = full_light()
-    for shape in scene.static_shapes:
+    for shape in scene.static_shapes[scene.shell :]:
         cast_shadow(light, shape=shape, scene=scene)
     return light
 

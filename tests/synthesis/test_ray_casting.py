@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis.plan import plan_scene
+from stereogenbench_data.synthesis.maps import open_map
+from stereogenbench_data.synthesis.planning import plan_scene
 from stereogenbench_data.synthesis.ray_casting import GROUND, SKY, View, first_hits, pixel_rays
 from stereogenbench_data.synthesis.render import (
     SceneState,
@@ -28,6 +29,12 @@ def view_from(eye, *, size_px=(5, 5), focal_px=5.0):
         centre_px=(width / 2, height / 2),
         size_px=size_px,
     )
+
+
+def state_of(plan, *, frame):
+    world = open_map(plan.proposal)
+    walker = world.limbs(plan.spawn, frame=frame)
+    return SceneState(world.scene, walker=walker, static_light=static_light(world.scene))
 
 
 def depth_of(shapes, view):
@@ -85,21 +92,25 @@ def test_a_shape_behind_the_camera_is_not_seen():
 @pytest.mark.parametrize("index", range(3))
 def test_every_hit_lies_on_the_surface_of_its_solid(index):
     """Independent of how it was found: the point at that depth fulfils the solid's equation."""
-    plan = plan_scene(SynthRequest(family="Uniform", size_px=48), index=index)
-    state = SceneState(plan.scene, moment_s=0.3, static_light=static_light(plan.scene))
+    plan = plan_scene(SynthRequest(family="Uniform", size_px=48), index=index).plan
+    state = state_of(plan, frame=40)
     view = plan.view(camera=2, frame=40)
     ((_, rays),) = pixel_rays(view)
     depth_m, solid = state.first_hits(rays, view=view)
 
     v, u = np.nonzero(np.isfinite(depth_m))
     camera = np.stack(
-        [np.ones(len(u)), (u + 0.5 - 24) / plan.focal_px[0], (23.5 - v) / plan.focal_px[1]]
+        [
+            np.ones(len(u)),
+            (u + 0.5 - 24) / plan.proposal.focal_px[0],
+            (23.5 - v) / plan.proposal.focal_px[1],
+        ]
     )
     points = view.eye[:, None] + depth_m[v, u] * (view.axes @ camera)
     checked = 0
     for point, met in zip(points.T, solid[v, u], strict=True):
         if met == GROUND:
-            level = point[2] - plan.scene.slope @ point[:2]
+            level = point[2] - state.scene.slope @ point[:2]
         else:
             shape = state.shapes[met - 2]
             place = shape.axes @ (point - shape.centre) / shape.half_m
@@ -111,8 +122,8 @@ def test_every_hit_lies_on_the_surface_of_its_solid(index):
 
 def test_strips_of_a_large_picture_join_without_a_seam():
     """A 1280 px picture is cast in strips; its rows are those of rays cast one row at a time."""
-    plan = plan_scene(SynthRequest(size_px=1280, height_px=112), index=0)
-    state = SceneState(plan.scene, moment_s=0.0, static_light=static_light(plan.scene))
+    plan = plan_scene(SynthRequest(size_px=1280, height_px=112), index=0).plan
+    state = state_of(plan, frame=0)
     view = plan.view(camera=0, frame=0)
 
     picture, depth_m = render_frame(state, view=view)
