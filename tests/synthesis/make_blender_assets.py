@@ -70,9 +70,7 @@ def ball(name, radius, centre, material):
         first = 1 + ring * parts
         for part in range(parts):
             after = (part + 1) % parts
-            faces.append(
-                (first + part, first + parts + part, first + parts + after, first + after)
-            )
+            faces.append((first + part, first + parts + part, first + parts + after, first + after))
     last, first = len(corners) - 1, 1 + (rings - 2) * parts
     faces += [(last, first + (part + 1) % parts, first + part) for part in range(parts)]
     return item(name, corners, faces, centre, material)
@@ -202,8 +200,8 @@ def make_room(folder):
     )
 
 
+"""Parent, head, tail and radius of each bone."""
 BONES = {
-    # name: (parent, head, tail, radius)
     "hips": (None, (0, 0, 0.95), (0, 0, 1.1), 0.16),
     "spine": ("hips", (0, 0, 1.1), (0, 0, 1.48), 0.17),
     "head": ("spine", (0, 0, 1.52), (0, 0, 1.75), 0.1),
@@ -395,7 +393,6 @@ def make_broken(folder):
         made.unlink()
 
     lit_floor()
-    bpy.context.scene.objects["sun"].select_set(False)
     save("boneless.blend")
     (folder / "cut.blend").write_bytes((folder / "boneless.blend").read_bytes()[:300])
     (folder / "cut.fbx").write_bytes(b"Kaydara FBX Binary  \x00\x1a\x00" + b"x" * 50)

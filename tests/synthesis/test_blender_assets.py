@@ -67,7 +67,9 @@ def folder(tmp_path):
 
 
 def write_gltf(path, *uris):
-    path.write_text(json.dumps({"asset": {"version": "2.0"}, "buffers": [{"uri": u} for u in uris]}))
+    path.write_text(
+        json.dumps({"asset": {"version": "2.0"}, "buffers": [{"uri": u} for u in uris]})
+    )
 
 
 def read(folder, text):

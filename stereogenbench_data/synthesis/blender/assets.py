@@ -10,9 +10,9 @@ import os
 import struct
 import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, NoReturn, get_args
 from urllib.parse import unquote
 
 from stereogenbench_data.errors import SynthesisError
@@ -20,10 +20,10 @@ from stereogenbench_data.errors import SynthesisError
 Device = Literal["CPU", "GPU"]
 Light = Literal["own", "sky"]
 Forward = Literal["-y", "+y", "-x", "+x"]
+Repeat = Literal["onward", "back"]
 
 SUFFIXES: Final = (".blend", ".glb", ".gltf", ".fbx")
 _GLB_MAGIC: Final = b"glTF"
-_GLB_JSON: Final = 0x4E4F534A
 _CHUNK_BYTES: Final = 1 << 20
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -71,11 +71,14 @@ class AnimationAsset:
         file: Its file, absolute.
         take: The name of the take; None if the file has a single one.
         rate_hz: Its frames a second; None for what the file says.
+        repeat: What follows its end. "onward" repeats a take that ends in its first pose, from
+            where it led; any other, and all with "back", are played backwards.
     """
 
     file: str
     take: str | None = None
     rate_hz: float | None = None
+    repeat: Repeat = "onward"
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +160,9 @@ def read_assets(path: str | Path) -> Assets:
     )
     settings = reader.settings(document.get("render", {}))
     digest = hashlib.sha256(text)
-    for file in sorted({each.file for kind in (maps, characters, animations) for each in kind.values()}):
+    for file in sorted(
+        {each.file for kind in (maps, characters, animations) for each in kind.values()}
+    ):
         digest.update(os.path.relpath(file, path.parent).encode() + _digest_of(Path(file)))
     return Assets(path, maps, characters, animations, sensors_mm, settings, digest.hexdigest())
 
@@ -172,18 +177,20 @@ class _Reader:
         self._path = path
         self._root = path.parent.resolve()
 
-    def refuse(self, place: str, found: object, cure: str) -> None:
+    def refuse(self, place: str, found: object, cure: str) -> NoReturn:
         """Raise the error of one value."""
         raise SynthesisError(f"{self._path}: {place}: found {found!r}. It {cure}.")
 
-    def require_known(self, table: Mapping[str, Any], known: tuple[str, ...], *, place: str) -> None:
+    def require_known(
+        self, table: Mapping[str, Any], known: tuple[str, ...], *, place: str
+    ) -> None:
         """Refuse keys that mean nothing, such as a misspelt one."""
         for key in table:
             if key not in known:
                 where = f"{place}.{key}" if place else key
                 raise SynthesisError(
-                    f"{self._path}: {where}: this key is unknown. Choose one of {', '.join(known)}, "
-                    f"or remove it."
+                    f"{self._path}: {where}: this key is unknown. Choose one of "
+                    f"{', '.join(known)}, or remove it."
                 )
 
     def entries(self, document: Mapping[str, Any], kind: str) -> Mapping[str, Any]:
@@ -198,7 +205,7 @@ class _Reader:
                 )
             if not isinstance(table, dict):
                 self.refuse(f"{kind}.{name}", table, f"must be a table, [{kind}.{name}]")
-        return found
+        return dict(found)
 
     def map(self, table: dict[str, Any], *, place: str) -> MapAsset:
         """Read a table of maps."""
@@ -223,7 +230,7 @@ class _Reader:
 
     def animation(self, table: dict[str, Any], *, place: str) -> AnimationAsset:
         """Read a table of animations."""
-        self.require_known(table, ("file", "take", "rate_hz"), place=place)
+        self.require_known(table, ("file", "take", "rate_hz", "repeat"), place=place)
         take = table.get("take")
         if take is not None and not (isinstance(take, str) and take):
             self.refuse(f"{place}.take", take, "must be the name of a take of the file")
@@ -235,22 +242,19 @@ class _Reader:
                 if "rate_hz" in table
                 else None
             ),
+            repeat=self._choice(table, "repeat", place=place, choices=get_args(Repeat)),
         )
 
     def sensor(self, value: object, *, place: str) -> tuple[float, float]:
         """Read the width and the height of a sensor."""
-        if not (
-            isinstance(value, list) and len(value) == 2 and all(_is_positive(side) for side in value)
-        ):
+        if not (isinstance(value, list) and len(value) == 2 and all(map(_is_positive, value))):
             self.refuse(place, value, "must be [width, height] in mm, both positive")
-        width_mm, height_mm = value  # type: ignore[misc]
-        return float(width_mm), float(height_mm)
+        return float(value[0]), float(value[1])
 
     def settings(self, table: object) -> RenderSettings:
         """Read the table of Cycles."""
         if not isinstance(table, dict):
             self.refuse("render", table, "must be a table, [render]")
-        assert isinstance(table, dict)
         known = ("samples_per_pixel", "device", "denoise", "threads")
         self.require_known(table, known, place="render")
         denoise = table.get("denoise", True)
@@ -277,9 +281,7 @@ class _Reader:
             self.refuse(f"{place}.{key}", value, f"must be one of {', '.join(choices)}")
         return value
 
-    def _positive(
-        self, table: Mapping[str, Any], key: str, *, place: str, default: float
-    ) -> float:
+    def _positive(self, table: Mapping[str, Any], key: str, *, place: str, default: float) -> float:
         value = table.get(key, default)
         if key in table and not _is_positive(value):
             self.refuse(f"{place}.{key}", value, "must be a positive number")
@@ -312,7 +314,6 @@ class _Reader:
         where = f"{place}.file"
         if not isinstance(name, str) or not name:
             self.refuse(where, name, f"must name a file ({', '.join(SUFFIXES)})")
-        assert isinstance(name, str)
         if Path(name).suffix.lower() not in SUFFIXES:
             self.refuse(where, name, f"must end in {', '.join(SUFFIXES)}; convert it with Blender")
         path = self._inside(name, where=where)
@@ -323,8 +324,8 @@ class _Reader:
                 referred = self._inside(str(path.parent / unquote(uri)), where=f"{where}: {name}")
                 if not referred.is_file():
                     raise SynthesisError(
-                        f"{self._path}: {where}: {name} refers to {uri!r}, which is missing. Copy it "
-                        f"beside {name}, or export one .glb file."
+                        f"{self._path}: {where}: {name} refers to {uri!r}, which is missing. Copy "
+                        f"it beside {name}, or export one .glb file."
                     )
         return str(path)
 
@@ -347,9 +348,7 @@ def gltf_uris(path: Path) -> list[str]:
     try:
         data = path.read_bytes()
         if data[:4] == _GLB_MAGIC:
-            length, kind = struct.unpack_from("<II", data, 12)
-            if kind != _GLB_JSON:
-                raise ValueError("the first chunk is not JSON")
+            (length,) = struct.unpack_from("<I", data, 12)
             data = data[20 : 20 + length]
         document = json.loads(data)
         holders = [*document.get("buffers", ()), *document.get("images", ())]
@@ -359,11 +358,6 @@ def gltf_uris(path: Path) -> list[str]:
             f"{path}: is not glTF ({error}). Export it again with Blender."
         ) from error
     return [str(uri) for uri in uris if not str(uri).startswith("data:")]
-
-
-def specification(asset: MapAsset | CharacterAsset | AnimationAsset) -> dict[str, Any]:
-    """Return an asset as plain values."""
-    return asdict(asset)
 
 
 def _digest_of(path: Path) -> bytes:

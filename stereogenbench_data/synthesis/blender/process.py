@@ -24,7 +24,7 @@ from stereogenbench_data.synthesis.blender.worker import read_message, write_mes
 _WORKER: Final = Path(__file__).with_name("worker.py")
 _VERSION: Final = [5, 0]
 _CURE: Final = (
-    'bpy 5.0 has wheels for Python 3.11 only, and asks for a NumPy below 2. Make an environment of '
+    "bpy 5.0 has wheels for Python 3.11 only, and asks for a NumPy below 2. Make an environment of "
     "its own, `python3.11 -m venv blender && blender/bin/pip install 'bpy==5.0.*'`, and name its "
     "Python by --blender-python blender/bin/python; or, under Python 3.11, add it to this one by "
     "`pip install --no-deps 'bpy==5.0.*'`."
@@ -53,8 +53,11 @@ class BlenderProcess:
                 env=os.environ | places,
             )
         except OSError as error:
+            self._log.close()
             self._home.cleanup()
-            raise ExtraError(f"{python}: this Python cannot be started ({error}). {_CURE}") from error
+            raise ExtraError(
+                f"{python}: this Python cannot be started ({error}). {_CURE}"
+            ) from error
         atexit.register(self.close)
         version = self._version(python)
         if version["number"] != _VERSION:
@@ -113,10 +116,15 @@ class BlenderProcess:
         if code is not None and code < 0:
             name = signal.Signals(-code).name
             how = f"Blender crashed ({name})"
-            cure = "Run it again, which keeps what is finished; if memory is short (SIGKILL), with " \
+            cure = (
+                "Run it again, which keeps what is finished; if memory is short (SIGKILL), with "
                 "fewer workers; if the same scene crashes again, open its map in Blender."
+            )
         else:
-            how, cure = f"Blender ended with status {code}", "Run it again; finished scenes are kept."
+            how, cure = (
+                f"Blender ended with status {code}",
+                "Run it again; finished scenes are kept.",
+            )
         return f"{how}. Its last lines: {shown or 'none'}. {cure}"
 
     @property

@@ -95,7 +95,7 @@ class BlenderRenderer:
         return BlenderWorld(self, proposal)
 
     def views(self, plan: ScenePlan, *, cameras: tuple[int, ...]) -> Iterator[RenderedView]:
-        """Yield the views of cameras: all of frame 0 in the order of ``cameras``, then frame 1, on."""
+        """Yield the views of cameras; see `Renderer.views`."""
         settings = self.assets.settings
         for frame in range(len(plan.centres_m)):
             views = [plan.view(camera=camera, frame=frame) for camera in cameras]
@@ -137,8 +137,17 @@ class BlenderRenderer:
                 yield RenderedView(picture=shown, depth_m=depth_m)
 
     def request(self, proposal: Proposal) -> dict[str, Any]:
-        """Return the map and the subject of a proposal, as the worker wants them."""
+        """Return the map and the subject of a proposal, as the worker wants them.
+
+        Raises:
+            SynthesisError: If there is no such map.
+        """
         assets = self.assets
+        if proposal.map_name not in assets.maps:
+            raise SynthesisError(
+                f"{assets.path}: maps: there is no map {proposal.map_name!r}. Choose by --map one "
+                f"of {', '.join(self.maps)}."
+            )
         the_map = assets.maps[proposal.map_name]
         character = assets.characters[proposal.character]
         animation = assets.animations[proposal.animation]
@@ -164,9 +173,7 @@ class BlenderRenderer:
     def description(self, plan: ScenePlan) -> dict[str, object]:
         """Return the document of ``scene_description_qwen_dataset_level.json``."""
         proposal = plan.proposal
-        place, motion = (
-            name.replace("_", " ") for name in (proposal.map_name, proposal.animation)
-        )
+        place, motion = (name.replace("_", " ") for name in (proposal.map_name, proposal.animation))
         return {
             "scene_type": "unknown",
             "setting": place,
@@ -192,13 +199,14 @@ class BlenderWorld:
         self._request = renderer.request(proposal)
         self._what = f"{proposal.map_name}, {proposal.character}, {proposal.animation}"
         asset = renderer.assets.maps[proposal.map_name]
-        found_m, self._points_m = _facts(
+        bounds_m, spawn_bounds_m, self._points_m = _facts(
             self._python, json.dumps(self._request), proposal.request.frames
         )
-        self._bounds_m = found_m if asset.bounds_m is None else np.array(asset.bounds_m)
-        self._spawn_bounds_m = (
-            self._bounds_m if asset.spawn_bounds_m is None else np.array(asset.spawn_bounds_m)
-        )
+        if asset.bounds_m is not None:
+            bounds_m = spawn_bounds_m = np.array(asset.bounds_m)
+        if asset.spawn_bounds_m is not None:
+            spawn_bounds_m = np.array(asset.spawn_bounds_m)
+        self._bounds_m, self._spawn_bounds_m = bounds_m, spawn_bounds_m
 
     @property
     def bounds_m(self) -> Bounds:
@@ -215,8 +223,8 @@ class BlenderWorld:
     ) -> Float64[np.ndarray, " n"]:
         """Return how many metres each ray goes until it meets the map, see `World.cast`.
 
-        A ray starts inside a solid if it meets only backs of faces along all axes, and along one of
-        them two less than 2 m apart.
+        A ray starts inside a solid if backs of faces are around it, along one axis less than 2 m
+        apart; so a room whose faces look outwards is not taken for a solid.
         """
         arrays = [np.asarray(each, np.float64) for each in (origins_m, directions)]
         process = blender(self._python, place=self._request["map"]["path"])
@@ -233,11 +241,16 @@ class BlenderWorld:
 
 
 @lru_cache(maxsize=64)
-def _facts(python: str, request_json: str, frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bounds of a map, and a subject's points (frames, p, 3) for a spawn at 0."""
+def _facts(
+    python: str, request_json: str, frames: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the bounds of a map, those of spawns, and a subject's points for a spawn at 0.
+
+    Bounds are two corners, and points are (frames, p, 3).
+    """
     request = json.loads(request_json)
     process = blender(python, place=request["map"]["path"])
-    answer, (bounds_m, points_m) = process.call(
+    answer, (bounds_m, spawn_bounds_m, points_m) = process.call(
         request | {"call": "facts", "frames": frames}, what=request["map"]["where"]
     )
     if answer["notes"]:
@@ -246,4 +259,4 @@ def _facts(python: str, request_json: str, frames: int) -> tuple[np.ndarray, np.
             BlenderAssetWarning,
             stacklevel=2,
         )
-    return bounds_m, points_m
+    return bounds_m, spawn_bounds_m, points_m

@@ -3,8 +3,8 @@
 `worker.py` loads it by its path, in a Python that has bpy, so it imports only the standard library,
 NumPy and Blender's modules.
 
-Axes here are Blender's: right-handed, x and y level, z up, in units of the map's file; `Mirror` turns
-map axes into them. Blender evaluates a scene anew for each render, and otherwise than for its
+Axes here are Blender's: right-handed, x and y level, z up, in units of the map's file; `Mirror`
+turns map axes into them. Blender evaluates a scene anew for each render, and otherwise than for its
 windows. So triangles for depth are taken from the evaluation that Cycles renders.
 """
 
@@ -29,10 +29,18 @@ _MESHES: Final = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
 _WITHOUT_MESH: Final = frozenset({"CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"})
 _SOLID_M: Final = 2.0
 """Closed surfaces that are wider than this in every direction are rooms, not solids."""
+_OPEN_SKY_M: Final = 20.0
+"""How far above its highest point cameras may be in a map without a ceiling."""
+_OPEN_SHARE: Final = 0.3
+_FLOOR_M: Final = 0.5
+_GRID: Final = 12
+_BACKS: Final = 5
 _MAP_SIZE_M: Final = (2.0, 2000.0)
 _HEIGHT_M: Final = (0.5, 3.0)
 _UNITS_M: Final = (0.01, 100.0, 0.001, 1000.0, 0.0254, 39.37, 0.3048, 3.281, 0.1, 10.0)
 _POINTS: Final = 24
+_MOST_STEPS: Final = 300
+_STRIP_FRAMES: Final = 1e6
 _CYCLE_M: Final = 0.05
 _STILL_M: Final = 0.02
 _BONE_PATH: Final = re.compile(r'pose\.bones\["((?:[^"\\]|\\.)*)"\]\.(\w+)')
@@ -242,10 +250,10 @@ def check_files(where: str, *, root: str) -> None:
     """Refuse what was opened if it needs files outside the asset folder, or missing ones."""
     own = bpy.utils.resource_path("LOCAL")
     for path in bpy.utils.blend_paths(absolute=True, packed=False, local=False):
-        if os.path.exists(path) and not _inside(path, root) and not _inside(path, own):
+        if Path(path).exists() and not _inside(path, root) and not _inside(path, own):
             raise AssetError(
-                f"{where}: it refers to {path}, which is outside the asset folder {root}. Copy that "
-                f"file into the folder and point to it there, or pack it into the .blend file."
+                f"{where}: it refers to {path}, which is outside the asset folder {root}. Copy "
+                f"that file into the folder and point to it there, or pack it into the .blend file."
             )
     for library in bpy.data.libraries:
         path = bpy.path.abspath(library.filepath)
@@ -262,7 +270,7 @@ def check_files(where: str, *, root: str) -> None:
             and image.users > image.use_fake_user
             and image.packed_file is None
             and not image.packed_files
-            and not os.path.exists(bpy.path.abspath(image.filepath, library=image.library))
+            and not Path(bpy.path.abspath(image.filepath, library=image.library)).exists()
         }
     )
     if missing:
@@ -314,8 +322,8 @@ def _import(path: str, where: str) -> None:
     except RuntimeError as error:
         text = str(error).strip().splitlines()
         raise AssetError(
-            f"{where}: Blender cannot import it ({text[-1] if text else 'no reason given'}). Open it "
-            f"in Blender, repair it and save it as a .blend file."
+            f"{where}: Blender cannot import it ({text[-1] if text else 'no reason given'}). Open "
+            f"it in Blender, repair it and save it as a .blend file."
         ) from error
 
 
@@ -323,7 +331,8 @@ def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
     """Add a file to the scene; return its new objects, its actions and their frames a second."""
     before, actions = set(bpy.data.objects), set(bpy.data.actions)
     for number, action in enumerate(actions):
-        action.name = f"stereogenbench {number}"  # So that takes keep the names in their file.
+        if action.library is None:
+            action.name = f"stereogenbench {number}"  # So that takes keep the names in their file.
     if Path(path).suffix.lower() == ".blend":
         try:
             with bpy.data.libraries.load(path, link=False) as (there, wanted):
@@ -422,8 +431,8 @@ class Subject:
         if not armatures:
             found = ", ".join(sorted({item.type.lower() for item in self.objects})) or "nothing"
             raise AssetError(
-                f"{where}: it has no armature, so it cannot be animated; it has {found}. Export the "
-                f"skeleton with the mesh, or name another file."
+                f"{where}: it has no armature, so it cannot be animated; it has {found}. Export "
+                f"the skeleton with the mesh, or name another file."
             )
         if animation["file"] != character["file"]:
             others, actions, rate_hz = _add(animation["file"], spec["animation_where"])
@@ -446,52 +455,35 @@ class Subject:
                 item.parent = self.empty
         self.scale = character["scale"] / unit_m
         self.facing = {"-y": 0.0, "+x": -90.0, "+y": 180.0, "-x": 90.0}[character["forward"]]
-        self._measure(character["scale"], where=where)
+        self._measure(character["scale"], repeat=animation["repeat"], where=where)
 
     def _animate(self, action: Any, *, where: str) -> list[Any]:
         """Bind the take to the armature and, where they have a slot of their own, to the rest."""
-        strips = []
-        best: tuple[int, Any] = (0, None)
         bones = self.armature.data.bones
-        tracks: dict[str, int] = {}
-        for slot in action.slots:
-            named = _bones_of(action, slot)
-            for bone in named:
-                tracks[bone] = tracks.get(bone, 0) + 1
-            best = max(best, (sum(bone in bones for bone in named), slot), key=lambda one: one[0])
-        if not best[0]:
+        own_slot = max(
+            action.slots, key=lambda slot: len(_bones_of(action, slot).keys() & bones.keys())
+        )
+        moved = _bones_of(action, own_slot)
+        if not moved.keys() & bones.keys():
             raise AssetError(
                 f"{where}: the take {action.name!r} moves no bone of the armature "
-                f"{self.armature.name!r}: it has {_few(tracks)}, the armature {_few(bones.keys())}. "
-                f"Name an animation of the same skeleton, or retarget it."
+                f"{self.armature.name!r}: it has {_few(moved)}, the armature has "
+                f"{_few(bones.keys())}. Name an animation of the same skeleton, or retarget it."
             )
-        for bone, names in _bones_of(action, best[1]).items():
-            pose = self.armature.pose.bones.get(bone)
-            if pose is None:
-                continue
+        for bone in moved.keys() & bones.keys():
+            pose, names = self.armature.pose.bones[bone], moved[bone]
             if "rotation_quaternion" in names:
                 pose.rotation_mode = "QUATERNION"
             elif "rotation_euler" in names and pose.rotation_mode in ("QUATERNION", "AXIS_ANGLE"):
                 pose.rotation_mode = "XYZ"
+        strips = []
         for item in self.objects:
-            owners = [item, getattr(item.data, "shape_keys", None)]
-            for owner in filter(None, owners):
-                data = owner.animation_data_create()
-                data.action = None
-                for track in list(data.nla_tracks):
-                    data.nla_tracks.remove(track)
-                slot = best[1] if owner == self.armature else _slot_of(action, owner)
-                if slot is None:
-                    continue
-                strip = data.nla_tracks.new().strips.new("take", 1, action)
-                strip.action_slot = slot
-                strip.frame_end = strip.frame_start + 1e6
-                strip.frame_start = -1e6
-                strip.use_animated_time = True
-                strips.append(strip)
+            for owner in filter(None, (item, getattr(item.data, "shape_keys", None))):
+                slot = own_slot if owner == self.armature else _slot_of(action, owner)
+                strips += _bind(owner, action=action, slot=slot)
         return strips
 
-    def _measure(self, scale: float, *, where: str) -> None:
+    def _measure(self, scale: float, *, repeat: str, where: str) -> None:
         """Find the soles, the height, and how the take repeats."""
         self.place(None, time_frames=self.start)
         points = self._vertices()
@@ -508,14 +500,22 @@ class Subject:
                 f"{_HEIGHT_M[0]:g} to {_HEIGHT_M[1]:g} m. "
                 + _scale_cure(height_m, scale, within=_HEIGHT_M)
             )
-        self.soles = np.array([*(low + high)[:2] / 2, low[2]])
         self.chosen = _spread(points)
         first = self._bones()
+        # No frame puts a sole below the floor on which the subject stands.
+        steps = min(_MOST_STEPS, math.ceil(self.frames / self.rate_hz * _RATE_HZ))
+        lowest = low[2]
+        for step in range(1, steps + 1):
+            self.place(None, time_frames=self.start + self.frames * step / steps)
+            lowest = min(lowest, self._vertices()[:, 2].min())
+        self.soles = np.array([*(low + high)[:2] / 2, lowest])
         self.place(None, time_frames=self.start + self.frames)
-        steps = (self._bones() - first) * scale
-        whole = steps.mean(axis=0)
+        moved = (self._bones() - first) * scale
+        whole = moved.mean(axis=0)
         self.travel = np.zeros(3)
-        self.is_cyclic = bool(np.linalg.norm(steps - whole, axis=1).max() < _CYCLE_M)
+        self.is_cyclic = repeat == "onward" and bool(
+            np.linalg.norm(moved - whole, axis=1).max() < _CYCLE_M
+        )
         if self.is_cyclic and np.linalg.norm(whole[:2]) > _STILL_M:
             self.travel = np.array([*whole[:2], 0.0]) / scale
 
@@ -531,7 +531,9 @@ class Subject:
             return self.start + rest, int(times)
         return self.start + (self.frames - rest if int(times) % 2 else rest), 0
 
-    def place(self, spawn: tuple[Array, float] | None, *, time_frames: float, times: int = 0) -> None:
+    def place(
+        self, spawn: tuple[Array, float] | None, *, time_frames: float, times: int = 0
+    ) -> None:
         """Put the subject at a place and a heading, in its file's own axes for None."""
         for strip in self.strips:
             strip.strip_time = time_frames
@@ -565,7 +567,9 @@ class Subject:
         markers = {bone.custom_shape for bone in self.armature.pose.bones}
         for item in self.objects:
             is_shown = item not in markers and not item.hide_render and item.visible_camera
-            places = [collection for collection in item.users_collection if not collection.hide_render]
+            places = [
+                collection for collection in item.users_collection if not collection.hide_render
+            ]
             if item.type not in _MESHES or not is_shown or not places:
                 continue
             shown = item.evaluated_get(depsgraph)
@@ -608,13 +612,33 @@ def _slot_of(action: Any, owner: Any) -> Any:
     )
 
 
+def _bind(owner: Any, *, action: Any, slot: Any) -> list[Any]:
+    """Replace what moves an object by a strip of an action, whose time is then set by hand."""
+    data = owner.animation_data_create()
+    data.action = None
+    for track in list(data.nla_tracks):
+        data.nla_tracks.remove(track)
+    if slot is None:
+        return []
+    strip = data.nla_tracks.new().strips.new("take", 1, action)
+    strip.action_slot = slot
+    strip.frame_end = strip.frame_start + _STRIP_FRAMES
+    strip.frame_start = -_STRIP_FRAMES
+    strip.use_animated_time = True
+    return [strip]
+
+
 def _stem(name: str) -> str:
     """Return a name without the number that Blender adds where it is taken."""
     return re.sub(r"\.\d{3,}$", "", name)
 
 
 def _take(actions: list[Any], *, name: str | None, where: str) -> Any:
-    takes = {action.name: action for action in actions if any(_bones_of(action, slot) for slot in action.slots)}
+    takes = {
+        action.name: action
+        for action in actions
+        if any(_bones_of(action, slot) for slot in action.slots)
+    }
     if name is None and len(takes) == 1:
         return next(iter(takes.values()))
     matching = [
@@ -640,7 +664,9 @@ def _take(actions: list[Any], *, name: str | None, where: str) -> Any:
 
 def _few(names: Any, most: int = 4) -> str:
     shown = sorted(names)
-    return (", ".join(map(repr, shown[:most])) or "nothing") + (", ..." if len(shown) > most else "")
+    return (", ".join(map(repr, shown[:most])) or "nothing") + (
+        ", ..." if len(shown) > most else ""
+    )
 
 
 def _scale_cure(size_m: float, scale: float, *, within: tuple[float, float]) -> str:
@@ -699,7 +725,7 @@ class Stage:
         self._subject_spec: dict[str, Any] = {}
         self.surfaces = Surfaces()
         self.still = self._gather()
-        self.bounds_m = self._bounds(spec)
+        self.bounds_m, self.spawn_bounds_m = self._bounds(spec)
         self._own = {*bpy.data.objects, *bpy.data.actions}
         if not _is_lit(self.scene):
             raise AssetError(
@@ -749,7 +775,8 @@ class Stage:
         bpy.ops.render.render()
         return self.surfaces.at_frame(found)
 
-    def _bounds(self, spec: dict[str, Any]) -> Array:
+    def _bounds(self, spec: dict[str, Any]) -> tuple[Array, Array]:
+        """Return two corners of where cameras may be, and of where subjects are spawned."""
         points = np.concatenate([each.vertices for each in self.still])
         if not len(points):
             raise AssetError(
@@ -758,30 +785,55 @@ class Stage:
             )
         corners = self.mirror.to_map(np.stack([points.min(axis=0), points.max(axis=0)]))
         bounds_m: Array = np.sort(corners, axis=0)
-        size_m = float((bounds_m[1] - bounds_m[0]).max())
+        low, high = bounds_m
+        size_m = float((high - low).max())
         if not (spec["is_bounded"] or _MAP_SIZE_M[0] <= size_m <= _MAP_SIZE_M[1]):
             raise AssetError(
                 f"{self.where}: the map is {size_m:.4g} m wide, and maps are {_MAP_SIZE_M[0]:g} to "
                 f"{_MAP_SIZE_M[1]:g} m. {_scale_cure(size_m, spec['scale'], within=(5.0, 500.0))} "
                 f"If it is right, set bounds_m to the part where cameras may be."
             )
-        return bounds_m
+        ceiling_m = self._ceiling_m(low, high)
+        if np.isfinite(ceiling_m):
+            return bounds_m, np.stack([low, [*high[:2], ceiling_m - 0.01]])
+        bounds_m[1, 2] += _OPEN_SKY_M
+        return bounds_m, np.stack([low, high + np.array([0.0, 0.0, 0.01])])
 
-    def cast(self, origins_m: Array, directions: Array) -> Array:
+    def _ceiling_m(self, low: Array, high: Array) -> float:
+        """Return the height of the highest ceiling above the lowest floors; infinity outdoors."""
+        across, along = np.meshgrid(
+            *((np.arange(_GRID) + 0.5) / _GRID * (high - low)[axis] + low[axis] for axis in (0, 1))
+        )
+        starts = np.stack([across.ravel(), along.ravel(), np.full(across.size, low[2] - 1.0)], 1)
+        upwards = np.broadcast_to([0.0, 0.0, 1.0], starts.shape)
+        # The lowest surface is the floor or its underside; what is thinner than this is one floor.
+        floor_m = low[2] - 1.0 + self.cast(starts, upwards, solids=False) + _FLOOR_M
+        is_floor = np.isfinite(floor_m)
+        starts = starts[is_floor]
+        starts[:, 2] = floor_m[is_floor]
+        above_m = starts[:, 2] + self.cast(starts, upwards[is_floor], solids=False)
+        if not len(above_m) or np.isinf(above_m).mean() > _OPEN_SHARE:
+            return math.inf
+        return float(above_m[np.isfinite(above_m)].max())
+
+    def cast(self, origins_m: Array, directions: Array, *, solids: bool = True) -> Array:
         """Return how many metres each ray goes until it meets the map; 0 inside a solid."""
         origins = self.mirror.to_blender(origins_m)
         ways = directions * self.mirror.flip
         distance, normals = first_hits(self.still, origins, ways)
         behind = np.einsum("ni,ni->n", normals, ways) > 0
         inside = np.flatnonzero(behind)
-        if inside.size:
+        if solids and inside.size:
             places, back = np.unique(origins[inside], axis=0, return_inverse=True)
             is_solid = self._in_solid(places)
             distance[inside[is_solid[back.reshape(-1)]]] = 0.0
         return distance * self.mirror.unit_m
 
     def _in_solid(self, places: Array) -> Array:
-        """Tell places that see only backs of faces along all axes, and nearby along one."""
+        """Tell places that see backs of faces both ways along the axes, and nearby along one.
+
+        One of the six may be a front: a thing that stands on a floor shares a face with it.
+        """
         axes = np.concatenate([np.eye(3), -np.eye(3)])
         is_back = np.empty((6, len(places)), bool)
         distance = np.empty((6, len(places)))
@@ -790,7 +842,7 @@ class Stage:
             distance[way], normals = first_hits(self.still, places, ways)
             is_back[way] = normals @ axis > 0
         thickness_m = (distance[:3] + distance[3:]).min(axis=0) * self.mirror.unit_m
-        solid: Array = is_back.all(axis=0) & (thickness_m < _SOLID_M)
+        solid: Array = (is_back.sum(axis=0) >= _BACKS) & (thickness_m < _SOLID_M)
         return solid
 
     def set_subject(self, spec: dict[str, Any]) -> Subject:
@@ -818,9 +870,7 @@ class Stage:
         exact = self.start + max(0, frame) / _RATE_HZ * self.rate_hz
         self.scene.frame_set(int(exact), subframe=exact - int(exact))
         place = self.mirror.to_blender(np.array(spec["place_m"]))
-        subject.place(
-            (place, 90.0 - spec["yaw_deg"]), time_frames=time_frames, times=times
-        )
+        subject.place((place, 90.0 - spec["yaw_deg"]), time_frames=time_frames, times=times)
         self.scene.frame_set(int(exact), subframe=exact - int(exact))
         eyes, ways = self.mirror.to_blender(eyes_m), axes * self.mirror.flip[:, None]
         self._set_render(spec)
@@ -844,7 +894,7 @@ class Stage:
         render = scene.render
         render.engine = "CYCLES"
         render.resolution_x, render.resolution_y = spec["size_px"]
-        render.filepath = os.path.join(spec["folder"], "view")
+        render.filepath = str(Path(spec["folder"]) / "view")
         render.use_file_extension = render.use_overwrite = True
         image = render.image_settings
         image.media_type = "IMAGE"
@@ -942,7 +992,9 @@ class Server:
         self._stage: Stage | None = None
         self._spec: dict[str, Any] = {}
 
-    def answer(self, call: dict[str, Any], arrays: list[Array]) -> tuple[dict[str, Any], list[Array]]:
+    def answer(
+        self, call: dict[str, Any], arrays: list[Array]
+    ) -> tuple[dict[str, Any], list[Array]]:
         """Return the answer to one request.
 
         Raises:
@@ -961,5 +1013,9 @@ class Server:
         subject = stage.set_subject(call["subject"])
         if name == "facts":
             points_m = [subject.points_m(frame) for frame in range(call["frames"])]
-            return {"notes": [*stage.notes, *subject.notes]}, [stage.bounds_m, np.stack(points_m)]
+            return {"notes": [*stage.notes, *subject.notes]}, [
+                stage.bounds_m,
+                stage.spawn_bounds_m,
+                np.stack(points_m),
+            ]
         return {}, [stage.render(call["view"], *arrays)]
