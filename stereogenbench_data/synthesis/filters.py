@@ -232,7 +232,7 @@ def _sight(world: World, start: Array, end: Array) -> Array:
 # What a rig sees from a pose.
 
 _SIGHT_POINTS: Final = 14
-_GRID: Final = 7
+_GRID: Final = 6
 _BORDER: Final = 0.98
 _AROUND: Final = np.array(
     [axis for sign in (-1.0, 1.0) for axis in (sign * np.eye(3))]

@@ -62,22 +62,21 @@ class RayWorld:
         return self.scene.distances(origins_m, directions)
 
     def subject_points_m(self, spawn: Spawn, *, frame: int) -> Float64[np.ndarray, "p 3"]:
-        """Return both ends of every limb, with the soles lowest; see `World.subject_points_m`."""
-        points = []
-        for shape in self.limbs(spawn, frame=frame):
-            reach = shape.half_m[0] * shape.axes[0]
-            points += [shape.centre - reach, shape.centre + reach]
-        return np.array(points)
+        """Return both ends of every limb; see `World.subject_points_m`."""
+        return self.figure.points_m(**self._walk(spawn, frame=frame))
 
     def limbs(self, spawn: Spawn, *, frame: int) -> list[Shape]:
         """Return the figure's limbs at a frame."""
+        return self.figure.limbs(**self._walk(spawn, frame=frame))
+
+    def _walk(self, spawn: Spawn, *, frame: int) -> dict[str, Any]:
         yaw = np.radians(spawn.yaw_deg)
-        return self.figure.limbs(
-            start_m=spawn.place_m,
-            yaw_deg=spawn.yaw_deg,
-            rise=float(self.scene.slope @ (np.cos(yaw), np.sin(yaw))),
-            moment_s=frame / FRAME_RATE_HZ,
-        )
+        return {
+            "start_m": spawn.place_m,
+            "yaw_deg": spawn.yaw_deg,
+            "rise": float(self.scene.slope @ (np.cos(yaw), np.sin(yaw))),
+            "moment_s": frame / FRAME_RATE_HZ,
+        }
 
 
 def open_map(proposal: Proposal) -> RayWorld:
@@ -289,14 +288,14 @@ PLACES: Final[dict[str, _Place]] = {
     "SynthCorridor": _Place((30.0, 3.4), wall_m=3.0, height_m=3.0, crates=5),
     "SynthRoom": _Place((9.0, 7.0), wall_m=3.2, height_m=3.2, crates=7),
     "SynthYard": _Place(
-        (18.0, 16.0), wall_m=3.5, height_m=8.0, roof="open", crates=10, posts=4, post_m=(0.16, 3.2)
+        (15.0, 13.0), wall_m=3.5, height_m=6.0, roof="open", crates=10, posts=4, post_m=(0.16, 3.2)
     ),
     "SynthHall": _Place(
-        (34.0, 22.0), wall_m=9.0, height_m=9.0, crates=12, posts=8, post_m=(0.6, 9.0)
+        (26.0, 16.0), wall_m=6.0, height_m=6.0, crates=14, posts=8, post_m=(0.6, 6.0)
     ),
     "SynthPark": _Place(
-        (70.0, 70.0), wall_m=6.0, height_m=15.0, roof="open", crates=14, posts=12,
-        post_m=(0.4, 3.6), crowns=1.6,
+        (40.0, 36.0), wall_m=5.0, height_m=12.0, roof="open", crates=16, posts=16,
+        post_m=(0.4, 3.2), crowns=1.8,
     ),
 }  # fmt: skip
 """The maps of fixed size, from narrow to wide."""

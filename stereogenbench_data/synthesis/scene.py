@@ -187,20 +187,43 @@ class SceneModel:
         with np.errstate(divide="ignore", invalid="ignore"):
             nearest = np.where(descent > 0, above / descent, np.inf)
         nearest = np.where(above <= 0, 0.0, nearest)
-        for shape in self.static_shapes:
-            apart = [o - c for o, c in zip(origins_m, shape.centre, strict=True)]
+        for shape, near in zip(
+            self.static_shapes, self._may_meet(origins_m, directions), strict=True
+        ):
+            index = np.flatnonzero(near)
+            if not len(index):
+                continue
+            apart = [o[index] - c for o, c in zip(origins_m, shape.centre, strict=True)]
             from_world = shape.axes / shape.half_m[:, None]
             origin = [a * apart[0] + b * apart[1] + c * apart[2] for a, b, c in from_world]
             if shape.kind == "box":
                 inside = np.maximum(np.maximum(abs(origin[0]), abs(origin[1])), abs(origin[2])) < 1
             else:
                 inside = sum(o * o for o in origin) < 1
-            ray = [
-                a * directions[0] + b * directions[1] + c * directions[2] for a, b, c in from_world
-            ]
-            met = entry_depth(shape, origin=origin, direction=ray)
-            nearest = np.minimum(nearest, np.where(inside, 0.0, met))
+            x, y, z = (d[index] for d in directions)
+            ray = [a * x + b * y + c * z for a, b, c in from_world]
+            met = np.where(inside, 0.0, entry_depth(shape, origin=origin, direction=ray))
+            nearest[index] = np.minimum(nearest[index], met)
         return nearest
+
+    def _may_meet(self, origins_m: Array, directions: Array) -> Array:
+        """Return for each shape which rays pass its bounding sphere."""
+        centres, radii_m = self._spheres
+        ahead = centres @ directions - (origins_m * directions).sum(axis=0)
+        squared = (centres * centres).sum(axis=1)[:, None] - 2 * (centres @ origins_m)
+        squared += (origins_m * origins_m).sum(axis=0)
+        radii_m = radii_m[:, None] * 1.001 + 0.001
+        return (ahead > -radii_m) & (squared - ahead * ahead < radii_m * radii_m)
+
+    @property
+    def _spheres(self) -> tuple[Array, Array]:
+        """Centres and radii of spheres around the shapes."""
+        centres = np.array([shape.centre for shape in self.static_shapes]).reshape(-1, 3)
+        radii_m = [
+            np.sqrt(shape.half_m @ shape.half_m) if shape.kind == "box" else shape.half_m.max()
+            for shape in self.static_shapes
+        ]
+        return centres, np.array(radii_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,45 +253,61 @@ class Figure:
             rise: Rise of the ground per metre in that direction.
             moment_s: The time.
         """
-        skin, upper, lower = self.clothes
+        first, second, radii_m = self._bones(start_m, yaw_deg, rise, moment_s)
         yaw = np.radians(yaw_deg)
+        side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+        skin, upper, lower = self.clothes
+        materials = (upper, lower, skin, *(lower, lower, skin, upper, skin) * 2)
+        return [
+            limb(start, end, radius_m=radius_m, side=side, material=material)
+            for start, end, radius_m, material in zip(
+                first, second, radii_m, materials, strict=True
+            )
+        ]
+
+    def points_m(
+        self, *, start_m: Float64[np.ndarray, "3"], yaw_deg: float, rise: float, moment_s: float
+    ) -> Float64[np.ndarray, "p 3"]:
+        """Return both ends of every limb at a time, given what `limbs` is given."""
+        first, second, radii_m = self._bones(start_m, yaw_deg, rise, moment_s)
+        along = second - first
+        along *= (0.5 * radii_m / np.sqrt((along * along).sum(axis=1)))[:, None]
+        return np.stack([first - along, second + along], axis=1).reshape(-1, 3)
+
+    def _bones(
+        self, start_m: Array, yaw_deg: float, rise: float, moment_s: float
+    ) -> tuple[Array, Array, Array]:
+        """Return where the limbs start and end, (13, 3) each, and their radii."""
+        yaw, swing = np.radians(yaw_deg), 2 * np.pi * moment_s / self.stride_s
         ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
         side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
-        swing = 2 * np.pi * moment_s / self.stride_s
         feet = start_m + self.walk_m_s * moment_s * (ahead + rise * _UP)
-        scale = self.scale
-        hips = feet + scale * (0.93 + 0.025 * np.cos(2 * swing)) * _UP
-        neck = hips + scale * (0.52 * _UP + 0.03 * ahead)
-
-        def part(first: Array, second: Array, *, radius_m: float, material: Material) -> Shape:
-            return limb(first, second, radius_m=scale * radius_m, side=side, material=material)
-
-        shapes = [
-            part(hips, neck, radius_m=0.17, material=upper),
-            part(
-                hips - 0.04 * scale * _UP, hips + 0.1 * scale * _UP, radius_m=0.16, material=lower
-            ),
-            part(neck + 0.1 * scale * _UP, neck + 0.27 * scale * _UP, radius_m=0.1, material=skin),
+        # The limbs of a figure of scale 1 whose hips are at the origin.
+        neck = 0.52 * _UP + 0.03 * ahead
+        bones = [
+            (np.zeros(3), neck, 0.17),
+            (-0.04 * _UP, 0.1 * _UP, 0.16),
+            (neck + 0.1 * _UP, neck + 0.27 * _UP, 0.1),
         ]
         for sign in (-1.0, 1.0):
             phase = sign * np.sin(swing)
             lag = sign * np.sin(swing - 0.9)
-            hip = hips + 0.1 * scale * sign * side
-            knee = hip + 0.43 * scale * _limb_direction(0.5 * phase, ahead)
-            heel = knee + 0.42 * scale * _limb_direction(0.5 * phase - 0.35 - 0.35 * lag, ahead)
-            shoulder = neck + scale * (0.2 * sign * side - 0.04 * _UP)
-            elbow = shoulder + scale * (
-                0.29 * _limb_direction(-0.5 * phase, ahead) + 0.04 * sign * side
-            )
-            hand = elbow + 0.27 * scale * _limb_direction(0.3 - 0.5 * phase, ahead)
-            shapes += [
-                part(hip, knee, radius_m=0.09, material=lower),
-                part(knee, heel, radius_m=0.065, material=lower),
-                part(heel, heel + 0.17 * scale * ahead, radius_m=0.05, material=skin),
-                part(shoulder, elbow, radius_m=0.055, material=upper),
-                part(elbow, hand, radius_m=0.045, material=skin),
+            hip = 0.1 * sign * side
+            knee = hip + 0.43 * _limb_direction(0.5 * phase, ahead)
+            heel = knee + 0.42 * _limb_direction(0.5 * phase - 0.35 - 0.35 * lag, ahead)
+            shoulder = neck + 0.2 * sign * side - 0.04 * _UP
+            elbow = shoulder + 0.29 * _limb_direction(-0.5 * phase, ahead) + 0.04 * sign * side
+            hand = elbow + 0.27 * _limb_direction(0.3 - 0.5 * phase, ahead)
+            bones += [
+                (hip, knee, 0.09),
+                (knee, heel, 0.065),
+                (heel, heel + 0.17 * ahead, 0.05),
+                (shoulder, elbow, 0.055),
+                (elbow, hand, 0.045),
             ]
-        return shapes
+        first, second, radii = (np.array(each) for each in zip(*bones, strict=True))
+        hips = feet + self.scale * (0.93 + 0.025 * np.cos(2 * swing)) * _UP
+        return hips + self.scale * first, hips + self.scale * second, self.scale * radii
 
 
 def _limb_direction(angle: float, ahead: Array) -> Array:
