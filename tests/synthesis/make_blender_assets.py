@@ -201,6 +201,39 @@ def make_room(folder):
 
 
 """Parent, head, tail and radius of each bone."""
+
+
+def glowing(name, colour):
+    """A material of one colour, whatever the light."""
+    material = matte(name, colour)
+    nodes = material.node_tree.nodes
+    glow = nodes.new("ShaderNodeEmission")
+    glow.inputs["Color"].default_value = (*colour, 1)
+    material.node_tree.links.new(glow.outputs[0], nodes["Material Output"].inputs["Surface"])
+    return material
+
+
+def make_screen(folder):
+    """A red card with holes, half a metre wide, before a blue wall and the open sky."""
+    clear()
+    bpy.context.scene.view_settings.view_transform = "Standard"
+    box("floor", (16, 16, 0.2), (0, 0, -0.1), glowing("green", (0, 0.5, 0)))
+    box("wall", (0.2, 5, 6), (6, 2.5, 3), glowing("blue", (0, 0, 1)))
+    red = glowing("red", (1, 0, 0))
+    nodes, links = red.node_tree.nodes, red.node_tree.links
+    place, checker = nodes.new("ShaderNodeTexCoord"), nodes.new("ShaderNodeTexChecker")
+    checker.inputs["Scale"].default_value = 2.0
+    holes, mix = nodes.new("ShaderNodeBsdfTransparent"), nodes.new("ShaderNodeMixShader")
+    links.new(place.outputs["Object"], checker.inputs["Vector"])
+    links.new(checker.outputs["Fac"], mix.inputs["Fac"])
+    links.new(holes.outputs[0], mix.inputs[1])
+    links.new(nodes["Emission"].outputs[0], mix.inputs[2])
+    links.new(mix.outputs[0], nodes["Material Output"].inputs["Surface"])
+    item("card", [(0.05, -2, 0), (0.05, 2, 0), (0.05, 2, 3), (0.05, -2, 3)], [(0, 1, 2, 3)],
+         (2, 0, 0.5), red)  # fmt: skip
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "screen.blend"), compress=True)
+
+
 BONES = {
     "hips": (None, (0, 0, 0.95), (0, 0, 1.1), 0.16),
     "spine": ("hips", (0, 0, 1.1), (0, 0, 1.48), 0.17),
@@ -417,5 +450,6 @@ if __name__ == "__main__":
     make_yard(out)
     make_room(out)
     make_figure(out)
+    make_screen(out)
     make_broken(out)
     (out / "assets.toml").write_text(ASSETS)

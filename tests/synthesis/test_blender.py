@@ -15,8 +15,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from stereogenbench_data import EvaluationProtocol, StereoPairs, score_controls
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.errors import ExtraError, SynthesisError
+from stereogenbench_data.evaluation.controls import relations
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.synthesis.blender.assets import read_assets
 from stereogenbench_data.synthesis.blender.process import blender
@@ -27,6 +31,8 @@ from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.renderer import Renderer
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from stereogenbench_data.synthesis.world import Spawn, World
+from tests.synthesis.conftest import Drawn
+from tests.synthesis.test_pictures import psnr_db
 
 HERE = Path(__file__).parent
 PYTHON = os.environ.get("BLENDER_PYTHON", "")
@@ -298,6 +304,26 @@ def test_pictures_have_sky_exactly_where_depth_has_none(renderer):
 
 
 @needs_blender
+def test_depth_goes_through_holes_that_a_material_cuts(assets):
+    """A red card with holes, before a blue wall on the left and nothing on the right."""
+    changed = _changed(assets, "yard.blend", "screen.blend")
+    quick = fast(BlenderRenderer(changed, PYTHON), samples_per_pixel=4)
+    made = plan(
+        proposal(frames=1), eye=(-4.0, 0.0, 1.8), target=(2.0, 0.0, 1.8), place=(0.0, 100.0, 0.0)
+    )
+
+    for view in views(quick, made, cameras=(0, 5)):
+        red, green, blue = np.moveaxis(view.picture.astype(int), -1, 0)
+        pure = np.maximum(np.maximum(red, green), blue) == red + green + blue
+        card, wall = pure & (red > 240), pure & (blue > 240)
+        sky = red + green + blue == 0
+        assert min(card.mean(), wall.mean(), sky.mean()) > 0.1
+        assert 5.5 < view.depth_m[card].min() <= view.depth_m[card].max() < 6.6
+        assert 9.4 < view.depth_m[wall].min() <= view.depth_m[wall].max() < 10.4
+        assert np.isinf(view.depth_m[sky]).all()
+
+
+@needs_blender
 def test_the_same_plan_gives_the_same_bytes_in_another_blender(renderer):
     made = plan(proposal(frames=2))
     few = fast(renderer, samples_per_pixel=4, denoise=True)
@@ -422,3 +448,70 @@ def test_a_scene_on_which_blender_crashed_is_rendered_by_the_next_run(renderer, 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert synthesise(tmp_path, request, renderer=quick) == [key]
+
+
+# Whole scenes, as any reader of the release takes them.
+
+
+@pytest.fixture(scope="session")
+def rendered(renderer, tmp_path_factory):
+    """A tree of two scenes, one of each map, 256 px wide."""
+    root = tmp_path_factory.mktemp("rendered")
+    request = SynthRequest(map_name=renderer.maps, scenes=2, size_px=256, frames=2, seed=3)
+    quick = fast(renderer, samples_per_pixel=8, denoise=True)
+    keys = synthesise(root, request, renderer=quick)
+    assert {key.split("/")[2] for key in keys} == {"Room", "Yard"}
+    return root
+
+
+@pytest.fixture
+def scenes(rendered):
+    """The two scenes, read with PyAV and json alone."""
+    return [Drawn(marker.parent) for marker in sorted(rendered.rglob("_scene_complete.json"))]
+
+
+@needs_blender
+def test_visible_pixels_agree_when_warped_by_depth(scenes):
+    for scene in scenes:
+        for left in range(5):
+            agreement_db, kept = psnr_db(scene, left=left, right=left + 1, frame=1)
+            assert agreement_db > 29
+            assert kept > 0.2
+        agreement_db, _ = psnr_db(scene, left=0, right=5, frame=1)
+        assert agreement_db > 28
+
+
+@needs_blender
+def test_the_subject_is_seen_and_moves(scenes):
+    for scene in scenes:
+        assert np.ptp(scene.pictures(0), axis=0).max() > 40
+        assert scene.json("baseline.json")["character_mesh"] == "Figure"
+
+
+@needs_blender
+def test_the_doctor_confirms_the_contract_and_the_audit_finds_nothing(rendered):
+    few = ("--frames", "2", "--workers", "1")
+
+    doctor = CliRunner().invoke(app, ["doctor", str(rendered), *few, "--scenes", "2"])
+    audit = CliRunner().invoke(app, ["audit", str(rendered), *few])
+
+    assert doctor.exit_code == 0, doctor.output
+    assert "The declared contract fits" in doctor.stdout
+    assert audit.exit_code == 0, audit.output
+
+
+@needs_blender
+def test_pairs_and_evaluation_read_the_scenes(rendered):
+    pairs = StereoPairs(rendered, pairs="all", frames="all")
+    sample = pairs[0]
+
+    scores = score_controls(
+        rendered, workers=1, protocol=EvaluationProtocol(size=(128, 128)), frames="first"
+    )
+
+    assert len(pairs) == 2 * 15 * 2
+    assert sample["valid"].float().mean() > 0.5
+    assert (sample["disparity"][sample["valid"]] > 0).all()
+    found = relations(scores)
+    assert found
+    assert all(relation.holds is not False for relation in found), found

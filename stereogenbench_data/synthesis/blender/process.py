@@ -157,13 +157,13 @@ def blender(python: str = "", *, place: str = "") -> BlenderProcess:
 
     Args:
         python: The Python that has bpy; "" for this one.
-        place: The map's file.
+        place: The map's file; "" for a Blender that waits for its first map.
 
     Raises:
         ExtraError: If there is no such Blender.
     """
     key = (python or sys.executable, place, os.getpid())
-    found = _running.pop(key, None)
+    found = _running.pop(key, None) or _running.pop((key[0], "", key[2]), None)
     if found is None or not found.is_running:
         found = BlenderProcess(key[0])
     _running[key] = found

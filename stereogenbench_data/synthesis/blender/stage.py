@@ -13,6 +13,8 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import repeat
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,6 +46,9 @@ _STRIP_FRAMES: Final = 1e6
 _CYCLE_M: Final = 0.05
 _STILL_M: Final = 0.02
 _BONE_PATH: Final = re.compile(r'pose\.bones\["((?:[^"\\]|\\.)*)"\]\.(\w+)')
+_NOTHING: Final = 1e9
+"""Depth of Cycles' pass from which on nothing is seen."""
+_MOST_LAYERS: Final = 64
 _GPU_KINDS: Final = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
 
 
@@ -70,42 +75,76 @@ class Mirror:
 # What is in front of the camera: triangles of the evaluated scene.
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """An evaluated mesh in Blender's world axes.
+
+    Attributes:
+        name: A name that stays over the frames.
+        is_subject: Whether it belongs to the subject.
+        vertices: (n, 3) float64.
+        corners: (m, 3) the vertices of its triangles.
+        is_cut: (m,) whether the material of a triangle lets rays through somewhere.
+    """
+
+    name: str
+    is_subject: bool
+    vertices: Array
+    corners: Array
+    is_cut: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hits:
+    """What rays meet first.
+
+    Attributes:
+        distance: (n,) how many directions away; infinity where they meet nothing.
+        normals: (n, 3) of the triangles, 0 where they meet nothing.
+        is_cut: (n,) whether the material there lets rays through somewhere.
+    """
+
+    distance: Array
+    normals: Array
+    is_cut: Array
+
+
 class Triangles:
     """Triangles in Blender's world axes, with a tree that finds the first that a ray meets."""
 
-    def __init__(self, meshes: list[tuple[Array, Array]]) -> None:
-        """Take vertices (n, 3) float64 and triangles (m, 3) of every mesh."""
-        starts = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
-        self.vertices = np.concatenate([np.empty((0, 3)), *(mesh[0] for mesh in meshes)])
+    def __init__(self, meshes: list[Mesh]) -> None:
+        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+        self.vertices = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes)])
         self.corners = np.concatenate(
             [
                 np.empty((0, 3), np.int64),
-                *(mesh[1] + start for mesh, start in zip(meshes, starts, strict=False)),
+                *(mesh.corners + start for mesh, start in zip(meshes, starts, strict=False)),
             ]
         )
+        self.is_cut = np.concatenate([np.empty(0, bool), *(mesh.is_cut for mesh in meshes)])
         self._tree = BVHTree.FromPolygons(
             self.vertices.tolist(), self.corners.tolist(), all_triangles=True, epsilon=0.0
         )
 
-    def first_hits(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Return how many directions away each ray meets its first triangle, and that one's normal.
+    def first_hits(self, origins: Array, directions: Array) -> Hits:
+        """Return what rays meet, from origins (n, 3) or from one (3,).
 
         The tree, in float32, tells which triangle; where the ray meets its plane is computed in
-        float64. Rays that meet nothing have infinity and a normal of 0.
+        float64.
         """
         cast = self._tree.ray_cast
-        places = (
-            zip(origins.tolist(), directions.tolist(), strict=True)
-            if origins.ndim == 2
-            else ((origins, direction) for direction in directions.tolist())
-        )
+        starts = origins.tolist() if origins.ndim == 2 else repeat(origins.tolist())
         found = np.fromiter(
-            (-1 if (hit := cast(start, way)[2]) is None else hit for start, way in places),
+            (
+                -1 if (hit := cast(start, way)[2]) is None else hit
+                for start, way in zip(starts, directions.tolist(), strict=False)
+            ),
             np.int64,
             len(directions),
         )
         distance = np.full(len(directions), np.inf)
         normals = np.zeros((len(directions), 3))
+        is_cut = np.zeros(len(directions), bool)
         met = np.flatnonzero(found >= 0)
         if met.size:
             first, second, third = np.moveaxis(self.vertices[self.corners[found[met]]], 1, 0)
@@ -116,17 +155,14 @@ class Triangles:
             with np.errstate(divide="ignore", invalid="ignore"):
                 ahead = away / towards
             distance[met] = np.where(np.isfinite(ahead) & (ahead > 0), ahead, np.inf)
-        return distance, normals
+            is_cut[met] = self.is_cut[found[met]]
+        return Hits(distance, normals, is_cut)
 
 
-Instance = tuple[str, bool, Array, Array]
-"""A name that stays over the frames, whether it is of the subject, vertices and triangles."""
-
-
-def triangles_of(depsgraph: Any, *, subject: frozenset[str]) -> list[Instance]:
+def triangles_of(depsgraph: Any, *, subject: frozenset[str]) -> list[Mesh]:
     """Return every mesh that the cameras see in an evaluated scene, with its modifiers applied."""
-    found: list[Instance] = []
-    meshes: dict[int, tuple[Array, Array]] = {}
+    found: list[Mesh] = []
+    meshes: dict[int, tuple[Array, Array, Array]] = {}
     for instance in depsgraph.object_instances:
         shown = instance.object
         if shown.type not in _MESHES or not instance.show_self or not shown.visible_camera:
@@ -137,29 +173,60 @@ def triangles_of(depsgraph: Any, *, subject: frozenset[str]) -> list[Instance]:
             mesh = _mesh_of(shown)
             if source:
                 meshes[source] = mesh
-        vertices, corners = mesh
+        vertices, corners, materials = mesh
         if not len(corners):
             continue
         matrix = np.array(instance.matrix_world)
         owner = (instance.parent or shown).original.name
-        name = f"{owner}/{shown.name}/{tuple(instance.persistent_id)}"
-        placed = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-        found.append((name, owner in subject, placed, corners))
+        cut = [slot.material is not None and _lets_through(slot.material) for slot in
+               shown.material_slots] or [False]  # fmt: skip
+        found.append(
+            Mesh(
+                name=f"{owner}/{shown.name}/{tuple(instance.persistent_id)}",
+                is_subject=owner in subject,
+                vertices=vertices @ matrix[:3, :3].T + matrix[:3, 3],
+                corners=corners,
+                is_cut=np.array(cut)[np.minimum(materials, len(cut) - 1)],
+            )
+        )
     return found
 
 
-def _mesh_of(shown: Any) -> tuple[Array, Array]:
-    """Return the vertices and the triangles of an evaluated object, in its own axes."""
+def _mesh_of(shown: Any) -> tuple[Array, Array, Array]:
+    """Return vertices, triangles and their slots of materials of an evaluated object."""
     mesh = shown.to_mesh()
     if mesh is None:
-        return np.empty((0, 3)), np.empty((0, 3), np.int64)
+        return np.empty((0, 3)), np.empty((0, 3), np.int64), np.empty(0, np.int64)
     mesh.calc_loop_triangles()
     vertices = np.empty(3 * len(mesh.vertices), np.float32)
     mesh.vertices.foreach_get("co", vertices)
     corners = np.empty(3 * len(mesh.loop_triangles), np.int32)
     mesh.loop_triangles.foreach_get("vertices", corners)
+    materials = np.empty(len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("material_index", materials)
     shown.to_mesh_clear()
-    return vertices.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3).astype(np.int64)
+    return vertices.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3).astype(int), materials
+
+
+def _lets_through(material: Any) -> bool:
+    """Return whether a material is transparent somewhere; refraction is not transparency."""
+    trees = [material.node_tree]
+    seen = set()
+    while trees:
+        tree = trees.pop()
+        if tree is None or tree.name in seen:
+            continue
+        seen.add(tree.name)
+        for node in tree.nodes:
+            if node.bl_idname == "ShaderNodeGroup":
+                trees.append(node.node_tree)
+            elif node.bl_idname == "ShaderNodeBsdfTransparent":
+                return True
+            elif node.bl_idname == "ShaderNodeBsdfPrincipled":
+                alpha = node.inputs["Alpha"]
+                if alpha.is_linked or alpha.default_value < 1:
+                    return True
+    return False
 
 
 class Surfaces:
@@ -170,9 +237,9 @@ class Surfaces:
         self._moving: set[str] = set()
         self._still: Triangles | None = None
 
-    def at_frame(self, instances: list[Instance]) -> list[Triangles]:
+    def at_frame(self, meshes: list[Mesh]) -> list[Triangles]:
         """Return what is to be searched: what stands still, and what moves."""
-        placed = {name: vertices for name, is_subject, vertices, _ in instances if not is_subject}
+        placed = {mesh.name: mesh.vertices for mesh in meshes if not mesh.is_subject}
         if not self._first:
             self._first = placed
         moved = {
@@ -182,31 +249,61 @@ class Surfaces:
             and not np.array_equal(self._first.get(name, ()), placed.get(name, ()))
         }
         self._moving |= moved
+        moving = [mesh for mesh in meshes if mesh.is_subject or mesh.name in self._moving]
         if self._still is None or moved:
-            self._still = Triangles(
-                [
-                    (vertices, corners)
-                    for name, is_subject, vertices, corners in instances
-                    if not is_subject and name not in self._moving
-                ]
-            )
-        moving = [
-            (vertices, corners)
-            for name, is_subject, vertices, corners in instances
-            if is_subject or name in self._moving
-        ]
+            self._still = Triangles([mesh for mesh in meshes if mesh not in moving])
         return [self._still, *([Triangles(moving)] if moving else [])]
 
 
-def first_hits(searched: list[Triangles], origins: Array, directions: Array) -> tuple[Array, Array]:
-    """Return distances in directions, and normals, of the first hits among several trees."""
-    distance, normals = searched[0].first_hits(origins, directions)
+def first_hits(searched: list[Triangles], origins: Array, directions: Array) -> Hits:
+    """Return what rays meet first among several trees."""
+    best = searched[0].first_hits(origins, directions)
     for other in searched[1:]:
-        nearer, their_normals = other.first_hits(origins, directions)
-        closer = nearer < distance
-        distance = np.where(closer, nearer, distance)
-        normals[closer] = their_normals[closer]
-    return distance, normals
+        hits = other.first_hits(origins, directions)
+        closer = hits.distance < best.distance
+        best = Hits(
+            np.where(closer, hits.distance, best.distance),
+            np.where(closer[:, None], hits.normals, best.normals),
+            np.where(closer, hits.is_cut, best.is_cut),
+        )
+    return best
+
+
+def pass_through(
+    searched: list[Triangles], hits: Hits, *, eye: Array, ways: Array, seen: Array
+) -> Array:
+    """Return the depth of rays that meet a material with holes first.
+
+    Cycles tells, to the precision of its pass of depth, which of the surfaces along a ray is seen;
+    how far that is comes from its triangle.
+
+    Args:
+        searched: The triangles.
+        hits: What the rays meet first.
+        eye: Where they start.
+        ways: (n, 3) their directions, whose part along the optical axis is 1.
+        seen: (n,) the pass, whose largest numbers mean that nothing is seen.
+    """
+    depth = hits.distance.copy()
+    rays = np.flatnonzero(hits.is_cut)
+    depth[rays] = np.where(seen[rays] < _NOTHING, depth[rays], np.inf)
+    at = hits.distance[rays]
+    first = at.copy()
+    for _ in range(_MOST_LAYERS):
+        if not rays.size:
+            break
+        onward = at * (1 + 1e-6) + 1e-6
+        behind = first_hits(searched, eye + onward[:, None] * ways[rays], ways[rays])
+        at = onward + behind.distance
+        nearer = np.abs(at - seen[rays]) < np.abs(depth[rays] - seen[rays])
+        nearer &= seen[rays] < _NOTHING
+        depth[rays[nearer]] = at[nearer]
+        # Something solid is behind, yet Cycles saw nothing: its ray ended at a half-open surface.
+        lost = (seen[rays] >= _NOTHING) & np.isfinite(at) & ~behind.is_cut
+        depth[rays[lost]] = first[lost]
+        more = np.isfinite(at) & behind.is_cut
+        rays, at, first = rays[more], at[more], first[more]
+    return depth
 
 
 class _GatherEngine(bpy.types.RenderEngine):  # type: ignore[misc]
@@ -222,20 +319,21 @@ class _GatherEngine(bpy.types.RenderEngine):  # type: ignore[misc]
 
 
 @contextlib.contextmanager
-def _seen_by_cycles(seen: Callable[[Any], None]) -> Iterator[None]:
-    """Hand the evaluated scene that Cycles renders to a function, before it is rendered."""
+def _around_cycles(before: Callable[[Any], None], after: Callable[[Any], None]) -> Iterator[None]:
+    """Hand over the evaluated scene before Cycles renders it, and the engine with its result."""
     from cycles import CyclesRender, engine
 
     def render(self: Any, depsgraph: Any) -> None:
-        seen(depsgraph)
+        before(depsgraph)
         engine.render(self, depsgraph)
+        after(self)
 
-    before = CyclesRender.render
+    own = CyclesRender.render
     CyclesRender.render = render
     try:
         yield
     finally:
-        CyclesRender.render = before
+        CyclesRender.render = own
 
 
 # Files.
@@ -757,11 +855,13 @@ class Stage:
         for material in bpy.data.materials:
             # Displacement that only Cycles sees would not be in the depth.
             material.displacement_method = "BUMP"
+        for layer in scene.view_layers:
+            layer.use = layer == bpy.context.view_layer
         scene.frame_set(self.start)
 
     def _gather(self) -> list[Triangles]:
         """Return the map's triangles at its first frame, without the subject."""
-        found: list[Instance] = []
+        found: list[Mesh] = []
         _GatherEngine.seen = lambda depsgraph: found.extend(
             triangles_of(depsgraph, subject=frozenset())
         )
@@ -820,8 +920,9 @@ class Stage:
         """Return how many metres each ray goes until it meets the map; 0 inside a solid."""
         origins = self.mirror.to_blender(origins_m)
         ways = directions * self.mirror.flip
-        distance, normals = first_hits(self.still, origins, ways)
-        behind = np.einsum("ni,ni->n", normals, ways) > 0
+        hits = first_hits(self.still, origins, ways)
+        distance = hits.distance
+        behind = np.einsum("ni,ni->n", hits.normals, ways) > 0
         inside = np.flatnonzero(behind)
         if solids and inside.size:
             places, back = np.unique(origins[inside], axis=0, return_inverse=True)
@@ -839,8 +940,8 @@ class Stage:
         distance = np.empty((6, len(places)))
         for way, axis in enumerate(axes):
             ways = np.broadcast_to(axis, places.shape)
-            distance[way], normals = first_hits(self.still, places, ways)
-            is_back[way] = normals @ axis > 0
+            hits = first_hits(self.still, places, ways)
+            distance[way], is_back[way] = hits.distance, hits.normals @ axis > 0
         thickness_m = (distance[:3] + distance[3:]).min(axis=0) * self.mirror.unit_m
         solid: Array = (is_back.sum(axis=0) >= _BACKS) & (thickness_m < _SOLID_M)
         return solid
@@ -872,22 +973,51 @@ class Stage:
         place = self.mirror.to_blender(np.array(spec["place_m"]))
         subject.place((place, 90.0 - spec["yaw_deg"]), time_frames=time_frames, times=times)
         self.scene.frame_set(int(exact), subframe=exact - int(exact))
-        eyes, ways = self.mirror.to_blender(eyes_m), axes * self.mirror.flip[:, None]
+        eyes, turned = self.mirror.to_blender(eyes_m), axes * self.mirror.flip[:, None]
         self._set_render(spec)
-        self._set_cameras(spec, eyes=eyes, axes=ways)
-        depths: list[Array] = []
+        self._set_cameras(spec, eyes=eyes, axes=turned)
+        searched: list[Triangles] = []
 
-        def measure(depsgraph: Any) -> None:
-            instances = triangles_of(depsgraph, subject=subject.names)
-            searched = self.surfaces.at_frame(instances)
-            depths.extend(
-                _depth(searched, eye=eye, axes=way, spec=spec)
-                for eye, way in zip(eyes, ways, strict=True)
-            )
+        def gather(depsgraph: Any) -> None:
+            searched.extend(self.surfaces.at_frame(triangles_of(depsgraph, subject=subject.names)))
 
-        with _seen_by_cycles(measure):
+        with _around_cycles(gather, lambda engine: None):
             bpy.ops.render.render(write_still=True)
-        return np.stack(depths) * self.mirror.unit_m
+        ways = [_pixel_ways(spec, axes=axes) for axes in turned]
+        hits = [first_hits(searched, eye, way) for eye, way in zip(eyes, ways, strict=True)]
+        depths = [each.distance for each in hits]
+        if any(each.is_cut.any() for each in hits):
+            depths = [
+                pass_through(searched, hit, eye=eye, ways=way, seen=seen)
+                for hit, eye, way, seen in zip(
+                    hits, eyes, ways, self._depth_passes(spec), strict=True
+                )
+            ]
+        width_px, height_px = spec["size_px"]
+        return np.stack(depths).reshape(-1, height_px, width_px) * self.mirror.unit_m
+
+    def _depth_passes(self, spec: dict[str, Any]) -> list[Array]:
+        """Return Cycles' own depth of every camera through (nearly) the centres of pixels."""
+        cycles, layer = self.scene.cycles, bpy.context.view_layer
+        cycles.samples, cycles.use_denoising, cycles.filter_width = 1, False, 0.01
+        layer.use_pass_z, layer.pass_alpha_threshold = True, 0.5
+        found: dict[int, Array] = {}
+
+        def read(engine: Any) -> None:
+            for each in engine.get_result().layers[layer.name].passes:
+                if each.name == "Depth":
+                    found[each.view_id] = np.empty(math.prod(spec["size_px"]), np.float32)
+                    each.rect.foreach_get(found[each.view_id])
+
+        with _around_cycles(lambda depsgraph: None, read):
+            bpy.ops.render.render()
+        layer.use_pass_z = False
+        width_px, height_px = spec["size_px"]
+        # Blender's first row is the lowest.
+        return [
+            found[view].reshape(height_px, width_px)[::-1].ravel().astype(np.float64)
+            for view in sorted(found)
+        ]
 
     def _set_render(self, spec: dict[str, Any]) -> None:
         scene, cycles = self.scene, self.scene.cycles
@@ -949,17 +1079,15 @@ class Stage:
                 scene.camera = item
 
 
-def _depth(searched: list[Triangles], *, eye: Array, axes: Array, spec: dict[str, Any]) -> Array:
-    """Return depth along the optical axis at pixel centres, in the file's units."""
+def _pixel_ways(spec: dict[str, Any], *, axes: Array) -> Array:
+    """Return the directions (n, 3) through pixel centres; their part along the axis is 1."""
     (width_px, height_px), (fx, fy) = spec["size_px"], spec["focal_px"]
     centre_x, centre_y = spec["centre_px"]
     across = (np.arange(width_px) + 0.5 - centre_x) / fx
     down = (np.arange(height_px) + 0.5 - centre_y) / fy
     forward, right, up = axes.T
-    ways = forward + across[None, :, None] * right - down[:, None, None] * up
-    distance, _ = first_hits(searched, eye, ways.reshape(-1, 3))
-    depth: Array = distance.reshape(height_px, width_px)
-    return depth
+    ways: Array = forward + across[None, :, None] * right - down[:, None, None] * up
+    return ways.reshape(-1, 3)
 
 
 def _device(asked: str) -> str:
