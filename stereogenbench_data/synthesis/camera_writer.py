@@ -19,6 +19,8 @@ from jaxtyping import Float64, UInt16
 
 from stereogenbench_data.media.depth_packing import grey_frame
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_name
+from stereogenbench_data.synthesis.checks import CameraCheck, FrameStatistics
+from stereogenbench_data.synthesis.filters import Limits
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.ray_casting import View
 from stereogenbench_data.synthesis.renderer import RenderedView, Renderer
@@ -38,17 +40,20 @@ def write_cameras(
     renderer: Renderer,
     cameras: tuple[int, ...],
     folder: Path,
+    limits: Limits,
     after_frame: Callable[[], None],
-) -> None:
-    """Write the two videos of some cameras into a folder.
+) -> list[CameraCheck]:
+    """Write the two videos of some cameras into a folder, and return what they look like.
 
     Args:
         plan: The scene.
         renderer: What draws it.
         cameras: Numbers of the cameras.
         folder: Where the videos go.
+        limits: Limits of near occluders and of depth.
         after_frame: Called after each frame of each camera; an exception from it ends the work.
     """
+    statistics = [FrameStatistics(plan, camera=camera, limits=limits) for camera in cameras]
     with ExitStack() as stack:
         writers = [
             stack.enter_context(_CameraWriter(plan, camera=camera, folder=folder))
@@ -56,9 +61,12 @@ def write_cameras(
         ]
         views = renderer.views(plan, cameras=cameras)
         for _ in range(plan.request.frames):
-            for writer in writers:
-                writer.write(next(views))
+            for writer, seen in zip(writers, statistics, strict=True):
+                view = next(views)
+                writer.write(view)
+                seen.add(view)
                 after_frame()
+    return [seen.check() for seen in statistics]
 
 
 class _CameraWriter:

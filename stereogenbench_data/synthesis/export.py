@@ -23,6 +23,7 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.synthesis.cameras import quaternion_from_rotator
 from stereogenbench_data.synthesis.plan import ScenePlan
+from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.request import ExportContract
 
 _REPRESENTATIONS: Final = {
@@ -33,18 +34,18 @@ _REPRESENTATIONS: Final = {
 }
 
 
-def completion_text(plan: ScenePlan, *, renderer: str) -> str:
+def completion_text(proposal: Proposal, *, renderer: str) -> str:
     """Return the completion marker. It records the request, so that a later run can compare it."""
-    request, map_name = plan.request, plan.proposal.map_name
-    marker = _labels(plan) | {
+    request, map_name = proposal.request, proposal.map_name
+    marker = _labels(proposal) | {
         "map_path": f"/Game/{map_name}/Maps/{map_name}",
         "synthesis": {
             "seed": request.seed,
-            "scene": plan.proposal.index,
-            "proposal": plan.proposal.number,
+            "scene": proposal.index,
+            "proposal": proposal.number,
             "frames": request.frames,
             "picture_px": request.picture_px,
-            "focal_mm": plan.proposal.focal_mm,
+            "focal_mm": proposal.focal_mm,
             "contract": repr(request.contract),
             "renderer": renderer,
         },
@@ -67,7 +68,7 @@ def metadata_texts(
         TRAJECTORY_JSON: _json(_trajectory(plan)),
         DESCRIPTION_JSON: _json(description),
         DESCRIPTION_TXT: str(description["detailed_caption"]),
-        COMPLETE_JSON: completion_text(plan, renderer=renderer),
+        COMPLETE_JSON: completion_text(plan.proposal, renderer=renderer),
     }
 
 
@@ -75,16 +76,16 @@ def _json(value: dict[str, Any]) -> str:
     return json.dumps(value, indent=2)
 
 
-def _labels(plan: ScenePlan) -> dict[str, Any]:
+def _labels(proposal: Proposal) -> dict[str, Any]:
     return {
-        "scene_label": plan.label,
-        "scene_index": plan.label_number,
-        "map_name": plan.proposal.map_name,
+        "scene_label": proposal.label,
+        "scene_index": proposal.label_number,
+        "map_name": proposal.map_name,
     }
 
 
 def _camera_name(plan: ScenePlan, *, camera: int) -> str:
-    return f"{plan.label}_Cam_{camera:02d}"
+    return f"{plan.proposal.label}_Cam_{camera:02d}"
 
 
 def _primary_pair(plan: ScenePlan) -> dict[str, str] | list[int]:
@@ -109,7 +110,7 @@ def _baseline(plan: ScenePlan) -> dict[str, Any]:
     if contract.principal_point_px is not None:
         x_px, y_px = contract.principal_point_px
         intrinsics["principal_point_px"] = {"x": x_px, "y": y_px}
-    return _labels(plan) | {
+    return _labels(plan.proposal) | {
         "unit": "cm",
         "camera_count": CAMERA_COUNT,
         "image_width": width_px,
@@ -132,7 +133,7 @@ def _pair(plan: ScenePlan, *, left: int, right: int) -> dict[str, Any]:
 
 
 def _trajectory(plan: ScenePlan) -> dict[str, Any]:
-    return _labels(plan) | {
+    return _labels(plan.proposal) | {
         "character_id": plan.proposal.character,
         "unit": "cm",
         "rotation_representation": _REPRESENTATIONS[plan.request.contract.rotation],

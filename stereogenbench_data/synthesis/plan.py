@@ -1,7 +1,6 @@
 """The plan of a scene: a proposal that passed the filters, with the path that was found for it."""
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,8 +12,6 @@ from stereogenbench_data.synthesis.ray_casting import View
 from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.world import Spawn
 
-_FIRST_LABEL: Final = 1000
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScenePlan:
@@ -25,6 +22,7 @@ class ScenePlan:
         spawn: Where the subject starts.
         centres_m: The middle of the rig at each frame, in map axes.
         rotators_deg: Pitch, yaw in -180..180 and roll of all cameras at each frame.
+        subject_m: Depth of the subject's middle at each frame, from the middle of the rig.
         splices: How often a part of the path was thrown away and connected anew.
     """
 
@@ -32,6 +30,7 @@ class ScenePlan:
     spawn: Spawn
     centres_m: Float64[np.ndarray, "frames 3"]
     rotators_deg: Float64[np.ndarray, "frames 3"]
+    subject_m: Float64[np.ndarray, " frames"]
     splices: int
 
     @property
@@ -42,17 +41,7 @@ class ScenePlan:
     @property
     def key(self) -> str:
         """The scene's whole path below the root."""
-        return self.request.key(self.proposal.index, map_name=self.proposal.map_name)
-
-    @property
-    def label_number(self) -> int:
-        """The number in the scene's label, which differs from that of its folder."""
-        return _FIRST_LABEL + self.proposal.index
-
-    @property
-    def label(self) -> str:
-        """The scene's label."""
-        return f"{self.proposal.map_name}_scene_{self.label_number}"
+        return self.proposal.key
 
     def view(self, *, camera: int, frame: int) -> View:
         """Return a camera's view, in map axes."""

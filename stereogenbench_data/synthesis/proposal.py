@@ -18,6 +18,7 @@ from stereogenbench_data.synthesis.cameras import (
 )
 from stereogenbench_data.synthesis.request import SynthRequest
 
+_FIRST_LABEL: Final = 1000
 _PARTS: Final = ("draw", "map", "spawn", "path")
 
 
@@ -47,6 +48,21 @@ class Proposal:
     focal_mm: float
     places_cm: Float64[np.ndarray, "6"]
     offset_cm: Float64[np.ndarray, "3"]
+
+    @property
+    def key(self) -> str:
+        """The scene's whole path below the root."""
+        return self.request.key(self.index, map_name=self.map_name)
+
+    @property
+    def label_number(self) -> int:
+        """The number in the scene's label, which differs from that of its folder."""
+        return _FIRST_LABEL + self.index
+
+    @property
+    def label(self) -> str:
+        """The scene's label."""
+        return f"{self.map_name}_scene_{self.label_number}"
 
     @property
     def focal_px(self) -> tuple[float, float]:

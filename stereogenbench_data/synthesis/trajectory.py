@@ -74,7 +74,9 @@ def examine(proposal: Proposal, *, world: World, limits: Limits) -> ScenePlan | 
     )
     if refusal is not None:
         return refusal
-    return ScenePlan(proposal, spawn, centres_m, rotators_deg, search.splices)
+    ahead = rotation_from_rotator_deg(rotators_deg)[..., 0]
+    subject_m = ((body_m.mean(axis=1) - centres_m) * ahead).sum(axis=1)
+    return ScenePlan(proposal, spawn, centres_m, rotators_deg, subject_m, search.splices)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
