@@ -29,7 +29,7 @@ _CURE: Final = (
     "Python by --blender-python blender/bin/python; or, under Python 3.11, add it to this one by "
     "`pip install --no-deps 'bpy==5.0.*'`."
 )
-_LOG_LINES: Final = 4
+_LOG_LINES: Final = 6
 
 
 class BlenderProcess:

@@ -983,6 +983,8 @@ class Stage:
 
         with _around_cycles(gather, lambda engine: None):
             bpy.ops.render.render(write_still=True)
+        if not searched:
+            raise RuntimeError("Cycles ended before it rendered")
         ways = [_pixel_ways(spec, axes=axes) for axes in turned]
         hits = [first_hits(searched, eye, way) for eye, way in zip(eyes, ways, strict=True)]
         depths = [each.distance for each in hits]
