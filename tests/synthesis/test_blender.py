@@ -341,6 +341,23 @@ def test_the_same_plan_gives_the_same_bytes_in_another_blender(renderer):
     assert not np.array_equal(first[0].depth_m, first[6].depth_m)
 
 
+@needs_blender
+def test_two_parts_write_the_files_of_one_run(renderer, tmp_path):
+    request = SynthRequest(map_name=renderer.maps, scenes=2, size_px=32, frames=1, seed=5)
+    quick = fast(renderer)
+    whole = synthesise(tmp_path / "whole", request, renderer=quick)
+    parts = [
+        key
+        for part in ((2, 2), (1, 2))
+        for key in synthesise(tmp_path / "parts", request, renderer=quick, part=part)
+    ]
+
+    assert sorted(parts) == sorted(whole)
+    for file in (path for key in whole for path in (tmp_path / "whole" / key).iterdir()):
+        other = tmp_path / "parts" / file.relative_to(tmp_path / "whole")
+        assert file.read_bytes() == other.read_bytes(), file.name
+
+
 # Assets that cannot be used.
 
 FAULTS = {
@@ -502,8 +519,12 @@ def test_the_doctor_confirms_the_contract_and_the_audit_finds_nothing(rendered):
 
     assert doctor.exit_code == 0, doctor.output
     assert audit.exit_code == 0, audit.output
-    verdicts = json.loads(doctor.stdout)["verdicts"]
-    assert verdicts
+    (verdict,) = json.loads(doctor.stdout)["verdicts"]
+    assert len(verdict["scenes"]) == 2
+    assert verdict["quotient"] == pytest.approx(1, rel=0.01)
+    found = {answer["topic"]: answer["status"] for answer in verdict["answers"]}
+    assert found["unit / (focal length x baseline)"] == "confirmed"
+    assert found["depth along"] == "confirmed"
 
 
 @needs_blender
@@ -512,7 +533,7 @@ def test_pairs_and_evaluation_read_the_scenes(rendered):
     sample = pairs[0]
 
     scores = score_controls(
-        rendered, workers=1, protocol=EvaluationProtocol(size=(128, 128)), frames="first"
+        rendered, workers=1, protocol=EvaluationProtocol(size=(224, 224)), frames="first"
     )
 
     assert len(pairs) == 2 * 15 * 2
