@@ -193,7 +193,9 @@ def check_spawn(
             "spawn_space", float(least.min()), limits.body_space_m,
             f"the map is {least.min():.2f} m from the subject at frame {int(least.argmin())}",
         )  # fmt: skip
-    seen = _sight(world, middle[:, None], body_m)
+    # The soles may sink as far as the filter of support allows.
+    low = body_m[..., 2] <= lowest[:, None] + limits.support_gap_m
+    seen = _sight(world, middle[:, None], body_m) | low
     if not seen.all():
         share = float(seen.mean(axis=1).min())
         return Refusal(

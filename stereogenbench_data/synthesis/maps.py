@@ -35,6 +35,9 @@ _UP: Final = np.array([0.0, 0.0, 1.0])
 _SKIN: Final = Material("plaster", 0.5, (1.5, 1.05, 0.8))
 _SUBJECT_M: Final = 1.75
 _SUBJECT_PART: Final = 0.62
+_BUILDINGS: Final = 26
+_NEAR: Final = 12
+_FAR: Final = 24
 
 Array = Any
 
@@ -135,32 +138,37 @@ def _bounds(low: tuple[float, ...], high: tuple[float, ...]) -> Bounds:
 
 @dataclass(frozen=True, slots=True)
 class _Framing:
-    """The part of a stage that cameras in front of it see.
+    """What cameras around a stage see of it.
 
     Attributes:
         distance_m: Distance from the cameras to the middle of the stage.
         width_per_m: Width of the picture at one metre, in metres.
-        span_m: Distance from the first camera to the last.
         pixel_per_m: Width of a pixel at one metre, in metres.
     """
 
     distance_m: float
     width_per_m: float
-    span_m: float
     pixel_per_m: float
 
-    def width_m(self, x_m: float) -> float:
-        """Return the width of the picture at a place on the stage."""
-        return (x_m + self.distance_m) * self.width_per_m
+    def width_m(self, beyond_m: float) -> float:
+        """Return the width of the picture at a distance beyond the middle of the stage."""
+        return (beyond_m + self.distance_m) * self.width_per_m
+
+
+def _around(rng: np.random.Generator, radius_m: float) -> tuple[float, float]:
+    """Return a place on a circle around the middle of the stage."""
+    turn = rng.uniform(-np.pi, np.pi)
+    return abs(radius_m) * np.cos(turn), abs(radius_m) * np.sin(turn)
 
 
 def _stage(proposal: Proposal) -> tuple[SceneModel, Bounds, Bounds]:
     rng = proposal.rng("map")
     width_m, height_m = proposal.picture_at_1m
     framing = _Framing(
-        distance_m=max(_SUBJECT_M / _SUBJECT_PART / height_m, proposal.span_m, 1.5),
+        distance_m=max(
+            _SUBJECT_M / _SUBJECT_PART / height_m, 1.2 * (proposal.span_m + 0.6) / width_m, 1.5
+        ),
         width_per_m=width_m,
-        span_m=proposal.span_m,
         pixel_per_m=width_m / proposal.request.size_px,
     )
     slope = rng.uniform(-0.07, 0.07, 2)
@@ -191,17 +199,17 @@ def _stage(proposal: Proposal) -> tuple[SceneModel, Bounds, Bounds]:
 
 
 def _backdrop(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
-    """Return buildings and walls behind the subject, with gaps that show the sky."""
+    """Return buildings and walls around the stage, with gaps that show the sky."""
     shapes = []
-    for x_m in framing.distance_m * rng.uniform(1.5, 3.5, 9) + 2:
-        view_m = framing.width_m(x_m)
+    for radius_m in framing.distance_m * rng.uniform(1.7, 3.5, _BUILDINGS) + 2:
+        view_m = framing.width_m(radius_m)
         half_m = view_m * rng.uniform((0.05, 0.08, 0.08), (0.1, 0.22, 0.3))
-        y_m = rng.uniform(-0.6, 0.6) * (view_m + framing.span_m)
+        x_m, y_m = _around(rng, radius_m)
         shapes.append(
             Shape(
                 "box",
                 np.array([x_m, y_m, half_m[2] * 0.98]),
-                _rotated_axes(yaw=rng.uniform(-0.5, 0.5)),
+                _rotated_axes(yaw=np.arctan2(y_m, x_m) + rng.uniform(-0.5, 0.5)),
                 half_m,
                 _material(rng, textures=_WALLS, tile_m=(2.0, 4.0)),
             )
@@ -210,16 +218,12 @@ def _backdrop(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
 
 
 def _objects(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
-    """Return crates and balls in front of and behind the subject, from near to far."""
+    """Return crates and balls between the cameras and the subject, and behind the cameras."""
     shapes = []
-    near, far = -0.55 * framing.distance_m, 1.6 * framing.distance_m
-    for place in (np.arange(16) + rng.uniform(0, 1, 16)) / 16:
-        x_m = near + place * (far - near)
-        view_m = framing.width_m(x_m)
-        half_m = view_m * rng.uniform(0.025, 0.075) * rng.uniform(0.7, 1.4, 3)
-        y_m = rng.uniform(-0.5, 0.5) * (view_m + framing.span_m)
-        if abs(x_m) < 0.4 + half_m.max():
-            x_m = 0.6 + 2 * half_m.max()
+    parts = np.concatenate([rng.uniform(-0.55, -0.15, _NEAR), rng.uniform(0.2, 1.6, _FAR)])
+    for beyond_m in parts * framing.distance_m:
+        half_m = framing.width_m(beyond_m) * rng.uniform(0.025, 0.075) * rng.uniform(0.7, 1.4, 3)
+        x_m, y_m = _around(rng, np.sign(beyond_m) * max(abs(beyond_m), 0.6 + 2 * half_m.max()))
         is_box = rng.random() < 0.55
         tilt = rng.uniform(-0.6, 0.6) if rng.random() < 0.4 else 0.0
         shapes.append(
@@ -237,13 +241,13 @@ def _objects(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
 def _poles(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
     """Return thin upright posts, a few pixels wide, some of them nearer than the subject."""
     shapes = []
-    for x_part in (*rng.uniform(-0.6, -0.25, 3), *rng.uniform(0.4, 1.6, 4)):
-        x_m = x_part * framing.distance_m + (0.8 if x_part > 0 else 0.0)
-        depth_m = x_m + framing.distance_m
+    for part in (*rng.uniform(-0.6, -0.25, 6), *rng.uniform(0.4, 1.6, 12)):
+        beyond_m = part * framing.distance_m
+        view_m = framing.width_m(beyond_m)
         relative = rng.uniform(0.002, 0.006) * framing.width_per_m
-        width_m = depth_m * max(relative, 2.2 * framing.pixel_per_m)
-        height_m = framing.width_m(x_m) * rng.uniform(0.3, 0.8) + 0.5
-        y_m = rng.uniform(-0.45, 0.45) * (framing.width_m(x_m) + framing.span_m)
+        width_m = view_m / framing.width_per_m * max(relative, 2.2 * framing.pixel_per_m)
+        height_m = view_m * rng.uniform(0.3, 0.8) + 0.5
+        x_m, y_m = _around(rng, beyond_m)
         shapes.append(
             Shape(
                 "box",

@@ -8,11 +8,11 @@ from stereogenbench_data.synthesis.textures import TEXTURES, sample_atlas, textu
 
 def sampled(name, *, footprint_tiles, shift=(0.0, 0.0), side=96):
     u, v = np.meshgrid(*[np.linspace(0, 1, side, endpoint=False)] * 2)
-    tiles = np.stack([u.ravel() + shift[0], v.ravel() + shift[1]]).astype(np.float32)
     return sample_atlas(
-        tiles=tiles,
-        rows=np.full(side * side, texture_row(name), np.float32),
-        footprint_tiles=np.full(side * side, footprint_tiles, np.float32),
+        (u.ravel() + shift[0]).astype(np.float32),
+        (v.ravel() + shift[1]).astype(np.float32),
+        row=texture_row(name),
+        log_footprint=np.full(side * side, np.log2(footprint_tiles), np.float32),
     )
 
 
