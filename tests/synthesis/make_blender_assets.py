@@ -290,6 +290,17 @@ def make_figure(folder):
     turn = take(rig, "Turn", 49, lambda part: {"arm.L": 150 * math.sin(math.pi * part) ** 2})
     fall = take(rig, "Lean", 25, lambda part: {"spine": 50 * part, "arm.R": -60 * part})
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "figure.blend"), compress=True)
+    extra = [box("plinth", (1, 1, 0.4), (0, 0, -0.2), cloth), ball("widget", 0.8, (0, 0, 1), cloth)]
+    hidden = bpy.data.collections.new("widgets")
+    bpy.context.scene.collection.children.link(hidden)
+    hidden.objects.link(extra[1])
+    bpy.context.scene.collection.objects.unlink(extra[1])
+    bpy.context.view_layer.layer_collection.children["widgets"].exclude = True
+    rig.pose.bones["hips"].custom_shape = extra[1]
+    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "figure_extra.blend"), compress=True)
+    rig.pose.bones["hips"].custom_shape = None
+    for made in extra:
+        bpy.data.objects.remove(made)
     rig.animation_data.action = None
     for action in (walk, turn, fall):
         track = rig.animation_data.nla_tracks.new()

@@ -97,6 +97,7 @@ def plan(made, *, eye=(-4.0, -1.5, 1.7), target=(0.0, 0.0, 0.9), place=(0.0, 0.0
         spawn=Spawn(np.array(place), 20.0),
         centres_m=np.tile(np.array(eye), (frames, 1)),
         rotators_deg=np.tile(np.array(rotator), (frames, 1)),
+        subject_m=np.full(frames, 4.0),
         splices=0,
     )
 
@@ -224,6 +225,22 @@ def test_all_kinds_of_files_give_the_same_motion(assets):
             found.append(np.concatenate([points.min(axis=1), points.max(axis=1)]))
 
     np.testing.assert_allclose(found[1:], [found[0]] * 8, atol=4e-3)
+
+
+@needs_blender
+def test_only_what_hangs_on_the_armature_is_the_subject(assets):
+    """Neither the plinth below it nor the shape of a handle, whose collection is excluded."""
+    file = '[characters.Figure]\nfile = "figure.glb"'
+    spawn = Spawn(np.zeros(3), 0.0)
+    alone = BlenderRenderer(_changed(assets, file, file), PYTHON).world(proposal())
+    changed = _changed(assets, file, file.replace("figure.glb", "figure_extra.blend"))
+
+    with pytest.warns(BlenderAssetWarning, match=r"object 'plinth', hidden: bound to no armature"):
+        world = BlenderRenderer(changed, PYTHON).world(proposal())
+
+    for points in (each.subject_points_m(spawn, frame=0) for each in (alone, world)):
+        np.testing.assert_allclose(points[:, 2].min(), 0, atol=0.02)
+        np.testing.assert_allclose(np.ptp(points, axis=0), [0.46, 0.56, 1.7], atol=0.02)
 
 
 @needs_blender

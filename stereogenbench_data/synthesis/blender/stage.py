@@ -446,10 +446,10 @@ def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
         here = bpy.context.scene.collection
         for scene in wanted.scenes:
             rate_hz = _rate_hz(scene)
-            hidden = {item for item in scene.objects if item.hide_render}
-            for item in scene.objects:
-                if item not in before and item not in hidden:
-                    here.objects.link(item)
+            shown = set(_rendered(scene.view_layers[0].layer_collection))
+            for item in set(scene.objects) - before:
+                item.hide_render |= item not in shown
+                here.objects.link(item)
             bpy.data.scenes.remove(scene)
         for item in wanted.objects or ():
             here.objects.link(item)
@@ -458,6 +458,15 @@ def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
         _import(path, where)
     objects = [item for item in bpy.data.objects if item not in before]
     return objects, [item for item in bpy.data.actions if item not in actions], rate_hz
+
+
+def _rendered(layer: Any) -> Iterator[Any]:
+    """Yield the objects of a layer and those below it, without what is not rendered."""
+    if layer.exclude or layer.collection.hide_render:
+        return
+    yield from layer.collection.objects
+    for child in layer.children:
+        yield from _rendered(child)
 
 
 # Light.
@@ -525,20 +534,13 @@ class Subject:
         for item in objects:
             if item not in self.objects:
                 bpy.data.objects.remove(item)
-        armatures = [item for item in self.objects if item.type == "ARMATURE"]
-        if not armatures:
-            found = ", ".join(sorted({item.type.lower() for item in self.objects})) or "nothing"
-            raise AssetError(
-                f"{where}: it has no armature, so it cannot be animated; it has {found}. Export "
-                f"the skeleton with the mesh, or name another file."
-            )
+        self.armature, unbound = _armature_of(self.objects, where=where)
         if animation["file"] != character["file"]:
             others, actions, rate_hz = _add(animation["file"], spec["animation_where"])
             check_files(spec["animation_where"], root=root)
             for item in others:
                 bpy.data.objects.remove(item)
-        self.notes = sorted(set(unrun_scripts()) - scripts)
-        self.armature = max(armatures, key=lambda item: len(item.data.bones))
+        self.notes = [*sorted(set(unrun_scripts()) - scripts), *unbound]
         action = _take(actions, name=animation["take"], where=spec["animation_where"])
         self.rate_hz = animation["rate_hz"] or rate_hz
         self.start, end = map(float, action.frame_range)
@@ -662,13 +664,8 @@ class Subject:
         """Return all vertices of the posed meshes, in file units."""
         depsgraph = bpy.context.evaluated_depsgraph_get()
         found = [np.empty((0, 3))]
-        markers = {bone.custom_shape for bone in self.armature.pose.bones}
         for item in self.objects:
-            is_shown = item not in markers and not item.hide_render and item.visible_camera
-            places = [
-                collection for collection in item.users_collection if not collection.hide_render
-            ]
-            if item.type not in _MESHES or not is_shown or not places:
+            if item.type not in _MESHES or item.hide_render or not item.visible_camera:
                 continue
             shown = item.evaluated_get(depsgraph)
             matrix = np.array(shown.matrix_world)
@@ -682,6 +679,37 @@ class Subject:
         ends = np.array([end for bone in shown.pose.bones for end in (bone.head, bone.tail)])
         placed: Array = ends @ matrix[:3, :3].T + matrix[:3, 3]
         return placed
+
+
+def _armature_of(objects: list[Any], *, where: str) -> tuple[Any, list[str]]:
+    """Return the armature with the most bones, and notes on meshes that are hidden.
+
+    Meshes that hang on no armature are no part of the subject, such as a floor that it stands on.
+    """
+    armatures = [item for item in objects if item.type == "ARMATURE"]
+    if not armatures:
+        found = ", ".join(sorted({item.type.lower() for item in objects})) or "nothing"
+        raise AssetError(
+            f"{where}: it has no armature, so it cannot be animated; it has {found}. Export the "
+            f"skeleton with the mesh, or name another file."
+        )
+    markers = {bone.custom_shape for each in armatures for bone in each.pose.bones}
+    notes = []
+    for item in objects:
+        if item.type in _MESHES and not item.hide_render and not _is_bound(item):
+            item.hide_render = True
+            if item not in markers:
+                notes.append(f"object {item.name!r}, hidden: bound to no armature")
+    return max(armatures, key=lambda item: len(item.data.bones)), notes
+
+
+def _is_bound(item: Any) -> bool:
+    """Return whether an armature moves an object or one that it hangs on."""
+    while item is not None:
+        if item.type == "ARMATURE" or any(each.type == "ARMATURE" for each in item.modifiers):
+            return True
+        item = item.parent
+    return False
 
 
 def _bones_of(action: Any, slot: Any) -> dict[str, set[str]]:
