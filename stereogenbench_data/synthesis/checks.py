@@ -9,12 +9,14 @@ import av
 import numpy as np
 
 from stereogenbench_data.audit.contract.doctor import diagnose
-from stereogenbench_data.audit.geometry.audit import audit, open_for_audit
+from stereogenbench_data.audit.geometry.audit import AuditRequest, audit, open_for_audit
 from stereogenbench_data.errors import StereoGenBenchError
+from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name, rgb_name
 from stereogenbench_data.synthesis.filters import Limits, Refusal
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.renderer import RenderedView
+from stereogenbench_data.synthesis.request import ExportContract
 
 _THIN: Final = 4
 """Brightness is measured on every fourth row and column."""
@@ -125,17 +127,21 @@ def check_files(folder: Path, *, frames: int) -> Refusal | None:
     return None
 
 
-def check_scene(root: Path, *, key: str) -> Refusal | None:
+def check_scene(root: Path, *, key: str, contract: ExportContract) -> Refusal | None:
     """Return what the audit or the doctor finds in a complete scene, if they find something.
 
     Args:
         root: The root of a tree with the scene.
         key: The scene's whole path below it.
+        contract: How its depth is written.
     """
+    depth = DepthEncoding(
+        unit_m=contract.depth_unit_m, kind=contract.depth_kind, frame_lag=contract.frame_lag
+    )
     try:
         index = open_for_audit(root, workers=1, scenes=(key,))
-        report = audit(index, workers=1, scenes=(key,))
-        diagnosis = diagnose(index, scenes=1, workers=1, filters={"scenes": (key,)})
+        report = audit(index, AuditRequest(depth=depth), workers=1, scenes=(key,))
+        diagnosis = diagnose(index, scenes=1, depth=depth, workers=1, filters={"scenes": (key,)})
     except StereoGenBenchError as error:
         return Refusal("audit", 1, 0, str(error))
     if report.findings:

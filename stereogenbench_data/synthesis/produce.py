@@ -46,6 +46,8 @@ from stereogenbench_data.synthesis.request import SynthRequest
 _TEMPORARY: Final = ".unfinished"
 _HOLDOUT: Final = ".holdout"
 _FEW: Final = 4
+_MOST_RENDERED: Final = 8
+"""How many rendered proposals of one scene may fail their checks."""
 _CURE: Final = "Check that the disk has free space and may be written to."
 _AGAIN: Final = "Then run the same request again: complete scenes are kept."
 
@@ -360,7 +362,16 @@ def _is_missing(work: _Work, proposal: Proposal) -> bool:
 def _refuse(work: _Work, index: int, refusal: Refusal) -> tuple[Drawn, ...]:
     """Return what was refused of a scene, with the accepted proposal as the last."""
     decision = _decided(work, index)
-    return (*decision.refused, replace(decision.accepted, refusal=refusal))
+    why = replace(refusal, rendered=True)
+    drawn = (*decision.refused, replace(decision.accepted, refusal=why))
+    rendered = [each.refusal for each in drawn if each.refusal and each.refusal.rendered]
+    if len(rendered) >= _MOST_RENDERED:
+        raise SynthesisError(
+            f"{work.request.stream}: {len(rendered)} rendered proposals of scene {index} fail "
+            f"their checks, the last one with {refusal.reason} ({refusal.text}). Check the "
+            f"renderer's maps and lights, and the depth's unit."
+        )
+    return drawn
 
 
 def _rendered(
@@ -468,7 +479,9 @@ def _finish(
         for name, text in texts.items():
             (folder / name).write_text(text)
         if check == "audit":
-            refusal = check_scene(work.out / _TEMPORARY, key=plan.key)
+            refusal = check_scene(
+                work.out / _TEMPORARY, key=plan.key, contract=plan.request.contract
+            )
             if refusal is not None:
                 return refusal
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -145,7 +145,7 @@ def first_hits(
     _draw_plane(picture, ground_plane(view, slope=slope), view=view)
     for number, shape in enumerate(shapes):
         bounds = _bounds(shape, view=view)
-        if bounds is None:
+        if bounds is None or not picture.overlaps(bounds):
             continue
         for part in visible_parts(view, number=number, shape=shape):
             if isinstance(part, Plane):
@@ -162,6 +162,16 @@ class _Picture(NamedTuple):
     faces: Array
     right: Array
     below: Array
+
+    def overlaps(self, bounds: tuple[float, float, float, float]) -> bool:
+        """Return whether left, right, top and bottom bounds have a part of the picture."""
+        left, right, top, bottom = bounds
+        return bool(
+            left <= self.right[-1]
+            and right >= self.right[0]
+            and top <= self.below[-1]
+            and bottom >= self.below[0]
+        )
 
 
 def _draw_plane(picture: _Picture, plane: Plane, *, view: View) -> None:

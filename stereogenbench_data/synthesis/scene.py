@@ -16,6 +16,7 @@ from jaxtyping import Float64
 Array = Any
 
 _UP: Final = np.array([0.0, 0.0, 1.0])
+_SIGNS: Final = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
 _BATCH_RAYS: Final = 4096
 _PARALLEL: Final = 1e-300
 """Replaces 0 for a ray parallel to a face: it enters and leaves the slab at infinity."""
@@ -48,8 +49,7 @@ class Shape:
 
     def corners(self) -> Float64[np.ndarray, "8 3"]:
         """Return the corners of the solid's bounding box along its own axes."""
-        signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
-        corners: Float64[np.ndarray, "8 3"] = self.centre + (signs * self.half_m) @ self.axes
+        corners: Float64[np.ndarray, "8 3"] = self.centre + (_SIGNS * self.half_m) @ self.axes
         return corners
 
 
