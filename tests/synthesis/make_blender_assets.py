@@ -406,6 +406,12 @@ def make_broken(folder):
         lit_floor()
         bpy.context.scene.objects["floor"].scale = (scale,) * 3
         save(name)
+    lit_floor()
+    box("ceiling", (8, 8, 0.2), (0, 0, 2.9), matte("white", (0.8, 0.8, 0.8)))
+    for name in ("floor", "ceiling"):
+        bpy.context.scene.objects[name].scale = (50, 50, 100)
+        bpy.context.scene.objects[name].location.z *= 100
+    save("vast.blend")
     lit_floor(textures=folder)
     save("textureless.blend")
     (folder / "far.png").unlink()

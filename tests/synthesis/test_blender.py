@@ -381,6 +381,7 @@ FAULTS = {
     "empty.blend": r"empty\.blend: the map is empty.*Show its",
     "dark.blend": r"dark\.blend: it has no light.*set light = \"sky\"",
     "huge.blend": r"huge\.blend: the map is 8e\+04 m wide.*Set scale = 0\.001",
+    "vast.blend": r"vast\.blend: its ceiling is 280 m high.*Set scale = 0\.01",
     "tiny.blend": r"tiny\.blend: the map is 0\.08 m wide.*Set scale = 100",
     "textureless.blend": r"1 textures are missing: //far\.png.*Copy",
     "far_texture.blend": r"refers to .*outside.far\.png, which is outside the asset folder.*Copy",

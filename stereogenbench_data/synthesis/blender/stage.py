@@ -34,10 +34,10 @@ _SOLID_M: Final = 2.0
 _OPEN_SKY_M: Final = 20.0
 """How far above its highest point cameras may be in a map without a ceiling."""
 _OPEN_SHARE: Final = 0.3
-_FLOOR_M: Final = 0.5
 _GRID: Final = 12
 _BACKS: Final = 5
-_MAP_SIZE_M: Final = (2.0, 2000.0)
+_MAP_SIZE_M: Final = (2.0, 500.0)
+_ROOM_HEIGHT_M: Final = (1.8, 40.0)
 _HEIGHT_M: Final = (0.5, 3.0)
 _UNITS_M: Final = (0.01, 100.0, 0.001, 1000.0, 0.0254, 39.37, 0.3048, 3.281, 0.1, 10.0)
 _POINTS: Final = 24
@@ -918,33 +918,56 @@ class Stage:
         if not (spec["is_bounded"] or _MAP_SIZE_M[0] <= size_m <= _MAP_SIZE_M[1]):
             raise AssetError(
                 f"{self.where}: the map is {size_m:.4g} m wide, and maps are {_MAP_SIZE_M[0]:g} to "
-                f"{_MAP_SIZE_M[1]:g} m. {_scale_cure(size_m, spec['scale'], within=(5.0, 500.0))} "
+                f"{_MAP_SIZE_M[1]:g} m. {_scale_cure(size_m, spec['scale'], within=(4.0, 200.0))} "
                 f"If it is right, set bounds_m to the part where cameras may be."
             )
-        ceiling_m = self._ceiling_m(low, high)
+        floor_m, ceiling_m = self._floor_and_ceiling_m(low, high)
         if np.isfinite(ceiling_m):
+            height_m = ceiling_m - floor_m
+            if not (spec["is_bounded"] or _ROOM_HEIGHT_M[0] <= height_m <= _ROOM_HEIGHT_M[1]):
+                raise AssetError(
+                    f"{self.where}: its ceiling is {height_m:.4g} m high, and rooms are "
+                    f"{_ROOM_HEIGHT_M[0]:g} to {_ROOM_HEIGHT_M[1]:g} m. "
+                    f"{_scale_cure(height_m, spec['scale'], within=(2.0, 12.0))} "
+                    f"If it is right, set bounds_m to the part where cameras may be."
+                )
             return bounds_m, np.stack([low, [*high[:2], ceiling_m - 0.01]])
         bounds_m[1, 2] += _OPEN_SKY_M
         return bounds_m, np.stack([low, high + np.array([0.0, 0.0, 0.01])])
 
-    def _ceiling_m(self, low: Array, high: Array) -> float:
-        """Return the height of the highest ceiling above the lowest floors; infinity outdoors."""
+    def _floor_and_ceiling_m(self, low: Array, high: Array) -> tuple[float, float]:
+        """Return the heights of the lowest floor and the highest ceiling; outdoors infinity.
+
+        Going up, a floor is the first face that looks up, and a ceiling the next that looks down.
+        """
         across, along = np.meshgrid(
             *((np.arange(_GRID) + 0.5) / _GRID * (high - low)[axis] + low[axis] for axis in (0, 1))
         )
-        starts = np.stack([across.ravel(), along.ravel(), np.full(across.size, low[2] - 1.0)], 1)
-        upwards = np.broadcast_to([0.0, 0.0, 1.0], starts.shape)
-        # The lowest surface is the floor or its underside; what is thinner than this is one floor.
-        floor_m = low[2] - 1.0 + self.cast(starts, upwards, solids=False) + _FLOOR_M
-        is_floor = np.isfinite(floor_m)
-        starts = starts[is_floor]
-        starts[:, 2] = floor_m[is_floor]
-        above_m = starts[:, 2] + self.cast(starts, upwards[is_floor], solids=False)
-        if not len(above_m) or np.isinf(above_m).mean() > _OPEN_SHARE:
-            return math.inf
-        return float(above_m[np.isfinite(above_m)].max())
+        bottom = np.full(across.size, low[2] - 1.0)
+        at = self.mirror.to_blender(np.stack([across.ravel(), along.ravel(), bottom], axis=1))
+        floors, ceilings = np.full((2, len(at)), np.inf)
+        left = np.arange(len(at))
+        for _ in range(_MOST_LAYERS):
+            upwards = np.broadcast_to([0.0, 0.0, 1.0], (len(left), 3))
+            hits = first_hits(self.still, at[left], upwards)
+            at[left, 2] += hits.distance
+            looks_up = hits.normals[:, 2] > 0
+            has_floor = np.isfinite(floors[left])
+            is_ceiling = has_floor & (hits.normals[:, 2] < 0)
+            ceilings[left[is_ceiling]] = at[left[is_ceiling], 2]
+            is_floor = looks_up & ~has_floor
+            floors[left[is_floor]] = at[left[is_floor], 2]
+            left = left[np.isfinite(hits.distance) & ~is_ceiling]
+            at[left, 2] += 1e-5 / self.mirror.unit_m
+            if not left.size:
+                break
+        found = ceilings[np.isfinite(floors)]
+        if not found.size or np.isinf(found).mean() > _OPEN_SHARE:
+            return float(low[2]), math.inf
+        ceiling = float(found[np.isfinite(found)].max())
+        return float(floors.min()) * self.mirror.unit_m, ceiling * self.mirror.unit_m
 
-    def cast(self, origins_m: Array, directions: Array, *, solids: bool = True) -> Array:
+    def cast(self, origins_m: Array, directions: Array) -> Array:
         """Return how many metres each ray goes until it meets the map; 0 inside a solid."""
         origins = self.mirror.to_blender(origins_m)
         ways = directions * self.mirror.flip
@@ -952,7 +975,7 @@ class Stage:
         distance = hits.distance
         behind = np.einsum("ni,ni->n", hits.normals, ways) > 0
         inside = np.flatnonzero(behind)
-        if solids and inside.size:
+        if inside.size:
             places, back = np.unique(origins[inside], axis=0, return_inverse=True)
             is_solid = self._in_solid(places)
             distance[inside[is_solid[back.reshape(-1)]]] = 0.0
