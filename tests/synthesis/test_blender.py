@@ -7,6 +7,7 @@ import importlib.util
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -131,7 +132,9 @@ def test_a_python_without_blender_is_refused_with_the_cure(tmp_path):
 
 @pytest.mark.skipif(importlib.util.find_spec("bpy") is not None, reason="bpy is installed here")
 def test_this_python_without_blender_names_the_way_to_get_it():
-    with pytest.raises(ExtraError, match=r"No module named 'bpy'.*--blender-python"):
+    with pytest.raises(
+        ExtraError, match=r"bpy cannot be imported \(No module named 'bpy'\).*--blender-python"
+    ):
         blender()
 
 
@@ -356,6 +359,28 @@ def test_the_same_plan_gives_the_same_bytes_in_another_blender(renderer):
         np.testing.assert_array_equal(one.depth_m, other.depth_m)
     assert not np.array_equal(first[0].picture, first[1].picture)
     assert not np.array_equal(first[0].depth_m, first[6].depth_m)
+
+
+@needs_blender
+def test_the_command_renders_all_maps_of_the_assets(assets, tmp_path):
+    quick = tmp_path / "assets"
+    shutil.copytree(assets, quick)
+    text = (quick / "assets.toml").read_text()
+    (quick / "assets.toml").write_text(text.replace("= 32", "= 1\ndenoise = false"))
+    options = ["--size", "32", "--frames", "1", "--scenes", "2", "--seed", "5", "--workers", "1"]
+    of_blender = ["--renderer", "blender", "--assets", str(quick / "assets.toml")]
+    python = ["--blender-python", PYTHON] if PYTHON else []
+
+    result = CliRunner().invoke(
+        app,
+        ["synth", str(tmp_path / "out"), *options, *of_blender, *python],
+        catch_exceptions=False,
+    )
+
+    assert result.exit_code == 0, result.output
+    markers = (tmp_path / "out").rglob("_scene_complete.json")
+    assert {marker.parts[-3] for marker in markers} <= {"Room", "Yard"}
+    assert "2 scenes in train/IPD_Gaussian/" in result.stdout
 
 
 @needs_blender

@@ -73,11 +73,10 @@ class BlenderProcess:
 
     def _version(self, python: str) -> dict[str, Any]:
         try:
-            return self.call({"call": "version"}, what="start")[0]
+            return self.call({"call": "version"}, what="this Python cannot start Blender")[0]
         except SynthesisError as error:
-            raise ExtraError(
-                f"{python}: this Python cannot start Blender: {error} {_CURE}"
-            ) from error
+            self.close()
+            raise ExtraError(f"{python}: {error} {_CURE}") from error
 
     def call(
         self, request: dict[str, Any], arrays: Sequence[np.ndarray] = (), *, what: str

@@ -71,7 +71,11 @@ def main() -> None:
     assert spec is not None
     assert spec.loader is not None
     stage = module_from_spec(spec)
-    spec.loader.exec_module(stage)
+    try:
+        spec.loader.exec_module(stage)
+    except ImportError as error:
+        write_message(answers, {"error": f"bpy cannot be imported ({error})."}, [])
+        return
     server = stage.Server()
     while True:
         try:
