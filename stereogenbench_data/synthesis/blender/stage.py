@@ -355,7 +355,7 @@ def check_files(where: str, *, root: str) -> None:
             )
     for library in bpy.data.libraries:
         path = bpy.path.abspath(library.filepath)
-        if library.is_missing or not _inside(path, root):
+        if library.is_missing or not (_inside(path, root) or _inside(path, own)):
             raise AssetError(
                 f"{where}: the library {path} is missing or outside the asset folder {root}. Copy "
                 f"it into the folder and relocate it in Blender."
