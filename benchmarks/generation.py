@@ -2,9 +2,10 @@
 
 ``python -m benchmarks.generation [--size 1280] [--frames 4] [--maps SynthStage SynthHall] [--grow]
 [--out FILE]``. Each scene is proposed and filtered whole (81 frames); a few frames of one camera
-are rendered, encoded and checked, and stand for the 486 of a scene. It measures processor time of
-one process, which other work on the machine hardly changes. A scene needs no other one and a camera no
-other camera, so N cores take an N-th of the time, as long as the memory's speed lasts.
+are rendered, encoded and checked, and stand for the 486 of a scene. It measures
+processor time of one process, which other work on the machine hardly changes. A scene needs no
+other one and a camera no other camera, so N cores take an N-th of the time, as long as the
+memory's speed lasts.
 """
 
 import argparse

@@ -171,7 +171,13 @@ class _Search:
         if isinstance(pool, Refusal):
             return pool
         start = pool[int(self.rng.integers(len(pool)))]
-        knots = [_Knot(0, start, np.zeros(3))]
+        # The path begins in motion: degrees a frame, and a share of the distance a frame.
+        arc_deg = np.degrees(_LARGEST_ARC_M / start[2])
+        fastest = min(1.0, arc_deg / _LARGEST_TURN_DEG[0]) * np.array([1.0, 0.3, 0.006])
+        speed = np.round(
+            self.rng.choice([-1.0, 1.0], 3) * self.rng.uniform(0.5, 1.0, 3) * fastest, _DIGITS
+        )
+        knots = [_Knot(0, start, speed * np.array([1.0, 1.0, start[2]]))]
         path = np.empty((self.frames, 3))
         path[0] = start
         tried: list[Iterator[Array]] = [self._targets(pool, start)]
