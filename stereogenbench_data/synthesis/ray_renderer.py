@@ -51,7 +51,7 @@ class RayCasting:
             else "yard"
         )
         detailed = (
-            f"A figure moves over a ground of {ground}, among crates, balls and poles ({things} "
+            f"A figure walks over a ground of {ground}, among crates, balls and poles ({things} "
             f"things in all), before walls of {walls}."
         )
         return {
@@ -60,7 +60,7 @@ class RayCasting:
             "primary_elements": ["figure", "crates", "balls", "poles", "walls"],
             "spatial_layout": "a figure in the middle, things scattered around it",
             "lighting_materials": "sunlight, matte procedural textures",
-            "short_caption": f"A figure moves over {ground}.",
+            "short_caption": f"A figure walks over {ground}.",
             "detailed_caption": detailed,
             "tags": [place, "figure", ground, walls],
         }
