@@ -1,8 +1,9 @@
-"""``stereogenbench synth``: draw scenes in the released layout, without Unreal."""
+"""``stereogenbench synth``: generate scenes in the released layout, without Unreal."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -14,6 +15,7 @@ from stereogenbench_data.cli.options import (
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.writing import write_report
 from stereogenbench_data.schema.release import (
     FAMILIES,
     FRAME_COUNT,
@@ -23,8 +25,57 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted
 
+if TYPE_CHECKING:
+    from stereogenbench_data.synthesis.renderer import Renderer
+    from stereogenbench_data.synthesis.report import Acceptance
+
+RendererName = Literal["ray-casting", "blender"]
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
 """The same as in `synthesis.request`, which the help does not import."""
+_ALL: str = "all"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RendererOptions:
+    """What draws the scenes of a command."""
+
+    renderer: Annotated[
+        RendererName,
+        typer.Option(help="ray-casting: built-in maps; blender: your own assets, by Cycles."),
+    ] = "ray-casting"
+    assets: Annotated[
+        Path | None, typer.Option(help="The assets.toml of the renderer blender.")
+    ] = None
+    blender_python: Annotated[
+        str, typer.Option(help="Python that has bpy 5.0, for the renderer blender [this one].")
+    ] = ""
+
+    def renderer_of(self) -> "Renderer":
+        """Return the renderer that the options name.
+
+        Raises:
+            SynthesisError: If the assets are missing, not wanted, or not as they should be.
+            ExtraError: If Blender cannot be started.
+        """
+        from stereogenbench_data.errors import SynthesisError
+
+        if self.renderer == "blender":
+            from stereogenbench_data.synthesis.blender.renderer import BlenderRenderer
+
+            if self.assets is None:
+                raise SynthesisError(
+                    "renderer blender: no assets are named. Name the maps, characters and "
+                    "animations in an assets.toml, and give it by --assets."
+                )
+            return BlenderRenderer.from_file(self.assets, python=self.blender_python)
+        if self.assets is not None or self.blender_python:
+            raise SynthesisError(
+                f"renderer {self.renderer}: it takes no --assets and no --blender-python. Choose "
+                f"--renderer blender, or leave them out."
+            )
+        from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
+
+        return RAY_CASTING
 
 
 @grouped
@@ -45,7 +96,14 @@ def synth(  # noqa: PLR0913 - one parameter an option
     seed: Annotated[int, typer.Option(help="Seed of all that is random.")] = 0,
     split: Annotated[Split, typer.Option(help="Pairwise_Uniform is only in train.")] = "train",
     subset: Annotated[Subset, typer.Option(help="Kind of maps; used in eval.")] = "seen_map",
-    map_name: Annotated[str, typer.Option("--map", help="Folder of the scenes.")] = "SynthStage",
+    map_name: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--map",
+            help="Map, and folder of the scenes; given again, or 'all', each proposal draws one "
+            "[SynthStage; all of the assets].",
+        ),
+    ] = None,
     focal_mm: Annotated[
         float | None, typer.Option(help="Focal length, mm [random, 18 to 85, for each scene].")
     ] = None,
@@ -56,17 +114,53 @@ def synth(  # noqa: PLR0913 - one parameter an option
     rotation: Annotated[
         RotationForm, typer.Option(help="How trajectory.json records rotations.")
     ] = "rotator",
+    drawn_by: RendererOptions,
+    part: Annotated[
+        str, typer.Option(help="I/N: the I-th of N parts, for N machines.", metavar="I/N")
+    ] = "1/1",
+    check: Annotated[
+        Literal["pictures", "audit"],
+        typer.Option(help="What rendered scenes must pass; audit: also the audit and the doctor."),
+    ] = "pictures",
+    plan_only: Annotated[
+        bool, typer.Option("--plan-only", help="Propose and filter, render nothing.")
+    ] = False,
+    report: Annotated[
+        Path | None,
+        typer.Option(help="File for a report on all proposals of OUT so far: .md or .json."),
+    ] = None,
+    contact_sheets: Annotated[
+        Path | None, typer.Option(help="Folder for a picture of each scene, to look through.")
+    ] = None,
+    holdout: Annotated[
+        Path | None,
+        typer.Option(help="File of scene paths, one a line: move them to OUT/.holdout, and end."),
+    ] = None,
     work: WorkOptions,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw scenes with exact depth, poses and intrinsics, in the released layout.
+    """Generate scenes with exact depth, poses and intrinsics, in the released layout.
 
-    To continue a stopped run, run it again: it keeps the scenes that the same request wrote. Scene
-    i is the same for any number of scenes and workers.
+    Proposals of subject, lens, rig and path are examined until one passes the filters; that one is
+    rendered and checked. To continue a stopped run, run it again: it keeps the scenes and decisions
+    of the same request. Scene i is the same for any number of scenes, workers and parts.
     """
-    from stereogenbench_data.synthesis.produce import synthesise
+    from stereogenbench_data.synthesis.produce import hold_out, plan_scenes, synthesise
+    from stereogenbench_data.synthesis.report import report_of, report_of_tree
     from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
+    if report is not None and report.suffix not in (".md", ".json"):
+        raise typer.BadParameter(f"{report} must end in .md or .json.", param_hint="--report")
+    if holdout is not None:
+        moved = hold_out(out, holdout.read_text().split())
+        _print(
+            {"root": str(out), "held_out": moved},
+            f"{out}: {counted(len(moved), 'scene')} moved to {out / '.holdout'}",
+            as_json=as_json,
+        )
+        return
+    chosen = drawn_by.renderer_of()
+    everywhere = map_name == [_ALL] or (map_name is None and drawn_by.assets is not None)
     request = SynthRequest(
         family=family,
         scenes=scenes,
@@ -75,15 +169,67 @@ def synth(  # noqa: PLR0913 - one parameter an option
         seed=seed,
         split=split,
         subset=subset,
-        map_name=map_name,
+        map_name=chosen.maps if everywhere else tuple(map_name or ["SynthStage"]),
         focal_mm=focal_mm,
         contract=ExportContract(
             rotation=rotation, depth_unit_m=depth_unit_m, depth_tag=depth_tag or None
         ),
     )
-    with progress_bar("drawing", unit="frames") as progress:
-        keys = synthesise(out, request, progress=progress, **work.options())
-    if as_json:
-        typer.echo(json.dumps({"root": str(out), "scenes": keys}, indent=2))
-    else:
-        typer.echo(f"{out}: {counted(len(keys), 'scene')} in {request.folder}")
+    how: Any = {"renderer": chosen, "part": _part_of(part), **work.options()}
+    with progress_bar("proposing", unit="scenes") as progress:
+        decisions = plan_scenes(out, request, progress=progress, **how)
+    keys: list[str] = []
+    if not plan_only:
+        with progress_bar("drawing", unit="frames") as progress:
+            keys = synthesise(out, request, check=check, progress=progress, **how)
+    if contact_sheets is not None and keys:
+        from stereogenbench_data.synthesis.sheets import write_sheets
+
+        with progress_bar("contact sheets", unit="scenes") as progress:
+            write_sheets(out, keys, folder=contact_sheets, progress=progress, **work.options())
+    if report is not None:
+        write_report(report, _report_text(report_of_tree(out), suffix=report.suffix))
+    if plan_only:
+        shown = report_of([(request.family, decisions)])
+        _print(_report_json(shown), _table(shown), as_json=as_json)
+        return
+    folders = sorted({key.rpartition("/")[0] for key in keys})
+    _print(
+        {"root": str(out), "scenes": keys},
+        f"{out}: {counted(len(keys), 'scene')} in {', '.join(folders)}",
+        as_json=as_json,
+    )
+
+
+def _part_of(text: str) -> tuple[int, int]:
+    number, _, count = text.partition("/")
+    if not (number.isdecimal() and count.isdecimal()):
+        raise typer.BadParameter(
+            f"{text!r} is not a part: write I/N, such as 1/4.", param_hint="--part"
+        )
+    return int(number), int(count)
+
+
+def _print(document: Any, text: str, *, as_json: bool) -> None:
+    typer.echo(json.dumps(document, indent=2) if as_json else text)
+
+
+def _report_json(report: "list[Acceptance]") -> Any:
+    from stereogenbench_data.synthesis.report import json_of
+
+    return json_of(report)
+
+
+def _report_text(report: "list[Acceptance]", *, suffix: str) -> str:
+    from stereogenbench_data.synthesis.report import markdown_of
+
+    return json.dumps(_report_json(report), indent=2) if suffix == ".json" else markdown_of(report)
+
+
+def _table(report: "list[Acceptance]") -> str:
+    from stereogenbench_data.synthesis.report import rows_of
+
+    rows = rows_of(report)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+    return "\n".join(lines)

@@ -4,7 +4,9 @@ One thread encodes, and the bytes depend only on frames and options, so the same
 same bytes on any number of processors.
 """
 
+from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -17,14 +19,11 @@ from jaxtyping import Float64, UInt16
 
 from stereogenbench_data.media.depth_packing import grey_frame
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_name
+from stereogenbench_data.synthesis.checks import CameraCheck, FrameStatistics
+from stereogenbench_data.synthesis.filters import Limits
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.ray_casting import View
-from stereogenbench_data.synthesis.render import (
-    SceneState,
-    render_depth,
-    render_frame,
-    static_light,
-)
+from stereogenbench_data.synthesis.renderer import RenderedView, Renderer
 from stereogenbench_data.synthesis.request import ExportContract
 
 _LARGEST: Final = {"gray16le": 65535, "gray12le": 4095, "gray10le": 1023}
@@ -35,44 +34,102 @@ _OPTIONS: Final = {
 }
 
 
-def write_camera(
-    plan: ScenePlan, *, camera: int, folder: Path, after_frame: Callable[[], None]
-) -> None:
-    """Write a camera's two videos into a folder.
+def write_cameras(
+    plan: ScenePlan,
+    *,
+    renderer: Renderer,
+    cameras: tuple[int, ...],
+    folder: Path,
+    limits: Limits,
+    after_frame: Callable[[], None],
+) -> list[CameraCheck]:
+    """Write the two videos of some cameras into a folder, and return what they look like.
 
-    ``after_frame`` is called after each frame; an exception from it ends the work.
+    Args:
+        plan: The scene.
+        renderer: What draws it.
+        cameras: Numbers of the cameras.
+        folder: Where the videos go.
+        limits: Limits of near occluders and of depth.
+        after_frame: Called after each frame of each camera; an exception from it ends the work.
     """
-    contract, size_px = plan.request.contract, plan.request.picture_px
-    tag = contract.depth_tag
-    light = static_light(plan.scene)
+    statistics = [FrameStatistics(plan, camera=camera, limits=limits) for camera in cameras]
+    with ExitStack() as stack:
+        writers = [
+            stack.enter_context(_CameraWriter(plan, camera=camera, folder=folder))
+            for camera in cameras
+        ]
+        views = renderer.views(plan, cameras=cameras)
+        for _ in range(plan.request.frames):
+            for writer, seen in zip(writers, statistics, strict=True):
+                view = next(views)
+                writer.write(view)
+                seen.add(view)
+                after_frame()
+    return [seen.check() for seen in statistics]
 
-    def moment(frame: int) -> tuple[SceneState, View]:
-        state = SceneState(plan.scene, moment_s=plan.moment_s(frame), static_light=light)
-        return state, plan.view(camera=camera, frame=frame)
 
-    with (
-        VideoWriter(
-            folder / rgb_name(camera), size_px=size_px, codec="libx264", pixel_format="yuv420p"
-        ) as rgb,
-        VideoWriter(
-            folder / depth_name(camera),
-            size_px=size_px,
-            codec="ffv1",
-            pixel_format=contract.depth_format,
-            tags=None if tag is None else {tag: repr(contract.depth_unit_m)},
-        ) as depth,
-    ):
-        for frame in range(plan.request.frames):
-            state, view = moment(frame)
-            picture, depth_m = render_frame(state, view=view)
-            shown = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            rgb.write(shown.reformat(format="yuv420p", threads=1))
-            if contract.frame_lag:
-                state, view = moment(frame - contract.frame_lag)
-                depth_m = render_depth(state, view=view)
-            units = depth_units(depth_m, view=view, contract=contract)
-            depth.write(grey_frame(units, pixel_format=contract.depth_format))
-            after_frame()
+class _CameraWriter:
+    """The two videos of a camera, as a context manager."""
+
+    def __init__(self, plan: ScenePlan, *, camera: int, folder: Path) -> None:
+        contract, size_px = plan.request.contract, plan.request.picture_px
+        tag = contract.depth_tag
+        self._contract, self._view = contract, plan.view(camera=camera, frame=0)
+        self._waiting: deque[UInt16[np.ndarray, "h w"]] = deque()
+        self._seen = 0
+        with ExitStack() as stack:
+            self._rgb = stack.enter_context(
+                VideoWriter(
+                    folder / rgb_name(camera),
+                    size_px=size_px,
+                    codec="libx264",
+                    pixel_format="yuv420p",
+                )
+            )
+            self._depth = stack.enter_context(
+                VideoWriter(
+                    folder / depth_name(camera),
+                    size_px=size_px,
+                    codec="ffv1",
+                    pixel_format=contract.depth_format,
+                    tags=None if tag is None else {tag: repr(contract.depth_unit_m)},
+                )
+            )
+            self._files = stack.pop_all()
+
+    def write(self, view: RenderedView) -> None:
+        """Append a picture, and a depth: picture t has depth t - lag, or the first or last one."""
+        shown = av.VideoFrame.from_ndarray(view.picture, format="rgb24")
+        self._rgb.write(shown.reformat(format="yuv420p", threads=1))
+        units = depth_units(view.depth_m, view=self._view, contract=self._contract)
+        lag = self._contract.frame_lag
+        if self._seen == 0:
+            self._waiting.extend([units] * max(lag, 0))
+        self._waiting.append(units)
+        first = self._waiting.popleft()
+        if self._seen >= -lag:
+            self._write_depth(first)
+        self._last = units
+        self._seen += 1
+
+    def _write_depth(self, units: UInt16[np.ndarray, "h w"]) -> None:
+        self._depth.write(grey_frame(units, pixel_format=self._contract.depth_format))
+
+    def __enter__(self) -> "_CameraWriter":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with self._files:
+            if error is not None:
+                raise error
+            for _ in range(min(-self._contract.frame_lag, self._seen)):
+                self._write_depth(self._last)
 
 
 class VideoWriter:

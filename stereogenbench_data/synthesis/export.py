@@ -23,6 +23,7 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.synthesis.cameras import quaternion_from_rotator
 from stereogenbench_data.synthesis.plan import ScenePlan
+from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.request import ExportContract
 
 _REPRESENTATIONS: Final = {
@@ -33,31 +34,41 @@ _REPRESENTATIONS: Final = {
 }
 
 
-def completion_text(plan: ScenePlan) -> str:
+def completion_text(proposal: Proposal, *, renderer: str) -> str:
     """Return the completion marker. It records the request, so that a later run can compare it."""
-    request = plan.request
-    marker = _labels(plan) | {
-        "map_path": f"/Game/{request.map_name}/Maps/{request.map_name}",
+    request, map_name = proposal.request, proposal.map_name
+    marker = _labels(proposal) | {
+        "map_path": f"/Game/{map_name}/Maps/{map_name}",
         "synthesis": {
             "seed": request.seed,
+            "scene": proposal.index,
+            "proposal": proposal.number,
             "frames": request.frames,
             "picture_px": request.picture_px,
-            "focal_mm": plan.focal_mm,
+            "focal_mm": proposal.focal_mm,
             "contract": repr(request.contract),
+            "renderer": renderer,
         },
     }
     return _json(marker)
 
 
-def metadata_texts(plan: ScenePlan) -> dict[str, str]:
-    """Return the text of every metadata file by name, with the completion marker last."""
-    description = _description(plan)
+def metadata_texts(
+    plan: ScenePlan, *, renderer: str, description: dict[str, object]
+) -> dict[str, str]:
+    """Return the text of every metadata file by name, with the completion marker last.
+
+    Args:
+        plan: The scene.
+        renderer: Name and fingerprint of what drew it.
+        description: The scene's description; "detailed_caption" is also written as text.
+    """
     return {
         BASELINE_JSON: _json(_baseline(plan)),
         TRAJECTORY_JSON: _json(_trajectory(plan)),
         DESCRIPTION_JSON: _json(description),
-        DESCRIPTION_TXT: description["detailed_caption"],
-        COMPLETE_JSON: completion_text(plan),
+        DESCRIPTION_TXT: str(description["detailed_caption"]),
+        COMPLETE_JSON: completion_text(plan.proposal, renderer=renderer),
     }
 
 
@@ -65,16 +76,16 @@ def _json(value: dict[str, Any]) -> str:
     return json.dumps(value, indent=2)
 
 
-def _labels(plan: ScenePlan) -> dict[str, Any]:
+def _labels(proposal: Proposal) -> dict[str, Any]:
     return {
-        "scene_label": plan.label,
-        "scene_index": plan.label_number,
-        "map_name": plan.request.map_name,
+        "scene_label": proposal.label,
+        "scene_index": proposal.label_number,
+        "map_name": proposal.map_name,
     }
 
 
 def _camera_name(plan: ScenePlan, *, camera: int) -> str:
-    return f"{plan.label}_Cam_{camera:02d}"
+    return f"{plan.proposal.label}_Cam_{camera:02d}"
 
 
 def _primary_pair(plan: ScenePlan) -> dict[str, str] | list[int]:
@@ -92,14 +103,14 @@ def _baseline(plan: ScenePlan) -> dict[str, Any]:
     width_px, height_px = plan.request.picture_px
     contract = plan.request.contract
     intrinsics: dict[str, Any] = {
-        "focal_length_mm": plan.focal_mm,
-        "sensor_width_mm": contract.sensor_mm[0],
-        "sensor_height_mm": contract.sensor_mm[1],
+        "focal_length_mm": plan.proposal.focal_mm,
+        "sensor_width_mm": plan.proposal.sensor_mm[0],
+        "sensor_height_mm": plan.proposal.sensor_mm[1],
     }
     if contract.principal_point_px is not None:
         x_px, y_px = contract.principal_point_px
         intrinsics["principal_point_px"] = {"x": x_px, "y": y_px}
-    return _labels(plan) | {
+    return _labels(plan.proposal) | {
         "unit": "cm",
         "camera_count": CAMERA_COUNT,
         "image_width": width_px,
@@ -108,8 +119,8 @@ def _baseline(plan: ScenePlan) -> dict[str, Any]:
         "primary_stereo_pair": _primary_pair(plan),
         "adjacent_pairs": [_pair(plan, left=left, right=right) for left, right in ADJACENT_PAIRS],
         "pairwise_pairs": [_pair(plan, left=left, right=right) for left, right in CAMERA_PAIRS],
-        "character_mesh": plan.character,
-        "animation": "AN_Walk",
+        "character_mesh": plan.proposal.character,
+        "animation": plan.proposal.animation,
     }
 
 
@@ -117,13 +128,13 @@ def _pair(plan: ScenePlan, *, left: int, right: int) -> dict[str, Any]:
     return {
         "camera_index_a": left,
         "camera_index_b": right,
-        "baseline_cm": float(plan.places_cm[right] - plan.places_cm[left]),
+        "baseline_cm": float(plan.proposal.places_cm[right] - plan.proposal.places_cm[left]),
     }
 
 
 def _trajectory(plan: ScenePlan) -> dict[str, Any]:
-    return _labels(plan) | {
-        "character_id": plan.character,
+    return _labels(plan.proposal) | {
+        "character_id": plan.proposal.character,
         "unit": "cm",
         "rotation_representation": _REPRESENTATIONS[plan.request.contract.rotation],
         "camera_count": CAMERA_COUNT,
@@ -137,7 +148,7 @@ def _trajectory(plan: ScenePlan) -> dict[str, Any]:
 
 
 def _poses(plan: ScenePlan, *, frame: int) -> list[dict[str, Any]]:
-    rotation = _rotation(plan.world_rotator_deg(frame), contract=plan.request.contract)
+    rotation = _rotation(plan.rotators_deg[frame], contract=plan.request.contract)
     return [
         {
             "camera_name": _camera_name(plan, camera=camera),
@@ -159,22 +170,3 @@ def _rotation(
         return rows
     x, y, z, w = quaternion_from_rotator(rotator_deg).tolist()
     return [x, y, z, w] if contract.rotation == "quaternion_xyzw" else [w, x, y, z]
-
-
-def _description(plan: ScenePlan) -> dict[str, Any]:
-    scene = plan.scene
-    walls, things = scene.static_shapes[0].material.texture, len(scene.static_shapes)
-    detailed = (
-        f"A figure walks across a slanted ground of {scene.ground.texture}, among crates, balls "
-        f"and thin poles ({things} things in all), before walls of {walls} under a cloudy sky."
-    )
-    return {
-        "scene_type": "outdoor",
-        "setting": "yard",
-        "primary_elements": ["walking figure", "crates", "balls", "poles", "walls"],
-        "spatial_layout": "a figure in the middle, things scattered before and behind it",
-        "lighting_materials": "sunlight, matte procedural textures",
-        "short_caption": f"A figure walks over {scene.ground.texture}.",
-        "detailed_caption": detailed,
-        "tags": ["outdoor", "figure", scene.ground.texture, walls],
-    }

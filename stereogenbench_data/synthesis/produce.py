@@ -1,47 +1,104 @@
 """Synthetic scenes on disk, for `stereogenbench synth`.
 
-A scene is rendered into a hidden folder beside the splits and moved to its place when it is
-complete. An interrupted run leaves no incomplete scenes, and the next run of the same request
-renders only the missing ones.
+Proposals of each scene are examined until one passes. Its scene is rendered into a hidden folder
+beside the splits, checked, and moved to its place when it is complete. An interrupted run leaves no
+incomplete scenes, and the next run of the same request goes on with what is missing.
 """
 
 import shutil
-from collections.abc import Iterator
-from contextlib import closing, suppress
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 import torch
 
-from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
+from stereogenbench_data.engine import (
+    LOCAL,
+    Advance,
+    Engine,
+    Progress,
+    advance_of,
+    require_workers,
+)
 from stereogenbench_data.errors import StorageError, SynthesisError, cure_of
 from stereogenbench_data.index.open import warn_if_stale
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
-from stereogenbench_data.synthesis.camera_writer import write_camera
+from stereogenbench_data.synthesis.camera_writer import write_cameras
+from stereogenbench_data.synthesis.checks import (
+    CameraCheck,
+    check_files,
+    check_pictures,
+    check_scene,
+)
+from stereogenbench_data.synthesis.decisions import Decision, Decisions, Drawn
 from stereogenbench_data.synthesis.export import completion_text, metadata_texts
-from stereogenbench_data.synthesis.plan import ScenePlan, plan_scene
+from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS, Limits, Refusal
+from stereogenbench_data.synthesis.plan import ScenePlan
+from stereogenbench_data.synthesis.planning import Search, plan_scene, propose
+from stereogenbench_data.synthesis.proposal import Proposal
+from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
+from stereogenbench_data.synthesis.renderer import Renderer
 from stereogenbench_data.synthesis.request import SynthRequest
 
 _TEMPORARY: Final = ".unfinished"
+_HOLDOUT: Final = ".holdout"
+_FEW: Final = 4
+_MOST_RENDERED: Final = 8
+"""How many rendered proposals of one scene may fail their checks."""
 _CURE: Final = "Check that the disk has free space and may be written to."
 _AGAIN: Final = "Then run the same request again: complete scenes are kept."
 
 
 @dataclass(frozen=True, slots=True)
-class _CameraTask:
-    """One camera of one scene, and the folder for its videos."""
+class _SearchTask:
+    """A scene to search a plan for, from one of its proposals on."""
 
     request: SynthRequest
     index: int
-    camera: int
+    first: int
+    renderer: Renderer
+    limits: Limits
+
+
+@dataclass(frozen=True, slots=True)
+class _RenderTask:
+    """Some cameras of one scene, and the folder for their videos."""
+
+    plan: ScenePlan
+    renderer: Renderer
+    limits: Limits
+    cameras: tuple[int, ...]
     folder: Path
 
 
-def synthesise(
+@dataclass(frozen=True, slots=True)
+class _Work:
+    """What all steps of a run share."""
+
+    out: Path
+    request: SynthRequest
+    renderer: Renderer
+    limits: Limits
+    decisions: Decisions
+    workers: int | None
+    engine: Engine
+
+    @property
+    def drawn_by(self) -> str:
+        """Name and fingerprint of the renderer, for completion markers."""
+        return f"{self.renderer.name} {self.renderer.fingerprint}"
+
+
+def synthesise(  # noqa: PLR0913 - each names one thing that a user chooses
     out: str | Path,
     request: SynthRequest,
     *,
+    renderer: Renderer = RAY_CASTING,
+    part: tuple[int, int] = (1, 1),
+    check: Literal["pictures", "audit"] = "pictures",
     workers: int | None = 1,
     engine: Engine = LOCAL,
     progress: Progress | None = None,
@@ -51,6 +108,12 @@ def synthesise(
     Args:
         out: Root of the tree; created if it does not exist.
         request: The scenes. Scene i does not depend on the number of scenes or on ``workers``.
+        renderer: What draws them.
+        part: (i, n) writes the i-th of n parts of the scenes, with i from 1. All parts together
+            are the same scenes as without parts.
+        check: What a rendered scene must pass: "pictures" looks for missing frames, pixels without
+            depth, dark and flat pictures, and near things at the border; "audit" also lets the
+            audit and the doctor look at the scene.
         workers: The number of processes; each renders one camera of one scene at a time. With 1,
             this process renders; None is one a core. More are spawned, so a script must call
             this function below ``if __name__ == "__main__"``.
@@ -58,43 +121,227 @@ def synthesise(
         progress: Called repeatedly with the numbers of camera frames rendered so far and in total.
 
     Returns:
-        The scenes' keys, from scene 0 on.
+        The scenes' keys, by number. Scenes in the holdout are left out.
 
     Raises:
         SynthesisError: If ``workers`` is below 1, a scene's folder has other content, a file
-            cannot be written, or a worker process dies.
+            cannot be written, all proposals of a scene are refused, or a worker process dies.
+    """
+    work = _work(Path(out), request, renderer=renderer, workers=workers, engine=engine)
+    with _as_synthesis_error():
+        plans = _searched(work, _of_part(request, part))
+        accepted = {index: _proposed(work, index) for index in _of_part(request, part)}
+        missing = [index for index, each in accepted.items() if _is_missing(work, each)]
+        per_scene = CAMERA_COUNT * request.frames
+        total = len(accepted) * per_scene
+        advance = advance_of(progress, done=total - len(missing) * per_scene, total=total)
+        advance(0)
+        while missing:
+            known = {index: plans[index] for index in missing if index in plans}
+            lost = {index: accepted[index].number for index in missing if index not in known}
+            for search in _search_all(work, lost):
+                known[search.plan.proposal.index] = _same_plan(work, search.plan)
+            refused = _rendered(work, known, check=check, advance=advance)
+            # A scene that failed its checks goes on with its next proposal.
+            before = {index: _refuse(work, index, why) for index, why in refused.items()}
+            first = {index: drawn[-1].number + 1 for index, drawn in before.items()}
+            plans = {}
+            for search in _search_all(work, first):
+                index = search.plan.proposal.index
+                work.decisions.write(Decision.of(search, before=before[index]))
+                plans[index], accepted[index] = search.plan, search.plan.proposal
+            missing = [index for index in sorted(plans) if _is_missing(work, accepted[index])]
+    warn_if_stale(work.out)
+    keys = (each.key for each in accepted.values())
+    return [key for key in keys if not (work.out / _HOLDOUT / key).exists()]
+
+
+def plan_scenes(  # noqa: PLR0913 - the choices of `synthesise`
+    out: str | Path,
+    request: SynthRequest,
+    *,
+    renderer: Renderer = RAY_CASTING,
+    part: tuple[int, int] = (1, 1),
+    workers: int | None = 1,
+    engine: Engine = LOCAL,
+    progress: Progress | None = None,
+) -> list[Decision]:
+    """Search for the plans of scenes without rendering them, and keep what was decided.
+
+    The arguments are those of `synthesise`, which takes the same decisions, and goes on from those
+    that are kept.
+
+    Args:
+        out: Root of the tree; the decisions go into a hidden folder there.
+        request: The scenes.
+        renderer: Whose maps are asked.
+        part: (i, n) for the i-th of n parts.
+        workers: The number of processes.
+        engine: Where they run.
+        progress: Called with the numbers of scenes decided so far and in total.
+
+    Returns:
+        The decisions by the scenes' numbers.
+
+    Raises:
+        SynthesisError: As `synthesise`.
+    """
+    work = _work(Path(out), request, renderer=renderer, workers=workers, engine=engine)
+    indices = _of_part(request, part)
+    with _as_synthesis_error():
+        _searched(work, indices, progress=progress)
+    return [_decided(work, index) for index in indices]
+
+
+def hold_out(out: str | Path, keys: Sequence[str]) -> list[str]:
+    """Move scenes that a person refused out of the tree, into its hidden folder ``.holdout``.
+
+    A later run of their request does not render them again.
+
+    Args:
+        out: Root of the tree.
+        keys: Whole paths of scenes below the root. All must be in the tree or in the holdout.
+
+    Returns:
+        The keys of the scenes that were moved now.
+
+    Raises:
+        SynthesisError: If a key is no scene of the tree, or a folder cannot be moved.
     """
     root = Path(out)
-    missing = [index for index in range(request.scenes) if _is_missing(root, request, index=index)]
-    per_scene = CAMERA_COUNT * request.frames
-    total = request.scenes * per_scene
-    advance = advance_of(progress, done=total - len(missing) * per_scene, total=total)
-    left = dict.fromkeys(missing, CAMERA_COUNT)
-    advance(0)
+    moved = []
+    for key in dict.fromkeys(keys):
+        try:
+            parse_scene_key(key)
+        except ValueError as error:
+            raise SynthesisError(f"{key!r} is not the path of a scene: {error}") from error
+        if not (root / key).is_dir() and not (root / _HOLDOUT / key).is_dir():
+            raise SynthesisError(
+                f"{root}: there is no scene {key!r} to hold out. List whole paths, such as "
+                f"train/Uniform/SynthStage/scene_000000, one a line."
+            )
+    for key in dict.fromkeys(keys):
+        if not (root / key).is_dir():
+            continue
+        target = root / _HOLDOUT / key
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            (root / key).rename(target)
+        except OSError as error:
+            raise SynthesisError(
+                f"{root / key}: cannot be moved to {target}: {error}. {cure_of(error, _CURE)}"
+            ) from error
+        moved.append(key)
+    warn_if_stale(root)
+    return moved
+
+
+def _work(
+    out: Path,
+    request: SynthRequest,
+    *,
+    renderer: Renderer,
+    workers: int | None,
+    engine: Engine,
+) -> _Work:
+    limits = DEFAULT_LIMITS
+    decisions = Decisions.at(out, request, renderer=renderer, limits=limits)
+    return _Work(out, request, renderer, limits, decisions, workers, engine)
+
+
+@contextmanager
+def _as_synthesis_error() -> Iterator[None]:
     try:
-        written = engine.map(
-            _write_camera,
-            list(_camera_tasks(root, request, missing=missing)),
-            name=lambda task: f"{task.request.key(task.index)}, camera {task.camera}",
-            workers=workers,
-            advance=advance,
-        )
-        with closing(written):
-            for task in written:
-                left[task.index] -= 1
-                if not left[task.index]:
-                    _finish(root, plan_scene(request, index=task.index), rendered_in=task.folder)
+        yield
     except StorageError as error:
         raise SynthesisError(str(error)) from error
-    finally:
-        _clear(root, request, missing=missing)
-    warn_if_stale(root)
-    return [request.key(index) for index in range(request.scenes)]
 
 
-def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
+def _of_part(request: SynthRequest, part: tuple[int, int]) -> list[int]:
+    number, count = part
+    if not 1 <= number <= count:
+        raise SynthesisError(
+            f"part {number}/{count} is none: it must be 1/{count}..{count}/{count}."
+        )
+    return list(range(number - 1, request.scenes, count))
+
+
+def _searched(
+    work: _Work, indices: list[int], *, progress: Progress | None = None
+) -> dict[int, ScenePlan]:
+    """Decide what is not decided yet, and return the plans that were found."""
+    left = {index: 0 for index in indices if work.decisions.read(index) is None}
+    advance = advance_of(progress, done=len(indices) - len(left), total=len(indices))
+    advance(0)
+    plans = {}
+    for search in _search_all(work, left):
+        work.decisions.write(Decision.of(search))
+        plans[search.plan.proposal.index] = search.plan
+        advance(1)
+    return plans
+
+
+def _search_all(work: _Work, first: dict[int, int]) -> Iterator[Search]:
+    """Yield the searches of scenes, each from one of its proposals on."""
+    # To start processes takes longer than a few searches.
+    few = len(first) <= _FEW
+    require_workers(work.workers)
+    searches = (LOCAL if few else work.engine).map(
+        _search,
+        [
+            _SearchTask(work.request, index, number, work.renderer, work.limits)
+            for index, number in sorted(first.items())
+        ],
+        name=lambda task: f"scene {task.index} of {work.request.stream}",
+        workers=1 if few else work.workers,
+    )
+    with closing(searches):
+        yield from searches
+
+
+def _search(task: _SearchTask, after_proposals: Advance) -> Search:
+    """Search for a scene's plan; a worker process calls this."""
+    return plan_scene(
+        task.request,
+        index=task.index,
+        renderer=task.renderer,
+        limits=task.limits,
+        first=task.first,
+    )
+
+
+def _decided(work: _Work, index: int) -> Decision:
+    decision = work.decisions.read(index)
+    if decision is None:
+        raise SynthesisError(
+            f"{work.decisions.folder}: the decision on scene {index} was removed or changed while "
+            f"scenes were generated. Run the same request again."
+        )
+    return decision
+
+
+def _same_plan(work: _Work, plan: ScenePlan) -> ScenePlan:
+    """Return a plan that was searched again; refuse one of another proposal."""
+    kept = _decided(work, plan.proposal.index).accepted.number
+    if plan.proposal.number != kept:
+        raise SynthesisError(
+            f"{work.decisions.folder}: proposal {kept} of scene {plan.proposal.index} was accepted "
+            f"by another version of this package; this one refuses it. Move this folder away."
+        )
+    return plan
+
+
+def _proposed(work: _Work, index: int) -> Proposal:
+    """Return the accepted proposal of a scene."""
+    number = _decided(work, index).accepted.number
+    return propose(work.request, index=index, number=number, renderer=work.renderer)
+
+
+def _is_missing(work: _Work, proposal: Proposal) -> bool:
     """Return whether a scene must be rendered; refuse a folder that another request wrote."""
-    folder = out / request.key(index)
+    folder = work.out / proposal.key
+    if (work.out / _HOLDOUT / proposal.key).exists():
+        return False
     try:
         if not folder.exists():
             return True
@@ -104,7 +351,7 @@ def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
             f"{folder}: a scene belongs here, but the {COMPLETE_JSON} of this folder cannot be "
             f"read ({error}). Move the folder away or choose another output."
         ) from error
-    if found != completion_text(plan_scene(request, index=index)):
+    if found != completion_text(proposal, renderer=work.drawn_by):
         raise SynthesisError(
             f"{folder}: another request wrote this scene (its {COMPLETE_JSON} differs). Choose "
             f"another output or map_name, or move the folder away."
@@ -112,62 +359,147 @@ def _is_missing(out: Path, request: SynthRequest, *, index: int) -> bool:
     return False
 
 
-def _camera_tasks(out: Path, request: SynthRequest, *, missing: list[int]) -> Iterator[_CameraTask]:
-    """Yield the cameras of all missing scenes, whose folders are made empty."""
-    for index in missing:
-        folder = out / _TEMPORARY / request.key(index)
+def _refuse(work: _Work, index: int, refusal: Refusal) -> tuple[Drawn, ...]:
+    """Return what was refused of a scene, with the accepted proposal as the last."""
+    decision = _decided(work, index)
+    why = replace(refusal, rendered=True)
+    drawn = (*decision.refused, replace(decision.accepted, refusal=why))
+    rendered = [each.refusal for each in drawn if each.refusal and each.refusal.rendered]
+    if len(rendered) >= _MOST_RENDERED:
+        raise SynthesisError(
+            f"{work.request.stream}: {len(rendered)} rendered proposals of scene {index} fail "
+            f"their checks, the last one with {refusal.reason} ({refusal.text}). Check the "
+            f"renderer's maps and lights, and the depth's unit."
+        )
+    return drawn
+
+
+def _rendered(
+    work: _Work,
+    plans: dict[int, ScenePlan],
+    *,
+    check: Literal["pictures", "audit"],
+    advance: Advance,
+) -> dict[int, Refusal]:
+    """Render scenes, move those that pass to their places, and return why others are refused."""
+    left = dict.fromkeys(plans, CAMERA_COUNT)
+    checks: dict[int, list[CameraCheck]] = {index: [] for index in plans}
+    refused: dict[int, Refusal] = {}
+    try:
+        written = work.engine.map(
+            _render,
+            list(_render_tasks(work, plans)),
+            name=lambda task: f"{task.plan.key}, {_cameras(task)}",
+            workers=work.workers,
+            advance=advance,
+        )
+        with closing(written):
+            for task, found in written:
+                index = task.plan.proposal.index
+                checks[index] += found
+                left[index] -= len(task.cameras)
+                if not left[index]:
+                    refusal = _finish(work, task, checks[index], check=check)
+                    if refusal is not None:
+                        refused[index] = refusal
+    finally:
+        _clear(work.out, [plan.key for plan in plans.values()])
+    return refused
+
+
+def _render_tasks(work: _Work, plans: dict[int, ScenePlan]) -> Iterator[_RenderTask]:
+    """Yield the cameras of scenes, whose folders are made empty."""
+    together = work.renderer.cameras_per_task
+    for _, plan in sorted(plans.items()):
+        folder = work.out / _TEMPORARY / plan.key
         try:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
         except OSError as error:
             raise SynthesisError(
-                f"{out}: cannot create a folder there ({error}). "
+                f"{work.out}: cannot create a folder there ({error}). "
                 + cure_of(error, "Choose an output that you may write to.")
             ) from error
-        for camera in range(CAMERA_COUNT):
-            yield _CameraTask(request, index, camera, folder)
+        for first in range(0, CAMERA_COUNT, together):
+            cameras = tuple(range(first, first + together))
+            yield _RenderTask(plan, work.renderer, work.limits, cameras, folder)
 
 
-def _write_camera(task: _CameraTask, after_frames: Advance) -> _CameraTask:
-    """Write a camera's videos; a worker process calls this."""
-    plan = plan_scene(task.request, index=task.index)
+def _cameras(task: _RenderTask) -> str:
+    return f"camera {', '.join(map(str, task.cameras))}"
+
+
+def _render(task: _RenderTask, after_frames: Advance) -> tuple[_RenderTask, list[CameraCheck]]:
+    """Write the videos of cameras; a worker process calls this."""
+    plan = task.plan
     # Torch renders with one thread, because its rounding depends on the number of threads.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        write_camera(
-            plan, camera=task.camera, folder=task.folder, after_frame=lambda: after_frames(1)
+        checks = write_cameras(
+            plan,
+            renderer=task.renderer,
+            cameras=task.cameras,
+            folder=task.folder,
+            limits=task.limits,
+            after_frame=lambda: after_frames(1),
         )
     except OSError as error:
         raise SynthesisError(
-            f"{plan.key}: camera {task.camera} cannot be written to {task.folder}: {error}. "
+            f"{plan.key}: {_cameras(task)} cannot be written to {task.folder}: {error}. "
             f"{cure_of(error, _CURE)} {_AGAIN}"
         ) from error
     finally:
         torch.set_num_threads(threads)
-    return task
+    return task, checks
 
 
-def _finish(out: Path, plan: ScenePlan, *, rendered_in: Path) -> None:
-    """Write the metadata, with the completion marker last, and move the scene to its place."""
-    folder = out / plan.key
+def _finish(
+    work: _Work,
+    task: _RenderTask,
+    checks: list[CameraCheck],
+    *,
+    check: Literal["pictures", "audit"],
+) -> Refusal | None:
+    """Check a rendered scene and move it to its place, or return why it is refused.
+
+    The completion marker is written last. The scene appears whole, by one renaming.
+    """
+    plan, folder = task.plan, task.folder
+    refusal = check_pictures(checks, limits=work.limits) or check_files(
+        folder, frames=plan.request.frames
+    )
+    if refusal is not None:
+        return refusal
+    texts = metadata_texts(
+        plan, renderer=work.drawn_by, description=work.renderer.description(plan)
+    )
+    target = work.out / plan.key
     try:
-        for name, text in metadata_texts(plan).items():
-            (rendered_in / name).write_text(text)
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        rendered_in.rename(folder)
+        for name, text in texts.items():
+            (folder / name).write_text(text)
+        if check == "audit":
+            refusal = check_scene(
+                work.out / _TEMPORARY, key=plan.key, contract=plan.request.contract
+            )
+            if refusal is not None:
+                return refusal
+        target.parent.mkdir(parents=True, exist_ok=True)
+        folder.rename(target)
     except OSError as error:
         raise SynthesisError(
-            f"{plan.key}: cannot be completed in {out}: {error}. {cure_of(error, _CURE)} {_AGAIN}"
+            f"{plan.key}: cannot be completed in {work.out}: {error}. {cure_of(error, _CURE)} "
+            f"{_AGAIN}"
         ) from error
+    return None
 
 
-def _clear(out: Path, request: SynthRequest, *, missing: list[int]) -> None:
+def _clear(out: Path, keys: list[str]) -> None:
     """Remove incomplete scenes, and the folders that are then empty."""
-    for index in missing:
-        shutil.rmtree(out / _TEMPORARY / request.key(index), ignore_errors=True)
-    folder = out / _TEMPORARY / request.folder
-    while folder != out:
-        with suppress(OSError):
-            folder.rmdir()
-        folder = folder.parent
+    for key in keys:
+        folder = out / _TEMPORARY / key
+        shutil.rmtree(folder, ignore_errors=True)
+        while folder.parent != out:
+            folder = folder.parent
+            with suppress(OSError):
+                folder.rmdir()

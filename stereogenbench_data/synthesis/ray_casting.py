@@ -1,27 +1,33 @@
-"""Rays from a pinhole camera, and their first hits.
+"""What a pinhole camera sees first, at the centre of each pixel.
 
-Pixel (u, v) is column, row; the centre of the top-left pixel is (0.5, 0.5). Scene axes are Unreal's
-(x forward, y right, z up), in metres. The direction of a ray has a component of 1 along the optical
-axis, so the t of a hit is its depth along that axis.
+Pixel (u, v) is column, row; the centre of the top-left pixel is (0.5, 0.5). Axes are those of a map
+(x forward, y right, z up), in metres. The ray of a pixel is ahead + right * r - up * b, where r and
+b are the pixel's place to the right of and below the optical axis, at depth 1. So the t of a hit is
+its depth along that axis.
+
+The inverse depth of a plane is affine in r and b, and so are its edges. So a face of a box is drawn
+like a polygon, without dividing, and one buffer of inverse depths keeps the nearest.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int32
 
-from stereogenbench_data.synthesis.scene import Shape, entry_depth
+from stereogenbench_data.synthesis.scene import Shape
 
 Array = Any
 
 SKY: Final = 0
 GROUND: Final = 1
-FIRST_SHAPE: Final = 2
+_FIRST_FACE: Final = 2
+_FACES: Final = 6
 
 _NEAREST_M: Final = 0.05
-_STRIP_RAYS: Final = 1 << 17
+_BLOCK_PX: Final = 1 << 16
+"""Pixels that are drawn at a time, so that they stay in the processor's cache."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,84 +57,253 @@ class View:
         return (v_px - self.centre_px[1]) / self.focal_px[1]
 
     def in_unit_solid(self, shape: Shape) -> tuple[Array, Array]:
-        """Return the eye, and the camera's axes as columns, in the unit solid's coordinates."""
-        from_world = shape.axes / shape.half_m[:, None]
-        return from_world @ (self.eye - shape.centre), from_world @ self.axes
+        """Return the eye, and the ray's coefficients as columns, in the unit solid's coordinates.
+
+        The coefficients are those of 1, r and b.
+        """
+        from_map = shape.axes / shape.half_m[:, None]
+        return from_map @ (self.eye - shape.centre), from_map @ self.ray
+
+    @property
+    def ray(self) -> Float64[np.ndarray, "3 3"]:
+        """The coefficients of 1, r and b in the directions of rays, as columns."""
+        return self.axes * (1.0, 1.0, -1.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Rays:
-    """Rays by their place in the plane at depth 1, to the right of and below the optical axis.
+def face_id(shape: int, *, axis: int = 0, sign: float = -1.0) -> int:
+    """Return the number of a face of a box, or of an ellipsoid, by the number of the shape."""
+    return _FIRST_FACE + _FACES * shape + 2 * axis + (sign > 0)
 
-    They are either a grid, with ``right`` (1, w) and ``below`` (h, 1), or a list, with both (n,).
+
+def shape_of(face: Array) -> Array:
+    """Return the number of the shape that a face belongs to; negative for sky and ground."""
+    return (face - _FIRST_FACE) // _FACES
+
+
+class Plane(NamedTuple):
+    """A plane of which a part is seen. Three numbers are the coefficients of 1, r and b.
+
+    Attributes:
+        face: Its number.
+        inverse: The inverse depth.
+        sides: For each of two directions, a quantity whose absolute value is at most the inverse
+            depth inside the part; none for all of the plane.
     """
 
-    right: Array
-    below: Array
-
-    def within(self, bounds: tuple[float, float, float, float]) -> tuple[Any, "Rays"]:
-        """Return the index of the rays within left, right, top and bottom bounds, and the rays."""
-        left, right, top, bottom = bounds
-        if self.right.ndim == 2:
-            columns = slice(*np.searchsorted(self.right[0], (left, right)))
-            rows = slice(*np.searchsorted(self.below[:, 0], (top, bottom)))
-            return (rows, columns), Rays(self.right[:, columns], self.below[rows])
-        inside = (self.right >= left) & (self.right <= right)
-        inside &= (self.below >= top) & (self.below <= bottom)
-        index = np.flatnonzero(inside)
-        return index, Rays(self.right[index], self.below[index])
-
-    def listed(self) -> "Rays":
-        """Return the same rays as a list."""
-        right, below = np.broadcast_arrays(self.right, self.below)
-        return Rays(right.ravel(), below.ravel())
-
-    def directions(self, axes: Array) -> list[Array]:
-        """Return the three components of the directions, given the camera's axes as columns."""
-        return [ahead + (right * self.right - up * self.below) for ahead, right, up in axes]
+    face: int
+    inverse: Array
+    sides: tuple[Array, ...]
 
 
-def pixel_rays(view: View) -> Iterator[tuple[slice, Rays]]:
-    """Yield the rays through pixel centres, in strips of rows that fit the processor's cache."""
-    width, height = view.size_px
-    step = max(1, _STRIP_RAYS // width)
-    right = view.right_of_axis(np.arange(width)[None] + 0.5)
-    for top in range(0, height, step):
-        rows = np.arange(top, min(top + step, height))
-        yield slice(top, top + len(rows)), Rays(right, view.below_axis(rows[:, None] + 0.5))
+class Ball(NamedTuple):
+    """An ellipsoid: its number, the eye in the unit ball's coordinates, and the ray's columns."""
+
+    face: int
+    eye: Array
+    ray: Array
+    shape: Shape
+
+
+def ground_plane(view: View, *, slope: Float64[np.ndarray, "2"]) -> Plane:
+    """Return the ground z = slope . (x, y), as seen from above."""
+    normal = np.array([-slope[0], -slope[1], 1.0])
+    return Plane(GROUND, -(normal @ view.ray) / (normal @ view.eye), ())
+
+
+def visible_parts(view: View, *, number: int, shape: Shape) -> Iterator[Plane | Ball]:
+    """Yield the faces of a box that are turned to the camera, or the ellipsoid."""
+    eye, ray = view.in_unit_solid(shape)
+    if shape.kind == "ellipsoid":
+        if eye @ eye > 1:
+            yield Ball(face_id(number), eye, ray, shape)
+        return
+    for axis in range(3):
+        if abs(eye[axis]) > 1:
+            sign = float(np.sign(eye[axis]))
+            inverse = ray[axis] / (sign - eye[axis])
+            others = [other for other in range(3) if other != axis]
+            sides = tuple(eye[other] * inverse + ray[other] for other in others)
+            yield Plane(face_id(number, axis=axis, sign=sign), inverse, sides)
 
 
 def first_hits(
-    rays: Rays, *, view: View, shapes: Sequence[Shape], slope: Float64[np.ndarray, "2"]
-) -> tuple[Array, Array]:
-    """Return the depth in metres of each ray's first hit, and the number of the solid.
+    view: View, *, shapes: Sequence[Shape], slope: Float64[np.ndarray, "2"]
+) -> tuple[Float64[np.ndarray, "h w"], Int32[np.ndarray, "h w"]]:
+    """Return the inverse depth in 1/m of each pixel's first hit, and the face that it hits.
 
-    The ground is the plane z = slope . (x, y). A solid is `SKY` (at infinite depth), `GROUND`,
-    or `FIRST_SHAPE` plus the index of a shape in ``shapes``.
+    A face is `SKY` (with inverse depth 0), `GROUND`, or a `face_id`.
     """
-    normal = np.array([-slope[0], -slope[1], 1.0])
-    (descent,) = rays.directions(-(normal @ view.axes)[None])
-    with np.errstate(divide="ignore"):
-        depth_m = np.where(descent > 0, (normal @ view.eye) / descent, np.inf)
-    solid = np.where(np.isfinite(depth_m), GROUND, SKY)
-    for number, shape in enumerate(shapes, FIRST_SHAPE):
-        index, inside = rays.within(_bounds(shape, view=view))
-        if inside.right.size == 0 or inside.below.size == 0:
+    width, height = view.size_px
+    inverse = np.zeros((height, width))
+    faces = np.zeros((height, width), np.int32)
+    picture = _Picture(
+        inverse,
+        faces,
+        view.right_of_axis(np.arange(width) + 0.5),
+        view.below_axis(np.arange(height) + 0.5),
+    )
+    _draw_plane(picture, ground_plane(view, slope=slope), view=view)
+    for number, shape in enumerate(shapes):
+        bounds = _bounds(shape, view=view)
+        if bounds is None or not picture.overlaps(bounds):
             continue
-        origin, axes = view.in_unit_solid(shape)
-        t = entry_depth(shape, origin=list(origin), direction=inside.directions(axes))
-        nearer = t < depth_m[index]
-        depth_m[index] = np.where(nearer, t, depth_m[index])
-        solid[index] = np.where(nearer, number, solid[index])
-    return depth_m, solid
+        for part in visible_parts(view, number=number, shape=shape):
+            if isinstance(part, Plane):
+                _draw_plane(picture, part, view=view)
+            else:
+                _draw_ball(picture, part, bounds=bounds)
+    return inverse, faces
 
 
-def _bounds(shape: Shape, *, view: View) -> tuple[float, float, float, float]:
-    """Return left, right, top and bottom bounds of a shape in the plane at depth 1."""
+class _Picture(NamedTuple):
+    """The nearest inverse depths so far, their faces, and the places of columns and rows."""
+
+    inverse: Array
+    faces: Array
+    right: Array
+    below: Array
+
+    def overlaps(self, bounds: tuple[float, float, float, float]) -> bool:
+        """Return whether left, right, top and bottom bounds have a part of the picture."""
+        left, right, top, bottom = bounds
+        return bool(
+            left <= self.right[-1]
+            and right >= self.right[0]
+            and top <= self.below[-1]
+            and bottom >= self.below[0]
+        )
+
+
+def _draw_plane(picture: _Picture, plane: Plane, *, view: View) -> None:
+    """Draw a part of a plane: in each row it covers the columns between two edges."""
+    ahead, across, down = plane.inverse
+    in_row = ahead + down * picture.below
+    if not plane.sides:
+        edges = [(in_row, across)]
+    else:
+        edges = []
+        for c_0, c_r, c_b in plane.sides:
+            side = c_0 + c_b * picture.below
+            edges += [(in_row - side, across - c_r), (in_row + side, across + c_r)]
+    least = np.full(len(in_row), -np.inf)
+    most = np.full(len(in_row), np.inf)
+    with np.errstate(divide="ignore", over="ignore"):
+        for constant, rate in edges:
+            if rate > 0:
+                least = np.maximum(least, -constant / rate)
+            elif rate < 0:
+                most = np.minimum(most, -constant / rate)
+            else:
+                most = np.where(constant < 0, -np.inf, most)
+    width = len(picture.right)
+    scale, shift = view.focal_px[0], view.centre_px[0] - 0.5
+    first = np.ceil(np.clip(least * scale + shift, -1, width)).clip(0).astype(np.int32)
+    last = np.floor(np.clip(most * scale + shift, -1, width)).clip(max=width - 1).astype(np.int32)
+    rows = np.flatnonzero(first <= last)
+    if not len(rows):
+        return
+    left, right = int(first[rows].min()), int(last[rows].max()) + 1
+    in_column = across * picture.right[left:right]
+    columns = np.arange(left, right, dtype=np.int32)
+    step = max(1, _BLOCK_PX // (right - left))
+    for top in range(int(rows[0]), int(rows[-1]) + 1, step):
+        block = slice(top, min(top + step, int(rows[-1]) + 1))
+        inverse = in_row[block, None] + in_column
+        kept = picture.inverse[block, left:right]
+        nearer = inverse > kept
+        if plane.sides:
+            nearer &= columns >= first[block, None]
+            nearer &= columns <= last[block, None]
+        np.copyto(kept, inverse, where=nearer)
+        np.copyto(picture.faces[block, left:right], plane.face, where=nearer)
+
+
+def _draw_ball(picture: _Picture, ball: Ball, *, bounds: tuple[float, float, float, float]) -> None:
+    left, right = np.searchsorted(picture.right, bounds[:2])
+    top, bottom = np.searchsorted(picture.below, bounds[2:])
+    if left == right:
+        return
+    step = max(1, _BLOCK_PX // int(right - left))
+    for start in range(int(top), int(bottom), step):
+        block = slice(start, min(start + step, int(bottom)))
+        inverse = ball_inverse(
+            ball, right=picture.right[left:right], below=picture.below[block, None]
+        )
+        kept = picture.inverse[block, left:right]
+        nearer = inverse > kept
+        np.copyto(kept, inverse, where=nearer)
+        np.copyto(picture.faces[block, left:right], ball.face, where=nearer)
+
+
+def ball_inverse(ball: Ball, *, right: Array, below: Array) -> Array:
+    """Return the inverse depth of an ellipsoid, nan where it is missed; arrays broadcast.
+
+    With q = |eye|^2 - 1 > 0, b = eye . ray and s = b^2 - |ray|^2 q, the depth is q / (-b + sqrt s).
+    """
+    c_0, c_r, c_b = ball.ray.T
+    outside = ball.eye @ ball.eye - 1
+    towards = (ball.eye @ c_0 + (ball.eye @ c_b) * below) + (ball.eye @ c_r) * right
+    squared = (c_0 @ c_0 + below * (2 * (c_0 @ c_b) + (c_b @ c_b) * below)) + right * (
+        2 * (c_0 @ c_r) + (c_r @ c_r) * right
+    )
+    squared += (2 * (c_r @ c_b) * below) * right
+    squared *= -outside
+    squared += towards * towards
+    with np.errstate(invalid="ignore"):
+        inverse = np.sqrt(squared)
+    inverse -= towards
+    inverse /= outside
+    # Behind the camera both are negative.
+    return np.where(towards < 0, inverse, np.nan)
+
+
+def _bounds(shape: Shape, *, view: View) -> tuple[float, float, float, float] | None:
+    """Return left, right, top and bottom bounds of a shape at depth 1; None if it is behind."""
     forward, right, up = ((shape.corners() - view.eye) @ view.axes).T
     if forward.max() <= 0:
-        return np.inf, -np.inf, np.inf, -np.inf
+        return None
     if forward.min() < _NEAREST_M:
         return -np.inf, np.inf, -np.inf, np.inf
     across, down = right / forward, -up / forward
     return float(across.min()), float(across.max()), float(down.min()), float(down.max())
+
+
+def hits_of_list(
+    view: View,
+    *,
+    right: Float64[np.ndarray, " n"],
+    below: Float64[np.ndarray, " n"],
+    shapes: Sequence[Shape],
+    slope: Float64[np.ndarray, "2"],
+    among: Sequence[tuple[int, Array]],
+) -> tuple[Float64[np.ndarray, " n"], Int32[np.ndarray, " n"]]:
+    """Return the inverse depth and the face of each ray's first hit.
+
+    Args:
+        view: The camera.
+        right: Where the rays pass to the right of the axis, at depth 1.
+        below: Where they pass below it.
+        shapes: The shapes.
+        slope: The ground's.
+        among: Numbers of shapes, each with the indices of the rays that may hit it.
+    """
+    inverse = np.zeros(len(right))
+    faces = np.zeros(len(right), np.int32)
+    c_0, c_r, c_b = ground_plane(view, slope=slope).inverse
+    ground = c_0 + c_r * right + c_b * below
+    np.copyto(inverse, ground, where=ground > 0)
+    np.copyto(faces, GROUND, where=ground > 0)
+    for number, index in among:
+        r, b = right[index], below[index]
+        for part in visible_parts(view, number=number, shape=shapes[number]):
+            if isinstance(part, Ball):
+                found = ball_inverse(part, right=r, below=b)
+            else:
+                c_0, c_r, c_b = part.inverse
+                found = c_0 + c_r * r + c_b * b
+                for s_0, s_r, s_b in part.sides:
+                    found[np.abs(s_0 + s_r * r + s_b * b) > found] = np.nan
+            nearer = found > inverse[index]
+            inverse[index[nearer]] = found[nearer]
+            faces[index[nearer]] = part.face
+    return inverse, faces

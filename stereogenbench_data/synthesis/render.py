@@ -4,22 +4,25 @@ Colours depend on the place on the surface and on the size of a pixel there, but
 direction. So a view that is warped into another view by its depth agrees with that view.
 """
 
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+import torch
+from jaxtyping import Float32, Float64, Int32, UInt8
+from torch.nn.functional import grid_sample
 
 from stereogenbench_data.synthesis.ray_casting import (
-    FIRST_SHAPE,
     GROUND,
     SKY,
-    Rays,
     View,
+    face_id,
     first_hits,
-    pixel_rays,
+    hits_of_list,
+    shape_of,
 )
-from stereogenbench_data.synthesis.scene import Material, SceneModel, Shape, entry_depth, surface
-from stereogenbench_data.synthesis.textures import sample_atlas, texture_row
+from stereogenbench_data.synthesis.scene import Material, SceneModel, Shape, entry_depth
+from stereogenbench_data.synthesis.textures import sample_atlas, sample_tile, texture_row
 
 Array = Any
 
@@ -31,10 +34,9 @@ _GRAIN_TILE_M: Final = 0.45
 _GRAIN_CONTRAST: Final = 2.0
 _BLUR_PX: Final = 0.8
 _SLANT_POWER: Final = 0.8
-_LEAST_SLANT: Final = np.float32(1e-3)
-_FACE_LIGHT: Final = 0.05
+_LEAST_SLANT: Final = 1e-3
 _SUBPIXELS: Final = np.array([(-1, -3), (3, -1), (1, 3), (-3, 1)]) / 8
-_SUBPIXEL_BATCH: Final = 1 << 15
+_STRIP_PX: Final = 1 << 17
 _LIGHT_TEXELS: Final = 512
 _SHADE: Final = 0.35
 
@@ -43,34 +45,38 @@ class SceneState:
     """A scene at one moment: its shapes, its materials and the sunlight on its ground."""
 
     def __init__(
-        self, scene: SceneModel, *, moment_s: float, static_light: Float64[np.ndarray, "side side"]
+        self,
+        scene: SceneModel,
+        *,
+        walker: Sequence[Shape],
+        static_light: Float64[np.ndarray, "side side"],
     ) -> None:
-        walker = scene.walker(moment_s)
         self.scene = scene
         self.shapes = [*scene.static_shapes, *walker]
         self.light = static_light.copy()
         for shape in walker:
             cast_shadow(self.light, shape=shape, scene=scene)
-        materials = (_SKY_MATERIAL, scene.ground, *(shape.material for shape in self.shapes))
-        rows = [(texture_row(each.texture), 1 / each.tile_m, *each.tint) for each in materials]
-        self.materials = np.array(rows, np.float32).T.copy()
-
-    def first_hits(self, rays: Rays, *, view: View) -> tuple[Array, Array]:
-        """Return the depth in metres of each ray's first hit, and the number of the solid."""
-        return first_hits(rays, view=view, shapes=self.shapes, slope=self.scene.slope)
+        self.light_map = torch.from_numpy(self.light.astype(np.float32))[None, None]
 
 
 def static_light(scene: SceneModel) -> Float64[np.ndarray, "side side"]:
-    """Return the map of sunlight on the ground, with the shadows of all static shapes."""
+    """Return the map of sunlight on the ground, with the shadows of things."""
     light = full_light()
-    for shape in scene.static_shapes:
+    for shape in scene.static_shapes[scene.shell :]:
         cast_shadow(light, shape=shape, scene=scene)
     return light
 
 
 def render_depth(state: SceneState, *, view: View) -> Float64[np.ndarray, "h w"]:
     """Return depth along the optical axis at pixel centres, in metres; the sky is infinite."""
-    return np.concatenate([state.first_hits(rays, view=view)[0] for _, rays in pixel_rays(view)])
+    inverse, _ = first_hits(view, shapes=state.shapes, slope=state.scene.slope)
+    return _depth_m(inverse)
+
+
+def _depth_m(inverse: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
+    with np.errstate(divide="ignore"):
+        depth_m: Float64[np.ndarray, "*n"] = 1 / inverse
+    return depth_m
 
 
 def render_frame(
@@ -78,137 +84,256 @@ def render_frame(
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Float64[np.ndarray, "h w"]]:
     """Return a picture with anti-aliased edges, and its depth as from `render_depth`."""
     width, height = view.size_px
-    colour = np.empty((height, width, 3), np.float32)
-    light = np.empty((height, width), np.float32)
-    depth_m = np.empty((height, width))
-    solid = np.empty((height, width), np.int64)
-    for rows, rays in pixel_rays(view):
-        near_m, met = depth_m[rows], solid[rows] = state.first_hits(rays, view=view)
-        strip, lit = _shaded(
-            state, view=view, rays=rays.listed(), depth_m=near_m.ravel(), solid=met.ravel()
+    inverse, faces = first_hits(view, shapes=state.shapes, slope=state.scene.slope)
+    depth_m = _depth_m(inverse)
+    right = view.right_of_axis(np.arange(width, dtype=np.float32) + np.float32(0.5))
+    below = view.below_axis(np.arange(height, dtype=np.float32) + np.float32(0.5))
+    picture = np.empty((height, width, 3), np.uint8)
+    step = max(1, _STRIP_PX // width)
+    for top in range(0, height, step):
+        rows = slice(top, min(top + step, height))
+        shape = (rows.stop - top, width)
+        colours = _shaded(
+            state,
+            view=view,
+            right=np.broadcast_to(right, shape).ravel(),
+            below=np.broadcast_to(below[rows, None], shape).ravel(),
+            depth_m=depth_m[rows].ravel().astype(np.float32),
+            faces=faces[rows].ravel(),
         )
-        colour[rows] = strip.T.reshape(-1, width, 3)
-        light[rows] = lit.reshape(-1, width)
-    _smooth_edges(colour, edges=_edges(solid, light=light), state=state, view=view)
-    return np.rint(colour * 255).astype(np.uint8), depth_m
-
-
-def _edges(
-    solid: Int64[np.ndarray, "h w"], *, light: Float32[np.ndarray, "h w"]
-) -> Bool[np.ndarray, "h w"]:
-    """Mark pixels beside another solid or another face of the same box."""
-    edges = np.zeros(solid.shape, bool)
-    for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        differ = solid[first] != solid[second]
-        differ |= np.abs(light[first] - light[second]) > _FACE_LIGHT
-        edges[first] |= differ
-        edges[second] |= differ
-    return edges
+        picture[rows] = colours.reshape(*shape, 3)
+    _smooth_edges(picture, faces=faces, state=state, view=view)
+    return picture, depth_m
 
 
 def _smooth_edges(
-    colour: Float32[np.ndarray, "h w 3"],
+    picture: UInt8[np.ndarray, "h w 3"],
     *,
-    edges: Bool[np.ndarray, "h w"],
+    faces: Int32[np.ndarray, "h w"],
     state: SceneState,
     view: View,
 ) -> None:
-    """Replace marked pixels, in place, by the mean of four rays per pixel."""
+    """Replace pixels beside another face, in place, by the mean of four rays per pixel.
+
+    A ray is tested against the shapes that the pixel and its four neighbours see.
+    """
+    edges = np.zeros(faces.shape, bool)
+    for first, second in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        differ = faces[first] != faces[second]
+        edges[first] |= differ
+        edges[second] |= differ
     rows, columns = np.nonzero(edges)
-    for start in range(0, len(rows), _SUBPIXEL_BATCH):
-        v, u = rows[start : start + _SUBPIXEL_BATCH], columns[start : start + _SUBPIXEL_BATCH]
-        rays = Rays(
-            view.right_of_axis(u + 0.5 + _SUBPIXELS[:, :1]).ravel(),
-            view.below_axis(v + 0.5 + _SUBPIXELS[:, 1:]).ravel(),
+    height, width = faces.shape
+    step = _STRIP_PX // len(_SUBPIXELS)
+    for start in range(0, len(rows), step):
+        v, u = rows[start : start + step], columns[start : start + step]
+        near = np.stack(
+            [
+                faces[v, u],
+                faces[v, np.maximum(u - 1, 0)],
+                faces[v, np.minimum(u + 1, width - 1)],
+                faces[np.maximum(v - 1, 0), u],
+                faces[np.minimum(v + 1, height - 1), u],
+            ]
         )
-        depth_m, solid = state.first_hits(rays, view=view)
-        drawn, _ = _shaded(state, view=view, rays=rays, depth_m=depth_m, solid=solid)
-        colour[v, u] = drawn.reshape(3, len(_SUBPIXELS), -1).mean(axis=1).T
+        shapes = np.where(near >= face_id(0), shape_of(near), -1)
+        offsets = len(v) * np.arange(len(_SUBPIXELS))[:, None]
+        among = [
+            (int(number), (offsets + np.flatnonzero((shapes == number).any(axis=0))).ravel())
+            for number in np.flatnonzero(np.bincount(shapes.ravel() + 1)[1:])
+        ]
+        right = view.right_of_axis(u + 0.5 + _SUBPIXELS[:, :1]).ravel()
+        below = view.below_axis(v + 0.5 + _SUBPIXELS[:, 1:]).ravel()
+        inverse, met = hits_of_list(
+            view,
+            right=right,
+            below=below,
+            shapes=state.shapes,
+            slope=state.scene.slope,
+            among=among,
+        )
+        colours = _shaded(
+            state,
+            view=view,
+            right=right.astype(np.float32),
+            below=below.astype(np.float32),
+            depth_m=_depth_m(inverse).astype(np.float32),
+            faces=met,
+        )
+        rays = colours.reshape(len(_SUBPIXELS), len(v), 3)
+        picture[v, u] = (rays.sum(axis=0, dtype=np.uint16) + len(rays) // 2) // len(rays)
+
+
+class _Lit(NamedTuple):
+    """Where rays meet one surface: the place on its texture, how they slant, and its light."""
+
+    u_m: Array
+    v_m: Array
+    slant: Array
+    light: Array
 
 
 def _shaded(
-    state: SceneState, *, view: View, rays: Rays, depth_m: Array, solid: Array
-) -> tuple[Float32[np.ndarray, "3 n"], Float32[np.ndarray, " n"]]:
-    """Return colours in 0..1, and the light alone, which differs between the faces of a box."""
-    place_m = np.empty((2, solid.size), np.float32)
-    footprint_m, slant, light = np.empty((3, solid.size), np.float32)
-    for number in np.flatnonzero(np.bincount(solid)):
-        index = np.flatnonzero(solid == number)
-        part = Rays(rays.right[index], rays.below[index])
-        reach = 1.0 if number == SKY else depth_m[index]
-        if number == SKY:
-            met = _on_sky(part, view=view)
-        elif number == GROUND:
-            met = _on_ground(part, view=view, state=state, depth_m=reach)
+    state: SceneState,
+    *,
+    view: View,
+    right: Float32[np.ndarray, " n"],
+    below: Float32[np.ndarray, " n"],
+    depth_m: Float32[np.ndarray, " n"],
+    faces: Int32[np.ndarray, " n"],
+) -> UInt8[np.ndarray, "n 3"]:
+    """Return the colours of what rays meet."""
+    # Neighbours on one surface are shaded together.
+    order = np.argsort(faces.astype(np.int16), kind="stable")
+    sorted_faces = faces[order]
+    ends = np.append(np.flatnonzero(np.diff(sorted_faces)) + 1, len(order))
+    right, below, depth_m = right[order], below[order], depth_m[order]
+    length = np.sqrt(1 + right * right + below * below)
+    # One number of 32 bits a pixel goes back to its place faster than three of 8.
+    colours = np.empty(len(order), np.uint32)
+    channels = colours.view(np.uint8).reshape(-1, 4)
+    start = 0
+    for end in ends.tolist():
+        part = slice(start, end)
+        rays = _Rays(right[part], below[part], depth_m[part], length[part])
+        face = int(sorted_faces[start])
+        if face == SKY:
+            material, lit = _SKY_MATERIAL, _on_sky(rays, view=view)
+            rays = rays._replace(depth_m=np.ones_like(rays.depth_m))
+        elif face == GROUND:
+            material, lit = state.scene.ground, _on_ground(rays, view=view, state=state)
         else:
-            shape = state.shapes[number - FIRST_SHAPE]
-            met = _on_shape(part, view=view, shape=shape, depth_m=reach, sun=state.scene.sun)
-        place_m[0, index], place_m[1, index], slant[index], light[index] = met
-        footprint_m[index] = reach
-    footprint_m *= np.maximum(slant, _LEAST_SLANT) ** np.float32(-_SLANT_POWER)
-    footprint_m *= _BLUR_PX / max(view.focal_px)
-    return _painted(
-        state.materials[:, solid], place_m=place_m, footprint_m=footprint_m, light=light
-    ), light
+            shape = state.shapes[int(shape_of(np.int64(face)))]
+            on = _on_face if shape.kind == "box" else _on_ball
+            material, lit = shape.material, on(rays, view, shape, face, state.scene.sun)
+        painted = _painted(material, lit, rays, focal_px=max(view.focal_px))
+        painted *= 255
+        painted += np.float32(0.5)
+        channels[part, :3] = painted.T
+        start = end
+    result = np.empty_like(colours)
+    result[order] = colours
+    return result.view(np.uint8).reshape(-1, 4)[:, :3]
+
+
+class _Rays(NamedTuple):
+    """Rays by their places at depth 1, with the depth of their hits and their length at depth 1."""
+
+    right: Array
+    below: Array
+    depth_m: Array
+    length: Array
+
+    def along(self, coefficients: Array) -> Array:
+        """Return a quantity that is affine in the rays' places, by its three coefficients."""
+        ahead, right, below = coefficients.astype(np.float32)
+        return ahead + right * self.right + below * self.below
 
 
 def _painted(
-    materials: Float32[np.ndarray, "5 n"],
-    *,
-    place_m: Float32[np.ndarray, "2 n"],
-    footprint_m: Float32[np.ndarray, " n"],
-    light: Float32[np.ndarray, " n"],
+    material: Material, lit: _Lit, rays: _Rays, *, focal_px: float
 ) -> Float32[np.ndarray, "3 n"]:
-    """Return textures times their tint, the light and, except for the sky, a fine grain."""
-    row, tiles_per_m, *tint = materials
-    grain = sample_atlas(
-        tiles=place_m / np.float32(_GRAIN_TILE_M),
-        rows=np.full_like(row, texture_row("grain")),
-        footprint_tiles=footprint_m / np.float32(_GRAIN_TILE_M),
-    )[0]
-    contrast = np.where(row == texture_row(_SKY_MATERIAL.texture), 0, np.float32(_GRAIN_CONTRAST))
+    """Return a texture times its tint, the light and, except for the sky, a fine grain."""
+    # The mip level is the binary logarithm of the texels that one pixel covers.
+    log_depth = torch.from_numpy(rays.depth_m * np.float32(_BLUR_PX / focal_px)).log2_()
+    slant = torch.from_numpy(np.maximum(lit.slant, np.float32(_LEAST_SLANT)))
+    log_footprint: Array = (log_depth - slant.log2_() * _SLANT_POWER).numpy()
+    per_m = np.float32(1 / material.tile_m)
     colour = sample_atlas(
-        tiles=place_m * tiles_per_m, rows=row, footprint_tiles=footprint_m * tiles_per_m
+        lit.u_m * per_m,
+        lit.v_m * per_m,
+        row=texture_row(material.texture),
+        log_footprint=log_footprint + np.float32(np.log2(per_m)),
     )
-    colour *= light * (1 + contrast * (grain - np.float32(0.5)))
-    colour *= np.stack(tint)
+    light = lit.light
+    if material is not _SKY_MATERIAL:
+        per_m = np.float32(1 / _GRAIN_TILE_M)
+        grain = sample_tile(
+            lit.u_m * per_m,
+            lit.v_m * per_m,
+            row=texture_row("grain"),
+            log_footprint=log_footprint + np.float32(np.log2(per_m)),
+        )
+        contrast = np.float32(_GRAIN_CONTRAST)
+        light = light * (np.float32(1 - 0.5 * _GRAIN_CONTRAST) + contrast * grain)
+    colour *= light
+    colour *= np.array(material.tint, np.float32)[:, None]
     return np.clip(colour, 0, 1, out=colour)
 
 
-def _lit(*, sunward: Array, upward: Array, sunlight: Array) -> Array:
+def _light(*, sunward: Array, upward: Array, sunlight: Array) -> Array:
     return _AMBIENT + _SKYLIGHT * upward + _SUNLIGHT * sunlight * np.maximum(sunward, 0)
 
 
-def _on_sky(rays: Rays, *, view: View) -> tuple[Array, Array, Array, Array]:
-    """Return u, v, facing and light on a layer of clouds that curves down to the horizon."""
-    x, y, z = rays.directions(view.axes)
-    length = np.sqrt(x * x + y * y + z * z)
-    height = np.abs(z) / length + 0.15
-    return x / length / height, y / length / height, height**2, 1.06 - 0.25 * height
+def _on_sky(rays: _Rays, *, view: View) -> _Lit:
+    """Return places on a layer of clouds that curves down to the horizon."""
+    x, y, z = (rays.along(row) / rays.length for row in view.ray)
+    height = np.abs(z) + np.float32(0.15)
+    return _Lit(x / height, y / height, height**2, np.float32(1.06) - np.float32(0.25) * height)
 
 
-def _on_ground(
-    rays: Rays, *, view: View, state: SceneState, depth_m: Array
-) -> tuple[Array, Array, Array, Array]:
+def _on_ground(rays: _Rays, *, view: View, state: SceneState) -> _Lit:
     scene = state.scene
-    directions = np.stack(rays.directions(view.axes))
-    x_m, y_m = view.eye[:2, None] + depth_m * directions[:2]
-    normal = np.array([*-scene.slope, 1.0]) / np.sqrt(1 + scene.slope @ scene.slope)
-    facing = np.abs(normal @ directions) / np.sqrt((directions * directions).sum(axis=0))
-    sunlight = sunlight_at(state.light, x_m=x_m, y_m=y_m, scene=scene)
-    return x_m, y_m, facing, _lit(sunward=normal @ scene.sun, upward=normal[2], sunlight=sunlight)
-
-
-def _on_shape(
-    rays: Rays, *, view: View, shape: Shape, depth_m: Array, sun: Array
-) -> tuple[Array, Array, Array, Array]:
-    origin, axes = view.in_unit_solid(shape)
-    directions = np.stack(rays.directions(axes))
-    met = surface(
-        shape, point=origin[:, None] + depth_m * directions, direction=directions, sun=sun
+    x_m, y_m = (
+        np.float32(eye) + rays.depth_m * rays.along(row)
+        for eye, row in zip(view.eye[:2], view.ray[:2], strict=True)
     )
-    light = _lit(sunward=met.sunward, upward=met.upward, sunlight=1.0)
-    return met.u_m, met.v_m, met.facing, light
+    normal = np.array([*-scene.slope, 1.0]) / np.sqrt(1 + scene.slope @ scene.slope)
+    sunlight = _sunlight_at(state.light_map, x_m=x_m, y_m=y_m, scene=scene)
+    return _Lit(
+        x_m,
+        y_m,
+        np.abs(rays.along(normal @ view.ray)) / rays.length,
+        _light(
+            sunward=np.float32(normal @ scene.sun), upward=np.float32(normal[2]), sunlight=sunlight
+        ),
+    )
+
+
+def _on_face(rays: _Rays, view: View, shape: Shape, face: int, sun: Array) -> _Lit:
+    """Return places on a face of a box; its texture lies in its plane."""
+    axis, up = divmod((face - face_id(0)) % 6, 2)
+    normal = shape.axes[axis] * (1.0 if up else -1.0)
+    across, along = (1, 2) if axis == 0 else (0, 2) if axis == 1 else (0, 1)
+    shift = 7.3 * shape.centre.sum()
+    u_m, v_m = (
+        np.float32(shape.axes[other] @ (view.eye - shape.centre) + offset)
+        + rays.depth_m * rays.along(shape.axes[other] @ view.ray)
+        for other, offset in ((across, shift + 0.37 * axis), (along, shift))
+    )
+    light = _light(sunward=normal @ sun, upward=normal[2], sunlight=1.0)
+    return _Lit(u_m, v_m, np.abs(rays.along(normal @ view.ray)) / rays.length, np.float32(light))
+
+
+def _on_ball(rays: _Rays, view: View, shape: Shape, face: int, sun: Array) -> _Lit:
+    """Return places on an ellipsoid, textured like a box, along the axes across its normal."""
+    eye, ray = view.in_unit_solid(shape)
+    directions = np.stack([rays.along(row) for row in ray])
+    point = eye.astype(np.float32)[:, None] + rays.depth_m * directions
+    half_m = shape.half_m.astype(np.float32)[:, None]
+    gradient = point / half_m
+    side = np.abs(gradient).argmax(axis=0)
+    normal = gradient / np.sqrt((gradient * gradient).sum(axis=0))
+    place_m = point * half_m + np.float32(7.3 * shape.centre.sum())
+    return _Lit(
+        np.where(side == 0, place_m[1], place_m[0]) + np.float32(0.37) * side.astype(np.float32),
+        np.where(side == 2, place_m[1], place_m[2]),
+        np.abs((normal * (directions * half_m)).sum(axis=0)) / rays.length,
+        _light(
+            sunward=(shape.axes @ sun).astype(np.float32) @ normal,
+            upward=shape.axes[:, 2].astype(np.float32) @ normal,
+            sunlight=np.float32(1),
+        ),
+    )
+
+
+def _sunlight_at(
+    light: torch.Tensor, *, x_m: Array, y_m: Array, scene: SceneModel
+) -> Float32[np.ndarray, " n"]:
+    """Return the interpolated light at places on the ground; beyond the map, that of its border."""
+    grid = torch.from_numpy(np.stack([x_m, y_m], axis=-1) / np.float32(scene.shadow_range_m))
+    found = grid_sample(light, grid[None, None], padding_mode="border", align_corners=False)
+    return found[0, 0, 0].numpy()
 
 
 def full_light() -> Float64[np.ndarray, "side side"]:
@@ -244,14 +369,11 @@ def cast_shadow(
 
 def sunlight_at(
     light: Float64[np.ndarray, "side side"], *, x_m: Array, y_m: Array, scene: SceneModel
-) -> Array:
+) -> Float32[np.ndarray, " n"]:
     """Return the interpolated light at places on the ground; beyond the map, that of its border."""
-    place = np.clip(_texel_of(np.stack([x_m, y_m]).T, scene=scene), 0, _LIGHT_TEXELS - 1.001)
-    corner = place.astype(int)
-    (across, down), (column, row) = (place - corner).T, corner.T
-    upper = light[row, column] * (1 - across) + light[row, column + 1] * across
-    lower = light[row + 1, column] * (1 - across) + light[row + 1, column + 1] * across
-    return upper * (1 - down) + lower * down
+    light_map = torch.from_numpy(light.astype(np.float32))[None, None]
+    places = (np.asarray(each, np.float32) for each in (x_m, y_m))
+    return _sunlight_at(light_map, **dict(zip(("x_m", "y_m"), places, strict=True)), scene=scene)
 
 
 def _texel_of(place_m: Array, *, scene: SceneModel) -> Array:

@@ -85,7 +85,8 @@ class SynthRequest:
         frames: The number of frames, at 15 Hz.
         seed: Determines all random choices, together with a scene's number and folder.
         split: ``train`` or ``eval``; ``subset`` (of maps) applies only to eval.
-        map_name: The folder of the scenes.
+        map_name: The map of the scenes, which names their folder; or several, of which each
+            proposal draws one.
         focal_mm: The focal length; None for a random one in 18..85 mm per scene.
         world_offset_cm: The largest distance of a scene from the world's origin, along each axis.
         contract: How the files are written.
@@ -102,7 +103,7 @@ class SynthRequest:
     seed: int = 0
     split: Split = "train"
     subset: Subset = "seen_map"
-    map_name: str = "SynthStage"
+    map_name: str | tuple[str, ...] = "SynthStage"
     focal_mm: float | None = None
     world_offset_cm: float = OFFSET_RANGE_CM
     contract: ExportContract = field(default_factory=ExportContract)
@@ -128,10 +129,7 @@ class SynthRequest:
                     f"{name} must be an even number of pixels in 2..{_LARGEST_PX} (yuv420p "
                     f"halves the colour), got {value}."
                 )
-        if not (self.map_name.isascii() and self.map_name.replace("_", "").isalnum()):
-            raise SynthesisError(
-                f"map_name must be letters, digits and underscores, got {self.map_name!r}."
-            )
+        _require_maps(self.maps)
         if self.focal_mm is not None:
             _require_positive("focal_mm", self.focal_mm)
         if not 0 <= self.world_offset_cm <= OFFSET_RANGE_CM:
@@ -145,16 +143,33 @@ class SynthRequest:
         return self.size_px, self.size_px if self.height_px is None else self.height_px
 
     @property
-    def folder(self) -> str:
-        """The folder of the scenes below the root, with forward slashes."""
-        if self.split == "train":
-            return f"train/{self.family}/{self.map_name}"
-        subset = SEEN_MAP_FOLDER if self.subset == "seen_map" else _UNSEEN_MAP_FOLDER
-        return f"eval/{subset}/{self.family}/{self.map_name}"
+    def maps(self) -> tuple[str, ...]:
+        """The maps that proposals draw from."""
+        return (self.map_name,) if isinstance(self.map_name, str) else self.map_name
 
-    def key(self, index: int) -> str:
-        """Return the key of a scene: its whole path below the root."""
-        return f"{self.folder}/scene_{index:06d}"
+    @property
+    def stream(self) -> str:
+        """What tells the random numbers of this request from others of the same seed."""
+        return self.folder("+".join(self.maps))
+
+    def folder(self, map_name: str) -> str:
+        """Return the folder of a map's scenes below the root, with forward slashes."""
+        if self.split == "train":
+            return f"train/{self.family}/{map_name}"
+        subset = SEEN_MAP_FOLDER if self.subset == "seen_map" else _UNSEEN_MAP_FOLDER
+        return f"eval/{subset}/{self.family}/{map_name}"
+
+    def key(self, index: int, *, map_name: str | None = None) -> str:
+        """Return the key of a scene, its whole path below the root; by default in the first map."""
+        return f"{self.folder(map_name or self.maps[0])}/scene_{index:06d}"
+
+
+def _require_maps(names: tuple[str, ...]) -> None:
+    for name in names or ("",):
+        if not (name.isascii() and name.replace("_", "").isalnum()):
+            raise SynthesisError(f"map_name must be letters, digits and underscores, got {name!r}.")
+    if len(set(names)) < len(names):
+        raise SynthesisError(f"map_name has a map twice: {', '.join(names)}.")
 
 
 def _require_choice(name: str, value: object, *, choices: tuple[object, ...]) -> None:

@@ -1,16 +1,13 @@
-"""A synthetic 3-D scene: a slanted ground, a backdrop, boxes, balls, poles and a walking figure.
+"""What a built-in scene is made of: boxes and ellipsoids on a plane, and a walking figure.
 
-Scene axes are Unreal's (x forward, y right, z up), in metres. The subject walks around the origin
-and the cameras are at negative x. Sizes follow the width of the picture at the depth of an object,
-so that a picture is full at any focal length.
+Axes are those of a map (x forward, y right, z up), in metres.
 
 A ray is origin + t * direction. Where directions have a component of exactly 1 along the optical
 axis, t is the depth along that axis.
 """
 
-import colorsys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -18,12 +15,9 @@ from jaxtyping import Float64
 
 Array = Any
 
-_GROUNDS: Final = ("soil", "mosaic", "bricks", "boards")
-_WALLS: Final = ("bricks", "plaster", "boards", "mosaic")
-_THINGS: Final = ("boards", "weave", "mosaic", "plaster", "soil", "bricks")
-_CLOTHES: Final = ("weave", "plaster", "mosaic")
 _UP: Final = np.array([0.0, 0.0, 1.0])
-_STRIDE_S: Final = 1.1
+_SIGNS: Final = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
+_BATCH_RAYS: Final = 4096
 _PARALLEL: Final = 1e-300
 """Replaces 0 for a ray parallel to a face: it enters and leaves the slab at infinity."""
 
@@ -55,8 +49,7 @@ class Shape:
 
     def corners(self) -> Float64[np.ndarray, "8 3"]:
         """Return the corners of the solid's bounding box along its own axes."""
-        signs = np.array(np.meshgrid(*[(-1.0, 1.0)] * 3)).reshape(3, 8).T
-        corners: Float64[np.ndarray, "8 3"] = self.centre + (signs * self.half_m) @ self.axes
+        corners: Float64[np.ndarray, "8 3"] = self.centre + (_SIGNS * self.half_m) @ self.axes
         return corners
 
 
@@ -65,13 +58,17 @@ def limb(
     end: Float64[np.ndarray, "3"],
     *,
     radius_m: float,
+    side: Float64[np.ndarray, "3"],
     material: Material,
 ) -> Shape:
-    """Return an ellipsoid along the line between two joints, a little longer than the line."""
+    """Return an ellipsoid along the line between two joints, a little longer than the line.
+
+    ``side`` is a unit direction that is not along the line.
+    """
     along = end - start
     length = float(np.linalg.norm(along))
     first = along / length
-    second = np.cross(first, [1.0, 0.0, 0.0])
+    second = np.cross(first, side)
     second /= np.linalg.norm(second)
     axes = np.stack([first, second, np.cross(first, second)])
     half_m = np.array([length / 2 + 0.5 * radius_m, radius_m, radius_m])
@@ -149,46 +146,23 @@ def surface(shape: Shape, *, point: Array, direction: Array, sun: Array) -> Surf
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Framing:
-    """The part of a scene that the cameras see.
-
-    Attributes:
-        distance_m: Distance from the cameras to the subject.
-        width_per_m: Width of the picture at one metre, in metres.
-        span_m: Distance from the first camera to the last.
-        pixel_per_m: Width of a pixel at one metre, in metres.
-    """
-
-    distance_m: float
-    width_per_m: float
-    span_m: float
-    pixel_per_m: float
-
-    def width_m(self, x_m: float) -> float:
-        """Return the width of the picture at a place in the scene."""
-        return (x_m + self.distance_m) * self.width_per_m
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneModel:
-    """The contents of a scene.
+    """A map without its subject.
 
     Attributes:
-        slope: (2,) rise of the ground per metre along x and y.
+        slope: (2,) rise of the ground per metre along x and y; the ground passes the origin.
         ground: The ground's material.
-        static_shapes: The shapes that do not move.
-        clothes: Three materials of the walker: skin, upper and lower clothes.
-        walk_m_s: Speed of the walker, positive to the right.
+        static_shapes: The shapes, none of which moves.
+        shell: How many of the first shapes, walls and ceilings, cast no shadow on the ground.
         sun: (3,) unit direction to the sun.
-        shadow_range_m: Distance from the origin up to which there are shadows.
+        shadow_range_m: Distance from the origin, along x and y, up to which there are shadows.
     """
 
     slope: Float64[np.ndarray, "2"]
     ground: Material
     static_shapes: tuple[Shape, ...]
-    clothes: tuple[Material, Material, Material]
-    walk_m_s: float
+    shell: int
     sun: Float64[np.ndarray, "3"]
     shadow_range_m: float
 
@@ -196,163 +170,144 @@ class SceneModel:
         """Return the ground's height at a place."""
         return float(self.slope @ (x_m, y_m))
 
-    def walker(self, moment_s: float) -> list[Shape]:
-        """Return the walker's limbs at a time."""
-        y_m = self.walk_m_s * moment_s
-        hips = np.array([0.0, y_m, self.ground_m(0.0, y_m) + 0.93])
-        swing = 2 * np.pi * moment_s / _STRIDE_S
-        return _limbs(hips, swing=swing, heading=np.sign(self.walk_m_s), clothes=self.clothes)
+    def distances(
+        self, origins_m: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, " n"]:
+        """Return how far rays of unit direction go until they meet the map, as `World.cast`."""
+        result = np.empty(len(origins_m))
+        for start in range(0, len(origins_m), _BATCH_RAYS):
+            batch = slice(start, start + _BATCH_RAYS)
+            result[batch] = self._distances(origins_m[batch].T, directions[batch].T)
+        return result
 
+    def _distances(self, origins_m: Array, directions: Array) -> Array:
+        rise_x, rise_y = self.slope
+        above = origins_m[2] - rise_x * origins_m[0] - rise_y * origins_m[1]
+        descent = rise_x * directions[0] + rise_y * directions[1] - directions[2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            nearest = np.where(descent > 0, above / descent, np.inf)
+        nearest = np.where(above <= 0, 0.0, nearest)
+        for shape, near in zip(
+            self.static_shapes, self._may_meet(origins_m, directions), strict=True
+        ):
+            index = np.flatnonzero(near)
+            if not len(index):
+                continue
+            apart = [o[index] - c for o, c in zip(origins_m, shape.centre, strict=True)]
+            from_world = shape.axes / shape.half_m[:, None]
+            origin = [a * apart[0] + b * apart[1] + c * apart[2] for a, b, c in from_world]
+            if shape.kind == "box":
+                inside = np.maximum(np.maximum(abs(origin[0]), abs(origin[1])), abs(origin[2])) < 1
+            else:
+                inside = sum(o * o for o in origin) < 1
+            x, y, z = (d[index] for d in directions)
+            ray = [a * x + b * y + c * z for a, b, c in from_world]
+            met = np.where(inside, 0.0, entry_depth(shape, origin=origin, direction=ray))
+            nearest[index] = np.minimum(nearest[index], met)
+        return nearest
 
-def random_scene(rng: np.random.Generator, *, framing: Framing, walk_m_s: float) -> SceneModel:
-    """Return a random scene for a framing, without its cameras."""
-    slope = rng.uniform(-0.07, 0.07, 2)
-    towards = rng.uniform(np.radians(-75), np.radians(75))
-    height = rng.uniform(np.radians(32), np.radians(58))
-    sun = np.array(
-        [-np.cos(height) * np.cos(towards), np.cos(height) * np.sin(towards), np.sin(height)]
-    )
-    static_shapes = [
-        *_backdrop(rng, framing=framing),
-        *_objects(rng, framing=framing),
-        *_poles(rng, framing=framing),
-    ]
-    return SceneModel(
-        slope=slope,
-        ground=_material(rng, textures=_GROUNDS, tile_m=(2.0, 4.0)),
-        # The shapes stand on a level ground; here they are raised to the slanted one.
-        static_shapes=tuple(
-            replace(shape, centre=shape.centre + _UP * (slope @ shape.centre[:2]))
-            for shape in static_shapes
-        ),
-        clothes=(
-            Material("plaster", 0.5, (1.5, 1.05, 0.8)),
-            _material(rng, textures=_CLOTHES, tile_m=(0.3, 0.8)),
-            _material(rng, textures=_CLOTHES, tile_m=(0.3, 0.8)),
-        ),
-        walk_m_s=walk_m_s,
-        sun=sun,
-        shadow_range_m=3 * framing.distance_m + 4,
-    )
+    def _may_meet(self, origins_m: Array, directions: Array) -> Array:
+        """Return for each shape which rays pass its bounding sphere."""
+        centres, radii_m = self._spheres
+        ahead = centres @ directions - (origins_m * directions).sum(axis=0)
+        squared = (centres * centres).sum(axis=1)[:, None] - 2 * (centres @ origins_m)
+        squared += (origins_m * origins_m).sum(axis=0)
+        radii_m = radii_m[:, None] * 1.001 + 0.001
+        return (ahead > -radii_m) & (squared - ahead * ahead < radii_m * radii_m)
 
-
-def _material(
-    rng: np.random.Generator, *, textures: tuple[str, ...], tile_m: tuple[float, float]
-) -> Material:
-    hue, saturation, value = rng.uniform((0, 0.03, 1.15), (1, 0.4, 1.5))
-    red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
-    texture = textures[int(rng.integers(len(textures)))]
-    return Material(texture, float(rng.uniform(*tile_m)), (red, green, blue))
-
-
-def _rotated_axes(*, yaw: float, tilt: float = 0.0) -> Array:
-    """Return the axes of a solid that is turned around the vertical and then tilted."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    upright = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    c, s = np.cos(tilt), np.sin(tilt)
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]]) @ upright
-
-
-def _backdrop(rng: np.random.Generator, *, framing: Framing) -> list[Shape]:
-    """Return buildings and walls behind the subject, with gaps that show the sky."""
-    shapes = []
-    for x_m in framing.distance_m * rng.uniform(1.5, 3.5, 9) + 2:
-        view_m = framing.width_m(x_m)
-        half_m = view_m * rng.uniform((0.05, 0.08, 0.08), (0.1, 0.22, 0.3))
-        y_m = rng.uniform(-0.6, 0.6) * (view_m + framing.span_m)
-        shapes.append(
-            Shape(
-                "box",
-                np.array([x_m, y_m, half_m[2] * 0.98]),
-                _rotated_axes(yaw=rng.uniform(-0.5, 0.5)),
-                half_m,
-                _material(rng, textures=_WALLS, tile_m=(2.0, 4.0)),
-            )
-        )
-    return shapes
-
-
-def _objects(rng: np.random.Generator, *, framing: Framing) -> list[Shape]:
-    """Return crates and balls in front of and behind the subject, from near to far."""
-    shapes = []
-    near, far = -0.55 * framing.distance_m, 1.6 * framing.distance_m
-    for place in (np.arange(16) + rng.uniform(0, 1, 16)) / 16:
-        x_m = near + place * (far - near)
-        view_m = framing.width_m(x_m)
-        half_m = view_m * rng.uniform(0.025, 0.075) * rng.uniform(0.7, 1.4, 3)
-        y_m = rng.uniform(-0.5, 0.5) * (view_m + framing.span_m)
-        if abs(x_m) < 0.4 + half_m.max():
-            x_m = 0.6 + 2 * half_m.max()
-        is_box = rng.random() < 0.55
-        tilt = rng.uniform(-0.6, 0.6) if rng.random() < 0.4 else 0.0
-        shapes.append(
-            Shape(
-                "box" if is_box else "ellipsoid",
-                np.array([x_m, y_m, half_m[2] * rng.uniform(0.75, 0.98)]),
-                _rotated_axes(yaw=rng.uniform(0, np.pi), tilt=tilt),
-                half_m,
-                _material(rng, textures=_THINGS, tile_m=(0.6, 2.0)),
-            )
-        )
-    return shapes
-
-
-def _poles(rng: np.random.Generator, *, framing: Framing) -> list[Shape]:
-    """Return thin upright posts, a few pixels wide, some of them nearer than the subject."""
-    shapes = []
-    for x_part in (*rng.uniform(-0.6, -0.25, 3), *rng.uniform(0.4, 1.6, 4)):
-        x_m = x_part * framing.distance_m + (0.8 if x_part > 0 else 0.0)
-        depth_m = x_m + framing.distance_m
-        relative = rng.uniform(0.002, 0.006) * framing.width_per_m
-        width_m = depth_m * max(relative, 2.2 * framing.pixel_per_m)
-        height_m = framing.width_m(x_m) * rng.uniform(0.3, 0.8) + 0.5
-        y_m = rng.uniform(-0.45, 0.45) * (framing.width_m(x_m) + framing.span_m)
-        shapes.append(
-            Shape(
-                "box",
-                np.array([x_m, y_m, 0.48 * height_m]),
-                _rotated_axes(yaw=rng.uniform(0, np.pi), tilt=rng.uniform(-0.12, 0.12)),
-                np.array([width_m / 2, width_m / 2, height_m / 2]),
-                _material(rng, textures=_WALLS, tile_m=(0.3, 0.8)),
-            )
-        )
-    return shapes
-
-
-def _limbs(
-    hips: Float64[np.ndarray, "3"],
-    *,
-    swing: float,
-    heading: float,
-    clothes: tuple[Material, Material, Material],
-) -> list[Shape]:
-    """Return the limbs of a figure, about 1.75 m tall, that walks along y."""
-    skin, upper, lower = clothes
-    ahead, side = np.array([0.0, heading, 0.0]), np.array([1.0, 0.0, 0.0])
-    hips = hips + _UP * 0.025 * np.cos(2 * swing)
-    neck = hips + 0.52 * _UP + 0.03 * ahead
-    shapes = [
-        limb(hips, neck, radius_m=0.17, material=upper),
-        limb(hips - 0.04 * _UP, hips + 0.1 * _UP, radius_m=0.16, material=lower),
-        limb(neck + 0.1 * _UP, neck + 0.27 * _UP, radius_m=0.1, material=skin),
-    ]
-    for sign in (-1.0, 1.0):
-        phase = sign * np.sin(swing)
-        lag = sign * np.sin(swing - 0.9)
-        hip = hips + 0.1 * sign * side
-        knee = hip + 0.43 * _limb_direction(0.5 * phase, ahead)
-        heel = knee + 0.42 * _limb_direction(0.5 * phase - 0.35 - 0.35 * lag, ahead)
-        shoulder = neck + 0.2 * sign * side - 0.04 * _UP
-        elbow = shoulder + 0.29 * _limb_direction(-0.5 * phase, ahead) + 0.04 * sign * side
-        hand = elbow + 0.27 * _limb_direction(0.3 - 0.5 * phase, ahead)
-        shapes += [
-            limb(hip, knee, radius_m=0.09, material=lower),
-            limb(knee, heel, radius_m=0.065, material=lower),
-            limb(heel, heel + 0.17 * ahead, radius_m=0.05, material=skin),
-            limb(shoulder, elbow, radius_m=0.055, material=upper),
-            limb(elbow, hand, radius_m=0.045, material=skin),
+    @property
+    def _spheres(self) -> tuple[Array, Array]:
+        """Centres and radii of spheres around the shapes."""
+        centres = np.array([shape.centre for shape in self.static_shapes]).reshape(-1, 3)
+        radii_m = [
+            np.sqrt(shape.half_m @ shape.half_m) if shape.kind == "box" else shape.half_m.max()
+            for shape in self.static_shapes
         ]
-    return shapes
+        return centres, np.array(radii_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure, about 1.75 m tall, that walks straight ahead.
+
+    Attributes:
+        clothes: Materials of its skin, upper and lower clothes.
+        walk_m_s: How fast it goes ahead.
+        stride_s: How long two steps take.
+        scale: Its size as a multiple of the usual one.
+    """
+
+    clothes: tuple[Material, Material, Material]
+    walk_m_s: float
+    stride_s: float
+    scale: float
+
+    def limbs(
+        self, *, start_m: Float64[np.ndarray, "3"], yaw_deg: float, rise: float, moment_s: float
+    ) -> list[Shape]:
+        """Return its limbs at a time.
+
+        Args:
+            start_m: Its place on the ground at time 0.
+            yaw_deg: Where it faces.
+            rise: Rise of the ground per metre in that direction.
+            moment_s: The time.
+        """
+        first, second, radii_m = self._bones(start_m, yaw_deg, rise, moment_s)
+        yaw = np.radians(yaw_deg)
+        side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+        skin, upper, lower = self.clothes
+        materials = (upper, lower, skin, *(lower, lower, skin, upper, skin) * 2)
+        return [
+            limb(start, end, radius_m=radius_m, side=side, material=material)
+            for start, end, radius_m, material in zip(
+                first, second, radii_m, materials, strict=True
+            )
+        ]
+
+    def points_m(
+        self, *, start_m: Float64[np.ndarray, "3"], yaw_deg: float, rise: float, moment_s: float
+    ) -> Float64[np.ndarray, "p 3"]:
+        """Return both ends of every limb at a time, given what `limbs` is given."""
+        first, second, radii_m = self._bones(start_m, yaw_deg, rise, moment_s)
+        along = second - first
+        along *= (0.5 * radii_m / np.sqrt((along * along).sum(axis=1)))[:, None]
+        return np.stack([first - along, second + along], axis=1).reshape(-1, 3)
+
+    def _bones(
+        self, start_m: Array, yaw_deg: float, rise: float, moment_s: float
+    ) -> tuple[Array, Array, Array]:
+        """Return where the limbs start and end, (13, 3) each, and their radii."""
+        yaw, swing = np.radians(yaw_deg), 2 * np.pi * moment_s / self.stride_s
+        ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+        side = np.array([-np.sin(yaw), np.cos(yaw), 0.0])
+        feet = start_m + self.walk_m_s * moment_s * (ahead + rise * _UP)
+        # The limbs of a figure of scale 1 whose hips are at the origin.
+        neck = 0.52 * _UP + 0.03 * ahead
+        bones = [
+            (np.zeros(3), neck, 0.17),
+            (-0.04 * _UP, 0.1 * _UP, 0.16),
+            (neck + 0.1 * _UP, neck + 0.27 * _UP, 0.1),
+        ]
+        for sign in (-1.0, 1.0):
+            phase = sign * np.sin(swing)
+            lag = sign * np.sin(swing - 0.9)
+            hip = 0.1 * sign * side
+            knee = hip + 0.43 * _limb_direction(0.5 * phase, ahead)
+            heel = knee + 0.42 * _limb_direction(0.5 * phase - 0.35 - 0.35 * lag, ahead)
+            shoulder = neck + 0.2 * sign * side - 0.04 * _UP
+            elbow = shoulder + 0.29 * _limb_direction(-0.5 * phase, ahead) + 0.04 * sign * side
+            hand = elbow + 0.27 * _limb_direction(0.3 - 0.5 * phase, ahead)
+            bones += [
+                (hip, knee, 0.09),
+                (knee, heel, 0.065),
+                (heel, heel + 0.17 * ahead, 0.05),
+                (shoulder, elbow, 0.055),
+                (elbow, hand, 0.045),
+            ]
+        first, second, radii = (np.array(each) for each in zip(*bones, strict=True))
+        hips = feet + self.scale * (0.93 + 0.025 * np.cos(2 * swing)) * _UP
+        return hips + self.scale * first, hips + self.scale * second, self.scale * radii
 
 
 def _limb_direction(angle: float, ahead: Array) -> Array:

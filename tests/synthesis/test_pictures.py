@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis.plan import plan_scene
+from stereogenbench_data.synthesis.maps import open_map
+from stereogenbench_data.synthesis.planning import plan_scene
 from stereogenbench_data.synthesis.request import SynthRequest
 
 
@@ -70,8 +71,9 @@ def test_depth_has_near_far_and_sky(draw):
 
 
 def test_every_limb_of_the_subject_moves():
-    scene = plan_scene(SynthRequest(), index=0).scene
-    before, after = scene.walker(0.0), scene.walker(0.4)
+    plan = plan_scene(SynthRequest(frames=7), index=0).plan
+    world = open_map(plan.proposal)
+    before, after = (world.limbs(plan.spawn, frame=frame) for frame in (0, 6))
 
     moved_m = [np.linalg.norm(a.centre - b.centre) for a, b in zip(before, after, strict=True)]
     turned = [np.abs(a.axes - b.axes).max() for a, b in zip(before, after, strict=True)]

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis.plan import plan_scene
-from stereogenbench_data.synthesis.ray_casting import GROUND, SKY, View, first_hits, pixel_rays
+from stereogenbench_data.synthesis.maps import open_map
+from stereogenbench_data.synthesis.planning import plan_scene
+from stereogenbench_data.synthesis.ray_casting import GROUND, SKY, View, first_hits, shape_of
 from stereogenbench_data.synthesis.render import (
     SceneState,
     render_depth,
@@ -30,17 +31,24 @@ def view_from(eye, *, size_px=(5, 5), focal_px=5.0):
     )
 
 
+def state_of(plan, *, frame):
+    world = open_map(plan.proposal)
+    walker = world.limbs(plan.spawn, frame=frame)
+    return SceneState(world.scene, walker=walker, static_light=static_light(world.scene))
+
+
 def depth_of(shapes, view):
-    ((_, rays),) = pixel_rays(view)
-    return first_hits(rays, view=view, shapes=shapes, slope=LEVEL)
+    inverse, faces = first_hits(view, shapes=shapes, slope=LEVEL)
+    with np.errstate(divide="ignore"):
+        return 1 / inverse, faces
 
 
 def test_the_ground_is_at_height_over_descent_and_the_sky_has_no_depth():
     """Rows look 0.4, 0.2, 0, -0.2, -0.4 up at depth 1, from 2 m: 10 m and 5 m to the ground."""
-    depth_m, solid = depth_of([], view_from([0.0, 0.0, 2.0]))
+    depth_m, faces = depth_of([], view_from([0.0, 0.0, 2.0]))
 
     np.testing.assert_allclose(depth_m[:, 3], [np.inf, np.inf, np.inf, 10.0, 5.0])
-    assert solid[:, 0].tolist() == [SKY, SKY, SKY, GROUND, GROUND]
+    assert faces[:, 0].tolist() == [SKY, SKY, SKY, GROUND, GROUND]
 
 
 def test_the_depth_of_a_box_face_is_the_same_all_over_the_face():
@@ -55,10 +63,10 @@ def test_the_depth_of_a_box_face_is_the_same_all_over_the_face():
 def test_the_depth_of_a_ball_is_that_of_the_nearest_point_on_its_axis():
     ball = Shape("ellipsoid", np.array([6.0, 0.0, 2.0]), np.eye(3), np.full(3, 1.5), STONE)
 
-    depth_m, solid = depth_of([ball], view_from([0.0, 0.0, 2.0]))
+    depth_m, faces = depth_of([ball], view_from([0.0, 0.0, 2.0]))
 
     assert depth_m[2, 2] == pytest.approx(4.5)
-    assert solid[0, 0] == SKY
+    assert faces[0, 0] == SKY
 
 
 def test_a_nearer_shape_hides_a_farther_one_in_either_order():
@@ -85,23 +93,27 @@ def test_a_shape_behind_the_camera_is_not_seen():
 @pytest.mark.parametrize("index", range(3))
 def test_every_hit_lies_on_the_surface_of_its_solid(index):
     """Independent of how it was found: the point at that depth fulfils the solid's equation."""
-    plan = plan_scene(SynthRequest(family="Uniform", size_px=48), index=index)
-    state = SceneState(plan.scene, moment_s=0.3, static_light=static_light(plan.scene))
+    plan = plan_scene(SynthRequest(family="Uniform", size_px=48), index=index).plan
+    state = state_of(plan, frame=40)
     view = plan.view(camera=2, frame=40)
-    ((_, rays),) = pixel_rays(view)
-    depth_m, solid = state.first_hits(rays, view=view)
+    depth_m = render_depth(state, view=view)
+    _, faces = first_hits(view, shapes=state.shapes, slope=state.scene.slope)
 
     v, u = np.nonzero(np.isfinite(depth_m))
     camera = np.stack(
-        [np.ones(len(u)), (u + 0.5 - 24) / plan.focal_px[0], (23.5 - v) / plan.focal_px[1]]
+        [
+            np.ones(len(u)),
+            (u + 0.5 - 24) / plan.proposal.focal_px[0],
+            (23.5 - v) / plan.proposal.focal_px[1],
+        ]
     )
     points = view.eye[:, None] + depth_m[v, u] * (view.axes @ camera)
     checked = 0
-    for point, met in zip(points.T, solid[v, u], strict=True):
+    for point, met in zip(points.T, faces[v, u], strict=True):
         if met == GROUND:
-            level = point[2] - plan.scene.slope @ point[:2]
+            level = point[2] - state.scene.slope @ point[:2]
         else:
-            shape = state.shapes[met - 2]
+            shape = state.shapes[shape_of(met)]
             place = shape.axes @ (point - shape.centre) / shape.half_m
             level = np.abs(place).max() - 1 if shape.kind == "box" else np.linalg.norm(place) - 1
         assert abs(level) < 1e-9
@@ -111,8 +123,8 @@ def test_every_hit_lies_on_the_surface_of_its_solid(index):
 
 def test_strips_of_a_large_picture_join_without_a_seam():
     """A 1280 px picture is cast in strips; its rows are those of rays cast one row at a time."""
-    plan = plan_scene(SynthRequest(size_px=1280, height_px=112), index=0)
-    state = SceneState(plan.scene, moment_s=0.0, static_light=static_light(plan.scene))
+    plan = plan_scene(SynthRequest(size_px=1280, height_px=112), index=0).plan
+    state = state_of(plan, frame=0)
     view = plan.view(camera=0, frame=0)
 
     picture, depth_m = render_frame(state, view=view)

@@ -22,15 +22,10 @@ def test_ipd_gaussian_gaps_follow_the_truncated_normal_of_the_paper():
     assert stats.kstest(gaps_cm("IPD_Gaussian").ravel(), truncated.cdf).pvalue > 0.01
 
 
-def test_uniform_gaps_come_out_as_the_release_realised_them():
-    """Train split: mean 52.79, standard deviation 38.95, median 43.29 cm in [1, 150]."""
-    drawn = gaps_cm("Uniform").ravel()
+def test_uniform_gaps_are_proposed_uniformly():
+    proposed = gaps_cm("Uniform").ravel()
 
-    assert drawn.min() >= 1
-    assert drawn.max() <= 150
-    assert drawn.mean() == pytest.approx(52.8, abs=2.5)
-    assert drawn.std() == pytest.approx(38.95, abs=1.5)
-    assert np.median(drawn) == pytest.approx(43.3, abs=3)
+    assert stats.kstest(proposed, stats.uniform(1, 149).cdf).pvalue > 0.01
 
 
 def test_pairwise_uniform_spreads_all_pairs_up_to_two_metres():

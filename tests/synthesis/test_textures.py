@@ -2,17 +2,17 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.synthesis.render import cast_shadow, full_light, sunlight_at
-from stereogenbench_data.synthesis.scene import Framing, Material, Shape, random_scene
+from stereogenbench_data.synthesis.scene import Material, SceneModel, Shape
 from stereogenbench_data.synthesis.textures import TEXTURES, sample_atlas, texture_row
 
 
 def sampled(name, *, footprint_tiles, shift=(0.0, 0.0), side=96):
     u, v = np.meshgrid(*[np.linspace(0, 1, side, endpoint=False)] * 2)
-    tiles = np.stack([u.ravel() + shift[0], v.ravel() + shift[1]]).astype(np.float32)
     return sample_atlas(
-        tiles=tiles,
-        rows=np.full(side * side, texture_row(name), np.float32),
-        footprint_tiles=np.full(side * side, footprint_tiles, np.float32),
+        (u.ravel() + shift[0]).astype(np.float32),
+        (v.ravel() + shift[1]).astype(np.float32),
+        row=texture_row(name),
+        log_footprint=np.full(side * side, np.log2(footprint_tiles), np.float32),
     )
 
 
@@ -40,9 +40,9 @@ def test_the_larger_a_pixel_the_less_detail_and_the_same_mean(name):
 
 
 def test_a_box_shades_the_ground_on_the_side_away_from_the_sun():
-    framing = Framing(distance_m=4.0, width_per_m=0.8, span_m=0.3, pixel_per_m=0.001)
-    scene = random_scene(np.random.default_rng(1), framing=framing, walk_m_s=0.6)
     stone = Material("plaster", 1.0, (1.0, 1.0, 1.0))
+    sun = np.array([-0.6, 0.48, 0.64])
+    scene = SceneModel(np.array([0.05, -0.02]), stone, (), 0, sun, shadow_range_m=16.0)
     box = Shape("box", np.array([0.0, 0.0, 1.0]), np.eye(3), np.full(3, 1.0), stone)
     light = full_light()
 

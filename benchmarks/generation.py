@@ -1,0 +1,145 @@
+"""The time to generate scenes with the built-in renderer, stage by stage, beside encoding alone.
+
+``python -m benchmarks.generation [--size 1280] [--frames 4] [--maps SynthStage SynthHall] [--grow]
+[--out FILE]``. Each scene is proposed and filtered whole (81 frames); a few frames of one camera
+are rendered, encoded and checked, and stand for the 486 of a scene. It measures
+processor time of one process, which other work on the machine hardly changes. A scene needs no
+other one and a camera no other camera, so N cores take an N-th of the time, as long as the
+memory's speed lasts.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import av
+import torch
+
+from stereogenbench_data.media.depth_packing import grey_frame
+from stereogenbench_data.schema.release import CAMERA_COUNT, FRAME_COUNT
+from stereogenbench_data.synthesis.camera_writer import VideoWriter, depth_units
+from stereogenbench_data.synthesis.checks import FrameStatistics
+from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS
+from stereogenbench_data.synthesis.planning import plan_scene
+from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
+from stereogenbench_data.synthesis.request import SynthRequest
+
+LIMIT = 3.0
+"""Generating may take so many times the encoding alone."""
+RELEASE_SCENES = 8493
+PAPER_SCENES_AN_HOUR = (16, 36)
+_CAMERA_FRAMES = CAMERA_COUNT * FRAME_COUNT
+
+
+def stages_s(request: SynthRequest, *, index: int, frames: int, folder: Path) -> dict[str, float]:
+    """Return the seconds of processor time of each stage of one scene of 6 x 81 frames."""
+    start = time.process_time()
+    search = plan_scene(request, index=index)
+    propose_s = time.process_time() - start
+    plan = search.plan
+    chosen = iter(RAY_CASTING.views(plan, cameras=(CAMERA_COUNT // 2,)))
+    start = time.process_time()
+    views = [next(chosen) for _ in range(frames)]
+    render_s = time.process_time() - start
+    width_px, height_px = request.picture_px
+    rgb, depth = folder / "rgb.mp4", folder / "depth.mkv"
+    start = time.process_time()
+    with VideoWriter(
+        rgb, size_px=(width_px, height_px), codec="libx264", pixel_format="yuv420p"
+    ) as writer:
+        for view in views:
+            frame = av.VideoFrame.from_ndarray(view.picture, format="rgb24")
+            writer.write(frame.reformat(format="yuv420p", threads=1))
+    rgb_s = time.process_time() - start
+    start = time.process_time()
+    eye = plan.view(camera=0, frame=0)
+    with VideoWriter(
+        depth, size_px=(width_px, height_px), codec="ffv1", pixel_format="gray16le"
+    ) as writer:
+        for view in views:
+            units = depth_units(view.depth_m, view=eye, contract=request.contract)
+            writer.write(grey_frame(units, pixel_format="gray16le"))
+    depth_s = time.process_time() - start
+    start = time.process_time()
+    seen = FrameStatistics(plan, camera=0, limits=DEFAULT_LIMITS)
+    for view in views:
+        seen.add(view)
+    seen.check()
+    check_s = time.process_time() - start
+    whole = _CAMERA_FRAMES / frames
+    return {
+        "propose": propose_s,
+        "render": render_s * whole,
+        "encode pictures": rgb_s * whole,
+        "encode depth": depth_s * whole,
+        "check": check_s * whole,
+    }
+
+
+def measured(
+    map_name: str, family: str, *, size_px: int, frames: int, scenes: int
+) -> dict[str, Any]:
+    """Return the median seconds of each stage over scenes of a map, and what follows from them."""
+    request = SynthRequest(family=family, map_name=map_name, size_px=size_px)
+    with tempfile.TemporaryDirectory() as folder:
+        found = [
+            stages_s(request, index=index, frames=frames, folder=Path(folder))
+            for index in range(scenes)
+        ]
+    stages = {name: statistics.median(each[name] for each in found) for name in found[0]}
+    scene_s = sum(stages.values())
+    encode_s = stages["encode pictures"] + stages["encode depth"]
+    return {
+        "map": map_name,
+        "family": family,
+        "size_px": size_px,
+        "stages_s": {name: round(seconds, 2) for name, seconds in stages.items()},
+        "scene_core_s": round(scene_s, 1),
+        "encode_core_s": round(encode_s, 1),
+        "times_encoding": round(scene_s / encode_s, 2),
+        "limit": LIMIT,
+        "scenes_an_hour_a_core": round(3600 / scene_s, 1),
+        "release_core_hours": round(RELEASE_SCENES * scene_s / 3600),
+    }
+
+
+def main() -> None:
+    """Measure maps, and how the time grows with the size of the pictures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", type=int, default=1280)
+    parser.add_argument("--frames", type=int, default=4)
+    parser.add_argument("--scenes", type=int, default=2)
+    parser.add_argument("--maps", nargs="+", default=["SynthStage", "SynthHall"])
+    parser.add_argument("--families", nargs="+", default=["IPD_Gaussian", "Uniform"])
+    parser.add_argument("--grow", action="store_true", help="also at a half and a quarter")
+    parser.add_argument("--out", type=Path)
+    chosen = parser.parse_args()
+    torch.set_num_threads(1)
+    # The textures are made once a process.
+    warm = plan_scene(SynthRequest(size_px=64, frames=1), index=0).plan
+    list(RAY_CASTING.views(warm, cameras=(0,)))
+    sizes = [chosen.size, *((chosen.size // 2, chosen.size // 4) if chosen.grow else ())]
+    report = {
+        "cores": os.cpu_count(),
+        "paper_scenes_an_hour": PAPER_SCENES_AN_HOUR,
+        "rows": [
+            measured(map_name, family, size_px=size, frames=chosen.frames, scenes=chosen.scenes)
+            for size in sizes
+            for map_name in chosen.maps
+            for family in chosen.families
+        ],
+    }
+    text = json.dumps(report, indent=2)
+    if chosen.out:
+        chosen.out.write_text(text)
+    sys.stdout.write(f"{text}\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1202 @@
+"""One scene inside Blender: it opens assets, answers rays, and renders frames with their depth.
+
+`worker.py` loads it by its path, in a Python that has bpy, so it imports only the standard library,
+NumPy and Blender's modules.
+
+Axes here are Blender's: right-handed, x and y level, z up, in units of the map's file; `Mirror`
+turns map axes into them. Blender evaluates a scene anew for each render, and otherwise than for its
+windows. So triangles for depth are taken from the evaluation that Cycles renders.
+"""
+
+import contextlib
+import math
+import os
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import repeat
+from pathlib import Path
+from typing import Any, Final
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+from mathutils.bvhtree import BVHTree
+
+Array = Any
+
+_GATHER: Final = "STEREOGENBENCH_GATHER"
+_RATE_HZ: Final = 15.0
+_MESHES: Final = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
+_WITHOUT_MESH: Final = frozenset({"CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"})
+_SOLID_M: Final = 2.0
+"""Closed surfaces that are wider than this in every direction are rooms, not solids."""
+_OPEN_SKY_M: Final = 20.0
+"""How far above its highest point cameras may be in a map without a ceiling."""
+_OPEN_SHARE: Final = 0.3
+_GRID: Final = 12
+_BACKS: Final = 5
+_MAP_SIZE_M: Final = (2.0, 500.0)
+_ROOM_HEIGHT_M: Final = (1.8, 40.0)
+_HEIGHT_M: Final = (0.5, 3.0)
+_UNITS_M: Final = (0.01, 100.0, 0.001, 1000.0, 0.0254, 39.37, 0.3048, 3.281, 0.1, 10.0)
+_POINTS: Final = 24
+_MOST_STEPS: Final = 300
+_STRIP_FRAMES: Final = 1e6
+_CYCLE_M: Final = 0.05
+_STILL_M: Final = 0.02
+_BONE_PATH: Final = re.compile(r'pose\.bones\["((?:[^"\\]|\\.)*)"\]\.(\w+)')
+_NOTHING: Final = 1e9
+"""Depth of Cycles' pass from which on nothing is seen."""
+_MOST_LAYERS: Final = 64
+_GPU_KINDS: Final = ("OPTIX", "CUDA", "HIP", "ONEAPI", "METAL")
+
+
+class AssetError(Exception):
+    """An asset that cannot be used; its text is what the user reads."""
+
+
+class Mirror:
+    """Map axes and Blender's: the same but for the sign of y, and the unit."""
+
+    def __init__(self, unit_m: float) -> None:
+        self.unit_m = unit_m
+        self.flip = np.array([1.0, -1.0, 1.0])
+
+    def to_map(self, points: Array) -> Array:
+        """Return points in metres of map axes."""
+        return points * self.flip * self.unit_m
+
+    def to_blender(self, points_m: Array) -> Array:
+        """Return points in Blender's axes and the file's units."""
+        return points_m * self.flip / self.unit_m
+
+
+# What is in front of the camera: triangles of the evaluated scene.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """An evaluated mesh in Blender's world axes.
+
+    Attributes:
+        name: A name that stays over the frames.
+        is_subject: Whether it belongs to the subject.
+        vertices: (n, 3) float64.
+        corners: (m, 3) the vertices of its triangles.
+        is_cut: (m,) whether the material of a triangle lets rays through somewhere.
+    """
+
+    name: str
+    is_subject: bool
+    vertices: Array
+    corners: Array
+    is_cut: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hits:
+    """What rays meet first.
+
+    Attributes:
+        distance: (n,) how many directions away; infinity where they meet nothing.
+        normals: (n, 3) of the triangles, 0 where they meet nothing.
+        is_cut: (n,) whether the material there lets rays through somewhere.
+    """
+
+    distance: Array
+    normals: Array
+    is_cut: Array
+
+
+class Triangles:
+    """Triangles in Blender's world axes, with a tree that finds the first that a ray meets."""
+
+    def __init__(self, meshes: list[Mesh]) -> None:
+        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+        self.vertices = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes)])
+        self.corners = np.concatenate(
+            [
+                np.empty((0, 3), np.int64),
+                *(mesh.corners + start for mesh, start in zip(meshes, starts, strict=False)),
+            ]
+        )
+        self.is_cut = np.concatenate([np.empty(0, bool), *(mesh.is_cut for mesh in meshes)])
+        self._tree = BVHTree.FromPolygons(
+            self.vertices.tolist(), self.corners.tolist(), all_triangles=True, epsilon=0.0
+        )
+
+    def first_hits(self, origins: Array, directions: Array) -> Hits:
+        """Return what rays meet, from origins (n, 3) or from one (3,).
+
+        The tree, in float32, tells which triangle; where the ray meets its plane is computed in
+        float64.
+        """
+        cast = self._tree.ray_cast
+        starts = origins.tolist() if origins.ndim == 2 else repeat(origins.tolist())
+        found = np.fromiter(
+            (
+                -1 if (hit := cast(start, way)[2]) is None else hit
+                for start, way in zip(starts, directions.tolist(), strict=False)
+            ),
+            np.int64,
+            len(directions),
+        )
+        distance = np.full(len(directions), np.inf)
+        normals = np.zeros((len(directions), 3))
+        is_cut = np.zeros(len(directions), bool)
+        met = np.flatnonzero(found >= 0)
+        if met.size:
+            first, second, third = np.moveaxis(self.vertices[self.corners[found[met]]], 1, 0)
+            normals[met] = np.cross(second - first, third - first)
+            start = origins[met] if origins.ndim == 2 else origins
+            towards = np.einsum("ni,ni->n", normals[met], directions[met])
+            away = np.einsum("ni,ni->n", normals[met], first - start)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ahead = away / towards
+            distance[met] = np.where(np.isfinite(ahead) & (ahead > 0), ahead, np.inf)
+            is_cut[met] = self.is_cut[found[met]]
+        return Hits(distance, normals, is_cut)
+
+
+def triangles_of(depsgraph: Any, *, subject: frozenset[str]) -> list[Mesh]:
+    """Return every mesh that the cameras see in an evaluated scene, with its modifiers applied."""
+    found: list[Mesh] = []
+    meshes: dict[int, tuple[Array, Array, Array]] = {}
+    for instance in depsgraph.object_instances:
+        shown = instance.object
+        if shown.type not in _MESHES or not instance.show_self or not shown.visible_camera:
+            continue
+        source = shown.data.as_pointer() if shown.type == "MESH" else 0
+        mesh = meshes.get(source) if source else None
+        if mesh is None:
+            mesh = _mesh_of(shown)
+            if source:
+                meshes[source] = mesh
+        vertices, corners, materials = mesh
+        if not len(corners):
+            continue
+        matrix = np.array(instance.matrix_world)
+        owner = (instance.parent or shown).original.name
+        cut = [slot.material is not None and _lets_through(slot.material) for slot in
+               shown.material_slots] or [False]  # fmt: skip
+        found.append(
+            Mesh(
+                name=f"{owner}/{shown.name}/{tuple(instance.persistent_id)}",
+                is_subject=owner in subject,
+                vertices=vertices @ matrix[:3, :3].T + matrix[:3, 3],
+                corners=corners,
+                is_cut=np.array(cut)[np.minimum(materials, len(cut) - 1)],
+            )
+        )
+    return found
+
+
+def _mesh_of(shown: Any) -> tuple[Array, Array, Array]:
+    """Return vertices, triangles and their slots of materials of an evaluated object."""
+    mesh = shown.to_mesh()
+    if mesh is None:
+        return np.empty((0, 3)), np.empty((0, 3), np.int64), np.empty(0, np.int64)
+    mesh.calc_loop_triangles()
+    vertices = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", vertices)
+    corners = np.empty(3 * len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("vertices", corners)
+    materials = np.empty(len(mesh.loop_triangles), np.int32)
+    mesh.loop_triangles.foreach_get("material_index", materials)
+    shown.to_mesh_clear()
+    return vertices.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3).astype(int), materials
+
+
+def _lets_through(material: Any) -> bool:
+    """Return whether a material is transparent somewhere; refraction is not transparency."""
+    trees = [material.node_tree]
+    seen = set()
+    while trees:
+        tree = trees.pop()
+        if tree is None or tree.name in seen:
+            continue
+        seen.add(tree.name)
+        for node in tree.nodes:
+            if node.bl_idname == "ShaderNodeGroup":
+                trees.append(node.node_tree)
+            elif node.bl_idname == "ShaderNodeBsdfTransparent":
+                return True
+            elif node.bl_idname == "ShaderNodeBsdfPrincipled":
+                alpha = node.inputs["Alpha"]
+                if alpha.is_linked or alpha.default_value < 1:
+                    return True
+    return False
+
+
+class Surfaces:
+    """The triangles of a map over its frames; the tree of what stands still is built once."""
+
+    def __init__(self) -> None:
+        self._first: dict[str, Array] = {}
+        self._moving: set[str] = set()
+        self._still: Triangles | None = None
+
+    def at_frame(self, meshes: list[Mesh]) -> list[Triangles]:
+        """Return what is to be searched: what stands still, and what moves."""
+        placed = {mesh.name: mesh.vertices for mesh in meshes if not mesh.is_subject}
+        if not self._first:
+            self._first = placed
+        moved = {
+            name
+            for name in self._first.keys() | placed.keys()
+            if name not in self._moving
+            and not np.array_equal(self._first.get(name, ()), placed.get(name, ()))
+        }
+        self._moving |= moved
+        moving = [mesh for mesh in meshes if mesh.is_subject or mesh.name in self._moving]
+        if self._still is None or moved:
+            self._still = Triangles([mesh for mesh in meshes if mesh not in moving])
+        return [self._still, *([Triangles(moving)] if moving else [])]
+
+
+def first_hits(searched: list[Triangles], origins: Array, directions: Array) -> Hits:
+    """Return what rays meet first among several trees."""
+    best = searched[0].first_hits(origins, directions)
+    for other in searched[1:]:
+        hits = other.first_hits(origins, directions)
+        closer = hits.distance < best.distance
+        best = Hits(
+            np.where(closer, hits.distance, best.distance),
+            np.where(closer[:, None], hits.normals, best.normals),
+            np.where(closer, hits.is_cut, best.is_cut),
+        )
+    return best
+
+
+def pass_through(
+    searched: list[Triangles], hits: Hits, *, eye: Array, ways: Array, seen: Array
+) -> Array:
+    """Return the depth of rays that meet a material with holes first.
+
+    Cycles tells, to the precision of its pass of depth, which of the surfaces along a ray is seen;
+    how far that is comes from its triangle.
+
+    Args:
+        searched: The triangles.
+        hits: What the rays meet first.
+        eye: Where they start.
+        ways: (n, 3) their directions, whose part along the optical axis is 1.
+        seen: (n,) the pass, whose largest numbers mean that nothing is seen.
+    """
+    depth = hits.distance.copy()
+    rays = np.flatnonzero(hits.is_cut)
+    depth[rays] = np.where(seen[rays] < _NOTHING, depth[rays], np.inf)
+    at = hits.distance[rays]
+    first = at.copy()
+    for _ in range(_MOST_LAYERS):
+        if not rays.size:
+            break
+        onward = at * (1 + 1e-6) + 1e-6
+        behind = first_hits(searched, eye + onward[:, None] * ways[rays], ways[rays])
+        at = onward + behind.distance
+        nearer = np.abs(at - seen[rays]) < np.abs(depth[rays] - seen[rays])
+        nearer &= seen[rays] < _NOTHING
+        depth[rays[nearer]] = at[nearer]
+        # Something solid is behind, yet Cycles saw nothing: its ray ended at a half-open surface.
+        lost = (seen[rays] >= _NOTHING) & np.isfinite(at) & ~behind.is_cut
+        depth[rays[lost]] = first[lost]
+        more = np.isfinite(at) & behind.is_cut
+        rays, at, first = rays[more], at[more], first[more]
+    return depth
+
+
+class _GatherEngine(bpy.types.RenderEngine):  # type: ignore[misc]
+    """A render engine that draws nothing: Blender hands it the scene as evaluated for rendering."""
+
+    bl_idname = _GATHER
+    bl_label = "Gather triangles"
+    seen: Callable[[Any], None]
+
+    def render(self, depsgraph: Any) -> None:
+        """Hand the evaluated scene on."""
+        type(self).seen(depsgraph)
+
+
+@contextlib.contextmanager
+def _around_cycles(before: Callable[[Any], None], after: Callable[[Any], None]) -> Iterator[None]:
+    """Hand over the evaluated scene before Cycles renders it, and the engine with its result."""
+    from cycles import CyclesRender, engine
+
+    def render(self: Any, depsgraph: Any) -> None:
+        before(depsgraph)
+        engine.render(self, depsgraph)
+        after(self)
+
+    own = CyclesRender.render
+    CyclesRender.render = render
+    try:
+        yield
+    finally:
+        CyclesRender.render = own
+
+
+# Files.
+
+
+def _inside(path: str, root: str) -> bool:
+    real, root = os.path.realpath(path), os.path.realpath(root)
+    return os.path.commonpath([real, root]) == root
+
+
+def check_files(where: str, *, root: str) -> None:
+    """Refuse what was opened if it needs files outside the asset folder, or missing ones."""
+    own = bpy.utils.resource_path("LOCAL")
+    for path in bpy.utils.blend_paths(absolute=True, packed=False, local=False):
+        if Path(path).exists() and not _inside(path, root) and not _inside(path, own):
+            raise AssetError(
+                f"{where}: it refers to {path}, which is outside the asset folder {root}. Copy "
+                f"that file into the folder and point to it there, or pack it into the .blend file."
+            )
+    for library in bpy.data.libraries:
+        path = bpy.path.abspath(library.filepath)
+        if library.is_missing or not (_inside(path, root) or _inside(path, own)):
+            raise AssetError(
+                f"{where}: the library {path} is missing or outside the asset folder {root}. Copy "
+                f"it into the folder and relocate it in Blender."
+            )
+    missing = sorted(
+        {
+            image.filepath or image.name
+            for image in bpy.data.images
+            if image.source in ("FILE", "SEQUENCE", "MOVIE")
+            and image.users > image.use_fake_user
+            and image.packed_file is None
+            and not image.packed_files
+            and not Path(bpy.path.abspath(image.filepath, library=image.library)).exists()
+        }
+    )
+    if missing:
+        shown = ", ".join(missing[:5]) + (", ..." if len(missing) > 5 else "")
+        raise AssetError(
+            f"{where}: {len(missing)} textures are missing: {shown}. Copy them beside the file and "
+            f"repair the paths (Blender: File, External Data, Find Missing Files), or pack them."
+        )
+    readers = sorted(
+        {
+            tree.name
+            for tree in bpy.data.node_groups
+            for node in tree.nodes
+            if node.bl_idname.startswith("GeometryNodeImport")
+        }
+    )
+    if readers:
+        raise AssetError(
+            f"{where}: the node group {readers[0]!r} imports files while the scene is evaluated. "
+            f"Apply its modifier in Blender and save the file again."
+        )
+
+
+def unrun_scripts() -> list[str]:
+    """Return what would have run Python if automatic execution were on."""
+    notes = [f"text {text.name!r}" for text in bpy.data.texts if text.use_module]
+    kinds = ("objects", "armatures", "meshes", "shape_keys", "materials", "node_groups", "lights")
+    for kind in (*kinds, "cameras", "curves", "scenes", "worlds"):
+        for owner in getattr(bpy.data, kind):
+            data = owner.animation_data
+            for curve in data.drivers if data else ():
+                if curve.driver.type == "SCRIPTED" and not curve.driver.is_simple_expression:
+                    notes.append(f"driver of {owner.name!r}, {curve.data_path}")
+    return notes
+
+
+def _rate_hz(scene: Any) -> float:
+    return float(scene.render.fps / scene.render.fps_base)
+
+
+def _import(path: str, where: str) -> None:
+    """Add the content of a glTF or FBX file to the scene."""
+    suffix = Path(path).suffix.lower()
+    try:
+        if suffix in (".glb", ".gltf"):
+            bpy.ops.import_scene.gltf(filepath=path, import_scene_as_collection=False)
+        else:
+            bpy.ops.wm.fbx_import(filepath=path)
+    except RuntimeError as error:
+        text = str(error).strip().splitlines()
+        raise AssetError(
+            f"{where}: Blender cannot import it ({text[-1] if text else 'no reason given'}). Open "
+            f"it in Blender, repair it and save it as a .blend file."
+        ) from error
+
+
+def _add(path: str, where: str) -> tuple[list[Any], list[Any], float]:
+    """Add a file to the scene; return its new objects, its actions and their frames a second."""
+    before, actions = set(bpy.data.objects), set(bpy.data.actions)
+    for number, action in enumerate(actions):
+        if action.library is None:
+            action.name = f"stereogenbench {number}"  # So that takes keep the names in their file.
+    if Path(path).suffix.lower() == ".blend":
+        try:
+            with bpy.data.libraries.load(path, link=False) as (there, wanted):
+                wanted.scenes = there.scenes[:1]
+                wanted.actions = there.actions
+                if not there.scenes:
+                    wanted.objects = there.objects
+        except (OSError, RuntimeError) as error:
+            raise AssetError(
+                f"{where}: Blender cannot open it ({error}). Save it again with Blender 5.0."
+            ) from error
+        rate_hz = 24.0
+        here = bpy.context.scene.collection
+        for scene in wanted.scenes:
+            rate_hz = _rate_hz(scene)
+            shown = set(_rendered(scene.view_layers[0].layer_collection))
+            for item in set(scene.objects) - before:
+                item.hide_render |= item not in shown
+                here.objects.link(item)
+            bpy.data.scenes.remove(scene)
+        for item in wanted.objects or ():
+            here.objects.link(item)
+    else:
+        rate_hz = _rate_hz(bpy.context.scene)
+        _import(path, where)
+    objects = [item for item in bpy.data.objects if item not in before]
+    return objects, [item for item in bpy.data.actions if item not in actions], rate_hz
+
+
+def _rendered(layer: Any) -> Iterator[Any]:
+    """Yield the objects of a layer and those below it, without what is not rendered."""
+    if layer.exclude or layer.collection.hide_render:
+        return
+    yield from layer.collection.objects
+    for child in layer.children:
+        yield from _rendered(child)
+
+
+# Light.
+
+
+def _is_lit(scene: Any) -> bool:
+    if any(
+        item.type == "LIGHT" and not item.hide_render and item.data.energy > 0
+        for item in scene.objects
+    ):
+        return True
+    for tree in (scene.world.node_tree if scene.world else None, *_material_trees(scene)):
+        for node in tree.nodes if tree else ():
+            if node.mute:
+                continue
+            if node.bl_idname in ("ShaderNodeBackground", "ShaderNodeEmission"):
+                colour, strength = node.inputs["Color"], node.inputs["Strength"]
+            elif node.bl_idname == "ShaderNodeBsdfPrincipled":
+                colour, strength = node.inputs["Emission Color"], node.inputs["Emission Strength"]
+            else:
+                continue
+            is_coloured = colour.is_linked or max(colour.default_value[:3]) > 0
+            if is_coloured and (strength.is_linked or strength.default_value > 0):
+                return True
+    return False
+
+
+def _material_trees(scene: Any) -> Iterator[Any]:
+    for item in scene.objects:
+        for slot in item.material_slots:
+            if slot.material is not None and not item.hide_render:
+                yield slot.material.node_tree
+
+
+def _add_sky(scene: Any) -> None:
+    """Light a map that has no light of its own: a sun, and a bluish sky."""
+    sun = bpy.data.lights.new("StereoGenBench sun", "SUN")
+    sun.energy, sun.angle = 3.0, math.radians(2)
+    item = bpy.data.objects.new(sun.name, sun)
+    item.rotation_euler = (math.radians(38), math.radians(12), math.radians(25))
+    scene.collection.objects.link(item)
+    world = bpy.data.worlds.new("StereoGenBench sky")
+    world.use_nodes = True
+    background = next(
+        node for node in world.node_tree.nodes if node.bl_idname == "ShaderNodeBackground"
+    )
+    background.inputs["Color"].default_value = (0.65, 0.78, 1.0, 1.0)
+    background.inputs["Strength"].default_value = 0.9
+    scene.world = world
+
+
+# The subject.
+
+
+class Subject:
+    """A character with one take of an animation, below an empty object that places it."""
+
+    def __init__(self, spec: dict[str, Any], *, root: str, unit_m: float) -> None:
+        character, animation = spec["character"], spec["animation"]
+        where = spec["character_where"]
+        scripts = set(unrun_scripts())
+        objects, actions, rate_hz = _add(character["file"], where)
+        check_files(where, root=root)
+        self.objects = [item for item in objects if item.type not in ("LIGHT", "CAMERA", "SPEAKER")]
+        for item in objects:
+            if item not in self.objects:
+                bpy.data.objects.remove(item)
+        self.armature, unbound = _armature_of(self.objects, where=where)
+        if animation["file"] != character["file"]:
+            others, actions, rate_hz = _add(animation["file"], spec["animation_where"])
+            check_files(spec["animation_where"], root=root)
+            for item in others:
+                bpy.data.objects.remove(item)
+        self.notes = [*sorted(set(unrun_scripts()) - scripts), *unbound]
+        action = _take(actions, name=animation["take"], where=spec["animation_where"])
+        self.rate_hz = animation["rate_hz"] or rate_hz
+        self.start, end = map(float, action.frame_range)
+        self.frames = max(end - self.start, 1e-6)
+        self.strips = self._animate(action, where=spec["animation_where"])
+        self.names = frozenset(item.name for item in self.objects)
+        self.unit_m = unit_m
+        self.empty = bpy.data.objects.new("StereoGenBench subject", None)
+        bpy.context.scene.collection.objects.link(self.empty)
+        for item in self.objects:
+            if item.parent is None:
+                item.parent = self.empty
+        self.scale = character["scale"] / unit_m
+        self.facing = {"-y": 0.0, "+x": -90.0, "+y": 180.0, "-x": 90.0}[character["forward"]]
+        self._measure(character["scale"], repeat=animation["repeat"], where=where)
+
+    def _animate(self, action: Any, *, where: str) -> list[Any]:
+        """Bind the take to the armature and, where they have a slot of their own, to the rest."""
+        bones = self.armature.data.bones
+        own_slot = max(
+            action.slots, key=lambda slot: len(_bones_of(action, slot).keys() & bones.keys())
+        )
+        moved = _bones_of(action, own_slot)
+        if not moved.keys() & bones.keys():
+            raise AssetError(
+                f"{where}: the take {action.name!r} moves no bone of the armature "
+                f"{self.armature.name!r}: it has {_few(moved)}, the armature has "
+                f"{_few(bones.keys())}. Name an animation of the same skeleton, or retarget it."
+            )
+        for bone in moved.keys() & bones.keys():
+            pose, names = self.armature.pose.bones[bone], moved[bone]
+            if "rotation_quaternion" in names:
+                pose.rotation_mode = "QUATERNION"
+            elif "rotation_euler" in names and pose.rotation_mode in ("QUATERNION", "AXIS_ANGLE"):
+                pose.rotation_mode = "XYZ"
+        strips = []
+        for item in self.objects:
+            for owner in filter(None, (item, getattr(item.data, "shape_keys", None))):
+                slot = own_slot if owner == self.armature else _slot_of(action, owner)
+                strips += _bind(owner, action=action, slot=slot)
+        return strips
+
+    def _measure(self, scale: float, *, repeat: str, where: str) -> None:
+        """Find the soles, the height, and how the take repeats."""
+        self.place(None, time_frames=self.start)
+        points = self._vertices()
+        if not len(points):
+            raise AssetError(
+                f"{where}: it has no mesh that is rendered. Export the mesh with "
+                f"the armature, or show it in renders."
+            )
+        low, high = points.min(axis=0), points.max(axis=0)
+        height_m = float(high[2] - low[2]) * scale
+        if not _HEIGHT_M[0] <= height_m <= _HEIGHT_M[1]:
+            raise AssetError(
+                f"{where}: it is {height_m:.3g} m tall, and subjects are "
+                f"{_HEIGHT_M[0]:g} to {_HEIGHT_M[1]:g} m. "
+                + _scale_cure(height_m, scale, within=_HEIGHT_M)
+            )
+        self.chosen = _spread(points)
+        first = self._bones()
+        # No frame puts a sole below the floor on which the subject stands.
+        steps = min(_MOST_STEPS, math.ceil(self.frames / self.rate_hz * _RATE_HZ))
+        lowest = low[2]
+        for step in range(1, steps + 1):
+            self.place(None, time_frames=self.start + self.frames * step / steps)
+            lowest = min(lowest, self._vertices()[:, 2].min())
+        self.soles = np.array([*(low + high)[:2] / 2, lowest])
+        self.place(None, time_frames=self.start + self.frames)
+        moved = (self._bones() - first) * scale
+        whole = moved.mean(axis=0)
+        self.travel = np.zeros(3)
+        self.is_cyclic = repeat == "onward" and bool(
+            np.linalg.norm(moved - whole, axis=1).max() < _CYCLE_M
+        )
+        if self.is_cyclic and np.linalg.norm(whole[:2]) > _STILL_M:
+            self.travel = np.array([*whole[:2], 0.0]) / scale
+
+    def time_of(self, frame: int) -> tuple[float, int]:
+        """Return the frame of the take at a frame of the clip, and how often it was played before.
+
+        A take that ends as it begins is repeated, and one that also moves on goes on from there;
+        any other is played to its end and back.
+        """
+        played = frame / _RATE_HZ * self.rate_hz
+        times, rest = divmod(played, self.frames)
+        if self.is_cyclic:
+            return self.start + rest, int(times)
+        return self.start + (self.frames - rest if int(times) % 2 else rest), 0
+
+    def place(
+        self, spawn: tuple[Array, float] | None, *, time_frames: float, times: int = 0
+    ) -> None:
+        """Put the subject at a place and a heading, in its file's own axes for None."""
+        for strip in self.strips:
+            strip.strip_time = time_frames
+        if spawn is None:
+            self.empty.matrix_world = Matrix.Identity(4)
+        else:
+            place, heading_deg = spawn
+            turn = Matrix.Rotation(math.radians(heading_deg + self.facing), 4, "Z")
+            shift = np.asarray(self.soles if not times else self.soles - times * self.travel)
+            self.empty.matrix_world = (
+                Matrix.Translation(place.tolist())
+                @ turn
+                @ Matrix.Scale(self.scale, 4)
+                @ Matrix.Translation((-shift).tolist())
+            )
+        bpy.context.scene.frame_set(bpy.context.scene.frame_current)
+
+    def points_m(self, frame: int) -> Array:
+        """Return points of the body in map axes, for a subject that starts at 0 with a yaw of 0."""
+        time_frames, times = self.time_of(frame)
+        self.place(None, time_frames=time_frames)
+        points = self._vertices()[self.chosen] + times * self.travel - self.soles
+        turn = np.array(Matrix.Rotation(math.radians(90.0 + self.facing), 3, "Z"))
+        placed: Array = points @ turn.T * (self.scale * self.unit_m) * [1.0, -1.0, 1.0]
+        return placed
+
+    def _vertices(self) -> Array:
+        """Return all vertices of the posed meshes, in file units."""
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        found = [np.empty((0, 3))]
+        for item in self.objects:
+            if item.type not in _MESHES or item.hide_render or not item.visible_camera:
+                continue
+            shown = item.evaluated_get(depsgraph)
+            matrix = np.array(shown.matrix_world)
+            found.append(_mesh_of(shown)[0] @ matrix[:3, :3].T + matrix[:3, 3])
+        return np.concatenate(found)
+
+    def _bones(self) -> Array:
+        """Return the heads and tails of all bones, in file units."""
+        shown = self.armature.evaluated_get(bpy.context.evaluated_depsgraph_get())
+        matrix = np.array(shown.matrix_world)
+        ends = np.array([end for bone in shown.pose.bones for end in (bone.head, bone.tail)])
+        placed: Array = ends @ matrix[:3, :3].T + matrix[:3, 3]
+        return placed
+
+
+def _armature_of(objects: list[Any], *, where: str) -> tuple[Any, list[str]]:
+    """Return the armature with the most bones, and notes on meshes that are hidden.
+
+    Meshes that hang on no armature are no part of the subject, such as a floor that it stands on.
+    """
+    armatures = [item for item in objects if item.type == "ARMATURE"]
+    if not armatures:
+        found = ", ".join(sorted({item.type.lower() for item in objects})) or "nothing"
+        raise AssetError(
+            f"{where}: it has no armature, so it cannot be animated; it has {found}. Export the "
+            f"skeleton with the mesh, or name another file."
+        )
+    markers = {bone.custom_shape for each in armatures for bone in each.pose.bones}
+    notes = []
+    for item in objects:
+        if item.type in _MESHES and not item.hide_render and not _is_bound(item):
+            item.hide_render = True
+            if item not in markers:
+                notes.append(f"object {item.name!r}, hidden: bound to no armature")
+    return max(armatures, key=lambda item: len(item.data.bones)), notes
+
+
+def _is_bound(item: Any) -> bool:
+    """Return whether an armature moves an object or one that it hangs on."""
+    while item is not None:
+        if item.type == "ARMATURE" or any(each.type == "ARMATURE" for each in item.modifiers):
+            return True
+        item = item.parent
+    return False
+
+
+def _bones_of(action: Any, slot: Any) -> dict[str, set[str]]:
+    """Return the bones that a slot of an action moves, with the properties that it moves."""
+    moved: dict[str, set[str]] = {}
+    for layer in action.layers:
+        for strip in layer.strips:
+            bag = strip.channelbag(slot)
+            for curve in bag.fcurves if bag is not None else ():
+                if path := _BONE_PATH.fullmatch(curve.data_path):
+                    bone = bpy.utils.unescape_identifier(path[1])
+                    moved.setdefault(bone, set()).add(path[2])
+    return moved
+
+
+def _slot_of(action: Any, owner: Any) -> Any:
+    """Return the slot of an action that is named after an object or its shape keys, else None."""
+    return next(
+        (
+            slot
+            for slot in action.slots
+            if slot.target_id_type == owner.id_type
+            and _stem(slot.name_display) == _stem(owner.name)
+        ),
+        None,
+    )
+
+
+def _bind(owner: Any, *, action: Any, slot: Any) -> list[Any]:
+    """Replace what moves an object by a strip of an action, whose time is then set by hand."""
+    data = owner.animation_data_create()
+    data.action = None
+    for track in list(data.nla_tracks):
+        data.nla_tracks.remove(track)
+    if slot is None:
+        return []
+    strip = data.nla_tracks.new().strips.new("take", 1, action)
+    strip.action_slot = slot
+    strip.frame_end = strip.frame_start + _STRIP_FRAMES
+    strip.frame_start = -_STRIP_FRAMES
+    strip.use_animated_time = True
+    return [strip]
+
+
+def _stem(name: str) -> str:
+    """Return a name without the number that Blender adds where it is taken."""
+    return re.sub(r"\.\d{3,}$", "", name)
+
+
+def _take(actions: list[Any], *, name: str | None, where: str) -> Any:
+    takes = {
+        action.name: action
+        for action in actions
+        if any(_bones_of(action, slot) for slot in action.slots)
+    }
+    if name is None and len(takes) == 1:
+        return next(iter(takes.values()))
+    matching = [
+        action
+        for full, action in sorted(takes.items())
+        if name is not None and (full == name or name in full.split("|"))
+    ]
+    if len(matching) == 1:
+        return matching[0]
+    if not takes:
+        raise AssetError(
+            f"{where}: it has no take that moves bones. Export the animation with the armature, or "
+            f"name another file."
+        )
+    if name is None:
+        raise AssetError(
+            f"{where}: it has {len(takes)} takes. Say which by `take`: {_few(takes, 12)}."
+        )
+    raise AssetError(
+        f"{where}: take = {name!r} names {len(matching)} takes. The file has {_few(takes, 12)}."
+    )
+
+
+def _few(names: Any, most: int = 4) -> str:
+    shown = sorted(names)
+    return (", ".join(map(repr, shown[:most])) or "nothing") + (
+        ", ..." if len(shown) > most else ""
+    )
+
+
+def _scale_cure(size_m: float, scale: float, *, within: tuple[float, float]) -> str:
+    for factor in _UNITS_M:
+        if within[0] <= size_m * factor <= within[1]:
+            return f"Set scale = {scale * factor:g} there, which makes it {size_m * factor:.3g} m."
+    return "Set scale there to the metres in one unit of the file."
+
+
+def _spread(points: Array) -> Array:
+    """Return the indices of points spread over a body, among them its lowest and its highest."""
+    chosen = [int(points[:, 2].argmin()), int(points[:, 2].argmax())]
+    far = np.minimum(*(np.linalg.norm(points - points[one], axis=1) for one in chosen))
+    while len(chosen) < _POINTS:
+        chosen.append(int(far.argmax()))
+        far = np.minimum(far, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen)
+
+
+# The scene.
+
+
+class Stage:
+    """The one scene of this process: a map, and a subject in it."""
+
+    def __init__(self, spec: dict[str, Any]) -> None:
+        self.root: str = spec["root"]
+        where = self.where = spec["where"]
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        bpy.context.preferences.filepaths.use_scripts_auto_execute = False
+        path = spec["path"]
+        if Path(path).suffix.lower() == ".blend":
+            try:
+                bpy.ops.wm.open_mainfile(filepath=path, load_ui=False, use_scripts=False)
+            except RuntimeError as error:
+                raise AssetError(
+                    f"{where}: Blender cannot open it ({str(error).strip()}). Save it again with "
+                    f"Blender 5.0."
+                ) from error
+        else:
+            _import(path, where)
+        check_files(where, root=self.root)
+        self.scene = bpy.context.scene
+        units = self.scene.unit_settings
+        self.mirror = Mirror(
+            spec["scale"] * (1.0 if units.system == "NONE" else float(units.scale_length))
+        )
+        self.start = self.scene.frame_start
+        self.rate_hz = _rate_hz(self.scene)
+        self.notes = unrun_scripts()
+        self._prepare()
+        if spec["light"] == "sky":
+            _add_sky(self.scene)
+        self.subject: Subject | None = None
+        self._own: set[Any] = set()
+        self._subject_spec: dict[str, Any] = {}
+        self.surfaces = Surfaces()
+        self.still = self._gather()
+        self.bounds_m, self.spawn_bounds_m = self._bounds(spec)
+        self._own = {*bpy.data.objects, *bpy.data.actions}
+        if not _is_lit(self.scene):
+            raise AssetError(
+                f"{where}: it has no light: no lamp, no background and no glowing material. Add "
+                f'lamps in Blender, or set light = "sky" there for a sun and a sky.'
+            )
+
+    def _prepare(self) -> None:
+        """Switch off what this program does not render alike in picture and depth."""
+        scene = self.scene
+        render = scene.render
+        render.use_compositing = render.use_sequencer = False
+        render.use_motion_blur = render.use_border = render.use_stamp = False
+        render.use_freestyle = render.film_transparent = False
+        render.resolution_percentage = 100
+        render.dither_intensity = 0.0
+        for item in scene.objects:
+            if item.type in _WITHOUT_MESH and not item.hide_render:
+                item.hide_render = True
+                self.notes.append(f"object {item.name!r} ({item.type.lower()}), hidden: no depth")
+            for modifier in item.modifiers:
+                if modifier.type == "PARTICLE_SYSTEM" and modifier.show_render:
+                    settings = modifier.particle_system.settings
+                    if settings.render_type in ("PATH", "HALO", "LINE"):
+                        modifier.show_render = False
+                        self.notes.append(f"hair of {item.name!r}, hidden: no depth")
+                if modifier.type == "SUBSURF" and hasattr(modifier, "use_adaptive_subdivision"):
+                    modifier.use_adaptive_subdivision = False
+        for material in bpy.data.materials:
+            # Displacement that only Cycles sees would not be in the depth.
+            material.displacement_method = "BUMP"
+        for layer in scene.view_layers:
+            layer.use = layer == bpy.context.view_layer
+        scene.frame_set(self.start)
+
+    def _gather(self) -> list[Triangles]:
+        """Return the map's triangles at its first frame, without the subject."""
+        found: list[Mesh] = []
+        _GatherEngine.seen = lambda depsgraph: found.extend(
+            triangles_of(depsgraph, subject=frozenset())
+        )
+        self.scene.render.engine = _GATHER
+        self.scene.render.use_multiview = False
+        self.scene.render.resolution_x = self.scene.render.resolution_y = 16
+        if self.scene.camera is None:
+            camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+            self.scene.collection.objects.link(camera)
+            self.scene.camera = camera
+        bpy.ops.render.render()
+        return self.surfaces.at_frame(found)
+
+    def _bounds(self, spec: dict[str, Any]) -> tuple[Array, Array]:
+        """Return two corners of where cameras may be, and of where subjects are spawned."""
+        points = np.concatenate([each.vertices for each in self.still])
+        if not len(points):
+            raise AssetError(
+                f"{self.where}: the map is empty: no mesh of its scene is rendered. Show its "
+                f"collections in renders, or name another file."
+            )
+        corners = self.mirror.to_map(np.stack([points.min(axis=0), points.max(axis=0)]))
+        bounds_m: Array = np.sort(corners, axis=0)
+        low, high = bounds_m
+        size_m = float((high - low).max())
+        if not (spec["is_bounded"] or _MAP_SIZE_M[0] <= size_m <= _MAP_SIZE_M[1]):
+            raise AssetError(
+                f"{self.where}: the map is {size_m:.4g} m wide, and maps are {_MAP_SIZE_M[0]:g} to "
+                f"{_MAP_SIZE_M[1]:g} m. {_scale_cure(size_m, spec['scale'], within=(4.0, 200.0))} "
+                f"If it is right, set bounds_m to the part where cameras may be."
+            )
+        floor_m, ceiling_m = self._floor_and_ceiling_m(low, high)
+        if np.isfinite(ceiling_m):
+            height_m = ceiling_m - floor_m
+            if not (spec["is_bounded"] or _ROOM_HEIGHT_M[0] <= height_m <= _ROOM_HEIGHT_M[1]):
+                raise AssetError(
+                    f"{self.where}: its ceiling is {height_m:.4g} m high, and rooms are "
+                    f"{_ROOM_HEIGHT_M[0]:g} to {_ROOM_HEIGHT_M[1]:g} m. "
+                    f"{_scale_cure(height_m, spec['scale'], within=(2.0, 12.0))} "
+                    f"If it is right, set bounds_m to the part where cameras may be."
+                )
+            return bounds_m, np.stack([low, [*high[:2], ceiling_m - 0.01]])
+        bounds_m[1, 2] += _OPEN_SKY_M
+        return bounds_m, np.stack([low, high + np.array([0.0, 0.0, 0.01])])
+
+    def _floor_and_ceiling_m(self, low: Array, high: Array) -> tuple[float, float]:
+        """Return the heights of the lowest floor and the highest ceiling; outdoors infinity.
+
+        Going up, a floor is the first face that looks up, and a ceiling the next that looks down.
+        """
+        across, along = np.meshgrid(
+            *((np.arange(_GRID) + 0.5) / _GRID * (high - low)[axis] + low[axis] for axis in (0, 1))
+        )
+        bottom = np.full(across.size, low[2] - 1.0)
+        at = self.mirror.to_blender(np.stack([across.ravel(), along.ravel(), bottom], axis=1))
+        floors, ceilings = np.full((2, len(at)), np.inf)
+        left = np.arange(len(at))
+        for _ in range(_MOST_LAYERS):
+            upwards = np.broadcast_to([0.0, 0.0, 1.0], (len(left), 3))
+            hits = first_hits(self.still, at[left], upwards)
+            at[left, 2] += hits.distance
+            looks_up = hits.normals[:, 2] > 0
+            has_floor = np.isfinite(floors[left])
+            is_ceiling = has_floor & (hits.normals[:, 2] < 0)
+            ceilings[left[is_ceiling]] = at[left[is_ceiling], 2]
+            is_floor = looks_up & ~has_floor
+            floors[left[is_floor]] = at[left[is_floor], 2]
+            left = left[np.isfinite(hits.distance) & ~is_ceiling]
+            at[left, 2] += 1e-5 / self.mirror.unit_m
+            if not left.size:
+                break
+        found = ceilings[np.isfinite(floors)]
+        if not found.size or np.isinf(found).mean() > _OPEN_SHARE:
+            return float(low[2]), math.inf
+        ceiling = float(found[np.isfinite(found)].max())
+        return float(floors.min()) * self.mirror.unit_m, ceiling * self.mirror.unit_m
+
+    def cast(self, origins_m: Array, directions: Array) -> Array:
+        """Return how many metres each ray goes until it meets the map; 0 inside a solid."""
+        origins = self.mirror.to_blender(origins_m)
+        ways = directions * self.mirror.flip
+        hits = first_hits(self.still, origins, ways)
+        distance = hits.distance
+        behind = np.einsum("ni,ni->n", hits.normals, ways) > 0
+        inside = np.flatnonzero(behind)
+        if inside.size:
+            places, back = np.unique(origins[inside], axis=0, return_inverse=True)
+            is_solid = self._in_solid(places)
+            distance[inside[is_solid[back.reshape(-1)]]] = 0.0
+        return distance * self.mirror.unit_m
+
+    def _in_solid(self, places: Array) -> Array:
+        """Tell places that see backs of faces both ways along the axes, and nearby along one.
+
+        One of the six may be a front: a thing that stands on a floor shares a face with it.
+        """
+        axes = np.concatenate([np.eye(3), -np.eye(3)])
+        is_back = np.empty((6, len(places)), bool)
+        distance = np.empty((6, len(places)))
+        for way, axis in enumerate(axes):
+            ways = np.broadcast_to(axis, places.shape)
+            hits = first_hits(self.still, places, ways)
+            distance[way], is_back[way] = hits.distance, hits.normals @ axis > 0
+        thickness_m = (distance[:3] + distance[3:]).min(axis=0) * self.mirror.unit_m
+        solid: Array = (is_back.sum(axis=0) >= _BACKS) & (thickness_m < _SOLID_M)
+        return solid
+
+    def set_subject(self, spec: dict[str, Any]) -> Subject:
+        """Put a character with an animation into the scene, in place of the one before."""
+        if self.subject is not None and spec == self._subject_spec:
+            return self.subject
+        self.subject = None
+        for kind in (bpy.data.objects, bpy.data.actions):
+            for added in set(kind) - self._own:
+                kind.remove(added)
+        bpy.data.orphans_purge(do_recursive=True)
+        self.subject = Subject(spec, root=self.root, unit_m=self.mirror.unit_m)
+        self._subject_spec = spec
+        return self.subject
+
+    def render(self, spec: dict[str, Any], eyes_m: Array, axes: Array) -> Array:
+        """Write the pictures of several cameras at a frame; return their depths in metres.
+
+        Pictures and depths come from one evaluation of the scene.
+        """
+        subject = self.subject
+        assert subject is not None
+        frame = spec["frame"]
+        time_frames, times = subject.time_of(frame)
+        exact = self.start + max(0, frame) / _RATE_HZ * self.rate_hz
+        self.scene.frame_set(int(exact), subframe=exact - int(exact))
+        place = self.mirror.to_blender(np.array(spec["place_m"]))
+        subject.place((place, 90.0 - spec["yaw_deg"]), time_frames=time_frames, times=times)
+        self.scene.frame_set(int(exact), subframe=exact - int(exact))
+        eyes, turned = self.mirror.to_blender(eyes_m), axes * self.mirror.flip[:, None]
+        self._set_render(spec)
+        self._set_cameras(spec, eyes=eyes, axes=turned)
+        searched: list[Triangles] = []
+
+        def gather(depsgraph: Any) -> None:
+            searched.extend(self.surfaces.at_frame(triangles_of(depsgraph, subject=subject.names)))
+
+        with _around_cycles(gather, lambda engine: None):
+            bpy.ops.render.render(write_still=True)
+        if not searched:
+            raise RuntimeError("Cycles ended before it rendered")
+        ways = [_pixel_ways(spec, axes=axes) for axes in turned]
+        hits = [first_hits(searched, eye, way) for eye, way in zip(eyes, ways, strict=True)]
+        depths = [each.distance for each in hits]
+        if any(each.is_cut.any() for each in hits):
+            depths = [
+                pass_through(searched, hit, eye=eye, ways=way, seen=seen)
+                for hit, eye, way, seen in zip(
+                    hits, eyes, ways, self._depth_passes(spec), strict=True
+                )
+            ]
+        width_px, height_px = spec["size_px"]
+        return np.stack(depths).reshape(-1, height_px, width_px) * self.mirror.unit_m
+
+    def _depth_passes(self, spec: dict[str, Any]) -> list[Array]:
+        """Return Cycles' own depth of every camera through (nearly) the centres of pixels."""
+        cycles, layer = self.scene.cycles, bpy.context.view_layer
+        cycles.samples, cycles.use_denoising, cycles.filter_width = 1, False, 0.01
+        layer.use_pass_z, layer.pass_alpha_threshold = True, 0.5
+        found: dict[int, Array] = {}
+
+        def read(engine: Any) -> None:
+            for each in engine.get_result().layers[layer.name].passes:
+                if each.name == "Depth":
+                    found[each.view_id] = np.empty(math.prod(spec["size_px"]), np.float32)
+                    each.rect.foreach_get(found[each.view_id])
+
+        with _around_cycles(lambda depsgraph: None, read):
+            bpy.ops.render.render()
+        layer.use_pass_z = False
+        width_px, height_px = spec["size_px"]
+        # Blender's first row is the lowest.
+        return [
+            found[view].reshape(height_px, width_px)[::-1].ravel().astype(np.float64)
+            for view in sorted(found)
+        ]
+
+    def _set_render(self, spec: dict[str, Any]) -> None:
+        scene, cycles = self.scene, self.scene.cycles
+        render = scene.render
+        render.engine = "CYCLES"
+        render.resolution_x, render.resolution_y = spec["size_px"]
+        render.filepath = str(Path(spec["folder"]) / "view")
+        render.use_file_extension = render.use_overwrite = True
+        image = render.image_settings
+        image.media_type = "IMAGE"
+        image.file_format, image.color_mode, image.color_depth = "PNG", "RGB", "8"
+        image.compression = 0
+        image.views_format = "INDIVIDUAL"
+        cycles.samples = spec["samples_per_pixel"]
+        cycles.seed, cycles.use_animated_seed = spec["seed"], False
+        cycles.use_adaptive_sampling = False
+        cycles.time_limit = 0.0
+        cycles.use_denoising = spec["denoise"]
+        cycles.denoiser = "OPENIMAGEDENOISE"
+        cycles.shading_system = False
+        cycles.use_auto_tile = False
+        cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 1.5
+        cycles.device = _device(spec["device"])
+        render.threads_mode = "FIXED" if spec["threads"] else "AUTO"
+        if spec["threads"]:
+            render.threads = spec["threads"]
+
+    def _set_cameras(self, spec: dict[str, Any], *, eyes: Array, axes: Array) -> None:
+        """Make one camera a view, whose pictures Cycles writes in one render."""
+        scene, render = self.scene, self.scene.render
+        (width_px, height_px), (fx, fy) = spec["size_px"], spec["focal_px"]
+        centre_x, centre_y = spec["centre_px"]
+        render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)
+        render.use_multiview = True
+        render.views_format = "MULTIVIEW"
+        for view in list(render.views):
+            view.use = False
+        for number, (eye, axis) in enumerate(zip(eyes, axes, strict=True)):
+            name = f"stereogenbench_{number}"
+            item = bpy.data.objects.get(name)
+            if item is None:
+                item = bpy.data.objects.new(name, bpy.data.cameras.new(name))
+                scene.collection.objects.link(item)
+            forward, right, up = axis.T
+            matrix = np.eye(4)
+            matrix[:3, :4] = np.stack([right, up, -forward, eye], axis=1)
+            item.matrix_world = Matrix(matrix.tolist())
+            camera = item.data
+            camera.type, camera.sensor_fit = "PERSP", "HORIZONTAL"
+            camera.sensor_width = 36.0
+            camera.lens = fx * 36.0 / width_px
+            camera.shift_x = (width_px / 2 - centre_x) / width_px
+            camera.shift_y = (centre_y - height_px / 2) * (fx / fy) / width_px
+            camera.clip_start, camera.clip_end = 1e-3 / self.mirror.unit_m, 1e6
+            camera.dof.use_dof = False
+            view = render.views.get(name) or render.views.new(name)
+            view.camera_suffix, view.use = f"_{number}", True
+            if number == 0:
+                scene.camera = item
+
+
+def _pixel_ways(spec: dict[str, Any], *, axes: Array) -> Array:
+    """Return the directions (n, 3) through pixel centres; their part along the axis is 1."""
+    (width_px, height_px), (fx, fy) = spec["size_px"], spec["focal_px"]
+    centre_x, centre_y = spec["centre_px"]
+    across = (np.arange(width_px) + 0.5 - centre_x) / fx
+    down = (np.arange(height_px) + 0.5 - centre_y) / fy
+    forward, right, up = axes.T
+    ways: Array = forward + across[None, :, None] * right - down[:, None, None] * up
+    return ways.reshape(-1, 3)
+
+
+def _device(asked: str) -> str:
+    """Return Cycles' name of a device, and switch it on."""
+    if asked == "CPU":
+        return "CPU"
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    kinds = {kind[0] for kind in preferences.get_device_types(bpy.context)}
+    for kind in _GPU_KINDS:
+        if kind not in kinds:
+            continue
+        preferences.compute_device_type = kind
+        preferences.refresh_devices()
+        devices = [device for device in preferences.devices if device.type == kind]
+        if devices:
+            for device in preferences.devices:
+                device.use = device.type == kind
+            return "GPU"
+    raise AssetError(
+        'device = "GPU": Cycles finds no GPU here. Install the driver of the GPU, or set '
+        'device = "CPU" in [render].'
+    )
+
+
+class Server:
+    """Answers requests about the one scene."""
+
+    def __init__(self) -> None:
+        bpy.utils.register_class(_GatherEngine)
+        self._stage: Stage | None = None
+        self._spec: dict[str, Any] = {}
+
+    def answer(
+        self, call: dict[str, Any], arrays: list[Array]
+    ) -> tuple[dict[str, Any], list[Array]]:
+        """Return the answer to one request.
+
+        Raises:
+            AssetError: If an asset cannot be used.
+        """
+        name = call["call"]
+        if name == "version":
+            return {"version": bpy.app.version_string, "number": list(bpy.app.version[:2])}, []
+        stage = self._stage
+        if stage is None or call["map"] != self._spec:
+            self._stage = None
+            stage = self._stage = Stage(call["map"])
+            self._spec = call["map"]
+        if name == "cast":
+            return {}, [stage.cast(*arrays)]
+        subject = stage.set_subject(call["subject"])
+        if name == "facts":
+            points_m = [subject.points_m(frame) for frame in range(call["frames"])]
+            return {"notes": [*stage.notes, *subject.notes]}, [
+                stage.bounds_m,
+                stage.spawn_bounds_m,
+                np.stack(points_m),
+            ]
+        return {}, [stage.render(call["view"], *arrays)]

@@ -1,0 +1,410 @@
+"""The built-in maps, in boxes and ellipsoids, and how filters ask them.
+
+`SynthStage` is made for each proposal anew: a backdrop, crates, balls and poles whose sizes follow
+the picture, so that it is full at any focal length. The others are places of fixed size, the same
+in every scene: the smaller a place, the more proposals it refuses. A map of any other name is a
+stage.
+"""
+
+import colorsys
+import zlib
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from stereogenbench_data.schema.release import FRAME_RATE_HZ
+from stereogenbench_data.synthesis.proposal import Proposal
+from stereogenbench_data.synthesis.scene import Figure, Material, SceneModel, Shape
+from stereogenbench_data.synthesis.world import Bounds, Spawn
+
+STAGE: Final = "SynthStage"
+CHARACTERS: Final = tuple(f"SK_Synth{number:02d}" for number in range(1, 20))
+ANIMATIONS: Final = ("AN_Walk", "AN_Stroll", "AN_March")
+
+_GAITS: Final = {"AN_Walk": (0.65, 1.1), "AN_Stroll": (0.35, 1.5), "AN_March": (0.0, 1.2)}
+"""Metres a second and seconds a stride."""
+
+_GROUNDS: Final = ("soil", "mosaic", "bricks", "boards")
+_WALLS: Final = ("bricks", "plaster", "boards", "mosaic")
+_THINGS: Final = ("boards", "weave", "mosaic", "plaster", "soil", "bricks")
+_CLOTHES: Final = ("weave", "plaster", "mosaic")
+_UP: Final = np.array([0.0, 0.0, 1.0])
+_SKIN: Final = Material("plaster", 0.5, (1.5, 1.05, 0.8))
+_SUBJECT_M: Final = 1.75
+_SUBJECT_PART: Final = 0.62
+_BUILDINGS: Final = 26
+_NEAR: Final = 12
+_FAR: Final = 24
+
+Array = Any
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RayWorld:
+    """A built-in map with the figure of a proposal; see `World`.
+
+    Attributes:
+        scene: The map's contents.
+        bounds_m: Where cameras may be.
+        spawn_bounds_m: Where the figure may start.
+        figure: The subject.
+    """
+
+    scene: SceneModel
+    bounds_m: Bounds
+    spawn_bounds_m: Bounds
+    figure: Figure
+
+    def cast(
+        self, origins_m: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"]
+    ) -> Float64[np.ndarray, " n"]:
+        """See `World.cast`."""
+        return self.scene.distances(origins_m, directions)
+
+    def subject_points_m(self, spawn: Spawn, *, frame: int) -> Float64[np.ndarray, "p 3"]:
+        """Return both ends of every limb; see `World.subject_points_m`."""
+        return self.figure.points_m(**self._walk(spawn, frame=frame))
+
+    def limbs(self, spawn: Spawn, *, frame: int) -> list[Shape]:
+        """Return the figure's limbs at a frame."""
+        return self.figure.limbs(**self._walk(spawn, frame=frame))
+
+    def _walk(self, spawn: Spawn, *, frame: int) -> dict[str, Any]:
+        yaw = np.radians(spawn.yaw_deg)
+        return {
+            "start_m": spawn.place_m,
+            "yaw_deg": spawn.yaw_deg,
+            "rise": float(self.scene.slope @ (np.cos(yaw), np.sin(yaw))),
+            "moment_s": frame / FRAME_RATE_HZ,
+        }
+
+
+def open_map(proposal: Proposal) -> RayWorld:
+    """Return the map of a proposal with its figure."""
+    place = PLACES.get(proposal.map_name)
+    if place is None:
+        scene, bounds, spawn_bounds = _stage(proposal)
+    else:
+        scene, bounds, spawn_bounds = _fixed_place(proposal.map_name)
+    return RayWorld(scene, bounds, spawn_bounds, _figure(proposal))
+
+
+def _figure(proposal: Proposal) -> Figure:
+    rng = np.random.default_rng(zlib.crc32(proposal.character.encode()))
+    walk_m_s, stride_s = _GAITS[proposal.animation]
+    clothes = (
+        _SKIN,
+        _material(rng, textures=_CLOTHES, tile_m=(0.3, 0.8)),
+        _material(rng, textures=_CLOTHES, tile_m=(0.3, 0.8)),
+    )
+    return Figure(clothes, walk_m_s, stride_s, scale=float(rng.uniform(0.92, 1.06)))
+
+
+def _material(
+    rng: np.random.Generator, *, textures: tuple[str, ...], tile_m: tuple[float, float]
+) -> Material:
+    hue, saturation, value = rng.uniform((0, 0.03, 1.15), (1, 0.4, 1.5))
+    red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
+    texture = textures[int(rng.integers(len(textures)))]
+    return Material(texture, float(rng.uniform(*tile_m)), (red, green, blue))
+
+
+def _sun(rng: np.random.Generator) -> Float64[np.ndarray, "3"]:
+    """Return a direction to the sun, behind cameras that look along x."""
+    towards = rng.uniform(np.radians(-75), np.radians(75))
+    height = rng.uniform(np.radians(32), np.radians(58))
+    return np.array(
+        [-np.cos(height) * np.cos(towards), np.cos(height) * np.sin(towards), np.sin(height)]
+    )
+
+
+def _rotated_axes(*, yaw: float, tilt: float = 0.0) -> Array:
+    """Return the axes of a solid that is turned around the vertical and then tilted."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    upright = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    c, s = np.cos(tilt), np.sin(tilt)
+    return np.array([[1.0, 0.0, 0.0], [0.0, c, s], [0.0, -s, c]]) @ upright
+
+
+def _bounds(low: tuple[float, ...], high: tuple[float, ...]) -> Bounds:
+    return Bounds(np.array(low, np.float64), np.array(high, np.float64))
+
+
+# The stage.
+
+
+@dataclass(frozen=True, slots=True)
+class _Framing:
+    """What cameras around a stage see of it.
+
+    Attributes:
+        distance_m: Distance from the cameras to the middle of the stage.
+        width_per_m: Width of the picture at one metre, in metres.
+        pixel_per_m: Width of a pixel at one metre, in metres.
+    """
+
+    distance_m: float
+    width_per_m: float
+    pixel_per_m: float
+
+    def width_m(self, beyond_m: float) -> float:
+        """Return the width of the picture at a distance beyond the middle of the stage."""
+        return (beyond_m + self.distance_m) * self.width_per_m
+
+
+def _around(rng: np.random.Generator, radius_m: float) -> tuple[float, float]:
+    """Return a place on a circle around the middle of the stage."""
+    turn = rng.uniform(-np.pi, np.pi)
+    return abs(radius_m) * np.cos(turn), abs(radius_m) * np.sin(turn)
+
+
+def _stage(proposal: Proposal) -> tuple[SceneModel, Bounds, Bounds]:
+    rng = proposal.rng("map")
+    width_m, height_m = proposal.picture_at_1m
+    framing = _Framing(
+        distance_m=max(
+            _SUBJECT_M / _SUBJECT_PART / height_m, 1.2 * (proposal.span_m + 0.6) / width_m, 1.5
+        ),
+        width_per_m=width_m,
+        pixel_per_m=width_m / proposal.request.size_px,
+    )
+    slope = rng.uniform(-0.07, 0.07, 2)
+    sun = _sun(rng)
+    shapes = [
+        *_backdrop(rng, framing=framing),
+        *_objects(rng, framing=framing),
+        *_poles(rng, framing=framing),
+    ]
+    scene = SceneModel(
+        slope=slope,
+        ground=_material(rng, textures=_GROUNDS, tile_m=(2.0, 4.0)),
+        # The shapes stand on a level ground; here they are raised to the slanted one.
+        static_shapes=tuple(
+            replace(shape, centre=shape.centre + _UP * (slope @ shape.centre[:2]))
+            for shape in shapes
+        ),
+        shell=0,
+        sun=sun,
+        shadow_range_m=3 * framing.distance_m + 4,
+    )
+    reach_m, aside_m = 4 * framing.distance_m, 0.12 * framing.distance_m
+    return (
+        scene,
+        _bounds((-reach_m, -reach_m, -reach_m), (reach_m, reach_m, reach_m)),
+        _bounds((-aside_m, -aside_m, -reach_m), (aside_m, aside_m, reach_m)),
+    )
+
+
+def _backdrop(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
+    """Return buildings and walls around the stage, with gaps that show the sky."""
+    shapes = []
+    for radius_m in framing.distance_m * rng.uniform(1.7, 3.5, _BUILDINGS) + 2:
+        view_m = framing.width_m(radius_m)
+        half_m = view_m * rng.uniform((0.05, 0.08, 0.08), (0.1, 0.22, 0.3))
+        x_m, y_m = _around(rng, radius_m)
+        shapes.append(
+            Shape(
+                "box",
+                np.array([x_m, y_m, half_m[2] * 0.98]),
+                _rotated_axes(yaw=np.arctan2(y_m, x_m) + rng.uniform(-0.5, 0.5)),
+                half_m,
+                _material(rng, textures=_WALLS, tile_m=(2.0, 4.0)),
+            )
+        )
+    return shapes
+
+
+def _objects(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
+    """Return crates and balls between the cameras and the subject, and behind the cameras."""
+    shapes = []
+    parts = np.concatenate([rng.uniform(-0.55, -0.15, _NEAR), rng.uniform(0.2, 1.6, _FAR)])
+    for beyond_m in parts * framing.distance_m:
+        half_m = framing.width_m(beyond_m) * rng.uniform(0.025, 0.075) * rng.uniform(0.7, 1.4, 3)
+        x_m, y_m = _around(rng, np.sign(beyond_m) * max(abs(beyond_m), 0.6 + 2 * half_m.max()))
+        is_box = rng.random() < 0.55
+        tilt = rng.uniform(-0.6, 0.6) if rng.random() < 0.4 else 0.0
+        shapes.append(
+            Shape(
+                "box" if is_box else "ellipsoid",
+                np.array([x_m, y_m, half_m[2] * rng.uniform(0.75, 0.98)]),
+                _rotated_axes(yaw=rng.uniform(0, np.pi), tilt=tilt),
+                half_m,
+                _material(rng, textures=_THINGS, tile_m=(0.6, 2.0)),
+            )
+        )
+    return shapes
+
+
+def _poles(rng: np.random.Generator, *, framing: _Framing) -> list[Shape]:
+    """Return thin upright posts, a few pixels wide, some of them nearer than the subject."""
+    shapes = []
+    for part in (*rng.uniform(-0.6, -0.25, 6), *rng.uniform(0.4, 1.6, 12)):
+        beyond_m = part * framing.distance_m
+        view_m = framing.width_m(beyond_m)
+        relative = rng.uniform(0.002, 0.006) * framing.width_per_m
+        width_m = view_m / framing.width_per_m * max(relative, 2.2 * framing.pixel_per_m)
+        height_m = view_m * rng.uniform(0.3, 0.8) + 0.5
+        x_m, y_m = _around(rng, beyond_m)
+        shapes.append(
+            Shape(
+                "box",
+                np.array([x_m, y_m, 0.48 * height_m]),
+                _rotated_axes(yaw=rng.uniform(0, np.pi), tilt=rng.uniform(-0.12, 0.12)),
+                np.array([width_m / 2, width_m / 2, height_m / 2]),
+                _material(rng, textures=_WALLS, tile_m=(0.3, 0.8)),
+            )
+        )
+    return shapes
+
+
+# Places of fixed size.
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A rectangular place around the origin.
+
+    Attributes:
+        size_m: Length along x and width along y inside the walls.
+        wall_m: Height of the walls; 0 for none.
+        height_m: Up to where cameras may be: the ceiling, where there is one.
+        roof: "closed" has a ceiling.
+        crates: How many boxes and balls stand about.
+        posts: How many upright posts or trunks.
+        post_m: Their thickness and height.
+        crowns: Radius of the balls on top of the posts; 0 for none.
+    """
+
+    size_m: tuple[float, float]
+    wall_m: float
+    height_m: float
+    roof: str = "closed"
+    crates: int = 8
+    posts: int = 0
+    post_m: tuple[float, float] = (0.3, 3.0)
+    crowns: float = 0.0
+
+
+PLACES: Final[dict[str, _Place]] = {
+    "SynthCorridor": _Place((30.0, 3.4), wall_m=3.0, height_m=3.0, crates=5),
+    "SynthRoom": _Place((9.0, 7.0), wall_m=3.2, height_m=3.2, crates=7),
+    "SynthYard": _Place(
+        (15.0, 13.0), wall_m=3.5, height_m=6.0, roof="open", crates=10, posts=4, post_m=(0.16, 3.2)
+    ),
+    "SynthHall": _Place(
+        (26.0, 16.0), wall_m=6.0, height_m=6.0, crates=14, posts=8, post_m=(0.6, 6.0)
+    ),
+    "SynthPark": _Place(
+        (40.0, 36.0), wall_m=5.0, height_m=12.0, roof="open", crates=16, posts=16,
+        post_m=(0.4, 3.2), crowns=1.8,
+    ),
+}  # fmt: skip
+"""The maps of fixed size, from narrow to wide."""
+
+MAPS: Final = (STAGE, *PLACES)
+
+
+@lru_cache(maxsize=len(PLACES))
+def _fixed_place(name: str) -> tuple[SceneModel, Bounds, Bounds]:
+    place = PLACES[name]
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    half = np.array(place.size_m) / 2
+    shell = _shell(rng, place=place)
+    things = [*_crates(rng, place=place), *_posts(rng, place=place)]
+    scene = SceneModel(
+        slope=np.zeros(2),
+        ground=_material(rng, textures=_GROUNDS, tile_m=(2.0, 4.0)),
+        static_shapes=(*shell, *things),
+        shell=len(shell),
+        sun=_sun(rng),
+        shadow_range_m=float(half.max()) + 1,
+    )
+    bounds = _bounds((-half[0], -half[1], 0.0), (half[0], half[1], place.height_m))
+    inner = half - 0.3
+    return scene, bounds, _bounds((-inner[0], -inner[1], 0.0), (inner[0], inner[1], 2.5))
+
+
+def _shell(rng: np.random.Generator, *, place: _Place) -> list[Shape]:
+    """Return four walls, and a ceiling where the place is closed."""
+    thick = 0.2
+    (long_m, wide_m), high_m = place.size_m, place.wall_m
+    walls = [
+        (sign * (long_m / 2 + thick), 0.0, thick, wide_m / 2 + 2 * thick) for sign in (-1, 1)
+    ] + [(0.0, sign * (wide_m / 2 + thick), long_m / 2, thick) for sign in (-1, 1)]
+    shapes = [
+        Shape(
+            "box",
+            np.array([x, y, high_m / 2]),
+            np.eye(3),
+            np.array([half_x, half_y, high_m / 2]),
+            _material(rng, textures=_WALLS, tile_m=(2.0, 4.0)),
+        )
+        for x, y, half_x, half_y in walls
+    ]
+    if place.roof == "closed":
+        shapes.append(
+            Shape(
+                "box",
+                np.array([0.0, 0.0, high_m + thick]),
+                np.eye(3),
+                np.array([long_m / 2 + 2 * thick, wide_m / 2 + 2 * thick, thick]),
+                _material(rng, textures=_WALLS, tile_m=(2.0, 4.0)),
+            )
+        )
+    return shapes
+
+
+def _crates(rng: np.random.Generator, *, place: _Place) -> list[Shape]:
+    """Return boxes and balls, most of them towards the walls."""
+    shapes = []
+    half = np.array(place.size_m) / 2
+    for _ in range(place.crates):
+        half_m = rng.uniform(0.18, 0.55, 3) * min(1.6, 0.7 + half.min() / 12)
+        # The largest of three draws in -1..1 along one axis, so that the middle stays free.
+        across = rng.uniform(-1, 1, (3, 2))
+        place_xy = across[np.abs(across).max(axis=1).argmax()] * (half - half_m[:2].max() - 0.1)
+        is_box = rng.random() < 0.65
+        shapes.append(
+            Shape(
+                "box" if is_box else "ellipsoid",
+                np.array([*place_xy, half_m[2] * (1.0 if is_box else 0.97)]),
+                _rotated_axes(yaw=rng.uniform(0, np.pi)),
+                half_m,
+                _material(rng, textures=_THINGS, tile_m=(0.6, 2.0)),
+            )
+        )
+    return shapes
+
+
+def _posts(rng: np.random.Generator, *, place: _Place) -> list[Shape]:
+    """Return upright posts on a grid that is a little disturbed, with or without crowns."""
+    if not place.posts:
+        return []
+    shapes = []
+    thick, high = place.post_m
+    columns = place.posts // 2
+    half = np.array(place.size_m) / 2
+    wood = _material(rng, textures=_WALLS, tile_m=(0.8, 1.6))
+    leaves = _material(rng, textures=_GROUNDS, tile_m=(1.0, 2.0))
+    for number in range(place.posts):
+        column, row = divmod(number, 2)
+        grid = np.array([(column + 0.5) / columns * 2 - 1, row - 0.5])
+        x, y = (grid + rng.uniform(-0.1, 0.1, 2)) * half
+        shapes.append(
+            Shape(
+                "box",
+                np.array([x, y, high / 2]),
+                _rotated_axes(yaw=rng.uniform(0, np.pi)),
+                np.array([thick / 2, thick / 2, high / 2]),
+                wood,
+            )
+        )
+        if place.crowns:
+            size = place.crowns * rng.uniform(0.7, 1.2, 3)
+            shapes.append(
+                Shape("ellipsoid", np.array([x, y, high + 0.5 * size[2]]), np.eye(3), size, leaves)
+            )
+    return shapes

@@ -1,0 +1,587 @@
+"""Scenes rendered by Blender, judged from what comes out. They are skipped where bpy is missing.
+
+Blender may be in another Python: name it by the environment variable BLENDER_PYTHON.
+"""
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from stereogenbench_data import EvaluationProtocol, StereoPairs, score_controls
+from stereogenbench_data.cli.commands import app
+from stereogenbench_data.errors import ExtraError, SynthesisError
+from stereogenbench_data.evaluation.controls import relations
+from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
+from stereogenbench_data.synthesis.blender.assets import read_assets
+from stereogenbench_data.synthesis.blender.process import blender
+from stereogenbench_data.synthesis.blender.renderer import BlenderAssetWarning, BlenderRenderer
+from stereogenbench_data.synthesis.plan import ScenePlan
+from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.proposal import Proposal
+from stereogenbench_data.synthesis.renderer import Renderer
+from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
+from stereogenbench_data.synthesis.world import Spawn, World
+from tests.synthesis.conftest import Drawn
+from tests.synthesis.test_pictures import psnr_db
+
+HERE = Path(__file__).parent
+PYTHON = os.environ.get("BLENDER_PYTHON", "")
+has_blender = PYTHON or importlib.util.find_spec("bpy") is not None
+needs_blender = pytest.mark.skipif(
+    not has_blender,
+    reason="needs bpy 5.0: install it, or name a Python that has it by BLENDER_PYTHON",
+)
+
+
+@pytest.fixture(scope="session")
+def assets(tmp_path_factory):
+    """A folder with a yard, a room, a walking figure, and assets that have a fault each."""
+    folder = tmp_path_factory.mktemp("blender") / "assets"
+    made = subprocess.run(
+        [PYTHON or sys.executable, str(HERE / "make_blender_assets.py"), str(folder)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert made.returncode == 0, made.stderr
+    return folder
+
+
+@pytest.fixture(scope="session")
+def renderer(assets):
+    """The renderer of the sound assets."""
+    return BlenderRenderer.from_file(assets / "assets.toml", python=PYTHON)
+
+
+def proposal(*, on="Yard", take="Walk", frames=3, size_px=64, height_px=None, **contract):
+    """A proposal of a rig of 10 cm gaps, made by hand."""
+    request = SynthRequest(
+        map_name=on,
+        frames=frames,
+        size_px=size_px,
+        height_px=height_px,
+        contract=ExportContract(**contract),
+    )
+    return Proposal(
+        request=request,
+        index=0,
+        number=0,
+        map_name=on,
+        character="Figure",
+        animation=take,
+        sensor_mm=request.contract.sensor_mm,
+        focal_mm=28.0,
+        places_cm=np.arange(6) * 10.0,
+        offset_cm=np.zeros(3),
+    )
+
+
+def plan(made, *, eye=(-4.0, -1.5, 1.7), target=(0.0, 0.0, 0.9), place=(0.0, 0.0, 0.0)):
+    """A plan whose rig stands still and looks at a point."""
+    x, y, z = np.subtract(target, eye)
+    rotator = [np.degrees(np.arctan2(z, np.hypot(x, y))), np.degrees(np.arctan2(y, x)), 1.5]
+    frames = made.request.frames
+    return ScenePlan(
+        proposal=made,
+        spawn=Spawn(np.array(place), 20.0),
+        centres_m=np.tile(np.array(eye), (frames, 1)),
+        rotators_deg=np.tile(np.array(rotator), (frames, 1)),
+        subject_m=np.full(frames, 4.0),
+        splices=0,
+    )
+
+
+def fast(renderer, **settings):
+    """The same renderer with few samples."""
+    settings = {"samples_per_pixel": 1, "denoise": False} | settings
+    return replace(
+        renderer,
+        assets=replace(renderer.assets, settings=replace(renderer.assets.settings, **settings)),
+    )
+
+
+def views(renderer, made, cameras=(0, 1, 2, 3, 4, 5)):
+    return list(renderer.views(made, cameras=cameras))
+
+
+# Without Blender.
+
+
+def test_a_python_without_blender_is_refused_with_the_cure(tmp_path):
+    bare = tmp_path / "python"
+    bare.write_text(f"#!/bin/sh\nexec {sys.executable} -c 'import absent_bpy'\n")
+    bare.chmod(0o755)
+
+    with pytest.raises(ExtraError, match=r"cannot start Blender.*absent_bpy.*Python 3\.11 only"):
+        blender(str(bare))
+    with pytest.raises(ExtraError, match=r"no_python: this Python cannot be started"):
+        blender(str(tmp_path / "no_python"))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("bpy") is not None, reason="bpy is installed here")
+def test_this_python_without_blender_names_the_way_to_get_it():
+    with pytest.raises(
+        ExtraError, match=r"bpy cannot be imported \(No module named 'bpy'\).*--blender-python"
+    ):
+        blender()
+
+
+# What a map and a subject answer.
+
+
+@needs_blender
+def test_it_is_a_renderer_whose_maps_are_worlds(renderer):
+    assert isinstance(renderer, Renderer)
+    assert renderer.maps == ("Room", "Yard")
+    assert renderer.characters == ("Figure",)
+    assert renderer.animations == ("Walk", "Wave")
+    assert isinstance(renderer.world(proposal()), World)
+
+
+@needs_blender
+def test_rays_meet_the_walls_of_a_room_where_they_were_built(renderer):
+    """The table stands at Blender's y = 2.2, so at y = -2.2 of a left-handed map."""
+    world = renderer.world(proposal(on="Room"))
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+
+    met_m = world.cast(np.tile([0.0, 0.5, 1.0], (6, 1)), axes)
+    down_m = world.cast(np.array([[2.8, -2.2, 3.0], [2.8, 2.2, 3.0]]), np.tile(-axes[2], (2, 1)))
+
+    np.testing.assert_allclose(met_m, [4.5, 3.0, 2.2, 4.5, 4.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(down_m, [3.0 - 1.35, 3.0], atol=1e-6)
+
+
+@needs_blender
+def test_a_ray_that_starts_in_a_solid_goes_nowhere_but_a_room_is_no_solid(renderer):
+    world = renderer.world(proposal(on="Room"))
+    origins = np.array([[2.4, -2.0, 0.3], [-4.2, -1.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 20.0]])
+
+    met_m = world.cast(origins, np.tile([0.0, 0.0, 1.0], (4, 1)))
+
+    np.testing.assert_allclose(met_m, [0, 0, 2.2, np.inf], atol=1e-6)
+
+
+@needs_blender
+def test_cameras_stay_below_a_ceiling_and_may_rise_above_a_yard(renderer):
+    room, yard = (renderer.world(proposal(on=name)) for name in ("Room", "Yard"))
+
+    np.testing.assert_allclose(room.bounds_m.high_m, [4.7, 3.7, 3.4], atol=1e-6)
+    assert room.spawn_bounds_m.high_m[2] == pytest.approx(3.19)
+    assert yard.bounds_m.high_m[2] == pytest.approx(24.0)
+    np.testing.assert_allclose(yard.spawn_bounds_m.high_m, [3, 3, 1])
+
+
+@needs_blender
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, -30.0])
+def test_the_subject_stands_on_its_place_and_walks_where_it_faces(renderer, yaw_deg):
+    world = renderer.world(proposal(frames=81))
+    spawn = Spawn(np.array([1.0, -2.0, 0.5]), yaw_deg)
+
+    points = np.stack([world.subject_points_m(spawn, frame=frame) for frame in range(81)])
+
+    assert points.shape[1] >= 8
+    assert points[0, :, 2].min() == pytest.approx(0.5, abs=0.02)
+    assert points[0, :, 2].max() - 0.5 == pytest.approx(1.7, abs=0.05)
+    assert points[..., 2].min() >= 0.5 - 1e-6
+    # 1.3 m a second, that is a take of 24 frames at 24 Hz, repeated from where it led.
+    way = points[75].mean(axis=0) - points[0].mean(axis=0)
+    ahead = rotation_from_rotator_deg(np.array([0.0, yaw_deg, 0.0]))[:, 0]
+    np.testing.assert_allclose(way, 6.5 * ahead, atol=1e-3)
+    assert np.linalg.norm(np.diff(points, axis=0), axis=2).max() < 0.35
+
+
+def _changed(assets, before, after):
+    path = assets / "changed.toml"
+    text = (assets / "assets.toml").read_text()
+    assert before in text
+    path.write_text(text.replace(before, after))
+    return read_assets(path)
+
+
+@needs_blender
+def test_all_kinds_of_files_give_the_same_motion(assets):
+    """A take of one file moves the mesh of another with the same bones."""
+    found = []
+    for mesh in ("blend", "glb", "fbx"):
+        for motion in ("blend", "glb", "fbx"):
+            text = (
+                f'[maps.Yard]\nfile = "yard.blend"\n[characters.Figure]\nfile = "figure.{mesh}"\n'
+                f'[animations.Walk]\nfile = "figure.{motion}"\ntake = "Walk"\n'
+            )
+            path = assets / "kinds.toml"
+            path.write_text(text)
+            world = BlenderRenderer(read_assets(path), PYTHON).world(proposal(frames=30))
+            spawn = Spawn(np.zeros(3), 0.0)
+            points = np.stack([world.subject_points_m(spawn, frame=t) for t in range(30)])
+            found.append(np.concatenate([points.min(axis=1), points.max(axis=1)]))
+
+    np.testing.assert_allclose(found[1:], [found[0]] * 8, atol=4e-3)
+
+
+@needs_blender
+def test_only_what_hangs_on_the_armature_is_the_subject(assets):
+    """Neither the plinth below it nor the shape of a handle, whose collection is excluded."""
+    file = '[characters.Figure]\nfile = "figure.glb"'
+    spawn = Spawn(np.zeros(3), 0.0)
+    alone = BlenderRenderer(_changed(assets, file, file), PYTHON).world(proposal())
+    changed = _changed(assets, file, file.replace("figure.glb", "figure_extra.blend"))
+
+    with pytest.warns(BlenderAssetWarning, match=r"object 'plinth', hidden: bound to no armature"):
+        world = BlenderRenderer(changed, PYTHON).world(proposal())
+
+    for points in (each.subject_points_m(spawn, frame=0) for each in (alone, world)):
+        np.testing.assert_allclose(points[:, 2].min(), 0, atol=0.02)
+        np.testing.assert_allclose(np.ptp(points, axis=0), [0.46, 0.56, 1.7], atol=0.02)
+
+
+@needs_blender
+@pytest.mark.parametrize(("take", "repeat"), [("Lean", "onward"), ("Walk", "back")])
+def test_a_take_that_cannot_go_on_is_played_back(assets, take, repeat):
+    changed = _changed(assets, 'take = "Walk"', f'take = "{take}"\nrepeat = "{repeat}"')
+    world = BlenderRenderer(changed, PYTHON).world(proposal(frames=32))
+    spawn = Spawn(np.zeros(3), 0.0)
+
+    points = np.stack([world.subject_points_m(spawn, frame=frame) for frame in range(32)])
+
+    # Takes of a second: frames 0 and 30 are its start, 15 is its end.
+    np.testing.assert_allclose(points[30], points[0], atol=1e-4)
+    np.testing.assert_allclose(points[16], points[14], atol=1e-4)
+    assert np.abs(points[15] - points[0]).max() > 0.3
+
+
+# What is rendered.
+
+
+@needs_blender
+def test_depth_is_that_of_another_librarys_rays(renderer, assets, tmp_path):
+    """Oblong pixels, a principal point off the centre, and a fan that turns."""
+    trimesh = pytest.importorskip("trimesh", reason="needs trimesh, and embreex to be fast")
+    frame = 7
+    made = proposal(
+        frames=frame + 1,
+        size_px=96,
+        height_px=64,
+        sensor_mm=(23.76, 12.0),
+        principal_point_px=(40.0, 36.5),
+    )
+    still = plan(made, eye=(-5.0, -2.0, 1.8), target=(0.0, 0.0, 2.4), place=(300.0, 0.0, 0.0))
+
+    last = views(fast(renderer), still, cameras=(0, 5))[-2:]
+
+    out = tmp_path / "truth.npz"
+    when = 1 + frame / 15 * 24
+    script = [str(HERE / "blender_truth.py"), str(assets / "yard.blend"), str(when), str(out)]
+    subprocess.run([PYTHON or sys.executable, *script], check=True, capture_output=True)
+    corners = np.load(out)["corners"] * [1, -1, 1]
+    mesh = trimesh.Trimesh(
+        corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False
+    )
+    for camera, rendered in zip((0, 5), last, strict=True):
+        view = still.view(camera=camera, frame=frame)
+        right = (np.arange(96) + 0.5 - 40.0) / view.focal_px[0]
+        down = (np.arange(64) + 0.5 - 36.5) / view.focal_px[1]
+        forward_axis, right_axis, up_axis = view.axes.T
+        rays = (
+            forward_axis + right[None, :, None] * right_axis - down[:, None, None] * up_axis
+        ).reshape(-1, 3)
+        _, which, met = mesh.ray.intersects_id(
+            np.tile(view.eye, (len(rays), 1)), rays, multiple_hits=False, return_locations=True
+        )
+        truth_m = np.full(len(rays), np.inf)
+        truth_m[which] = (met - view.eye) @ forward_axis
+        np.testing.assert_allclose(rendered.depth_m.ravel(), truth_m, rtol=1e-6)
+        assert np.isinf(truth_m).mean() > 0.05
+
+
+@needs_blender
+def test_pictures_have_sky_exactly_where_depth_has_none(renderer):
+    """So intrinsics of pictures and depth agree, also off the centre and with oblong pixels."""
+    made = proposal(
+        frames=1, size_px=96, height_px=64, sensor_mm=(23.76, 12.0), principal_point_px=(40.0, 26.5)
+    )
+
+    shown = views(
+        fast(renderer, samples_per_pixel=8), plan(made, target=(0.0, 0.0, 2.4)), cameras=(0, 5)
+    )
+
+    for view in shown:
+        picture = view.picture.astype(int)
+        is_sky = (picture[..., 2] > 200) & (picture[..., 2] > picture[..., 0] + 20)
+        nothing = np.isinf(view.depth_m)
+        assert 0.1 < nothing.mean() < 0.9
+        assert (is_sky == nothing).mean() > 0.985
+
+
+@needs_blender
+def test_depth_goes_through_holes_that_a_material_cuts(assets):
+    """A red card with holes, before a blue wall on the left and nothing on the right."""
+    changed = _changed(assets, "yard.blend", "screen.blend")
+    quick = fast(BlenderRenderer(changed, PYTHON), samples_per_pixel=4)
+    made = plan(
+        proposal(frames=1), eye=(-4.0, 0.0, 1.8), target=(2.0, 0.0, 1.8), place=(0.0, 100.0, 0.0)
+    )
+
+    for view in views(quick, made, cameras=(0, 5)):
+        red, green, blue = np.moveaxis(view.picture.astype(int), -1, 0)
+        pure = np.maximum(np.maximum(red, green), blue) == red + green + blue
+        card, wall = pure & (red > 240), pure & (blue > 240)
+        sky = red + green + blue == 0
+        assert min(card.mean(), wall.mean(), sky.mean()) > 0.1
+        assert 5.5 < view.depth_m[card].min() <= view.depth_m[card].max() < 6.6
+        assert 9.4 < view.depth_m[wall].min() <= view.depth_m[wall].max() < 10.4
+        assert np.isinf(view.depth_m[sky]).all()
+
+
+@needs_blender
+def test_the_same_plan_gives_the_same_bytes_in_another_blender(renderer):
+    made = plan(proposal(frames=2))
+    few = fast(renderer, samples_per_pixel=4, denoise=True)
+
+    first = views(few, made)
+    blender(PYTHON, place=renderer.assets.maps["Yard"].file).close()
+    second = views(few, made)
+
+    assert len(first) == 12
+    for one, other in zip(first, second, strict=True):
+        np.testing.assert_array_equal(one.picture, other.picture)
+        np.testing.assert_array_equal(one.depth_m, other.depth_m)
+    assert not np.array_equal(first[0].picture, first[1].picture)
+    assert not np.array_equal(first[0].depth_m, first[6].depth_m)
+
+
+@needs_blender
+def test_the_command_renders_all_maps_of_the_assets(assets, tmp_path):
+    quick = tmp_path / "assets"
+    shutil.copytree(assets, quick)
+    text = (quick / "assets.toml").read_text()
+    (quick / "assets.toml").write_text(text.replace("= 32", "= 1\ndenoise = false"))
+    options = ["--size", "32", "--frames", "1", "--scenes", "2", "--seed", "5", "--workers", "1"]
+    of_blender = ["--renderer", "blender", "--assets", str(quick / "assets.toml")]
+    python = ["--blender-python", PYTHON] if PYTHON else []
+
+    result = CliRunner().invoke(
+        app,
+        ["synth", str(tmp_path / "out"), *options, *of_blender, *python],
+        catch_exceptions=False,
+    )
+
+    assert result.exit_code == 0, result.output
+    markers = (tmp_path / "out").rglob("_scene_complete.json")
+    assert {marker.parts[-3] for marker in markers} <= {"Room", "Yard"}
+    assert "2 scenes in train/IPD_Gaussian/" in result.stdout
+
+
+@needs_blender
+def test_two_parts_write_the_files_of_one_run(renderer, tmp_path):
+    request = SynthRequest(map_name=renderer.maps, scenes=2, size_px=32, frames=1, seed=5)
+    quick = fast(renderer)
+    whole = synthesise(tmp_path / "whole", request, renderer=quick)
+    parts = [
+        key
+        for part in ((2, 2), (1, 2))
+        for key in synthesise(tmp_path / "parts", request, renderer=quick, part=part)
+    ]
+
+    assert sorted(parts) == sorted(whole)
+    for file in (path for key in whole for path in (tmp_path / "whole" / key).iterdir()):
+        other = tmp_path / "parts" / file.relative_to(tmp_path / "whole")
+        assert file.read_bytes() == other.read_bytes(), file.name
+
+
+# Assets that cannot be used.
+
+FAULTS = {
+    "empty.blend": r"empty\.blend: the map is empty.*Show its",
+    "dark.blend": r"dark\.blend: it has no light.*set light = \"sky\"",
+    "huge.blend": r"huge\.blend: the map is 8e\+04 m wide.*Set scale = 0\.001",
+    "vast.blend": r"vast\.blend: its ceiling is 280 m high.*Set scale = 0\.01",
+    "tiny.blend": r"tiny\.blend: the map is 0\.08 m wide.*Set scale = 100",
+    "textureless.blend": r"1 textures are missing: //far\.png.*Copy",
+    "far_texture.blend": r"refers to .*outside.far\.png, which is outside the asset folder.*Copy",
+    "linked.blend": r"library\.blend.* outside the asset folder",
+    "cut.blend": r"cut\.blend: Blender cannot open it",
+    "cut.fbx": r"cut\.fbx: Blender cannot import it.*Open it in Blender",
+}
+
+
+@needs_blender
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_faulty_map_is_refused_with_the_cure(assets, name):
+    changed = _changed(assets, "yard.blend", name)
+
+    with pytest.raises(SynthesisError, match=rf"maps\.Yard: .*{FAULTS[name]}"):
+        BlenderRenderer(changed, PYTHON).world(proposal())
+
+
+@needs_blender
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ('[characters.Figure]\nfile = "figure.glb"', '[characters.Figure]\nfile = "boneless.blend"',
+         r"characters\.Figure: .*has no armature.*it has mesh"),
+        ('[characters.Figure]', '[characters.Figure]\nscale = 100',
+         r"characters\.Figure: .*is 170 m tall.*Set scale = 1 "),
+        ('[characters.Figure]', '[characters.Figure]\nscale = 0.01',
+         r"is 0\.017 m tall.*Set scale = 1 "),
+        ('file = "figure.glb"\ntake = "Walk"', 'file = "figure.glb"',
+         r"animations\.Walk: .*has 3 takes.*'Lean', 'Turn', 'Walk'"),
+        ('take = "Walk"', 'take = "Run"', r"take = 'Run' names 0 takes.*'Walk'"),
+        ('file = "figure.glb"\ntake = "Walk"', 'file = "other_bones.blend"',
+         r"moves no bone of the armature.*'Bip01'.*'arm\.L'"),
+        ('file = "figure.glb"\ntake = "Walk"', 'file = "boneless.blend"',
+         r"no take that moves bones"),
+    ],
+)  # fmt: skip
+def test_a_faulty_subject_is_refused_with_the_cure(assets, before, after, says):
+    changed = _changed(assets, before, after)
+
+    with pytest.raises(SynthesisError, match=says):
+        BlenderRenderer(changed, PYTHON).world(proposal())
+
+
+@needs_blender
+def test_a_gpu_is_used_or_its_lack_is_told(renderer):
+    on_gpu = fast(renderer, device="GPU")
+    try:
+        (view,) = views(on_gpu, plan(proposal(frames=1)), cameras=(0,))
+    except SynthesisError as error:
+        assert re.search(r'device = "GPU": Cycles finds no GPU.*device = "CPU"', str(error))  # noqa: PT017
+    else:
+        assert view.picture.std() > 5
+
+
+@needs_blender
+def test_a_map_of_another_name_is_refused(renderer):
+    with pytest.raises(SynthesisError, match=r"there is no map 'Moon'.*Room, Yard"):
+        renderer.world(proposal(on="Moon"))
+
+
+@needs_blender
+def test_scripts_in_files_do_not_run_and_are_told(assets):
+    changed = _changed(assets, "yard.blend", "scripted.blend")
+
+    with pytest.warns(BlenderAssetWarning, match=r"harm\.py.*driver of 'floor', location"):
+        world = BlenderRenderer(changed, PYTHON).world(proposal())
+
+    assert not list((assets.parent / "outside").glob("was_*"))
+    # The driver would have lifted the floor by 3 m.
+    fall_m = world.cast(np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 0.0, -1.0]]))
+    assert fall_m == pytest.approx([2.0], abs=0.2)
+
+
+@needs_blender
+def test_a_crash_of_blender_is_an_error_and_the_next_call_starts_anew(renderer):
+    world = renderer.world(proposal())
+    process = blender(PYTHON, place=renderer.assets.maps["Yard"].file)
+    os.kill(process.pid, signal.SIGSEGV)
+    up = (np.array([[0.0, 0.0, 1.0]]), np.array([[0.0, 0.0, -1.0]]))
+
+    with pytest.raises(SynthesisError, match=r"Yard.*Blender crashed \(SIGSEGV\).*Run it again"):
+        world.cast(*up)
+    np.testing.assert_allclose(world.cast(*up), [1.0], atol=1e-6)
+
+
+@needs_blender
+def test_a_scene_on_which_blender_crashed_is_rendered_by_the_next_run(renderer, tmp_path):
+    request = SynthRequest(map_name=("Yard",), size_px=32, frames=2, seed=1)
+    quick = fast(renderer)
+
+    def kill(done, total):
+        if done == 6:
+            os.kill(blender(PYTHON, place=renderer.assets.maps["Yard"].file).pid, signal.SIGSEGV)
+
+    with pytest.raises(SynthesisError, match=r"scene_000000, frame 1: Blender crashed"):
+        synthesise(tmp_path, request, renderer=quick, progress=kill)
+    assert not list(tmp_path.rglob("_scene_complete.json"))
+    (key,) = synthesise(tmp_path, request, renderer=quick)
+
+    assert (tmp_path / key / "_scene_complete.json").exists()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert synthesise(tmp_path, request, renderer=quick) == [key]
+
+
+# Whole scenes, as any reader of the release takes them.
+
+
+@pytest.fixture(scope="session")
+def rendered(renderer, tmp_path_factory):
+    """A tree of two scenes, one of each map, 256 px wide."""
+    root = tmp_path_factory.mktemp("rendered")
+    quick = fast(renderer, samples_per_pixel=8, denoise=True)
+    for name, family in (("Room", "IPD_Gaussian"), ("Yard", "Uniform")):
+        request = SynthRequest(
+            map_name=(name,), family=family, size_px=256, frames=2, seed=3, focal_mm=20.0
+        )
+        synthesise(root, request, renderer=quick)
+    return root
+
+
+@pytest.fixture
+def scenes(rendered):
+    """The two scenes, read with PyAV and json alone."""
+    return [Drawn(marker.parent) for marker in sorted(rendered.rglob("_scene_complete.json"))]
+
+
+@needs_blender
+def test_visible_pixels_agree_when_warped_by_depth(scenes):
+    for scene in scenes:
+        for left in range(5):
+            agreement_db, kept = psnr_db(scene, left=left, right=left + 1, frame=1)
+            assert agreement_db > 29
+            assert kept > 0.2
+        agreement_db, _ = psnr_db(scene, left=0, right=5, frame=1)
+        assert agreement_db > 28
+
+
+@needs_blender
+def test_the_subject_is_seen_and_moves(scenes):
+    for scene in scenes:
+        assert np.ptp(scene.pictures(0), axis=0).max() > 40
+        assert scene.json("baseline.json")["character_mesh"] == "Figure"
+
+
+@needs_blender
+def test_the_doctor_confirms_the_contract_and_the_audit_finds_nothing(rendered):
+    few = ("--frames", "2", "--workers", "1")
+
+    doctor = CliRunner().invoke(app, ["doctor", str(rendered), *few, "--scenes", "2", "--json"])
+    audit = CliRunner().invoke(app, ["audit", str(rendered), *few])
+
+    assert doctor.exit_code == 0, doctor.output
+    assert audit.exit_code == 0, audit.output
+    (verdict,) = json.loads(doctor.stdout)["verdicts"]
+    assert len(verdict["scenes"]) == 2
+    assert verdict["quotient"] == pytest.approx(1, rel=0.01)
+    found = {answer["topic"]: answer["status"] for answer in verdict["answers"]}
+    assert found["unit / (focal length x baseline)"] == "confirmed"
+    assert found["depth along"] == "confirmed"
+
+
+@needs_blender
+def test_pairs_and_evaluation_read_the_scenes(rendered):
+    pairs = StereoPairs(rendered, pairs="all", frames="all")
+    sample = pairs[0]
+
+    scores = score_controls(
+        rendered, workers=1, protocol=EvaluationProtocol(size=(224, 224)), frames="first"
+    )
+
+    assert len(pairs) == 2 * 15 * 2
+    assert sample["valid"].float().mean() > 0.5
+    assert (sample["disparity"][sample["valid"]] > 0).all()
+    found = relations(scores)
+    assert found
+    assert all(relation.holds is not False for relation in found), found

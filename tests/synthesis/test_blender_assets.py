@@ -1,0 +1,227 @@
+"""``assets.toml``, without Blender: what is read, and what is refused in which words."""
+
+import io
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.synthesis.blender.assets import gltf_uris, read_assets
+from stereogenbench_data.synthesis.blender.worker import read_message, write_message
+
+COMPLETE = """\
+[maps.Yard]
+file = "maps/yard.blend"
+scale = 0.01
+light = "sky"
+bounds_m = [[-5, -5, 0], [5, 5.5, 3]]
+
+[maps.Room]
+file = "room.gltf"
+
+[characters.Figure]
+file = "figure.fbx"
+forward = "+x"
+
+[animations.Walk]
+file = "figure.fbx"
+take = "Walk"
+
+[animations.Wave]
+file = "figure.fbx"
+take = "Wave"
+rate_hz = 30
+
+[sensors]
+full_frame = [36.0, 24.0]
+square = [23.76, 23.76]
+
+[render]
+samples_per_pixel = 8
+device = "GPU"
+denoise = false
+threads = 2
+"""
+LEAST = """\
+[maps.Room]
+file = "room.gltf"
+[characters.Figure]
+file = "figure.fbx"
+[animations.Walk]
+file = "figure.fbx"
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder of assets whose content only Blender would look at."""
+    folder = tmp_path / "assets"
+    (folder / "maps").mkdir(parents=True)
+    (folder / "maps" / "yard.blend").write_bytes(b"BLENDER")
+    (folder / "figure.fbx").write_bytes(b"Kaydara")
+    (folder / "room.bin").write_bytes(b"1234")
+    write_gltf(folder / "room.gltf", "room.bin")
+    return folder
+
+
+def write_gltf(path, *uris):
+    path.write_text(
+        json.dumps({"asset": {"version": "2.0"}, "buffers": [{"uri": u} for u in uris]})
+    )
+
+
+def read(folder, text):
+    path = folder / "assets.toml"
+    path.write_text(text)
+    return read_assets(path)
+
+
+def test_everything_that_a_file_can_name_is_read(folder):
+    assets = read(folder, COMPLETE)
+
+    yard = assets.maps["Yard"]
+    assert yard.file == str(folder / "maps" / "yard.blend")
+    assert (yard.scale, yard.light) == (0.01, "sky")
+    assert yard.bounds_m == ((-5.0, -5.0, 0.0), (5.0, 5.5, 3.0))
+    assert assets.characters["Figure"].forward == "+x"
+    assert assets.animations["Wave"].take == "Wave"
+    assert assets.animations["Wave"].rate_hz == 30
+    assert assets.sensors_mm == ((36.0, 24.0), (23.76, 23.76))
+    settings = assets.settings
+    assert (settings.samples_per_pixel, settings.device) == (8, "GPU")
+    assert (settings.denoise, settings.threads) == (False, 2)
+
+
+def test_what_is_not_said_has_a_default(folder):
+    assets = read(folder, LEAST)
+
+    assert assets.maps["Room"].scale == 1.0
+    assert assets.maps["Room"].light == "own"
+    assert assets.maps["Room"].bounds_m is None
+    assert assets.characters["Figure"].forward == "-y"
+    assert assets.animations["Walk"].take is None
+    assert assets.sensors_mm == ()
+    assert assets.settings.device == "CPU"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ('file = "room.gltf"', 'fiel = "room.gltf"', r"maps\.Room\.fiel.*unknown.*Choose.*file"),
+        ('file = "room.gltf"', "", r"maps\.Room\.file: found None.*must name a file"),
+        ('file = "room.gltf"', "file = 3", r"maps\.Room\.file: found 3"),
+        ('"room.gltf"', '"room.obj"', r"found 'room.obj'.*must end in \.blend"),
+        ('"room.gltf"', '"hall.gltf"', r"found 'hall.gltf'.*must exist"),
+        ('"room.gltf"', '"../room.gltf"', r"found '../room.gltf'.*outside the folder.*Copy"),
+        ('"room.gltf"', '"/etc/room.gltf"', r"found '/etc/room.gltf'.*outside the folder"),
+        ("[maps.Room]", "[maps.'my room']", r"maps\.my room.*letters, digits and underscores"),
+        ("[maps.Room]", "[map.Room]", r"assets.toml: map: this key is unknown.*maps"),
+        ("[characters.Figure]", "[render]\ndevice = 'TPU'\n[characters.Figure]",
+         r"render\.device: found 'TPU'.*CPU, GPU"),
+        ("[characters.Figure]", "[render]\nsamples_per_pixel = 0\n[characters.Figure]",
+         r"samples_per_pixel: found 0.*at least 1"),
+        ("[characters.Figure]", "[render]\nsamples_per_pixel = true\n[characters.Figure]",
+         r"samples_per_pixel: found True"),
+        ("[characters.Figure]", "[render]\ndenoise = 1\n[characters.Figure]", r"denoise: found 1"),
+        ("[characters.Figure]", "scale = -1\n[characters.Figure]",
+         r"maps\.Room\.scale: found -1.*positive"),
+        ("[characters.Figure]", "scale = inf\n[characters.Figure]", r"scale: found inf"),
+        ("[characters.Figure]", "light = 'lamp'\n[characters.Figure]", r"light.*own, sky"),
+        ("[characters.Figure]", "bounds_m = [[0, 0, 0], [1, -1, 1]]\n[characters.Figure]",
+         r"bounds_m: found .*the smaller corner first"),
+        ("[characters.Figure]", "bounds_m = [0, 1]\n[characters.Figure]", r"bounds_m: found \[0"),
+        ("[characters.Figure]", "[sensors]\nsmall = [0, 4]\n[characters.Figure]",
+         r"sensors\.small: found \[0, 4\].*positive"),
+        ("[animations.Walk]\nfile = \"figure.fbx\"", "", r"animations: found \{\}.*at least"),
+        ("[animations.Walk]", "[animations.Walk]\ntake = 3", r"Walk\.take: found 3"),
+        ("[animations.Walk]", "[animations.Walk]\nforward = '-y'", r"Walk\.forward.*unknown"),
+        ("[animations.Walk]", "[animations.Walk", r"is not TOML.*line 5"),
+    ],
+)  # fmt: skip
+def test_what_does_not_follow_the_format_is_refused(folder, before, after, says):
+    assert before in LEAST
+
+    with pytest.raises(SynthesisError, match=says):
+        read(folder, LEAST.replace(before, after))
+
+
+def test_a_missing_file_of_assets_is_named(tmp_path):
+    with pytest.raises(SynthesisError, match=r"none\.toml: cannot be read.*--assets"):
+        read_assets(tmp_path / "none.toml")
+
+
+def test_a_link_out_of_the_folder_is_refused(folder, tmp_path):
+    (tmp_path / "elsewhere.blend").write_bytes(b"BLENDER")
+    (folder / "room.blend").symlink_to(tmp_path / "elsewhere.blend")
+
+    with pytest.raises(SynthesisError, match=r"maps\.Room\.file: found 'room.blend'.*outside"):
+        read(folder, LEAST.replace("room.gltf", "room.blend"))
+
+
+@pytest.mark.parametrize(
+    ("uri", "says"),
+    [
+        ("../secret.bin", r"room\.gltf.*found .*outside the folder"),
+        ("%2e%2e/secret.bin", r"room\.gltf.*outside the folder"),
+        ("/etc/passwd", r"room\.gltf.*outside the folder"),
+        ("file:///etc/passwd", r"refers to 'file:///etc/passwd', which is missing"),
+        ("gone.bin", r"refers to 'gone.bin', which is missing"),
+    ],
+)
+def test_gltf_refers_only_to_files_of_the_folder(folder, tmp_path, uri, says):
+    (tmp_path / "secret.bin").write_bytes(b"1234")
+    write_gltf(folder / "room.gltf", uri)
+
+    with pytest.raises(SynthesisError, match=says):
+        read(folder, LEAST)
+
+
+def test_references_of_a_glb_are_read_too(tmp_path):
+    document = json.dumps(
+        {"buffers": [{"byteLength": 4}], "images": [{"uri": "a.png"}, {"uri": "data:,x"}]}
+    ).encode()
+    header = struct.pack("<4sII", b"glTF", 2, 20 + len(document))
+    path = tmp_path / "room.glb"
+    path.write_bytes(header + struct.pack("<II", len(document), 0x4E4F534A) + document)
+
+    assert gltf_uris(path) == ["a.png"]
+
+
+@pytest.mark.parametrize("content", [b"", b"glTF", b"[1, 2]", b"\xff\xfe", b'{"buffers": 3}'])
+def test_what_is_not_gltf_is_refused(tmp_path, content):
+    path = tmp_path / "room.gltf"
+    path.write_bytes(content)
+
+    with pytest.raises(SynthesisError, match=r"room\.gltf: is not glTF.*Export it again"):
+        gltf_uris(path)
+
+
+def test_the_digest_follows_every_file(folder):
+    before = read(folder, LEAST).digest
+
+    assert read(folder, LEAST).digest == before
+    (folder / "figure.fbx").write_bytes(b"Kaydarb")
+    assert read(folder, LEAST).digest != before
+
+
+def test_messages_arrive_as_they_were_sent():
+    stream = io.BytesIO()
+    arrays = [np.arange(6.0).reshape(2, 3), np.empty((0, 3)), np.array([[1, 2]], np.uint8)]
+
+    write_message(stream, {"call": "cast"}, arrays)
+    stream.seek(0)
+    message, found = read_message(stream)
+
+    assert message == {"call": "cast"}
+    for sent, received in zip(arrays, found, strict=True):
+        np.testing.assert_array_equal(sent, received)
+
+
+def test_a_message_that_is_cut_short_is_an_end():
+    stream = io.BytesIO()
+    write_message(stream, {"call": "cast"}, [np.zeros(4)])
+
+    with pytest.raises(EOFError, match="8 bytes early"):
+        read_message(io.BytesIO(stream.getvalue()[:-8]))

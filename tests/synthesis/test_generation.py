@@ -1,0 +1,328 @@
+"""Generation as a whole: parts, resuming, what is refused after rendering, reports, the holdout."""
+
+import json
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+import typer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from stereogenbench_data.cli.synth import synth
+from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
+from stereogenbench_data.schema.release import FAMILIES
+from stereogenbench_data.synthesis.checks import check_files
+from stereogenbench_data.synthesis.decisions import FOLDER, all_decisions
+from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS, Rig, check_poses
+from stereogenbench_data.synthesis.maps import MAPS, open_map
+from stereogenbench_data.synthesis.planning import plan_scene, propose
+from stereogenbench_data.synthesis.produce import hold_out, plan_scenes, synthesise
+from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING, RayCasting
+from stereogenbench_data.synthesis.renderer import RenderedView
+from stereogenbench_data.synthesis.report import ALL_MAPS, markdown_of, report_of, report_of_tree
+from stereogenbench_data.synthesis.request import SynthRequest
+from stereogenbench_data.synthesis.sheets import write_sheets
+from stereogenbench_data.synthesis.trajectory import steps
+
+app = typer.Typer()
+app.command()(synth)
+SMALL = {"size_px": 32, "frames": 2, "seed": 9}
+MIXED = ("SynthRoom", "SynthYard", "SynthHall")
+
+
+def contents(root):
+    paths = sorted(path for path in root.rglob("*") if path.is_file() and FOLDER not in path.parts)
+    return {str(path.relative_to(root)): path.read_bytes() for path in paths}
+
+
+# Accepted plans.
+
+
+@pytest.mark.parametrize("map_name", MAPS)
+def test_every_accepted_frame_passes_all_filters_and_moves_little(map_name):
+    for index in range(2):
+        plan = plan_scene(SynthRequest(map_name=map_name, size_px=64), index=index).plan
+        world, rig = open_map(plan.proposal), Rig.of(plan.proposal)
+        frames = range(plan.request.frames)
+        body_m = np.stack([world.subject_points_m(plan.spawn, frame=frame) for frame in frames])
+
+        checks = check_poses(
+            plan.centres_m, plan.rotators_deg,
+            body_m=body_m, rig=rig, world=world, limits=DEFAULT_LIMITS,
+        )  # fmt: skip
+        axes = rotation_from_rotator_deg(plan.rotators_deg)
+        step_m, turn_deg = steps(rig.eyes(plan.centres_m, axes), axes)
+
+        assert checks.passed.all()
+        assert step_m.max() <= DEFAULT_LIMITS.step_m
+        assert turn_deg.max() <= DEFAULT_LIMITS.turn_deg
+        assert np.abs(np.diff(turn_deg)).max() <= DEFAULT_LIMITS.jerk_deg
+
+
+@given(
+    family=st.sampled_from(FAMILIES), seed=st.integers(0, 2**40), index=st.integers(0, 10_000),
+    number=st.integers(0, 4000),
+)  # fmt: skip
+@settings(max_examples=40, deadline=None)
+def test_a_proposal_follows_from_its_numbers_alone(family, seed, index, number):
+    request = SynthRequest(family=family, seed=seed, map_name=MAPS)
+
+    first, again = (propose(request, index=index, number=number) for _ in range(2))
+    other = propose(request, index=index, number=number + 1)
+
+    assert first.places_cm.tolist() == again.places_cm.tolist() != other.places_cm.tolist()
+    assert (first.map_name, first.character, first.animation, first.focal_mm) == (
+        again.map_name, again.character, again.animation, again.focal_mm,
+    )  # fmt: skip
+    assert first.offset_cm.tolist() == again.offset_cm.tolist()
+    assert 18 <= first.focal_mm <= 85
+
+
+def test_realised_baselines_are_those_of_the_accepted_proposal():
+    plan = plan_scene(
+        SynthRequest(family="Uniform", map_name="SynthHall", size_px=64), index=0
+    ).plan
+
+    for frame in (0, 40, 80):
+        gaps_cm = np.linalg.norm(np.diff(plan.world_locations_cm(frame), axis=0), axis=1)
+        np.testing.assert_allclose(gaps_cm, np.diff(plan.proposal.places_cm), rtol=0, atol=1e-9)
+
+
+def test_the_poses_are_rounded_so_that_processors_agree():
+    plan = plan_scene(SynthRequest(map_name="SynthYard", size_px=64, frames=9), index=0).plan
+
+    for values in (plan.centres_m, plan.rotators_deg, plan.spawn.place_m):
+        np.testing.assert_array_equal(values, np.round(values, 6))
+
+
+# Parts and resuming.
+
+
+def test_parts_together_are_the_same_scenes_as_one_run(tmp_path):
+    request = SynthRequest(scenes=3, family="Uniform", map_name=MIXED, **SMALL)
+
+    whole = synthesise(tmp_path / "whole", request)
+    second = synthesise(tmp_path / "parts", request, part=(2, 2))
+    first = synthesise(tmp_path / "parts", request, part=(1, 2))
+
+    assert [first[0], second[0], first[1]] == whole
+    assert contents(tmp_path / "parts") == contents(tmp_path / "whole")
+
+
+def test_a_run_goes_on_from_the_decisions_of_a_plan(tmp_path, monkeypatch):
+    request = SynthRequest(scenes=4, family="Uniform", map_name=MIXED, **SMALL)
+    decisions = plan_scenes(tmp_path, request)
+    refused = sum(len(decision.refused) for decision in decisions)
+    asked = []
+    monkeypatch.setattr(
+        RayCasting, "world", lambda self, proposal: asked.append(1) or open_map(proposal)
+    )
+
+    synthesise(tmp_path, request)
+
+    assert refused > 0
+    assert len(asked) == 4  # Only the accepted proposals are examined again.
+    asked.clear()
+    synthesise(tmp_path, request)
+    assert not asked
+
+
+def test_decisions_that_were_cut_short_are_taken_again(tmp_path):
+    request = SynthRequest(scenes=1, **SMALL)
+    (before,) = plan_scenes(tmp_path, request)
+    (path,) = tmp_path.glob(f"{FOLDER}/*/scene_000000.json")
+    path.write_text(path.read_text()[:40])
+
+    assert plan_scenes(tmp_path, request) == [before]
+
+
+@pytest.mark.parametrize("part", [(0, 2), (3, 2)])
+def test_a_part_that_is_none_is_refused(tmp_path, part):
+    with pytest.raises(SynthesisError, match=r"part ./2 is none: it must be 1/2\.\.2/2"):
+        synthesise(tmp_path, SynthRequest(**SMALL), part=part)
+
+
+def test_a_map_without_room_ends_with_the_reasons(tmp_path, monkeypatch):
+    monkeypatch.setattr("stereogenbench_data.synthesis.planning.MOST_PROPOSALS", 5)
+
+    with pytest.raises(SynthesisError, match=r"all of 5 proposals are refused \(.* Choose wider"):
+        plan_scenes(
+            tmp_path, SynthRequest(family="Uniform", map_name="SynthCorridor", focal_mm=85, **SMALL)
+        )
+
+
+# After rendering.
+
+
+@dataclass(frozen=True)
+class Spoilt(RayCasting):
+    """A renderer that spoils the views of one proposal."""
+
+    number: int = 0
+    picture: object = None
+    depth_m: object = None
+    frames: object = None
+    name: str = "spoilt"
+    seen: list = field(default_factory=list, compare=False)
+
+    def views(self, plan, *, cameras):
+        self.seen.append(plan.proposal.number)
+        for view in RAY_CASTING.views(plan, cameras=cameras):
+            if plan.proposal.number > self.number:
+                yield view
+                continue
+            picture = view.picture if self.picture is None else self.picture(view.picture)
+            depth_m = view.depth_m if self.depth_m is None else self.depth_m(view.depth_m)
+            yield RenderedView(picture, depth_m)
+
+
+def bordered(depth_m):
+    depth_m = depth_m.copy()
+    depth_m[:, : depth_m.shape[1] // 2] = 0.1
+    return depth_m
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "reason"),
+    [
+        ({"picture": lambda picture: picture // 64}, "dark"),
+        ({"picture": lambda picture: np.full_like(picture, 90)}, "flat"),
+        ({"depth_m": lambda depth_m: np.full_like(depth_m, np.inf)}, "invalid_depth"),
+        ({"depth_m": bordered}, "border_occluder"),
+    ],
+)
+def test_a_scene_that_fails_after_rendering_is_replaced_by_its_next_proposal(
+    tmp_path, spoilt, reason
+):
+    request = SynthRequest(map_name="SynthYard", **SMALL)
+    first = plan_scene(request, index=0).plan.proposal.number
+
+    (key,) = synthesise(tmp_path, request, renderer=Spoilt(number=first, **spoilt))
+
+    ((_, (decision,)),) = all_decisions(tmp_path)
+    refused = decision.refused[first]
+    assert (refused.number, refused.refusal.reason) == (first, reason)
+    assert decision.accepted.number > first
+    marker = json.loads((tmp_path / key / "_scene_complete.json").read_text())
+    assert marker["synthesis"]["proposal"] == decision.accepted.number
+
+
+def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason(tmp_path, monkeypatch):
+    monkeypatch.setattr("stereogenbench_data.synthesis.produce._MOST_RENDERED", 2)
+
+    with pytest.raises(SynthesisError, match=r"2 rendered proposals .* dark .* Check the renderer"):
+        synthesise(
+            tmp_path,
+            SynthRequest(map_name="SynthYard", **SMALL),
+            renderer=Spoilt(number=9999, picture=lambda picture: picture // 64),
+        )
+
+
+def test_missing_frames_and_broken_videos_are_found(tmp_path):
+    (key,) = synthesise(tmp_path, SynthRequest(**SMALL))
+    scene = tmp_path / key
+
+    assert check_files(scene, frames=2) is None
+    refusal = check_files(scene, frames=3)
+    assert (refusal.reason, refusal.value, refusal.limit) == ("missing_frames", 2, 3)
+    (scene / "cam_04_depth.mkv").write_bytes(b"not a video")
+    assert "cam_04_depth.mkv: 0 of 2" in check_files(scene, frames=2).text
+
+
+def test_a_scene_can_be_made_to_pass_the_audit_and_the_doctor(tmp_path):
+    request = SynthRequest(map_name="SynthYard", size_px=128, frames=3, seed=2, focal_mm=25)
+
+    (key,) = synthesise(tmp_path, request, check="audit")
+
+    assert (tmp_path / key / "_scene_complete.json").exists()
+    assert not (tmp_path / ".unfinished").exists()
+
+
+# Reports, sheets and the holdout.
+
+
+def test_the_report_counts_acceptance_by_map_and_reason_and_wide_rigs_are_refused_more(tmp_path):
+    request = SynthRequest(
+        scenes=24, family="Uniform", map_name=("SynthYard", "SynthHall"), **SMALL
+    )
+    decisions = plan_scenes(tmp_path, request)
+
+    report = report_of([("Uniform", decisions)])
+
+    by_map = {each.map_name: each for each in report}
+    assert list(by_map) == ["SynthHall", "SynthYard", ALL_MAPS]
+    everything = by_map[ALL_MAPS]
+    assert everything.accepted == 24
+    assert everything.proposals == 24 + sum(len(each.refused) for each in decisions)
+    assert sum(everything.reasons.values()) == everything.proposals - 24
+    assert everything.proposed_cm.count == 5 * everything.proposals
+    assert everything.proposed_cm.median == pytest.approx(75.5, abs=12)
+    assert everything.realised_cm.median < everything.proposed_cm.median - 5
+    assert everything.reasons["collision"] > 0
+    assert report_of_tree(tmp_path) == report
+    assert "| Uniform | SynthHall |" in markdown_of(report)
+
+
+def test_contact_sheets_show_every_scene_once(tmp_path):
+    keys = synthesise(tmp_path, SynthRequest(**SMALL))
+
+    (path,) = write_sheets(tmp_path, keys, folder=tmp_path / "sheets")
+
+    assert path.name == "train__IPD_Gaussian__SynthStage__scene_000000.png"
+    before = path.stat().st_mtime_ns
+    assert write_sheets(tmp_path, keys, folder=tmp_path / "sheets") == [path]
+    assert path.stat().st_mtime_ns == before
+
+
+def test_held_out_scenes_leave_the_tree_and_do_not_come_back(tmp_path):
+    request = SynthRequest(scenes=2, **SMALL)
+    first, second = synthesise(tmp_path, request)
+
+    assert hold_out(tmp_path, [first]) == [first]
+    assert hold_out(tmp_path, [first]) == []
+    assert not (tmp_path / first).exists()
+    assert synthesise(tmp_path, request) == [second]
+    assert not (tmp_path / first).exists()
+
+
+@pytest.mark.parametrize("key", ["train/Uniform/Elsewhere/scene_000000", "../outside", "scene_1"])
+def test_a_holdout_of_what_is_no_scene_moves_nothing(tmp_path, key):
+    (there,) = synthesise(tmp_path, SynthRequest(**SMALL))
+
+    with pytest.raises(SynthesisError, match=r"(no scene|not the path of a scene)"):
+        hold_out(tmp_path, [there, key])
+    assert (tmp_path / there).is_dir()
+
+
+# The command.
+
+
+def test_the_command_plans_reports_and_holds_out(tmp_path):
+    out, report = tmp_path / "out", tmp_path / "report.json"
+    small = [str(out), "--size", "32", "--frames", "1", "--workers", "1"]
+    mixed = [*small, "--family", "Uniform", "--map", "SynthYard", "--map", "SynthHall"]
+
+    planned = CliRunner().invoke(
+        app,
+        [*mixed, "--scenes", "2", "--plan-only", "--report", str(report)],
+        catch_exceptions=False,
+    )
+    drawn = CliRunner().invoke(
+        app,
+        [*mixed, "--scenes", "2", "--part", "1/2", "--json", "--contact-sheets", f"{out}/sheets"],
+        catch_exceptions=False,
+    )
+
+    assert "all maps" in planned.stdout
+    assert not (tmp_path / "out" / "train").exists() or drawn
+    assert {each["map_name"] for each in json.loads(report.read_text())} >= {ALL_MAPS}
+    (key,) = json.loads(drawn.stdout)["scenes"]
+    assert len(list((out / "sheets").glob("*.png"))) == 1
+    refused = tmp_path / "refused.txt"
+    refused.write_text(f"{key}\n")
+    held = CliRunner().invoke(app, [*small, "--holdout", str(refused)], catch_exceptions=False)
+    assert "1 scene moved" in held.stdout
+    assert not (out / key).exists()
