@@ -229,7 +229,7 @@ def test_a_flipped_byte_is_reported_by_its_checksum(shards):
     assert reported.startswith(f"{PAIR}: {KEY}: cam_05_depth.b2frame: its bytes have crc32 ")
 
 
-def test_one_frame_far_away_costs_the_header_and_its_own_bytes(web, large_release):
+def test_one_frame_far_away_costs_its_own_bytes(web, large_release):
     require_module("blosc2")
     pack(large_release, web.folder / "shards", depth_codec="blosc2", workers=1)
     index = SceneIndex.open(web.folder / "shards")
@@ -239,9 +239,10 @@ def test_one_frame_far_away_costs_the_header_and_its_own_bytes(web, large_releas
 
     depth = pairs[0]["depth"]
 
-    size, header, chunk = [each for each in web.asked if each.path.endswith(".tar")]
+    *_, chunk = [each for each in web.asked if each.path.endswith(".tar")]
     assert depth.shape == (1, 320, 320)
-    assert (size.sent, header.start, header.sent) == (1, member.offset, 65536)
+    assert sum(each.sent for each in web.asked if each.path.endswith(".tar")) <= chunk.sent + 1
+    assert chunk.start >= member.offset
     assert chunk.start + chunk.sent <= member.offset + member.size
     assert chunk.sent <= 320 * 320 * 2 + 32 < 0.2 * member.size
 
