@@ -19,6 +19,7 @@ from itertools import islice, takewhile
 from typing import Final, Literal, NamedTuple
 
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.sources.retry import Cancellation
 
 FETCH_AHEAD_BYTES: Final = 256_000_000
 """Bytes that a process fetches ahead at the most, unless the user says otherwise."""
@@ -43,14 +44,14 @@ class Wanted(NamedTuple):
         place: What tells objects apart: ranges of one place are merged.
         start: The first byte.
         stop: The byte behind the last one.
-        fetch: Returns the bytes from a start to a stop.
+        fetch: Returns the bytes from a start to a stop; another thread may cancel that.
         held_bytes: How many bytes it counts for, where these are not those of the range.
     """
 
     place: Hashable
     start: int
     stop: int
-    fetch: Callable[[int, int], bytes]
+    fetch: Callable[[int, int, Cancellation], bytes]
     held_bytes: int | None = None
 
 
@@ -66,7 +67,7 @@ class _Part:
     place: Hashable
     start: int
     stop: int
-    fetch: Callable[[int, int], bytes]
+    fetch: Callable[[int, int, Cancellation], bytes]
     first: int
     last: int
     held_bytes: int
@@ -81,6 +82,7 @@ class _State:
 
     connections: int
     pid: int = field(default_factory=os.getpid)
+    cancellation: Cancellation = field(default_factory=Cancellation)
     changed: threading.Condition = field(default_factory=threading.Condition)
     queue: list[tuple[int, int, _Part]] = field(default_factory=list)
     threads: set[threading.Thread] = field(default_factory=set)
@@ -280,7 +282,7 @@ def _work(state: _State) -> None:
             part.state = "under way"
         data, error = b"", None
         try:
-            data = part.fetch(part.start, part.stop)
+            data = part.fetch(part.start, part.stop, state.cancellation)
         except BaseException as found:  # noqa: BLE001 - raised again in the thread that reads
             error = found
         with state.changed:
@@ -300,6 +302,7 @@ def _end(state: _State) -> None:
         state.queue.clear()
         state.due.clear()
         threads = list(state.threads)
+    state.cancellation.cancel()
     for thread in threads:
         if thread is not threading.current_thread():
             thread.join(_END_S / len(threads))

@@ -26,7 +26,7 @@ from stereogenbench_data.sources.ranged_file import (
     require_crc32,
 )
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import RetryPolicy
+from stereogenbench_data.sources.retry import Cancellation, RetryPolicy
 
 UNSAFE_PATH: Final = r"^/|\\|:|(?:^|/)\.{0,2}(?:/|$)|[\x00-\x1f]"
 """What a member's path may not hold: a root, a drive, a backslash, an empty part, '.' or '..'."""
@@ -186,7 +186,7 @@ class MemberSource:
         cache = self._cache
         if cache is not None:
 
-            def fill(start: int, stop: int) -> bytes:
+            def fill(start: int, stop: int, cancellation: Cancellation) -> bytes:
                 cache.open(member, remote=remote, revision=self._revision).close()
                 return b""
 
@@ -194,9 +194,9 @@ class MemberSource:
                 return []
             return [Wanted(_cached(member), 0, 1, fill, member.size)]
 
-        def fetch(start: int, stop: int) -> bytes:
+        def fetch(start: int, stop: int, cancellation: Cancellation) -> bytes:
             self.fetched.add(stop - start)
-            return remote.read(start, stop)
+            return remote.read(start, stop, cancellation=cancellation)
 
         parts = [(0, member.size)] if ranges is None else ranges
         return [Wanted(member.path, offset + a, offset + b, fetch) for a, b in parts]

@@ -20,7 +20,6 @@ from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.media.seek_table import packed_tables, parse_tables
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.cache import ShardCache
-from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
 from tests.servers.failing_server import Answer, serving
 
 FIELDS = ("left", "right", "disparity", "frame_index", "__key__")
@@ -341,20 +340,16 @@ def test_options_out_of_their_range_are_named(options, named, large_shards):
         StereoPairs(large_shards, **options)
 
 
-def test_closing_ends_requests_that_hang_within_seconds(alone):
-    begun, over = threading.Event(), threading.Event()
-
-    def fetch(start, stop):
-        begun.set()
-        over.wait(20)
-        return bytes(stop - start)
-
-    ahead = FetchAhead()
-    ahead.plan(1, [Wanted("place", 0, 5, fetch)])
-    ahead.begin()
-    begun.wait(5)
+def test_closing_ends_requests_that_hang_at_once(served):
+    pairs = StereoPairs(served.url, fields=("left",), frames="all")
+    shards = {member.path for member in pairs.index.scene(0).members.values()}
+    served.always = {path: Answer(delay_s=20) for path in shards}
+    address = pairs.plan.locate(0, epoch=0)
+    pairs._loader.begin(address)
+    time.sleep(0.5)
+    assert fetching()
     began = time.perf_counter()
-    ahead.close()
+    pairs.close()
 
-    assert time.perf_counter() - began < 4
-    over.set()
+    assert time.perf_counter() - began < 1
+    assert fetching() == []

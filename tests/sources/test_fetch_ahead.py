@@ -19,7 +19,7 @@ class Log:
     def __init__(self):
         self.asked = []
 
-    def fetch(self, start, stop):
+    def fetch(self, start, stop, cancellation):
         self.asked.append((start, stop))
         return CONTENT[start:stop]
 
@@ -91,7 +91,7 @@ def test_ranges_of_later_samples_wait_and_grow():
 def test_requests_are_made_at_a_time_up_to_their_number():
     running, most, lock = [0], [0], threading.Lock()
 
-    def fetch(start, stop):
+    def fetch(start, stop, cancellation):
         with lock:
             running[0] += 1
             most[0] = max(most[0], running[0])
@@ -111,7 +111,7 @@ def test_requests_are_made_at_a_time_up_to_their_number():
 
 
 def test_an_error_is_raised_where_the_bytes_are_read_and_not_before():
-    def fetch(start, stop):
+    def fetch(start, stop, cancellation):
         raise StorageError("place: gone.")
 
     ahead = FetchAhead()
