@@ -29,8 +29,9 @@ from stereogenbench_data.selection.pairs import (
 )
 from stereogenbench_data.selection.windows import FramesSpec, Windows, parse_frames, run_starts
 
-LEAST_RUN: Final = 8
-"""So many frames a run has at least: where key frames lie closer, opening would cost too much."""
+LEAST_RUN: Final = 24
+"""So many frames a run has at least: where key frames lie closer, opening would cost too much, and
+batches would hardly be mixed better."""
 
 
 class PairOptions(TypedDict, total=False):

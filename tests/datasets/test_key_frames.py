@@ -11,6 +11,7 @@ import torch
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.index.rows import ADDED
 from stereogenbench_data.samples import streams
+from stereogenbench_data.selection import plan
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
@@ -31,6 +32,12 @@ def encode_again(path, *, key_every):
             frame.pict_type = 0  # the encoder decides
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
+
+
+@pytest.fixture(autouse=True)
+def runs_of_eight_frames(monkeypatch):
+    """So short runs as these scenes have; scenes of 81 frames have longer ones."""
+    monkeypatch.setattr(plan, "LEAST_RUN", 8)
 
 
 @pytest.fixture(scope="module")
