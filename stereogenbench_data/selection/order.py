@@ -20,6 +20,7 @@ keeps the same for ever.
 """
 
 import heapq
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Final, Literal, NamedTuple
@@ -66,10 +67,13 @@ class Runs:
         first_sample: (r + 1,) int64, the number of each run's first sample, and how many there are.
         pairs: (r,) int64, how many samples show each moment of the run. The samples of a run are
             numbered moment by moment.
+        key_distance: (r,) int64, how many moments lie between two of the run at which decoding can
+            begin; 1 where that is not regular, or not known.
     """
 
     first_sample: Int64[np.ndarray, " r1"]
     pairs: Int64[np.ndarray, " r"]
+    key_distance: Int64[np.ndarray, " r"]
 
     @property
     def lengths(self) -> Numbers:
@@ -418,7 +422,8 @@ class _Group:
         """Return a stream that starts inside its first piece and ends with what lies before."""
         run, begin, stop = int(stream.run[0]), int(stream.begin[0]), int(stream.stop[0])
         pairs = int(self._runs.pairs[run])
-        block = pairs * self._rule.open_frames if pairs > 1 else 1
+        interleaved = self._rule.open_frames if pairs > 1 else 1
+        block = pairs * math.lcm(interleaved, int(self._runs.key_distance[run]))
         start = round((begin + share * (stop - begin)) / block) * block
         if not begin < start < stop:
             return stream

@@ -27,7 +27,13 @@ from stereogenbench_data.selection.pairs import (
     baselines_cm,
     choose_pairs,
 )
-from stereogenbench_data.selection.windows import FramesSpec, Windows, parse_frames, run_starts
+from stereogenbench_data.selection.windows import (
+    FramesSpec,
+    Windows,
+    key_distance,
+    parse_frames,
+    run_starts,
+)
 
 LEAST_RUN: Final = 24
 """So many frames a run has at least: where key frames lie closer, opening would cost too much, and
@@ -240,6 +246,7 @@ def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) ->
     kind = kind_of_row[scene_rows]
     per_scene = np.empty(len(scene_rows), dtype=np.int64)
     run_counts = np.empty(len(scene_rows), dtype=np.int64)
+    key_distances = np.empty(len(scene_rows), dtype=np.int64)
     classes: list[tuple[np.ndarray, tuple[int, ...]]] = []
     for frames, which in sorted(set(zip(frame_counts.tolist(), kind.tolist(), strict=True))):
         same = (frame_counts == frames) & (kind == which)
@@ -250,6 +257,7 @@ def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) ->
             raise SelectionError(f"{keys[same][0]}{others}: {error}") from error
         starts_of = run_starts(windows, frames=frames, key_frames=kinds[which], least=LEAST_RUN)
         run_counts[same] = len(starts_of)
+        key_distances[same] = key_distance(windows, key_frames=kinds[which])
         classes.append((same, starts_of))
     first_sample = np.concatenate([[0], np.cumsum(pairs_of * per_scene)]).astype(np.int64)
     first_run = np.concatenate([[0], np.cumsum(run_counts)])
@@ -265,7 +273,9 @@ def _plan(index: SceneIndex, pairs: PairList, *, windows: Windows, seed: int) ->
         scene_rows=scene_rows,
         first_pair=first_pair,
         first_sample=first_sample,
-        runs=Runs(first_of_run, np.repeat(pairs_of, run_counts)),
+        runs=Runs(
+            first_of_run, np.repeat(pairs_of, run_counts), np.repeat(key_distances, run_counts)
+        ),
         frame_counts=frame_counts,
         scene_seeds=np.array([zlib.crc32(str(key).encode()) for key in keys], dtype=np.int64),
         seed=seed,

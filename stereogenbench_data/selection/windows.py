@@ -149,6 +149,14 @@ def run_starts(
     return tuple(np.flatnonzero(np.diff(run, prepend=-1)).tolist())
 
 
+def key_distance(windows: Windows, *, key_frames: Sequence[int]) -> int:
+    """Return how many windows lie between those that are key frames, 1 if that is not regular."""
+    apart = np.unique(np.diff(key_frames))
+    if isinstance(windows, Every) and len(apart) == 1 and apart[0] % windows.step == 0:
+        return int(apart[0]) // windows.step
+    return 1
+
+
 def parse_frames(spec: Any) -> Windows:
     """Return the windows that a user's ``frames=`` asks for.
 

@@ -22,16 +22,17 @@ WORLDS, WORKERS = range(1, 6), range(5)
 KINDS = ("shuffled", "sequential")
 
 
-def runs_of(lengths, *, pairs=1):
+def runs_of(lengths, *, pairs=1, key_distance=1):
     """Return runs with so many moments each, of each of which there are so many pairs."""
     first_sample = np.concatenate([[0], np.cumsum(np.array(lengths) * pairs)])
-    return Runs(first_sample, np.full(len(lengths), pairs))
+    count = len(lengths)
+    return Runs(first_sample, np.full(count, pairs), np.full(count, key_distance))
 
 
-def order_of(lengths, *, pairs=1, epoch=0, **rule):
+def order_of(lengths, *, pairs=1, key_distance=1, epoch=0, **rule):
     """Return the order of runs with so many moments each."""
     rule = OrderRule(**({"batch_size": 16} | rule))
-    return EpochOrder(runs_of(lengths, pairs=pairs), rule, epoch=epoch)
+    return EpochOrder(runs_of(lengths, pairs=pairs, key_distance=key_distance), rule, epoch=epoch)
 
 
 def run_of(order, numbers):
@@ -364,6 +365,18 @@ def test_moments_of_few_open_scenes_are_interleaved():
     assert moments[1] > 12
     pairs = [set((more.batch(number) % 15).tolist()) for number in range(100)]
     assert np.mean([len(each) for each in pairs]) > 4
+
+
+@pytest.mark.parametrize(("pairs", "open_frames"), [(1, 1), (15, 1), (15, 3)])
+def test_streams_start_where_decoding_can_begin(pairs, open_frames):
+    """What lies between a key frame and a start would be decoded twice."""
+    order = order_of([24] * 64, pairs=pairs, key_distance=4, open_frames=open_frames)
+    for group in range(order.groups):
+        for run, numbers in pieces_of(order, group).items():
+            moments = (numbers - order.runs.first_sample[run]) // pairs // open_frames
+            starts = np.concatenate([moments[:1], moments[1:][np.diff(moments) < 0]])
+
+            assert all(start * open_frames % 4 == 0 for start in starts.tolist())
 
 
 @given(lengths=lengths_of_scenes, rule=rules)

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stereogenbench_data.errors import SelectionError
-from stereogenbench_data.selection.windows import Clips, parse_frames
+from stereogenbench_data.selection.windows import Clips, key_distance, parse_frames
 
 DRAW = (3, 0, 12)
 
@@ -49,6 +49,22 @@ def test_clips_are_as_many_as_fit(frames, length, stride, step):
     else:
         with pytest.raises(SelectionError, match="spans"):
             windows(("clips", length, stride, step), frames)
+
+
+@pytest.mark.parametrize(
+    ("spec", "key_frames", "expected"),
+    [
+        ("all", (0, 4, 8, 12), 4),
+        (("every", 2), (0, 4, 8), 2),
+        (("every", 3), (0, 4, 8), 1),
+        ("all", (0,), 1),
+        ("all", (0, 4, 9), 1),
+        (("clips", 4), (0, 4, 8), 1),
+    ],
+    ids=str,
+)
+def test_key_frames_are_regular_windows_apart_or_count_as_unknown(spec, key_frames, expected):
+    assert key_distance(parse_frames(spec), key_frames=key_frames) == expected
 
 
 @given(st.integers(1, 40), st.integers(0, 2**31), st.integers(0, 5))
