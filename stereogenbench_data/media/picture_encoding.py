@@ -70,7 +70,8 @@ def _h264(rate_factor: int, *, key_frame_distance: int, bits_a_pixel: float) -> 
     # Without B-frames each packet gives its picture at once: nothing beyond a run is decoded.
     parameters = {
         "keyint": key_frame_distance, "min-keyint": key_frame_distance, "scenecut": 0,
-        "open-gop": 0, "bframes": 0, "mbtree": 0, "cpu-independent": 1,
+        "open-gop": 0, "bframes": 0, "mbtree": 0, "fast-pskip": 0, "dct-decimate": 0,
+        "cpu-independent": 1,
         "colormatrix": "smpte170m", "fullrange": "off", "chromaloc": 1,
     }  # fmt: skip
     options = {

@@ -513,7 +513,7 @@ def test_what_no_layout_has_is_refused(small_release, tmp_path):
         exported(small_release, tmp_path, "sora")
     with pytest.raises(SelectionError, match=r"control='left': the layout stereocrafter takes"):
         exported(small_release, tmp_path, "stereocrafter", form=ClipForm(control="left"))
-    with pytest.raises(SelectionError, match="frames= is not known here"):
+    with pytest.raises(SelectionError, match="export_clips has no option 'frames'"):
         exported(small_release, tmp_path, frames="all")
     for wrong in ({"direction": "right_to_left"}, {"pairs": "sweep"}):
         with pytest.raises(SelectionError, match="choose pairs='primary'"):

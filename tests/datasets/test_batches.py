@@ -90,7 +90,7 @@ def test_a_position_is_flat_json_and_says_what_it_belongs_to(keyed):
 
     assert json.loads(json.dumps(state)) == state
     assert state == {
-        "version": 3,
+        "version": 4,
         "epoch": 0,
         "batches_consumed": 4,
         "seed": 3,
@@ -145,7 +145,7 @@ def test_a_position_of_an_earlier_order_is_refused_by_its_version(keyed):
         "selection": keyed.plan.digest, "index": keyed.index.digest,
     }  # fmt: skip
 
-    with pytest.raises(StateError, match="version is 3 here and 2 there"):
+    with pytest.raises(StateError, match="version is 4 here and 2 there"):
         EpochBatches(keyed, 4).load_state_dict(saved)
 
 
@@ -193,8 +193,8 @@ def test_a_position_in_another_index_is_refused_by_name(keyed):
     [
         ({"batches_consumed": -1}, "batches_consumed is -1, no whole number"),
         ({"epoch": "2"}, "epoch is '2', no whole number"),
-        ({"version": 0}, "version is 3 here and 0 there"),
-        ({"version": True}, "version is 3 here and True there"),
+        ({"version": 0}, "version is 4 here and 0 there"),
+        ({"version": True}, "version is 4 here and True there"),
         ({"batches_consumed": 36}, "batches_consumed is 36, and there are 35"),
         ({"batches_consumed": True}, "batches_consumed is True, no whole number"),
     ],

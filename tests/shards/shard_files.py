@@ -23,7 +23,7 @@ def bytes_of(folder: Path) -> dict[str, str]:
     return {
         path.relative_to(folder).as_posix(): sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and ".parts" not in path.parts
+        if path.is_file() and not {".parts", ".generation"} & set(path.parts)
     }
 
 

@@ -174,7 +174,7 @@ def test_the_index_says_from_what_and_how_scenes_were_derived(release, packed):
         assert scene.training.source_digest == source.digest
         assert (scene.training.quality, scene.training.codec) == ("balanced", "h264")
         assert json.loads(scene.training.settings)["options"]["crf"] == "10"
-        assert scene.key_frames == (0, 8, 16)
+        assert scene.key_frames == (0, 4, 8, 12, 16)
         assert scene.depth_codec == ("blosc2",) * 6
         assert replace(
             scene, rig=released.rig, members={}, key_frames=(0,), training=None, depth_codec=()
@@ -591,7 +591,10 @@ def test_an_index_cannot_say_other_things_of_training_shards(packed, facts, foun
         (lambda text: text.replace(b'"format": 1', b'"format": 2'), r"\$\.format must be 1"),
         (lambda text: text.replace(b'"psnr_db": ', b'"psnr_db": 1'), r"psnr_db must be 0 to 100"),
         (lambda text: text.replace(b"cam_00_rgb.mp4", b"../../etc"), r"\$\.files must name"),
-        (lambda text: text.replace(b"[0, 8, 16]", b"[0, 16, 8]"), "key_frames must be frames"),
+        (
+            lambda text: text.replace(b"[0, 4, 8, 12, 16]", b"[0, 8, 4, 12, 16]"),
+            "key_frames must be frames",
+        ),
         (lambda text: text.replace(b'"width_px": 32', b'"width_px": -1'), "width_px must be"),
         (lambda text: text.replace(b'"versions"', b'"version"'), r"\$\.version must be there"),
         (lambda text: text.replace(b'"bytes": ', b'"bytes": -'), "bytes must be a whole number"),
