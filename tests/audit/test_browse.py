@@ -9,6 +9,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
 from tests.audit.browsing import run, serving
+from tests.audit.corruption import rewrite_depth
 from tests.servers.tools import require_module, require_tool
 
 # The index names a scene that was left out, each time that it is opened.
@@ -26,11 +27,18 @@ COPIES = 40
 WAIT_S = 60
 
 
+def unmeasured_corner(units):
+    units = units.copy()
+    units[:, :6, :6] = 0
+    return units
+
+
 @pytest.fixture(scope="module")
 def data(small_release, tmp_path_factory):
     """A tree with an index of many scenes: the same videos under other keys, and a broken one."""
     root = tmp_path_factory.mktemp("many") / "data"
     shutil.copytree(small_release, root)
+    rewrite_depth(root / "train/Uniform/SynthStage/scene_000001", unmeasured_corner)
     index = SceneIndex.open(root)
     scenes = []
     for row in range(len(index)):

@@ -289,8 +289,11 @@ def contradicting(folder):
     ],
     ids=lambda value: getattr(value, "__name__", None),
 )  # fmt: skip
-def test_what_is_wrong_is_a_finding(decidable_release, tmp_path, change, where, check, found):
-    report = made_wrong(decidable_release, tmp_path, change)
+def test_what_is_wrong_is_a_finding(
+    small_release, decidable_release, tmp_path, change, where, check, found
+):
+    tells_time = change in (late_pictures, reversed_pictures)
+    report = made_wrong(decidable_release if tells_time else small_release, tmp_path, change)
 
     (finding, *_) = [each for each in report.findings if each.check == check]
     assert (finding.scene, finding.member) == (SCENE, where)
