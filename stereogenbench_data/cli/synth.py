@@ -152,13 +152,17 @@ def synth(  # noqa: PLR0913 - one parameter an option
     if report is not None and report.suffix not in (".md", ".json"):
         raise typer.BadParameter(f"{report} must end in .md or .json.", param_hint="--report")
     if holdout is not None:
-        moved = hold_out(out, holdout.read_text().split())
+        moved = hold_out(out, _listed(holdout))
         _print(
             {"root": str(out), "held_out": moved},
             f"{out}: {counted(len(moved), 'scene')} moved to {out / '.holdout'}",
             as_json=as_json,
         )
         return
+    if map_name is not None and _ALL in map_name and len(map_name) > 1:
+        raise typer.BadParameter(
+            f"'{_ALL}' is all maps: give it alone, or name maps without it.", param_hint="--map"
+        )
     chosen = drawn_by.renderer_of()
     everywhere = map_name == [_ALL] or (map_name is None and drawn_by.assets is not None)
     request = SynthRequest(
@@ -199,6 +203,15 @@ def synth(  # noqa: PLR0913 - one parameter an option
         f"{out}: {counted(len(keys), 'scene')} in {', '.join(folders)}",
         as_json=as_json,
     )
+
+
+def _listed(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").split()
+    except UnicodeDecodeError as error:
+        raise typer.BadParameter(
+            f"{path} is not text. List paths of scenes, one a line.", param_hint="--holdout"
+        ) from error
 
 
 def _part_of(text: str) -> tuple[int, int]:

@@ -29,7 +29,7 @@ from stereogenbench_data.synthesis.trajectory import steps
 
 FOLDER: Final = ".generation"
 _REQUEST: Final = "request.json"
-_VERSION: Final = 1
+_VERSION: Final = 2
 """Raise it when the same request comes to other decisions."""
 
 

@@ -48,7 +48,6 @@ _SEGMENT_FRAMES: Final = (24, 48)
 _TRANSITIONS: Final = 24
 _TARGETS: Final = 4
 """How many viewpoints are tried from a place before the path goes back beyond it."""
-_CHECK_STEP: Final = 8
 
 Array = Any
 
@@ -60,8 +59,7 @@ def examine(proposal: Proposal, *, world: World, limits: Limits) -> ScenePlan | 
         return spawn
     frames = proposal.request.frames
     body_m = np.stack([world.subject_points_m(spawn, frame=frame) for frame in range(frames)])
-    looked_at = np.unique([*range(0, frames, _CHECK_STEP), frames - 1])
-    refusal = check_spawn(body_m[looked_at], world=world, limits=limits)
+    refusal = check_spawn(body_m, world=world, limits=limits)
     if refusal is not None:
         return refusal
     search = _Search(proposal, world=world, limits=limits, body_m=body_m)

@@ -53,3 +53,24 @@ def test_an_impossible_request_ends_the_command(tmp_path):
 def test_a_renderer_and_its_assets_go_together(tmp_path, options, says):
     with pytest.raises(SynthesisError, match=says):
         CliRunner().invoke(app, [str(tmp_path), *SMALL, *options], catch_exceptions=False)
+
+
+def test_all_maps_and_a_map_of_its_own_contradict_each_other(tmp_path):
+    options = ["--map", "all", "--map", "SynthRoom"]
+
+    result = CliRunner().invoke(app, [str(tmp_path), *SMALL, *options], catch_exceptions=False)
+
+    assert result.exit_code == 2
+    assert "give it alone" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_holdout_list_that_is_no_text_is_told(tmp_path):
+    refused = tmp_path / "refused.png"
+    refused.write_bytes(b"\x89PNG\xff")
+    options = ["--holdout", str(refused)]
+
+    result = CliRunner().invoke(app, [str(tmp_path), *SMALL, *options], catch_exceptions=False)
+
+    assert result.exit_code == 2
+    assert "is not text" in result.stderr

@@ -253,6 +253,17 @@ def test_a_free_yard_accepts_and_every_frame_holds(frames):
         assert plan.subject_m.min() > 0.5
 
 
+def test_a_subject_that_runs_through_a_fence_between_frames_0_and_8_is_refused():
+    fence = [
+        ((-1.1, -1.1, 0), (-1.0, 1.1, 1)), ((1.0, -1.1, 0), (1.1, 1.1, 1)),
+        ((-1.0, -1.1, 0), (1.0, -1.0, 1)), ((-1.0, 1.0, 0), (1.0, 1.1, 1)),
+    ]  # fmt: skip
+
+    refusal = examine(proposal(), world=yard(*fence, walk_m=24.0), limits=DEFAULT_LIMITS)
+
+    assert refusal.reason == "spawn_space"
+
+
 def test_a_cell_around_the_subject_refuses_all_viewpoints():
     cell = [
         ((-1.6, -1.6, 0), (-1.5, 1.6, 2.5)), ((1.5, -1.6, 0), (1.6, 1.6, 2.5)),
