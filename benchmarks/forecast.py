@@ -2,7 +2,7 @@
 
 The decoding of each kind of shards is measured once, from the local disk; the forecast of a point
 is the formula with the network and the workers of the point. The server runs on the same cores as
-the workers, which the formula does not know.
+the workers, which the formula does not know. Rates are those behind the first batch.
 """
 
 import math
@@ -58,6 +58,16 @@ POINTS: Final = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class _Derived(Material):
+    """The drawn scenes, in a training shard of the stored size, of which the first counts."""
+
+    @property
+    def shards(self) -> Path:
+        """The training shards."""
+        return self.root / "derived"
+
+
 class _TrainingJob(Job):
     """A workload on training shards."""
 
@@ -70,9 +80,9 @@ class _TrainingJob(Job):
 def measure_forecast(
     material: Material,
     *,
-    scenes: int = 8,
+    scenes: int = 24,
     points: Sequence[Point] = POINTS,
-    seconds: float = 6.0,
+    seconds: float = 24.0,
     rounds: int = 3,
     report: Report,
 ) -> list[dict[str, Any]]:
@@ -140,8 +150,8 @@ def _decoding(job: Job, *, seconds: float) -> dict[str, Any]:
 
 
 def _rate(turn: Turn) -> float:
-    """Return the samples a second of a whole pass."""
-    return turn.samples / turn.seconds
+    """Return the samples a second behind the first batch."""
+    return (turn.samples - turn.first_samples) / (turn.seconds - turn.first_s)
 
 
 def _job(material: Material, point: Point, *, scenes: int) -> Job:
@@ -152,10 +162,11 @@ def _job(material: Material, point: Point, *, scenes: int) -> Job:
     if point.kind == "released":
         return released
     job = _TrainingJob(workload, root, scenes)
-    if not (job.shards / INDEX_NAME).exists():
-        size = (material.size_px, material.size_px)
-        pack(released.shards, job.shards, training=TrainingSettings(size), target_bytes=10**7)
-        (job.shards / "keys.txt").write_text((released.shards / "keys.txt").read_text())
+    derived = _Derived(material.root, material.size_px, material.frames)
+    if not (derived.shards / INDEX_NAME).exists():
+        settings = TrainingSettings((material.size_px, material.size_px))
+        pack(material.release, derived.shards, training=settings)
+    link_shards(derived, job)
     return job
 
 
