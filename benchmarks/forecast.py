@@ -48,12 +48,13 @@ POINTS: Final = (
     Point("all-frames", "released", 1, None),
     Point("all-frames", "released", 2, None),
     Point("all-frames", "released", 2, Served(0.06)),
-    Point("all-frames", "released", 2, Served(0.0, connection_mb_s=0.5)),
+    Point("all-frames", "released", 1, Served(0.0, connection_mb_s=0.2)),
+    Point("all-frames", "released", 2, Served(0.0, total_mb_s=3.0)),
     Point("all-frames", "training", 1, None),
     Point("all-frames", "training", 2, Served(0.06)),
     Point("all-frames", "training", 2, Served(0.0, total_mb_s=8.0)),
-    Point("random", "released", 2, Served(0.06)),
-    Point("random", "released", 1, Served(0.06, connection_mb_s=1.0)),
+    Point("random", "released", 1, Served(0.06, connection_mb_s=0.5)),
+    Point("random", "training", 1, Served(0.3)),
     Point("random", "training", 2, Served(0.3)),
 )
 
