@@ -6,6 +6,7 @@ the workers, which the formula does not know. Rates are those behind the first b
 """
 
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -117,7 +118,7 @@ def measure_forecast(
             {
                 "workload": point.workload, "kind": point.kind, "workers": point.workers,
                 "network": None if point.network is None else asdict(point.network),
-                "forecast": expected, "limit": limit, "measured": rates[len(rates) // 2],
+                "forecast": expected, "limit": limit, "measured": statistics.median(rates),
                 "rates": rates,
             }
         )  # fmt: skip
