@@ -17,6 +17,7 @@ from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
 from stereogenbench_data.cli.errors import ErrorsReported
 from stereogenbench_data.cli.evaluate import controls, evaluate, export_inputs
+from stereogenbench_data.cli.forecast import forecast
 from stereogenbench_data.cli.help import HelpedCommand, HelpedGroup
 from stereogenbench_data.cli.index import index
 from stereogenbench_data.cli.pack import pack, unpack, verify
@@ -48,6 +49,7 @@ _COMMANDS: Final[dict[str, dict[Callable[..., None], str]]] = {
         doctor: "doctor scenes/ -o doctor.png",
         audit: "audit shards/ --scenes 20 -o audit.md",
         verify: "verify shards/ --deep",
+        forecast: "forecast shards/ --samples-s 100 --delay-ms 60",
         bench: "bench --only all-frames",
     },
     "Score with them": {

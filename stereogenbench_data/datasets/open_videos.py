@@ -106,11 +106,9 @@ def fitting_rule(
         plan: The selection.
         open_scenes: How many scenes the user asks for; None for as many as fit.
     """
-    rows = plan.scene_rows
-    pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
-    of_cameras = int(pixels) * videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
     shares_moments = bool((plan.runs.pairs > 1).any())
-    scene_bytes = of_cameras * (_DECODER_BYTES + (_KEPT_BYTES if shares_moments else 0))
+    of_cameras = _camera_pixels(index, plan)
+    scene_bytes = open_scene_bytes(index, plan)
     fitting = max(2, GROUP_BYTES // max(1, scene_bytes))
     if open_scenes is None:
         open_scenes = min(max(OPEN_SCENES, rule.batch_size), fitting)
@@ -124,6 +122,19 @@ def fitting_rule(
         shuffle_groups=SHUFFLE_GROUPS if fitting >= OPEN_SCENES else GROUPS_OF_LARGE,
         open_frames=frames,
     )
+
+
+def open_scene_bytes(index: SceneIndex, plan: Plan) -> int:
+    """Return about how much memory the decoders of an open scene take, at the most."""
+    shares_moments = bool((plan.runs.pairs > 1).any())
+    return _camera_pixels(index, plan) * (_DECODER_BYTES + (_KEPT_BYTES if shares_moments else 0))
+
+
+def _camera_pixels(index: SceneIndex, plan: Plan) -> int:
+    """Return how many pixels the pictures of the needed cameras have, at the most."""
+    rows = plan.scene_rows
+    pixels = (index.column("image_width_px")[rows] * index.column("image_height_px")[rows]).max()
+    return int(pixels) * videos_per_scene(plan, frozenset({"source_rgb", "target_rgb"}))
 
 
 def _most_files() -> int:

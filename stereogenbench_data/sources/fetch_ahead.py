@@ -199,6 +199,35 @@ class FetchAhead:
         return self.__dict__ | {"_own": None, "_finalizer": None}
 
 
+class PlannedFetches(FetchAhead):
+    """Counts what would be fetched, and fetches nothing.
+
+    Attributes:
+        requests: Requests for what was released.
+        bytes: Their bytes.
+    """
+
+    requests = 0
+    bytes = 0
+
+    def begin(self, sample: int = sys.maxsize) -> None:
+        """Take what is planned for the samples up to one as fetched."""
+        state = self._state
+        state.up_to = sample
+        while state.queue and state.queue[0][0] <= sample:
+            part = heapq.heappop(state.queue)[2]
+            if part.state == "queued":
+                part.state = "here"
+
+    def release(self, sample: int) -> None:
+        """Count what no sample after this one needs, and forget it."""
+        for part in self._state.due.get(sample, ()):
+            if part.last == sample and part.state == "here":
+                self.requests += 1
+                self.bytes += part.stop - part.start
+        super().release(sample)
+
+
 def _uncovered(state: _State, wanted: Wanted, sample: int) -> list[tuple[int, int]]:
     """Return what is not planned of a range; what is planned is kept for the sample."""
     left, start = [], wanted.start
