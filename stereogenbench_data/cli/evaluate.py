@@ -125,8 +125,15 @@ class PairsOptions(SceneOptions):
             typer.BadParameter: If the text of the pairs or of the frames cannot be parsed.
         """
         baseline = {} if self.baseline_cm is None else {"baseline_cm": self.baseline_cm}
-        chosen = {"pairs": pairs_option(self.pairs), "frames": frames_option(self.frames)}
-        return self.filters() | baseline | chosen
+        return self.filters() | baseline | {"pairs": pairs_option(self.pairs)} | self.windows()
+
+    def windows(self) -> dict[str, Any]:
+        """Return the option of `StereoPairs` that selects frames.
+
+        Raises:
+            typer.BadParameter: If the text of the frames cannot be parsed.
+        """
+        return {"frames": frames_option(self.frames)}
 
 
 @dataclass(frozen=True, kw_only=True)

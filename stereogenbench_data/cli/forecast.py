@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from stereogenbench_data.cli.evaluate import pairs_option, parse_picture_size
+from stereogenbench_data.cli.evaluate import PairsOptions, parse_picture_size
 from stereogenbench_data.cli.help import RARE, SCENES
-from stereogenbench_data.cli.options import DataOptions, JsonOption, SceneOptions, grouped
+from stereogenbench_data.cli.options import DataOptions, JsonOption, grouped
 
 if TYPE_CHECKING:
     from stereogenbench_data.datasets.forecast import Forecast
@@ -22,13 +22,9 @@ _MACHINES: Final = "What trains"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SampleOptions(SceneOptions):
-    """Which samples of which scenes are trained on."""
+class SampleOptions(PairsOptions):
+    """Which samples of which scenes are trained on: frames drawn at random and clips, too."""
 
-    pairs: Annotated[
-        str,
-        typer.Option(help="primary, adjacent, all, or such as 0-1,0-5.", rich_help_panel=SCENES),
-    ] = "primary"
     frames: Annotated[
         str,
         typer.Option(
@@ -36,20 +32,10 @@ class SampleOptions(SceneOptions):
             rich_help_panel=SCENES,
         ),
     ] = "all"
-    baseline_cm: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="Baselines, such as 10 60.", rich_help_panel=SCENES),
-    ] = None
 
-    def selection(self) -> dict[str, Any]:
-        """Return the options of `StereoPairs` that select.
-
-        Raises:
-            typer.BadParameter: If the text of the pairs or of the frames cannot be parsed.
-        """
-        baseline = {} if self.baseline_cm is None else {"baseline_cm": self.baseline_cm}
-        chosen = {"pairs": pairs_option(self.pairs), "frames": _frames(self.frames)}
-        return self.filters() | baseline | chosen
+    def windows(self) -> dict[str, Any]:
+        """Return the option of `StereoPairs` that selects frames."""
+        return {"frames": _frames(self.frames)}
 
 
 @dataclass(frozen=True, kw_only=True)

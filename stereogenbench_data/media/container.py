@@ -6,6 +6,7 @@ containers of the release are allowed, and a path is never read as an address.
 
 import errno
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import cache
@@ -213,13 +214,13 @@ def open_by_header(file: VideoFile, *, name: str) -> tuple[InputContainer, Place
     if isinstance(file, HeaderFirstFile) and file.opens_by_header:
         file.hides_packets = True
         try:
-            container = _open(file, options=_UNDECODED)
-            video = container.streams.video
-            if video and video[0].start_time is not None and video[0].codec_context is not None:
-                return container, "anywhere"
-            container.close()
-        except av.FFmpegError:
-            pass  # the whole file says what is wrong with it
+            # Where its header is not enough, the whole file says what is wrong with it.
+            with suppress(av.FFmpegError):
+                container = _open(file, options=_UNDECODED)
+                video = container.streams.video
+                if video and video[0].start_time is not None and video[0].codec_context is not None:
+                    return container, "anywhere"
+                container.close()
         finally:
             file.hides_packets = False
     return open_container(file, name=name, pixel_format="later"), "at the first packet"

@@ -16,6 +16,7 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from io import FileIO
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -336,8 +337,12 @@ class DepthFrames(FrameReader):
         """
         self.name = name
         self._blosc2: Any = blosc2_module()
-        self._own = Path(file).open("rb", buffering=0) if isinstance(file, str | Path) else None  # noqa: SIM115
-        self._file: BinaryFile = self._own if isinstance(file, str | Path) else file  # type: ignore[assignment]  # its own if a path
+        self._own: FileIO | None = None
+        if isinstance(file, str | Path):
+            self._own = FileIO(file)
+            self._file: BinaryFile = self._own
+        else:
+            self._file = file
         try:
             self._header = self._read_header(frames)
         except MediaError:

@@ -306,7 +306,7 @@ def pass_through(
     return depth
 
 
-class _GatherEngine(bpy.types.RenderEngine):  # type: ignore[misc]
+class _GatherEngine(bpy.types.RenderEngine):  # type: ignore[misc]  # bpy ships no types
     """A render engine that draws nothing: Blender hands it the scene as evaluated for rendering."""
 
     bl_idname = _GATHER
