@@ -290,8 +290,8 @@ def _far(index: SceneIndex) -> SceneIndex:
     if not index.load_seek_tables():
         raise StorageError(
             f"{index.where}: its index does not say where the packets of videos lie, so the bytes "
-            f"of a sample are not known. Make the index again: `stereogenbench index`, or "
-            f"`stereogenbench pack` in the folder of the shards, which keeps them."
+            f"of a sample are not known. Make the index again: `stereogenbench index` for a "
+            f"released tree, `stereogenbench unpack` and `pack` for shards."
         )
     if is_remote(index.root):
         return index

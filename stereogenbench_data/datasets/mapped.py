@@ -88,8 +88,8 @@ class _MappedScenes(Dataset[Sample]):
             warnings.warn(
                 f"{index.where}: its index does not say where the packets of videos lie, so a "
                 f"frame takes several requests, one after another, and nothing is fetched ahead. "
-                f"Make the index again: `stereogenbench index`, or `stereogenbench pack` in the "
-                f"folder of the shards, which keeps them.",
+                f"Make the index again where the data are: `stereogenbench index` for a released "
+                f"tree, `stereogenbench unpack` and `pack` for shards.",
                 SeekTableWarning,
                 stacklevel=3,
             )

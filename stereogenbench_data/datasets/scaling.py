@@ -147,7 +147,7 @@ def fetching_s(cost: SampleCost, network: Network) -> float:
     """Return the seconds in which a worker fetches a sample, by all its connections.
 
     >>> cost = SampleCost(cpu_s=0.01, bytes=1e6, requests=4)
-    >>> fetching_s(cost, Network(delay_s=0.06, connections=8, connection_bytes_s=25e6))
+    >>> round(fetching_s(cost, Network(delay_s=0.06, connections=8, connection_bytes_s=25e6)), 6)
     0.035
     """
     one_by_one = cost.requests * network.delay_s + cost.bytes / network.connection_bytes_s

@@ -300,6 +300,15 @@ def test_the_keyboard_alone_flips_frames_pairs_scenes_and_views(page):
     assert page.script("return document.activeElement.id") == "caption"
 
 
+def test_keys_pressed_before_the_last_scene_is_shown_each_go_one_scene_on(page):
+    page.script(
+        "for (const key of 'jjjk') document.body.dispatchEvent("
+        "new KeyboardEvent('keydown', {key, bubbles: true}));"
+    )
+
+    page.until(lambda: page.text("key") == keys_listed(page)[2])
+
+
 def test_the_list_holds_few_rows_and_scrolls_to_any(page):
     assert len(keys_listed(page)) < 60
 

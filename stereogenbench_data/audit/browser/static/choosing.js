@@ -48,9 +48,15 @@ function fillForm(query) {
 }
 
 let choosing = 0;
+let chosen = Promise.resolve();
 
 /** Counts, list and lines for what the form says, or for the filters of a link. */
-export async function choose(linked = null) {
+export function choose(linked = null) {
+  chosen = showChoice(linked);
+  return chosen;
+}
+
+async function showChoice(linked) {
   const turn = ++choosing;
   state.choice = linked ?? choiceQuery();
   try {
@@ -68,7 +74,7 @@ export async function choose(linked = null) {
     $("rows").style.height = `${found.scenes * ROW_PX}px`;
     $("list").scrollTop = 0;
     await showRows();
-    if (state.scene) await selectScene(state.scene.key, { keep: true });
+    if (wanted) await selectScene(wanted, { keep: true });
     if (found.scenes && !(state.scene?.place >= 0)) await selectPlace(0);
     remember();
   } catch (error) {
@@ -181,20 +187,39 @@ function listRow(row, place) {
   return element;
 }
 
+let stepping = Promise.resolve();
+
+/** Select the scene so many places on. Each step goes from where the last one, or a new choice, led. */
+export function step(places) {
+  stepping = stepping.then(() => chosen).then(() => {
+    const from = state.scene.place;
+    const place = Math.min(Math.max(from + places, 0), state.total - 1);
+    return place === from ? null : selectPlace(place);
+  }).catch((error) => tell($("error"), error.message));
+}
+
 export async function selectPlace(place) {
   if (place < 0 || place >= state.total) return;
   const rows = await page(Math.floor(place / PAGE_ROWS));
   await selectScene(rows[place % PAGE_ROWS].key);
 }
 
+let selecting = 0;
+let wanted = null;
+
+/** Show a scene; return false if it is refused. A later call takes the place of one that waits. */
 export async function selectScene(key, { keep = false, pair = null, frame = 0 } = {}) {
+  const turn = ++selecting;
+  wanted = key;
   let scene;
   try {
     scene = await ask(`/api/scene?key=${encodeURIComponent(key)}&${state.choice}`);
   } catch (error) {
+    if (turn === selecting) wanted = state.scene?.key;
     tell($("error"), error.message);
     return false;
   }
+  if (turn !== selecting) return true;
   if (!keep) tell($("notice"), "");
   const cameras = keep && state.scene ? state.scene.pairs[state.pair].cameras : pair;
   state.scene = scene;

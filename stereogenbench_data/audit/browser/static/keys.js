@@ -1,6 +1,6 @@
 /** What each key does. */
 
-import { selectPlace } from "/choosing.js";
+import { selectPlace, step } from "/choosing.js";
 import { copy } from "/copying.js";
 import { openDrawer } from "/drawer.js";
 import { play, selectFrame, selectPair, selectView } from "/moment.js";
@@ -14,8 +14,8 @@ const KEYS = {
   ArrowDown: () => selectPair(state.pair + 1),
   Home: () => selectFrame(0),
   End: () => selectFrame(Infinity),
-  j: () => selectPlace(state.scene.place + 1),
-  k: () => selectPlace(state.scene.place - 1),
+  j: () => step(1),
+  k: () => step(-1),
   w: (event) => movePoint(0, event.shiftKey ? -10 : -1),
   a: (event) => movePoint(event.shiftKey ? -10 : -1, 0),
   s: (event) => movePoint(0, event.shiftKey ? 10 : 1),
@@ -26,12 +26,12 @@ const KEYS = {
   " ": () => play(),
 };
 const LIST_KEYS = {
-  ArrowUp: () => selectPlace(state.scene.place - 1),
-  ArrowDown: () => selectPlace(state.scene.place + 1),
+  ArrowUp: () => step(-1),
+  ArrowDown: () => step(1),
   Home: () => selectPlace(0),
   End: () => selectPlace(state.total - 1),
-  PageUp: () => selectPlace(Math.max(state.scene.place - 10, 0)),
-  PageDown: () => selectPlace(Math.min(state.scene.place + 10, state.total - 1)),
+  PageUp: () => step(-10),
+  PageDown: () => step(10),
 };
 
 export function pressed(event) {

@@ -1,6 +1,6 @@
 /** Starts the page: what it is about, and what its controls do. */
 
-import { choose, selectPlace, selectScene, showRows } from "/choosing.js";
+import { choose, selectScene, showRows, step } from "/choosing.js";
 import { copy } from "/copying.js";
 import { closeDrawer, openDrawer } from "/drawer.js";
 import { pressed } from "/keys.js";
@@ -33,8 +33,8 @@ function listen() {
   $("open-drawer").addEventListener("click", openDrawer);
   $("close-drawer").addEventListener("click", closeDrawer);
   $("backdrop").addEventListener("click", closeDrawer);
-  $("before").addEventListener("click", () => selectPlace(state.scene.place - 1));
-  $("after").addEventListener("click", () => selectPlace(state.scene.place + 1));
+  $("before").addEventListener("click", () => step(-1));
+  $("after").addEventListener("click", () => step(1));
   $("list").addEventListener("scroll", () => showRows());
   $("frame").addEventListener("input", () => selectFrame(Number($("frame").value)));
   $("play").addEventListener("click", play);
