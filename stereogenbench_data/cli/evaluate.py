@@ -12,19 +12,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from stereogenbench_data.cli.errors import FINDINGS, resumable
-from stereogenbench_data.cli.help import SCENES
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
     JsonOption,
-    SceneOptions,
     SplitOption,
     WorkOptions,
     depth_of,
     grouped,
-    pair_of,
 )
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.samples import SampleOptions, parse_picture_size
 from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, require_metrics
 from stereogenbench_data.schema.text import counted
 
@@ -33,44 +31,6 @@ if TYPE_CHECKING:
     from stereogenbench_data.evaluation.controls import Relation
     from stereogenbench_data.evaluation.protocol import EvaluationProtocol
     from stereogenbench_data.evaluation.tables import Table
-
-
-def pairs_option(text: str) -> Any:
-    """Return the pairs of ``--pairs`` as `StereoPairs` takes them."""
-    if text in ("primary", "adjacent", "all"):
-        return text
-    pairs = [each.split("-") for each in text.split(",")]
-    if not all(len(pair) == 2 and all(map(str.isdecimal, pair)) for pair in pairs):
-        raise typer.BadParameter(
-            f"{text!r} is not primary, adjacent, all or pairs such as 0-1,0-5.",
-            param_hint="--pairs",
-        )
-    return [pair_of("-".join(pair), option="--pairs") for pair in pairs]
-
-
-def frames_option(text: str) -> Any:
-    """Return the frames of ``--frames`` as `StereoPairs` takes them."""
-    if text in ("all", "first"):
-        return text
-    every, _, step = text.partition(":")
-    if every == "every" and step.isdecimal():
-        return ("every", int(step))
-    if all(map(str.isdecimal, text.split(","))):
-        return [int(number) for number in text.split(",")]
-    raise typer.BadParameter(
-        f"{text!r} is not all, first, every:K or numbers such as 0,40,80.", param_hint="--frames"
-    )
-
-
-def parse_picture_size(text: str) -> tuple[int, int]:
-    """Return (height, width) of ``--size``, which is WIDTHxHEIGHT."""
-    from stereogenbench_data.errors import FieldError
-    from stereogenbench_data.samples.size import parse_size
-
-    try:
-        return parse_size(text)
-    except FieldError as error:
-        raise typer.BadParameter(str(error), param_hint="--size") from None
 
 
 def parse_strata(texts: list[str] | None) -> dict[str, tuple[float, ...]]:
@@ -102,43 +62,8 @@ PAPER_SIZE = "832x480"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairsOptions(SceneOptions):
-    """Which pairs and frames of which scenes are scored."""
-
-    pairs: Annotated[
-        str,
-        typer.Option(help="primary, adjacent, all, or such as 0-1,0-5.", rich_help_panel=SCENES),
-    ] = "primary"
-    frames: Annotated[
-        str,
-        typer.Option(help="all, first, every:K, or such as 0,40,80.", rich_help_panel=SCENES),
-    ] = "all"
-    baseline_cm: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="Baselines, such as 10 60.", rich_help_panel=SCENES),
-    ] = None
-
-    def selection(self) -> dict[str, Any]:
-        """Return the options of `StereoPairs` that select samples.
-
-        Raises:
-            typer.BadParameter: If the text of the pairs or of the frames cannot be parsed.
-        """
-        baseline = {} if self.baseline_cm is None else {"baseline_cm": self.baseline_cm}
-        return self.filters() | baseline | {"pairs": pairs_option(self.pairs)} | self.windows()
-
-    def windows(self) -> dict[str, Any]:
-        """Return the option of `StereoPairs` that selects frames.
-
-        Raises:
-            typer.BadParameter: If the text of the frames cannot be parsed.
-        """
-        return {"frames": frames_option(self.frames)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvalPairsOptions(PairsOptions):
-    """The same, with the eval split as the default."""
+class ScoredOptions(SampleOptions):
+    """Which samples are scored: those of the eval split by default."""
 
     split: SplitOption = "eval"
 
@@ -276,7 +201,7 @@ def export_inputs(  # noqa: PLR0913 - one parameter an option
     out: Annotated[Path, typer.Argument(help="Folder to write into.")],
     *,
     tier: TierOption,
-    chosen: PairsOptions,
+    chosen: SampleOptions,
     size: SizeOption = PAPER_SIZE,
     depth_unit_m: DepthUnitOption = None,
     work: WorkOptions,
@@ -318,7 +243,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     name: Annotated[
         str | None, typer.Option(help="Name of the method [the folder's name].")
     ] = None,
-    chosen: PairsOptions,
+    chosen: SampleOptions,
     scoring: ProtocolOptions,
     by: Annotated[
         list[str] | None,
@@ -371,7 +296,7 @@ def controls(
     source: DataOptions,
     *,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random right views.")] = 0,
-    chosen: EvalPairsOptions,
+    chosen: ScoredOptions,
     scoring: ProtocolOptions,
     report: ControlsReportOptions,
     work: WorkOptions,

@@ -9,19 +9,23 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import typer
 
 from stereogenbench_data.cli.errors import resumable
-from stereogenbench_data.cli.evaluate import pairs_option, parse_picture_size
-from stereogenbench_data.cli.help import SCENES
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
     JsonOption,
-    SceneOptions,
     WorkersOption,
     complete_from,
     depth_of,
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.samples import (
+    BaselineOption,
+    ExportedSceneOptions,
+    PairsOption,
+    pairs_option,
+    parse_picture_size,
+)
 
 if TYPE_CHECKING:
     from stereogenbench_data.bridges.clips import ClipForm
@@ -33,28 +37,11 @@ _ENCODING: Final = "How videos are encoded"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PairOptions(SceneOptions):
+class ExportedPairOptions(ExportedSceneOptions):
     """Which pairs of which scenes are exported."""
 
-    split: Annotated[
-        str | None,
-        typer.Option(
-            "--split",
-            help="train; eval only if you say so [train].",
-            rich_help_panel=SCENES,
-            autocompletion=complete_from(("train", "eval")),
-        ),
-    ] = None
-    pairs: Annotated[
-        str,
-        typer.Option(
-            "--pairs", help="primary, adjacent, all, or such as 0-1,0-5.", rich_help_panel=SCENES
-        ),
-    ] = "primary"
-    baseline_cm: Annotated[
-        tuple[float, float] | None,
-        typer.Option("--baseline-cm", help="Baselines, such as 10 60.", rich_help_panel=SCENES),
-    ] = None
+    pairs: PairsOption = "primary"
+    baseline_cm: BaselineOption = None
 
     def selection(self) -> dict[str, Any]:
         """Return the options of `StereoPairs` that select.
@@ -189,7 +176,7 @@ def export_clips(  # noqa: PLR0913 - one parameter an option
         Literal["diffsynth", "finetrainers", "musubi", "stereocrafter"],
         typer.Option(help="Whose manifests to write: the trainer's."),
     ],
-    chosen: PairOptions,
+    chosen: ExportedPairOptions,
     clip: ClipOptions,
     depth_unit_m: DepthUnitOption = None,
     workers: WorkersOption = None,

@@ -8,46 +8,35 @@ from typing import Annotated, Any, Final, Literal
 import typer
 
 from stereogenbench_data.cli.errors import resumable
-from stereogenbench_data.cli.evaluate import frames_option, parse_picture_size
 from stereogenbench_data.cli.help import SCENES
 from stereogenbench_data.cli.options import (
     DataOptions,
     DepthUnitOption,
-    SceneOptions,
     WorkersOption,
-    complete_from,
     depth_of,
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
+from stereogenbench_data.cli.samples import (
+    ExportedSceneOptions,
+    FramesOption,
+    frames_option,
+    parse_picture_size,
+)
 from stereogenbench_data.schema.text import counted
 
 OutArgument = Annotated[Path, typer.Argument(help="Folder to write into.")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewOptions(SceneOptions):
+class ViewOptions(ExportedSceneOptions):
     """Which views of which scenes are exported."""
 
-    split: Annotated[
-        str | None,
-        typer.Option(
-            "--split",
-            help="train; eval only if you say so [train].",
-            rich_help_panel=SCENES,
-            autocompletion=complete_from(("train", "eval")),
-        ),
-    ] = None
     cameras: Annotated[
         str,
         typer.Option("--cameras", help="all, or numbers such as 0,2,5.", rich_help_panel=SCENES),
     ] = "all"
-    frames: Annotated[
-        str,
-        typer.Option(
-            "--frames", help="first, all, every:K, or such as 0,40,80.", rich_help_panel=SCENES
-        ),
-    ] = "first"
+    frames: FramesOption = "first"
     size: Annotated[
         str | None,
         typer.Option(

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from stereogenbench_data.cli.evaluate import PairsOptions, parse_picture_size
 from stereogenbench_data.cli.help import RARE, SCENES
 from stereogenbench_data.cli.options import DataOptions, JsonOption, grouped
+from stereogenbench_data.cli.samples import SampleOptions, parse_picture_size
 
 if TYPE_CHECKING:
     from stereogenbench_data.datasets.forecast import Forecast
@@ -22,7 +22,7 @@ _MACHINES: Final = "What trains"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SampleOptions(PairsOptions):
+class TrainedOptions(SampleOptions):
     """Which samples of which scenes are trained on: frames drawn at random and clips, too."""
 
     frames: Annotated[
@@ -171,7 +171,7 @@ def forecast(  # noqa: PLR0913 - one parameter an option
         float, typer.Option(min=0.1, help="How long to decode.", rich_help_panel=RARE)
     ] = 6.0,
     where: NetworkOptions,
-    chosen: SampleOptions,
+    chosen: TrainedOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Forecast what will limit a training: processors, network, requests.

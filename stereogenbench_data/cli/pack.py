@@ -165,7 +165,7 @@ def _training(
             if value is not None:
                 raise typer.BadParameter("is of training shards: give --size.", param_hint=option)
         return None
-    from stereogenbench_data.cli.evaluate import parse_picture_size
+    from stereogenbench_data.cli.samples import parse_picture_size
     from stereogenbench_data.shards.training import TrainingSettings
 
     if depth_codec != "released":
