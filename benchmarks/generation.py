@@ -23,7 +23,7 @@ import torch
 
 from stereogenbench_data.media.depth_packing import grey_frame
 from stereogenbench_data.schema.release import CAMERA_COUNT, FRAME_COUNT
-from stereogenbench_data.synthesis.camera_writer import VideoWriter, depth_units
+from stereogenbench_data.synthesis.camera_writer import depth_units, depth_video, picture_video
 from stereogenbench_data.synthesis.checks import FrameStatistics
 from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS
 from stereogenbench_data.synthesis.planning import plan_scene
@@ -47,24 +47,19 @@ def stages_s(request: SynthRequest, *, index: int, frames: int, folder: Path) ->
     start = time.process_time()
     views = [next(chosen) for _ in range(frames)]
     render_s = time.process_time() - start
-    width_px, height_px = request.picture_px
     rgb, depth = folder / "rgb.mp4", folder / "depth.mkv"
     start = time.process_time()
-    with VideoWriter(
-        rgb, size_px=(width_px, height_px), codec="libx264", pixel_format="yuv420p"
-    ) as writer:
+    with picture_video(rgb) as writer:
         for view in views:
             frame = av.VideoFrame.from_ndarray(view.picture, format="rgb24")
             writer.write(frame.reformat(format="yuv420p", threads=1))
     rgb_s = time.process_time() - start
     start = time.process_time()
     eye = plan.view(camera=0, frame=0)
-    with VideoWriter(
-        depth, size_px=(width_px, height_px), codec="ffv1", pixel_format="gray16le"
-    ) as writer:
+    with depth_video(depth, request.contract) as writer:
         for view in views:
             units = depth_units(view.depth_m, view=eye, contract=request.contract)
-            writer.write(grey_frame(units, pixel_format="gray16le"))
+            writer.write(grey_frame(units, pixel_format=request.contract.depth_format))
     depth_s = time.process_time() - start
     start = time.process_time()
     seen = FrameStatistics(plan, camera=0, limits=DEFAULT_LIMITS)

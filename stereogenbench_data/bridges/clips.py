@@ -580,7 +580,7 @@ def _write_clip(work: _ClipWork, advance: Advance) -> None:
         encoders = {kind: stack.enter_context(_encoder(work, kind)) for kind in work.videos}
         for sample in _frames(work, loader):
             for kind, encoder in encoders.items():
-                encoder.write(_picture(kind, sample, ranges))
+                encoder.write_picture(_picture(kind, sample, ranges))
             advance(1)
         height, width = sample["right"].shape[-2:]
     record: dict[str, Any] = work.facts | {"height": height, "width": width}

@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 from fractions import Fraction
 from io import BufferedIOBase
+from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Final, Literal
+from typing import Any, BinaryIO, Final, Literal, TypeVar, cast
 
 import av
 import numpy as np
+from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
 from stereogenbench_data.errors import MediaError
@@ -27,6 +29,7 @@ to be, and some of them any video."""
 _TO_BT601: Final = 5
 """The scaler's number of the same."""
 _LIMITED_RANGE: Final = 1
+_Writer = TypeVar("_Writer", bound="VideoWriter")
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +74,74 @@ class Encoding:
         return options
 
 
-class VideoEncoder:
-    """An MP4 video to write, as a context manager; it is whole after an exit without error.
+class VideoWriter:
+    """A video to write, as a context manager; it is whole after an exit without error.
 
-    It takes one thread, so that the same pictures give the same bytes.
+    One thread encodes, so that the same frames give the same bytes.
     """
+
+    def __init__(
+        self,
+        file: Path | BinaryIO | BufferedIOBase,
+        *,
+        container: str,
+        codec: str,
+        rate_hz: float,
+        options: dict[str, str],
+        tags: dict[str, str] | None = None,
+    ) -> None:
+        """Begin a video.
+
+        Args:
+            file: Where it goes; an open file stays the caller's to close.
+            container: FFmpeg's name of the container.
+            codec: FFmpeg's name of the codec.
+            rate_hz: Frames a second.
+            options: The codec's own options.
+            tags: Metadata of the container.
+        """
+        self._rate = Fraction(rate_hz).limit_denominator(1001)
+        self._container = av.open(
+            file, "w", format=container, container_options={"fflags": "+bitexact"}
+        )
+        self._container.metadata.update(tags or {})
+        self._stream = cast(
+            VideoStream, self._container.add_stream(codec, rate=self._rate, options=options)
+        )
+        self._stream.codec_context.thread_count = 1
+        self._frames = 0
+
+    def write(self, frame: av.VideoFrame) -> None:
+        """Append a frame; the first one sets the video's size and pixel format.
+
+        Raises:
+            OSError: If the file cannot be written.
+        """
+        if self._frames == 0:
+            self._stream.width, self._stream.height = frame.width, frame.height
+            self._stream.pix_fmt = frame.format.name
+        frame.pts, frame.time_base = self._frames, 1 / self._rate
+        self._frames += 1
+        self._container.mux(self._stream.encode(frame))
+
+    def __enter__(self: _Writer) -> _Writer:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            if error is None:
+                self._container.mux(self._stream.encode(None))
+        finally:
+            self._container.close()
+
+
+class VideoEncoder(VideoWriter):
+    """An MP4 video of RGB pictures to write: H.264, tagged BT.601."""
 
     def __init__(
         self,
@@ -93,57 +159,28 @@ class VideoEncoder:
             encoding: How pictures are encoded.
             quality: "lossless" instead of the encoding's rate factor.
         """
-        self._rate = Fraction(rate_hz).limit_denominator(1001)
-        self._encoding = encoding
-        self._container = av.open(
-            file, "w", format="mp4", container_options={"fflags": "+bitexact"}
-        )
-        self._stream = self._container.add_stream(
-            _CODEC, rate=self._rate, options=encoding.options(quality=quality)
-        )
-        self._frames = 0
+        options = encoding.options(quality=quality)
+        super().__init__(file, container="mp4", codec=_CODEC, rate_hz=rate_hz, options=options)
+        self._pixel_format = encoding.pixel_format
+        context: Any = self._stream.codec_context
+        context.colorspace = context.color_primaries = context.color_trc = _BT601
+        context.color_range = _LIMITED_RANGE
 
-    def write(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
+    def write_picture(self, picture: UInt8[np.ndarray, "h w 3"]) -> None:
         """Append an RGB picture.
 
         Raises:
             MediaError: If a side is odd, and the pixel format halves colours.
             OSError: If the file cannot be written.
         """
-        if self._frames == 0:
-            self._begin(*picture.shape[:2])
-        pixel_format = self._encoding.pixel_format
-        frame = av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(
-            format=pixel_format, dst_colorspace=_TO_BT601, dst_color_range=_LIMITED_RANGE
-        )
-        frame.pts, frame.time_base = self._frames, 1 / self._rate
-        self._frames += 1
-        self._container.mux(self._stream.encode(frame))
-
-    def _begin(self, height: int, width: int) -> None:
-        if self._encoding.pixel_format == "yuv420p" and (height % 2 or width % 2):
+        height, width = picture.shape[:2]
+        if self._pixel_format == "yuv420p" and (height % 2 or width % 2):
             raise MediaError(
                 f"pictures of {width}x{height} pixels have an odd side, which yuv420p cannot "
                 "store: choose an even size, or pixel_format yuv444p."
             )
-        self._stream.height, self._stream.width = height, width
-        self._stream.pix_fmt = self._encoding.pixel_format
-        context: Any = self._stream.codec_context
-        context.thread_count = 1
-        context.colorspace = context.color_primaries = context.color_trc = _BT601
-        context.color_range = _LIMITED_RANGE
-
-    def __enter__(self) -> "VideoEncoder":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        try:
-            if error is None:
-                self._container.mux(self._stream.encode(None))
-        finally:
-            self._container.close()
+        self.write(
+            av.VideoFrame.from_ndarray(picture, format="rgb24").reformat(
+                format=self._pixel_format, dst_colorspace=_TO_BT601, dst_color_range=_LIMITED_RANGE
+            )
+        )

@@ -7,17 +7,16 @@ same bytes on any number of processors.
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
-from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
-from typing import Final, cast
+from typing import Final
 
 import av
 import numpy as np
-from av.video.stream import VideoStream
 from jaxtyping import Float64, UInt16
 
 from stereogenbench_data.media.depth_packing import grey_frame
+from stereogenbench_data.media.encoder import VideoWriter
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_name
 from stereogenbench_data.synthesis.checks import CameraCheck, FrameStatistics
 from stereogenbench_data.synthesis.filters import Limits
@@ -27,11 +26,8 @@ from stereogenbench_data.synthesis.renderer import RenderedView, Renderer
 from stereogenbench_data.synthesis.request import ExportContract
 
 _LARGEST: Final = {"gray16le": 65535, "gray12le": 4095, "gray10le": 1023}
-_RATE_HZ: Final = int(FRAME_RATE_HZ)
-_OPTIONS: Final = {
-    "libx264": {"crf": "18", "x264-params": "cpu-independent=1"},
-    "ffv1": {"level": "3", "slices": "4", "slicecrc": "1"},
-}
+_H264: Final = {"crf": "18", "x264-params": "cpu-independent=1"}
+_FFV1: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
 
 
 def write_cameras(
@@ -73,29 +69,13 @@ class _CameraWriter:
     """The two videos of a camera, as a context manager."""
 
     def __init__(self, plan: ScenePlan, *, camera: int, folder: Path) -> None:
-        contract, size_px = plan.request.contract, plan.request.picture_px
-        tag = contract.depth_tag
+        contract = plan.request.contract
         self._contract, self._view = contract, plan.view(camera=camera, frame=0)
         self._waiting: deque[UInt16[np.ndarray, "h w"]] = deque()
         self._seen = 0
         with ExitStack() as stack:
-            self._rgb = stack.enter_context(
-                VideoWriter(
-                    folder / rgb_name(camera),
-                    size_px=size_px,
-                    codec="libx264",
-                    pixel_format="yuv420p",
-                )
-            )
-            self._depth = stack.enter_context(
-                VideoWriter(
-                    folder / depth_name(camera),
-                    size_px=size_px,
-                    codec="ffv1",
-                    pixel_format=contract.depth_format,
-                    tags=None if tag is None else {tag: repr(contract.depth_unit_m)},
-                )
-            )
+            self._rgb = stack.enter_context(picture_video(folder / rgb_name(camera)))
+            self._depth = stack.enter_context(depth_video(folder / depth_name(camera), contract))
             self._files = stack.pop_all()
 
     def write(self, view: RenderedView) -> None:
@@ -132,48 +112,23 @@ class _CameraWriter:
                 self._write_depth(self._last)
 
 
-class VideoWriter:
-    """A video to write, as a context manager; the file is complete after an exit without error."""
+def picture_video(path: Path) -> VideoWriter:
+    """Begin a camera's video of pictures."""
+    return VideoWriter(path, container="mp4", codec="libx264", rate_hz=FRAME_RATE_HZ, options=_H264)
 
-    def __init__(
-        self,
-        path: Path,
-        *,
-        size_px: tuple[int, int],
-        codec: str,
-        pixel_format: str,
-        tags: dict[str, str] | None = None,
-    ) -> None:
-        self._container = av.open(path, "w", container_options={"fflags": "+bitexact"})
-        self._container.metadata.update(tags or {})
-        self._stream = cast(
-            VideoStream, self._container.add_stream(codec, rate=_RATE_HZ, options=_OPTIONS[codec])
-        )
-        self._stream.width, self._stream.height = size_px
-        self._stream.pix_fmt = pixel_format
-        self._stream.codec_context.thread_count = 1
-        self._frames = 0
 
-    def write(self, frame: av.VideoFrame) -> None:
-        """Append a frame."""
-        frame.pts, frame.time_base = self._frames, Fraction(1, _RATE_HZ)
-        self._frames += 1
-        self._container.mux(self._stream.encode(frame))
-
-    def __enter__(self) -> "VideoWriter":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        try:
-            if error is None:
-                self._container.mux(self._stream.encode(None))
-        finally:
-            self._container.close()
+def depth_video(path: Path, contract: ExportContract) -> VideoWriter:
+    """Begin a camera's video of depth, tagged with its unit where the contract says so."""
+    tag = contract.depth_tag
+    tags = None if tag is None else {tag: repr(contract.depth_unit_m)}
+    return VideoWriter(
+        path,
+        container="matroska",
+        codec="ffv1",
+        rate_hz=FRAME_RATE_HZ,
+        options=_FFV1,
+        tags=tags,
+    )
 
 
 def depth_units(

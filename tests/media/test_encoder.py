@@ -28,7 +28,7 @@ def encoded(pictures, *, rate_hz=24.0, quality="as set", **settings):
     encoding = Encoding(**settings)
     with VideoEncoder(file, rate_hz=rate_hz, encoding=encoding, quality=quality) as encoder:
         for picture in pictures:
-            encoder.write(picture)
+            encoder.write_picture(picture)
     file.seek(0)
     return file
 
@@ -134,7 +134,7 @@ def test_settings_that_cannot_be_are_named(settings, said):
 
 def write_until_odd(file):
     with VideoEncoder(file, rate_hz=24.0, encoding=Encoding()) as encoder:
-        encoder.write(smooth(0, 31, 48))
+        encoder.write_picture(smooth(0, 31, 48))
 
 
 def test_a_video_that_is_broken_off_leaves_no_trailer():

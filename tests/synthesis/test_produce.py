@@ -7,7 +7,7 @@ import os
 import pytest
 
 from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.synthesis.camera_writer import VideoWriter
+from stereogenbench_data.media.encoder import VideoWriter
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
