@@ -23,8 +23,9 @@ shards/index.parquet:
 demo: shards/index.parquet $(READY)
 	$(BIN)/python examples/train.py
 
+# The processes of the tests fill the cores by themselves.
 test: shards/index.parquet lint
-	$(BIN)/python -m pytest $(PYTEST_ARGS) --numprocesses auto --maxprocesses 8 --dist worksteal
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS) --numprocesses auto --maxprocesses 8 --dist worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .

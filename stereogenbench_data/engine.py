@@ -412,6 +412,9 @@ def _run_on_ray(
     where = f"{working_folder}: the working folder cannot be entered on the node {platform.node()}"
     with explain_os_errors(where, "Start the command in a folder that all nodes have."):
         os.chdir(working_folder)
+    # Ray cancels a task as Ctrl-C does, which the workers of a node that a script started ignore.
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     done = 0
 
     def advance(count: int) -> None:

@@ -36,7 +36,10 @@ ONE_EACH = 250_000
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Return the address of a Ray cluster of two nodes, one core each."""
+    """Return the address of a Ray cluster of two nodes, one core each.
+
+    They ignore Ctrl-C, as where a script started them in the background.
+    """
     require_module("ray")
     from ray.cluster_utils import Cluster
 
@@ -44,8 +47,10 @@ def cluster():
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     monkeypatch.setenv("PYTHONPATH", str(Path.cwd()))  # which workers get from their node
     node = {"num_cpus": 1, "object_store_memory": 80_000_000, "include_dashboard": False}
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     cluster = Cluster(initialize_head=True, head_node_args=node)
     cluster.add_node(**node)
+    signal.signal(signal.SIGINT, before)
     yield cluster.address
     cluster.shutdown()
     monkeypatch.undo()
