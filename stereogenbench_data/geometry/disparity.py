@@ -8,6 +8,7 @@ disparity of all of these is 0, so a disparity map needs the mask of measured pi
 """
 
 import math
+from functools import lru_cache
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -205,6 +206,7 @@ def write_disparity(
                 np.copyto(found, 0, where=~known)
 
 
+@lru_cache(maxsize=1024)
 def _exact_quotient(shift_units: float) -> tuple[float, float, Literal["float32", "float64"]]:
     """Return product, factor and dtype with shift / units = product / (units * factor)."""
     product, factor, is_exact = _exact_quotients(np.array(shift_units))

@@ -4,7 +4,6 @@
 time of every frame. Times are integers in ticks of the stream's time base.
 """
 
-import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,19 +25,21 @@ class SteadyClock:
     start: int
     step: Fraction
 
-    @property
-    def _tolerance(self) -> Fraction:
-        return min(Fraction(1), self.step / 4)
+    # A time may be off by a tick, or by a quarter of a step where that is less. It is computed in
+    # integers, as every packet asks.
 
     def index(self, pts: int) -> int | None:
         """Return the frame that is shown at a time, None where the time fits no frame."""
-        index = round((pts - self.start) / self.step)
-        off = abs(pts - self.start - index * self.step)
-        return index if off <= self._tolerance else None
+        step, parts = self.step.numerator, self.step.denominator
+        since_start = (pts - self.start) * parts
+        index = (2 * since_start + step) // (2 * step)
+        off = abs(since_start - index * step)
+        return index if 4 * off <= min(4 * parts, step) else None
 
     def latest(self, index: int) -> int:
         """Return the greatest time that counts as a frame's."""
-        return math.floor(self.start + index * self.step + self._tolerance)
+        step, parts = self.step.numerator, self.step.denominator
+        return self.start + (4 * index * step + min(4 * parts, step)) // (4 * parts)
 
 
 @dataclass(frozen=True, slots=True)

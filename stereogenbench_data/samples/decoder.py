@@ -93,6 +93,7 @@ class SampleDecoder:
         self._scenes: OrderedDict[int, Scene] = OrderedDict()
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
         self._depths: OrderedDict[tuple[int, ...], StoredDepth] = OrderedDict()
+        self._encodings: dict[tuple[float, str], DepthEncoding] = {}
 
     @property
     def stats(self) -> StreamStats:
@@ -297,10 +298,12 @@ class SampleDecoder:
 
     def _encoding(self, scene: Scene, camera: int) -> DepthEncoding:
         contract = self._request.depth or DepthEncoding()
-        source = scene.depth_unit_source[camera]
+        unit_m, source = scene.depth_unit_m[camera], scene.depth_unit_source[camera]
         if source == "unreadable":
             return contract
-        return contract.with_file_unit(scene.depth_unit_m[camera], source=source)
+        if (unit_m, source) not in self._encodings:
+            self._encodings[unit_m, source] = contract.with_file_unit(unit_m, source=source)
+        return self._encodings[unit_m, source]
 
     def _pictures(
         self,

@@ -129,14 +129,19 @@ class Streams:
             MediaError: If it does not decode to the scene's number of colour pictures.
         """
         most = self._kept_frames
+        height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
         with self._stream(scene, name, run) as stream:
-
-            def decoded() -> UInt8[np.ndarray, "3 h w"]:
-                height, width = size or (scene.rig.image_height_px, scene.rig.image_width_px)
-                out = stream.picture(height=height, width=width, most=most)
-                return read_rgb(stream.reader, index, size=size, out=out, content="colour")
-
-            kept: UInt8[np.ndarray, "3 h w"] = stream.keep((index, size), decoded, most=most)
+            kept: UInt8[np.ndarray, "3 h w"] = stream.keep(
+                (index, size),
+                lambda: read_rgb(
+                    stream.reader,
+                    index,
+                    size=size,
+                    out=stream.picture(height=height, width=width, most=most),
+                    content="colour",
+                ),
+                most=most,
+            )
             return kept
 
     def write_rgb(

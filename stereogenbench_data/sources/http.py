@@ -3,48 +3,25 @@
 Errors do not chain urllib3's own, whose messages hold the whole URL with its secrets.
 """
 
-import atexit
 import base64
-import http.client
-import io
 import json
-import logging
-import os
 import re
-import socket
 import time
-import weakref
 from collections.abc import Generator, Mapping
 from contextlib import ExitStack, suppress
-from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
-from functools import partial
 from typing import Any, Final
 from urllib.parse import parse_qs, unquote, urljoin, urlunsplit
-from urllib.request import getproxies, proxy_bypass
 
 import urllib3
-import urllib3.connection
-from urllib3.exceptions import (
-    ConnectTimeoutError,
-    HTTPError,
-    LocationValueError,
-    NameResolutionError,
-    NewConnectionError,
-)
-from urllib3.util.connection import allowed_gai_family
+from urllib3.exceptions import HTTPError, LocationValueError
 
 from stereogenbench_data.errors import StorageError
+from stereogenbench_data.sources.connections import failure_reason, request
 from stereogenbench_data.sources.location import WEB_SCHEMES, is_inside, shown, split_url
-from stereogenbench_data.sources.retry import (
-    Attempt,
-    ProcessLock,
-    TooSlow,
-    TransientError,
-    shut_down,
-)
+from stereogenbench_data.sources.retry import Attempt, ProcessLock, TooSlow, TransientError
 from stereogenbench_data.sources.transport import (
     MISSING,
     busy,
@@ -75,23 +52,10 @@ _STRONG_TAG: Final = re.compile(r'"[!#-~]{0,256}"')
 _DATE: Final = re.compile(r"[A-Za-z0-9,: +-]{1,64}")
 _RATE_LIMIT: Final = re.compile(r";r=0;t=([0-9]{1,6})(?:[;,]|$)")
 _CHUNK: Final = 64 * 1024
-_MOST_CONNECTIONS: Final = 64
-"""Connections to one server that a process keeps for later requests."""
-
 _MARGIN_S: Final = 60.0
 """Seconds before a signed URL expires from which on it is not used; at most a tenth of its time."""
 
 _LONGEST_KEPT_S: Final = 86_400.0
-
-_pools: Final[dict[tuple[int, str], urllib3.PoolManager]] = {}
-"""Connections by process and proxy. Those inherited over a fork are not used: their sockets belong
-to the parent."""
-
-_sockets: Final[weakref.WeakSet[socket.socket]] = weakref.WeakSet()
-"""The open connections of this process."""
-
-_current_attempt: Final[ContextVar[Attempt | None]] = ContextVar("_current_attempt", default=None)
-"""The attempt that this thread's request belongs to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +166,7 @@ class WebTransport:
                 if data:
                     yield data
         except HTTPError as error:
-            raise TransientError(_reason(error)) from None
+            raise TransientError(failure_reason(error)) from None
         finally:
             # A response that was read to its end is back in the pool, and is not closed.
             response.close()
@@ -293,27 +257,15 @@ class WebTransport:
     ) -> urllib3.BaseHTTPResponse:
         """Return a server's response, which may be a redirect."""
         require_no_pause(server_of(url), attempt)
-        token = _current_attempt.set(attempt)
         try:
-            allowed_s = attempt.next_wait_s()
-            return _pool(url).request(
-                "GET",
-                url,
-                headers={**headers, **self._condition(url)},
-                timeout=urllib3.Timeout(connect=allowed_s, read=allowed_s),
-                retries=False,
-                redirect=False,
-                preload_content=False,
-            )
+            return request(url, headers={**headers, **self._condition(url)}, attempt=attempt)
         except TooSlow as error:
             raise TransientError(str(error)) from None
         except (LocationValueError, UnicodeError):
             sent = "" if url == self._url else f"is redirected to {shown(url)[:200]}, which "
             raise StorageError(f"{self._where}: {sent}is not a valid URL: correct it.") from None
         except HTTPError as error:
-            raise TransientError(_reason(error)) from None
-        finally:
-            _current_attempt.reset(token)
+            raise TransientError(failure_reason(error)) from None
 
     def _redirected(self, url: str, response: urllib3.BaseHTTPResponse) -> str:
         """Return where a response redirects to, if that may be followed."""
@@ -436,197 +388,6 @@ class WebTransport:
             )
         first, last, size = found.groups(default="")
         return first, last, size
-
-
-class _TimedStream(io.RawIOBase):
-    """The bytes of a connection; waits for them stay within the limits of the attempt."""
-
-    def __init__(self, stream: io.RawIOBase, connection: socket.socket, attempt: Attempt) -> None:
-        super().__init__()
-        self._stream = stream
-        self._connection = connection
-        self._attempt = attempt
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any, /) -> int | None:
-        self._connection.settimeout(self._attempt.next_wait_s())
-        began_s, count = self._attempt.clock(), 0
-        try:
-            count = self._stream.readinto(buffer) or 0
-        except TooSlow:
-            raise
-        except TimeoutError:
-            self._attempt.add(self._attempt.clock() - began_s, 0)
-            raise self._attempt.too_slow() from None
-        self._attempt.add(self._attempt.clock() - began_s, count)
-        return count
-
-    def close(self) -> None:
-        self._stream.close()
-        super().close()
-
-
-class _TimedResponse(http.client.HTTPResponse):
-    """A response whose head and body arrive within the limits of the attempt."""
-
-    def __init__(self, sock: socket.socket, *args: Any, **how: Any) -> None:
-        super().__init__(sock, *args, **how)
-        attempt = _current_attempt.get()
-        if attempt is not None:
-            _sockets.add(sock)
-            attempt.on_cancel(partial(shut_down, sock))
-            self.fp = io.BufferedReader(_TimedStream(self.fp.detach(), sock, attempt))
-
-
-class _TimedConnection(urllib3.connection.HTTPConnection):
-    """A connection that is made within the limits of the attempt, all its addresses together."""
-
-    response_class = _TimedResponse
-    _during_handshake: socket.socket | None = None
-    _handshake_from_s = 0.0
-
-    def connect(self) -> None:
-        """Connect, and make the connection secure where it is to be."""
-        try:
-            super().connect()
-        finally:
-            attempt = _current_attempt.get()
-            if self._during_handshake is not None and attempt is not None:
-                attempt.add(attempt.clock() - self._handshake_from_s, 0)
-                self._during_handshake.close()
-                self._during_handshake = None
-
-    def _new_conn(self) -> socket.socket:
-        attempt = _current_attempt.get()
-        if attempt is None:
-            return super()._new_conn()
-        try:
-            connection = self._connected(attempt)
-            allowed_s = attempt.next_wait_s()
-        except socket.gaierror as error:
-            raise NameResolutionError(self.host, self, error) from error
-        except TooSlow as error:
-            raise ConnectTimeoutError(self, str(error)) from error
-        except TimeoutError as error:
-            raise ConnectTimeoutError(self, "timed out") from error
-        except OSError as error:
-            raise NewConnectionError(self, "no connection") from error
-        # TLS takes the socket over: a copy can be shut down meanwhile.
-        self._during_handshake = connection.dup()
-        self._handshake_from_s = attempt.clock()
-        attempt.on_cancel(partial(shut_down, self._during_handshake))
-        connection.settimeout(allowed_s)
-        return connection
-
-    def _connected(self, attempt: Attempt) -> socket.socket:
-        """Return a connection to the first of the host's addresses that accepts one."""
-        refused: OSError | None = None
-        began_s = attempt.clock()
-        found = socket.getaddrinfo(
-            self._dns_host.strip("[]"), self.port, allowed_gai_family(), socket.SOCK_STREAM
-        )
-        attempt.add(attempt.clock() - began_s, 0)
-        for family, kind, protocol, _, address in found:
-            connection = socket.socket(family, kind, protocol)
-            began_s = attempt.clock()
-            try:
-                for option in self.socket_options or ():
-                    connection.setsockopt(*option)
-                attempt.on_cancel(partial(shut_down, connection))
-                connection.settimeout(attempt.next_wait_s())
-                connection.connect(address)
-            except OSError as error:
-                connection.close()
-                refused = error
-            else:
-                return connection
-            finally:
-                attempt.add(attempt.clock() - began_s, 0)
-        raise refused or OSError("the host has no address")
-
-
-class _Connection(_TimedConnection):
-    pass
-
-
-class _SecureConnection(_TimedConnection, urllib3.connection.HTTPSConnection):
-    pass
-
-
-class _Pool(urllib3.HTTPConnectionPool):
-    ConnectionCls = _Connection
-
-
-class _SecurePool(urllib3.HTTPSConnectionPool):
-    ConnectionCls = _SecureConnection
-
-
-def _pool(url: str) -> urllib3.PoolManager:
-    """Return the connections of this process, through the machine's proxy where it has one."""
-    parts = split_url(url)
-    proxy = "" if proxy_bypass(parts.netloc) else getproxies().get(parts.scheme, "")
-    key = (os.getpid(), proxy)
-    if key not in _pools:
-        pool = (
-            urllib3.ProxyManager(proxy, maxsize=_MOST_CONNECTIONS)
-            if proxy
-            else urllib3.PoolManager(maxsize=_MOST_CONNECTIONS)
-        )
-        pool.pool_classes_by_scheme = {"http": _Pool, "https": _SecurePool}
-        _pools.setdefault(key, pool)
-    return _pools[key]
-
-
-@atexit.register
-def close_connections() -> None:
-    """Close the connections of this process; reading opens new ones."""
-    for key in [key for key in _pools if key[0] == os.getpid()]:
-        _pools.pop(key).clear()
-
-
-def _reason(error: BaseException) -> str:
-    """Return what happened, without the URL that urllib3's messages hold."""
-    reason = getattr(error, "reason", None)
-    inner = reason if isinstance(reason, BaseException) else error
-    cause = inner.__cause__ or inner.__context__
-    if isinstance(cause, TooSlow):
-        return str(cause)
-    if isinstance(cause, OSError) and cause.strerror:
-        return f"{type(inner).__name__}: {cause.strerror}"
-    return type(inner).__name__
-
-
-def _leave_connections() -> None:
-    """Close this process's copies of the connections of the process that it was forked from.
-
-    Locks may be held there by threads that do not exist here, so none is used.
-    """
-    for connection in list(_sockets):
-        number = connection.detach()
-        if number >= 0:
-            os.close(number)
-    _sockets.clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_leave_connections)
-
-
-class _WithoutQueries(logging.Filter):
-    """Removes the queries of this module's URLs from what urllib3 logs: they may be signed."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Keep every record, changed where it is of a request of this module."""
-        if _current_attempt.get() is not None and isinstance(record.args, tuple):
-            record.args = tuple(
-                each.partition("?")[0] if isinstance(each, str) else each for each in record.args
-            )
-        return True
-
-
-logging.getLogger("urllib3.connectionpool").addFilter(_WithoutQueries())
 
 
 def _use_up(response: urllib3.BaseHTTPResponse) -> None:

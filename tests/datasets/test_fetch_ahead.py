@@ -54,7 +54,7 @@ def fetching():
 
 
 def remote_pools_closed():
-    from stereogenbench_data.sources.http import close_connections
+    from stereogenbench_data.sources.connections import close_connections
 
     close_connections()
 

@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.sources import http as web_transport
+from stereogenbench_data.sources.connections import close_connections
+from stereogenbench_data.sources.http import signed_for_s
 from stereogenbench_data.sources.pauses import begin_pause, pause_end_s
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import Cancellation, ReadCancelled, RetryPolicy
@@ -186,7 +187,7 @@ def test_a_cancelled_read_ends_at_once_whatever_it_waits_for(dead):
 
     assert len(ended) == 3
     assert max(ended) < 2
-    web_transport.close_connections()
+    close_connections()
     assert connections_to(dead) == before
 
 
@@ -403,7 +404,7 @@ ENCODED = base64.b64encode(json.dumps(POLICY).encode()).decode()
     ],
 )
 def test_a_signed_url_says_how_long_it_is_valid(query, left_s):
-    assert web_transport.signed_for_s(f"https://h/x?{query}", NOW) == left_s
+    assert signed_for_s(f"https://h/x?{query}", NOW) == left_s
 
 
 def test_a_web_servers_signed_url_is_kept_and_resolved_again_when_it_is_refused(served):

@@ -7,7 +7,7 @@ import pytest
 import urllib3
 
 from stereogenbench_data.errors import ShardError, StorageError
-from stereogenbench_data.sources import http as web_transport
+from stereogenbench_data.sources.connections import close_connections
 from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import RetryPolicy
 from tests.servers.failing_server import Answer, serving
@@ -263,7 +263,7 @@ def test_threads_read_at_the_same_time_over_connections_that_are_used_again(serv
 
 def test_connections_can_be_closed_and_are_opened_anew(served):
     read_range(f"{served.url}/x.tar", 0, 9)
-    web_transport.close_connections()
+    close_connections()
 
     assert read_range(f"{served.url}/x.tar", 0, 9) == DATA[:9]
 
