@@ -14,14 +14,17 @@ import io
 import json
 import statistics
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final
 
 import av
 import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
@@ -31,11 +34,12 @@ from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import open_depth, read_depth_units, resized_nearest
 from stereogenbench_data.media.depth_frames import blosc2_module
+from stereogenbench_data.media.picture_encoding import QUALITIES, write_pictures
 from stereogenbench_data.media.video import VideoReader, read_rgb
 from stereogenbench_data.samples.size import parse_size
 from stereogenbench_data.schema.records import DepthEncoding
 
-FRAMES: Final = 48
+FRAMES: Final = 24
 """Frames of a scene that are encoded: several groups of pictures of the longest kind."""
 
 MATCHED: Final = 4
@@ -79,10 +83,12 @@ class Codec:
 
 
 def codecs() -> Iterator[Codec]:
-    """Yield what is compared."""
-    for gop in (1, 2, 8, 16):
+    """Yield what is compared: the qualities of training shards, and ways beside them."""
+    for quality in QUALITIES:
+        yield Codec(f"quality {quality}", "quality", "", {"quality": quality})
+    for gop in (1, 2, 8):
         for rate in (10, 14, 18, 23, 28):
-            for tune in ("fastdecode", ""):
+            for tune in ("fastdecode", "") if gop == 8 else ("fastdecode",):
                 options = {"crf": str(rate), "preset": "medium"}
                 name = f"H.264 key {gop} crf {rate}"
                 if tune:
@@ -106,6 +112,13 @@ def codecs() -> Iterator[Codec]:
 
 def encoded(codec: Codec, pictures: np.ndarray) -> list[bytes]:
     """Return the encoded pictures: one video, or one file a picture."""
+    if codec.encoder == "quality":
+        with tempfile.TemporaryDirectory() as folder:
+            video = Path(folder, "pictures.mp4")
+            quality: Any = codec.options["quality"]
+            planes = pictures.transpose(0, 3, 1, 2)
+            write_pictures(planes, video, quality=quality, rate_hz=Fraction(30))
+            return [video.read_bytes()]
     if codec.encoder in ("jpeg", "png"):
         options: dict[str, Any] = {name: int(value) for name, value in codec.options.items()}
         files = []
@@ -517,7 +530,7 @@ def main() -> None:
     parser.add_argument("--middlebury", type=Path)
     parser.add_argument("--size", default="832x480")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--only", default="", help="codecs whose name holds this text")
+    parser.add_argument("--only", action="append", help="codecs whose name holds this text")
     parser.add_argument("--out", type=Path, default=Path("docs/performance"))
     options = parser.parse_args()
     size = parse_size(options.size)
@@ -531,7 +544,7 @@ def main() -> None:
         moves = pictures.released_ms > 0
         rows.append({"codec": "original", "material": pictures.name, "moves": moves, **errors})
         for codec in codecs():
-            if options.only in codec.name:
+            if options.only is None or any(text in codec.name for text in options.only):
                 rows.append(compared(codec, pictures, rounds=options.rounds))
                 sys.stderr.write(json.dumps(rows[-1]) + "\n")
     depth = [
