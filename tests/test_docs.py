@@ -106,7 +106,7 @@ return code.filter(each => each.scrollWidth > each.clientWidth).map(each => each
     ("width_px", "blocks"),
     [
         pytest.param(1440, "", id="desktop"),
-        pytest.param(390, ".highlight:not(.language-text)", id="phone"),
+        pytest.param(390, ".highlight:not(.drawing)", id="phone"),
     ],
 )
 def test_no_line_of_code_is_cut_at_the_right_edge(built, browser, width_px, blocks):
