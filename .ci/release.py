@@ -55,6 +55,10 @@ def problems(tag: str, *, project: dict, changelog: str) -> list[str]:
         )
     if version not in dict(LINK.findall(changelog)):
         found.append(f"CHANGELOG.md: has no link for [{version}]: run `python .ci/release.py date`")
+    entry = changelog.partition(f"## [{version}]")[2].partition("\n## [")[0]
+    sections = re.findall(r"^### (.+)$", entry, re.MULTILINE)
+    for name in sorted({each for each in sections if sections.count(each) > 1}):
+        found.append(f"CHANGELOG.md: {version} has several sections {name!r}: make them one")
     for name in ("Repository", "Changelog", "Issues"):
         if name not in project["urls"]:
             found.append(
@@ -70,7 +74,12 @@ def main(arguments: list[str]) -> int:
     match arguments:
         case ["date"]:
             today = datetime.now(UTC).date().isoformat()
-            path.write_text(dated(path.read_text(), version=project["version"], day=today))
+            try:
+                text = dated(path.read_text(), version=project["version"], day=today)
+            except ValueError as error:
+                sys.stderr.write(f"{error}\n")
+                return 1
+            path.write_text(text)
             return 0
         case ["check", tag]:
             found = problems(tag, project=project, changelog=path.read_text())

@@ -40,6 +40,7 @@ def plot_all(sections: dict[str, Any], folder: Path) -> list[Path]:
     web = [w for w in WORKLOADS if w.name in races and w.source == "web"]
     made = []
     for name, wanted, make in (
+        ("speed", local, lambda: _speed(races, local)),
         ("contestants", local, lambda: _contestants(races, local)),
         ("workers", "all-frames" in races, lambda: _workers(races["all-frames"])),
         ("rates", any(w.name in races for w in RATES), lambda: _by_rate(sections)),
@@ -89,6 +90,49 @@ def _bars(axes: Any, names: list[str], spreads: list[Spread], *, form: str) -> N
     axes.set_yticks(places, [title(name) for name in names], fontsize=8)
     axes.margins(x=0.15)
     axes.set_xlim(left=0)
+
+
+_SHOWN: Final = (
+    ("ours", "stereogenbench_data", _OURS, "o"),
+    ("webdataset", "webdataset", "#d68910", "s"),
+    ("datasets", "HF datasets", "#8e6bbf", "D"),
+    ("torchcodec", "torchcodec", "#555555", "^"),
+    ("naive", "the paper's snippet", "#a0a0a0", "v"),
+)
+
+
+def _speed(races: dict[str, Any], workloads: list[Workload]) -> Any:
+    """Draw one loader of each kind in all local races: the plot of the README."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(8, 0.5 * len(workloads) + 1.4))
+    places = np.arange(len(workloads))[::-1]
+    for place in places:
+        axes.axhline(place, color="#e8e8e8", linewidth=1, zorder=0)
+    for name, label, colour, marker in _SHOWN:
+        for place, workload in zip(places, workloads, strict=True):
+            workers = workload.workers[0]
+            share = ratios(
+                races[workload.name]["rounds"], entry(name, workers), to=entry(LIMIT, workers)
+            )
+            if share is None:
+                continue
+            axes.errorbar(
+                share.median, place, xerr=[[share.median - share.low], [share.high - share.median]],
+                color=colour, marker=marker, markersize=7, label=label, zorder=3,
+            )  # fmt: skip
+    axes.axvline(1, color=_INK, linewidth=1, zorder=1)
+    axes.set_yticks(places, [workload.title for workload in workloads], fontsize=9)
+    axes.set_xlim(left=-0.03)
+    axes.set_ylim(-0.6, len(workloads) - 0.4)
+    axes.set_xlabel("samples a second, as a share of a bare decoding loop's (line)", fontsize=9)
+    handles = dict(zip(*axes.get_legend_handles_labels()[::-1], strict=True))
+    figure.legend(
+        handles.values(), handles.keys(), frameon=False, fontsize=9, ncol=len(_SHOWN),
+        loc="upper center", handletextpad=0.3, columnspacing=1.5,
+    )  # fmt: skip
+    figure.tight_layout(rect=(0, 0, 1, 0.93))
+    return figure
 
 
 def _contestants(races: dict[str, Any], workloads: list[Workload]) -> Any:
@@ -234,9 +278,9 @@ _FLOOR_PX: Final = 1e-13
 def _accuracy(found: dict[str, Any]) -> Any:
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(figsize=(11, 6))
-    ways = sorted(found["ways"], key=lambda way: way["worst_on_screen_px"])
-    for number, way in enumerate(ways):
+    figure, axes = plt.subplots(figsize=(9, 6))
+    ways = sorted(found["ways"], key=lambda way: (way["worst_on_screen_px"], way["name"]))
+    for number, way in enumerate(ways, start=1):
         ns = way["ns_a_pixel"]["median"]
         marker, colour = _MARKS[way["offered"]]
         worst, most = (
@@ -246,23 +290,24 @@ def _accuracy(found: dict[str, Any]) -> Any:
         axes.scatter([ns], [worst], marker=marker, color=colour, s=55, zorder=3)
         axes.scatter([ns], [most], marker="_", color=colour, s=80, zorder=3)
         axes.annotate(
-            way["name"], (ns, worst), xytext=(1.03, (number + 0.5) / len(ways)),
-            textcoords="axes fraction", fontsize=8.5, va="center", annotation_clip=False,
-            arrowprops={
-                "arrowstyle": "-", "color": "#d0d0d0", "linewidth": 0.8, "relpos": (0, 0.5),
-            },
+            str(number), (ns, most), xytext=(0, -6), textcoords="offset points", fontsize=8.5,
+            ha="center", va="top",
+        )  # fmt: skip
+        axes.text(
+            1.03, 0.72 - 0.06 * (len(ways) - number), f"{number}  {way['name']}", fontsize=8.5,
+            transform=axes.transAxes,
         )  # fmt: skip
     conversion = found["conversion_ns"]["median"]
     axes.axvline(conversion, color=_INK, linestyle=":", linewidth=1, zorder=1)
     axes.annotate(
-        "one conversion\nuint16 to float32", (conversion, 3e-12), xytext=(4, 0),
+        "one conversion\nuint16 to float32", (conversion, 1e-11), xytext=(4, 0),
         textcoords="offset points", fontsize=8,
     )  # fmt: skip
     ulp = float(np.spacing(np.float32(1279)))
     axes.axhline(ulp, color=_TARGET, linestyle="--", linewidth=1, zorder=1)
     axes.annotate(
-        "1 ulp of float32 below 1280 px", (0.02, ulp), xycoords=("axes fraction", "data"),
-        xytext=(0, 4), textcoords="offset points", fontsize=8, color=_TARGET,
+        "1 ulp of float32 below 1280 px", (3 * conversion, ulp), xytext=(0, 4),
+        textcoords="offset points", fontsize=8, color=_TARGET,
     )  # fmt: skip
     for label, (marker, colour) in _MARKS.items():
         axes.scatter([], [], marker=marker, color=colour, label=f"{label} in the package")
@@ -272,7 +317,7 @@ def _accuracy(found: dict[str, Any]) -> Any:
     axes.set_xlabel("nanoseconds a pixel")
     axes.set_ylabel("error in px, of disparities up to 1280 px\n(mark: worst; dash: 99.9 %)")
     axes.set_title("Ways from stored depth to disparity: speed against error")
-    axes.legend(frameon=False, fontsize=8, loc="upper left")
+    axes.legend(frameon=False, fontsize=8.5, loc="upper left", bbox_to_anchor=(1.01, 1))
     return figure
 
 
@@ -299,6 +344,7 @@ def _profile(profile: dict[str, Any]) -> Any:
         [f"{name}\n{total:.1f} ms a sample" for name, total in zip(names, totals, strict=True)],
         fontsize=8,
     )
+    axes.set_xlim(0, 100)
     axes.set_xlabel("% of one worker's time")
     axes.set_title("Where an epoch's time goes")
     axes.legend(
@@ -314,7 +360,8 @@ def _memory(memory: dict[str, Any]) -> Any:
     axes.plot(memory["resident_mb"], color=_OURS, label="resident")
     axes.plot(memory["private_mb"], color=_OTHERS, label="without shared memory")
     axes.axhline(1500, color=_TARGET, linestyle="--", linewidth=1, label="target")
-    axes.set_ylim(bottom=0)
+    axes.set_xlim(0, len(memory["resident_mb"]))
+    axes.set_ylim(0, 1650)
     axes.set_xlabel(f"batches of {memory['batch']}")
     axes.set_ylabel("MB of the larger worker")
     axes.set_title("A worker's memory: all pairs, all frames, default settings")

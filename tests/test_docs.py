@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from stereogenbench_data.cli.commands import app
-from tests.servers.tools import require_module
+from tests.servers.tools import require_module, require_tool
 
 HOME = Path(__file__).resolve().parents[1]
 
@@ -27,6 +27,21 @@ def built(tmp_path_factory):
         env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
     )  # fmt: skip
     return done, site
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """A browser without a window."""
+    webdriver = require_module("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = require_tool("chromium")
+    for argument in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
+        options.add_argument(argument)
+    service = require_module("selenium.webdriver.chrome.service").Service(
+        executable_path=require_tool("chromedriver")
+    )
+    with webdriver.Chrome(options=options, service=service) as driver:
+        yield driver
 
 
 def text_of(site, page):
@@ -79,3 +94,32 @@ def test_the_reference_shows_signatures_and_defaults_of_zero(built):
     assert "StereoPairs(data, *," in " ".join(reference.split())
     assert "_MappedScenes" not in reference
     assert re.search(r"--seed\s+Seed of all that is random\.\s+0\s", commands)
+
+
+CUT_CODE = """
+const code = [...document.querySelectorAll(arguments[0] + ' pre > code')];
+return code.filter(each => each.scrollWidth > each.clientWidth).map(each => each.textContent);
+"""
+
+
+@pytest.mark.parametrize(
+    ("width_px", "blocks"),
+    [
+        pytest.param(1440, "", id="desktop"),
+        pytest.param(390, ".highlight:not(.drawing)", id="phone"),
+    ],
+)
+def test_no_line_of_code_is_cut_at_the_right_edge(built, browser, width_px, blocks):
+    _, site = built
+    screen = {"width": width_px, "height": 900, "deviceScaleFactor": 1, "mobile": width_px < 500}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
+    pages = sorted(site.rglob("index.html"))
+    cut = {}
+    for page in pages:
+        browser.get(page.as_uri())
+        cut[page.parent.name] = browser.execute_script(CUT_CODE, blocks)
+        width = browser.execute_script("return document.documentElement.scrollWidth")
+        assert width <= width_px, page
+
+    assert {name: found for name, found in cut.items() if found} == {}
+    assert len(pages) > 15

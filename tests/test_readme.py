@@ -2,15 +2,22 @@
 
 import gc
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+import typer
 
+from stereogenbench_data.cli.commands import app
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 PAGES = sorted((README.parent / "docs").glob("*.md"))
+WITH_COMMANDS = [
+    README, README.parent / "CONTRIBUTING.md", README.parent / "shards" / "README.md",
+    *sorted((README.parent / "docs").rglob("*.md")),
+]  # fmt: skip
 
 
 def blocks_of(path):
@@ -58,6 +65,31 @@ def test_a_block_of_the_documentation_runs_by_itself(folder_with_scenes, monkeyp
     gc.collect()
 
 
+def commands_of(path):
+    """The commands of a page in its blocks and in its text, those with arguments."""
+    text = path.read_text().replace("\\\n", " ")
+    blocks = "\n".join(re.findall(r"```\w*\n(.*?)```", text, flags=re.DOTALL))
+    lines = [line.strip() for line in blocks.splitlines()] + re.findall(
+        r"`(stereogenbench [^`]+)`", text
+    )
+    words = [
+        shlex.split(line, comments=True) for line in lines if line.startswith("stereogenbench ")
+    ]
+    return [each[1:] for each in words if len(each) > 2 and "--help" not in each]
+
+
+@pytest.mark.parametrize("path", WITH_COMMANDS, ids=[path.stem for path in WITH_COMMANDS])
+def test_every_command_of_a_page_has_arguments_and_options_that_exist(path):
+    for words in commands_of(path):
+        command = typer.main.get_command(app)
+        while hasattr(command, "commands"):
+            command, words = command.commands[words[0]], words[1:]
+
+        if words:
+            command.make_context(command.name, list(words))
+
+
 def test_there_are_blocks_to_run():
     assert len(BLOCKS) >= 3
     assert len(DOCUMENTED) >= 10
+    assert sum(len(commands_of(path)) for path in WITH_COMMANDS) > 60

@@ -70,6 +70,9 @@ def test_the_changelog_can_be_dated_and_its_links_are_those_of_its_headings(rele
     headings = set(re.findall(r"^## \[(.+?)\]", text, re.MULTILINE))
 
     assert set(dict(release.LINK.findall(text))) == headings
+    for entry in text.split("\n## [")[1:]:
+        sections = re.findall(r"^### (.+)$", entry, re.MULTILINE)
+        assert len(sections) == len(set(sections)), sections
     assert "## [9.9.9] - 2026-11-22" in release.dated(text, version="9.9.9", day="2026-11-22")
 
 
@@ -92,6 +95,15 @@ def test_a_dated_release_with_addresses_may_be_published(release):
     found = release.problems("v0.1.0", project={"version": "0.1.0", "urls": urls}, changelog=text)
 
     assert found == []
+
+
+def test_an_entry_with_two_sections_of_one_kind_is_named(release):
+    entries = ENTRIES.replace("- A thing.\n", "- A thing.\n\n### Added\n- More.\n")
+    text = release.dated(entries, version="0.1.0", day="2026-11-22")
+
+    lines = release.problems("v0.1.0", project={"version": "0.1.0", "urls": {}}, changelog=text)
+
+    assert "CHANGELOG.md: 0.1.0 has several sections 'Added': make them one" in lines
 
 
 def test_the_version_stands_in_one_place():

@@ -305,9 +305,13 @@ def write_plots(
 def _histogram(axes: Any, values: Float64[np.ndarray, " n"], *, bins: Any, colour: str) -> None:
     axes.hist(values, bins=bins, color=colour, edgecolor="white", linewidth=0.3)
     mean, median = float(values.mean()), float(np.median(values))
-    axes.axvline(mean, color="black", linestyle="--", linewidth=1, label=f"mean {mean:.2f}")
-    axes.axvline(median, color="black", linestyle=":", linewidth=1.4, label=f"median {median:.2f}")
-    axes.set_ylim(top=axes.get_ylim()[1] * _HEADROOM)
+    for place, label, style in ((mean, "mean", "--"), (median, "median", ":")):
+        axes.axvline(
+            place, ymax=1 / _HEADROOM, color="black", linestyle=style, linewidth=1.2,
+            label=f"{label} {place:.2f}",
+        )  # fmt: skip
+    axes.set_ylim(0, axes.get_ylim()[1] * _HEADROOM)
+    axes.yaxis.get_major_locator().set_params(integer=True)
     axes.legend(
         title=f"n = {len(values):,}", loc="upper right", fontsize=8, title_fontsize=8, ncols=2,
         framealpha=1,

@@ -13,6 +13,7 @@ from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.request import Transform
 from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.selection.options import options_of, require_options
 from stereogenbench_data.selection.plan import Selection
 from stereogenbench_data.sources.cache import ShardCache
 
@@ -29,6 +30,8 @@ class PairsOptions(Selection, total=False):
     cache: ShardCache | None
     check: Check
     buffers: Buffers
+    fetch_ahead_bytes: int
+    connections: int
 
 
 class AdaptedPairs(Dataset[Item], Generic[Item]):
@@ -62,8 +65,8 @@ class AdaptedPairs(Dataset[Item], Generic[Item]):
             options: As for `StereoPairs`.
 
         Raises:
-            SelectionError: If nothing matches; or if the samples are sweeps, or clips where single
-                frames are needed, or the reverse.
+            SelectionError: If there is no such option; if nothing matches; or if the samples are
+                sweeps, or clips where single frames are needed, or the reverse.
             FieldError: If ``fields`` is among the options, or the data are a dataset.
         """
         name = type(self).__name__
@@ -74,6 +77,10 @@ class AdaptedPairs(Dataset[Item], Generic[Item]):
                 f"{name} takes what {type(data).__name__} takes, not the dataset itself: give the "
                 "data and the options that it was made with."
             )
+        # A subclass of the user may take options that it does not declare.
+        declares = next(each for each in type(self).__mro__ if options_of(each))
+        known = options_of(StereoPairs)
+        require_options(declares, [option for option in options if option not in known])
         self.pairs = StereoPairs(data, fields=fields, **options)
         self.adapt = adapt
         plan = self.pairs.plan

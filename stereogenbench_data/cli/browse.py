@@ -14,7 +14,7 @@ from stereogenbench_data.schema.text import counted
 def browse(
     source: DataOptions,
     *,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port [any free one].")] = 0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; 0 is any free one.")] = 0,
     open_page: Annotated[
         bool, typer.Option("--open/--no-open", help="Open the web browser.")
     ] = True,

@@ -38,11 +38,11 @@ _COMMANDS: Final[dict[str, dict[Callable[..., None], str]]] = {
         browse: "browse shards/",
     },
     "Pack them": {
-        pack: "pack scenes/ shards/ --shard-size 2GB",
+        pack: "pack scenes/ packed/ --shard-size 2GB",
         unpack: "unpack shards/ scenes/",
         croissant: "croissant shards/ -o croissant/sample.json",
-        card: "card shards/ ORG/NAME -o shards/",
-        upload: "upload shards/ ORG/NAME",
+        card: "card packed/ ORG/NAME -o packed/",
+        upload: "upload packed/ ORG/NAME",
     },
     "Check them": {
         stats: "stats shards/ --plots plots/",

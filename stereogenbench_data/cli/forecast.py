@@ -209,6 +209,17 @@ def forecast(  # noqa: PLR0913 - one parameter an option
     typer.echo("\n".join(_lines(found)))
 
 
+def _digits(number: float) -> str:
+    """Return a number with its first four digits, or all before the point; no exponent.
+
+    >>> _digits(14306.2), _digits(27.943), _digits(10.0)
+    ('14,306', '27.94', '10')
+    """
+    decimals = max(0, 3 - math.floor(math.log10(number))) if number > 0 else 0
+    text = f"{number:,.{decimals}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
 def _lines(found: "Forecast") -> list[str]:
     network = found.network
     ways = [
@@ -216,7 +227,7 @@ def _lines(found: "Forecast") -> list[str]:
         _bandwidth(network.connection_bytes_s, "a connection"),
         _bandwidth(network.machine_bytes_s, "a machine"),
         _bandwidth(network.total_bytes_s, "in all"),
-        f"{network.requests_s:,.4g} requests/s" if math.isfinite(network.requests_s) else "",
+        f"{_digits(network.requests_s)} requests/s" if math.isfinite(network.requests_s) else "",
     ]
     here = f", {found.cost.slowdown:.2f} times that in each of {found.measured_on} at a time"
     counted = "all" if found.bytes_of == "epoch" else "a part"
@@ -237,7 +248,7 @@ def _lines(found: "Forecast") -> list[str]:
 
 def _cost(cost: "SampleCost") -> str:
     return (
-        f"{cost.cpu_s * 1e3:.3g} ms of a core, {cost.bytes / 1e3:,.4g} kB in "
+        f"{cost.cpu_s * 1e3:.3g} ms of a core, {_digits(cost.bytes / 1e3)} kB in "
         f"{cost.requests:.3g} requests"
     )
 
@@ -250,7 +261,7 @@ def _table(scales: "tuple[Scale, ...]") -> list[str]:
     rows = [
         (
             f"{each.accelerators:,}", f"{each.machines:,}", f"{each.cores:,}",
-            f"{each.workers:,}", f"{each.bytes_s / 1e6:,.4g}", f"{each.requests_s:,.4g}",
+            f"{each.workers:,}", _digits(each.bytes_s / 1e6), _digits(each.requests_s),
             f"{each.share:.0%}", each.limit,
         )
         for each in scales
@@ -266,7 +277,7 @@ def _table(scales: "tuple[Scale, ...]") -> list[str]:
 
 
 def _bandwidth(bytes_s: float, of: str) -> str:
-    return f"{bytes_s / 1e6:,.4g} MB/s {of}" if math.isfinite(bytes_s) else ""
+    return f"{_digits(bytes_s / 1e6)} MB/s {of}" if math.isfinite(bytes_s) else ""
 
 
 def _bytes_s(mb_s: float | None) -> float | None:

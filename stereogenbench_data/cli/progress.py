@@ -72,7 +72,7 @@ def progress_bar(doing: str, *, unit: str, log_every_s: float = 60) -> Iterator[
 
     def report(done: int, total: int) -> None:
         nonlocal last_line_s
-        if not bar.live.is_started:
+        if done and not bar.live.is_started:
             bar.start()
         bar.update(task, completed=-(-done // divisor), total=-(-total // divisor))
         if not console.is_terminal and time.monotonic() - last_line_s >= log_every_s:

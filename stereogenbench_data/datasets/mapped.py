@@ -37,6 +37,7 @@ from stereogenbench_data.samples.request import Request, Transform, parse_reques
 from stereogenbench_data.samples.streams import StreamStats
 from stereogenbench_data.samples.writer import Allocate, new_array
 from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import options_of, require_options
 from stereogenbench_data.selection.order import EpochOrder, OrderRule, Runs, Tail
@@ -309,10 +310,8 @@ class _MappedScenes(Dataset[Sample]):
 
     def __repr__(self) -> str:
         """Return a summary."""
-        scenes = len(self.plan.scene_rows)
-        return (
-            f"<{type(self).__name__}: {len(self)} samples of {scenes} scenes, {self.index.where}>"
-        )
+        samples, scenes = counted(len(self), "sample"), counted(len(self.plan.scene_rows), "scene")
+        return f"<{type(self).__name__}: {samples} of {scenes}, {self.index.where}>"
 
 
 class KnownOrder:

@@ -8,6 +8,7 @@ import sys
 import numpy as np
 import pytest
 import typer
+from matplotlib.figure import Figure
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -192,6 +193,24 @@ def test_markdown_has_the_papers_tables(release):
     assert "## Against the paper: 154 of 154 figures agree" in markdown
     assert "| same | scenes, train Uniform | 774 | 774 |" in markdown
     assert "Against the paper" not in statistics_markdown(found)
+
+
+def test_axes_count_whole_scenes_and_lines_end_below_the_legend(three, tmp_path, monkeypatch):
+    drawn = []
+    save = Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, *a, **k: (save(figure, *a, **k), drawn.append(figure))
+    )
+
+    write_plots(three, tmp_path / "plots")
+
+    axes = [each for figure in drawn for each in figure.axes if each.lines]
+    assert len(drawn) == 2
+    assert axes
+    for each in axes:
+        assert all(float(tick).is_integer() for tick in each.get_yticks())
+        legend = each.get_legend().get_window_extent()
+        assert all(line.get_window_extent().y1 <= legend.y0 for line in each.lines)
 
 
 def test_plots_show_each_family(release, tmp_path):

@@ -195,7 +195,7 @@ def test_the_tables_and_the_plots_are_made_of_the_results(results, tmp_path):
     assert "## Scoring" in text
     assert "| primary pair, all frames shuffled, 1280 | 26 |" in text
     assert {path.name for path in made} == {
-        "contestants.png", "workers.png", "accuracy.png", "rates.png",
+        "speed.png", "contestants.png", "workers.png", "accuracy.png", "rates.png",
     }  # fmt: skip
     assert all(path.stat().st_size > 10_000 for path in made)
 

@@ -186,6 +186,7 @@ def test_a_narrow_terminal_has_no_room_for_a_bar(printed_progress):
 
 def test_a_bar_that_counted_nothing_leaves_no_line(printed_progress):
     assert printed_progress(width=80, every_s=60, done_mb=()) == []
+    assert printed_progress(width=80, every_s=60, done_mb=(0,)) == []
 
 
 def test_a_bar_that_counted_nothing_is_taken_off_the_terminal(monkeypatch, capsys):

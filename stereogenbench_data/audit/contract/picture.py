@@ -26,6 +26,8 @@ _WIDE_M: Final = np.logspace(-6, 6, 121)
 _NEAR: Final = np.exp(np.linspace(-0.15, 0.15, 41))
 _FLOOR: Final = 1e-4
 _LONGEST_PX: Final = 640
+_MOST_RIVALS: Final = 22
+"""Names that a panel has room for."""
 
 
 def require_picture_file(path: Path) -> None:
@@ -216,8 +218,9 @@ def _score_db(
 
 
 def _draw_rivals(axis: Any, diagnosis: SceneDiagnosis) -> None:
-    """Draw how far each other answer is behind the best contract."""
-    tested = [rival for rival in diagnosis.rivals if math.isfinite(rival.behind.mean_db)]
+    """Draw how far the nearest other answers are behind the best contract."""
+    finite = [rival for rival in diagnosis.rivals if math.isfinite(rival.behind.mean_db)]
+    tested = sorted(finite, key=lambda rival: rival.behind.mean_db)[:_MOST_RIVALS]
     if not tested:
         axis.set_axis_off()
         axis.text(0.5, 0.5, diagnosis.problem or "no other answers", ha="center", wrap=True)
@@ -225,7 +228,8 @@ def _draw_rivals(axis: Any, diagnosis: SceneDiagnosis) -> None:
     names = [f"{rival.question}: {rival.answer}" for rival in tested]
     heights = [rival.behind.mean_db for rival in tested]
     errors = [min(1.96 * rival.behind.error_db, 50.0) for rival in tested]
-    axis.set_title("other answers", fontsize=10)
+    count = f"the nearest {len(tested)} of {len(finite)} " if len(finite) > len(tested) else ""
+    axis.set_title(f"{count}other answers", fontsize=10)
     axis.barh(names, heights, xerr=errors, color="tab:grey", error_kw={"linewidth": 0.8})
     axis.axvline(0, color="black", linewidth=0.8)
     axis.tick_params(axis="y", labelsize=7)
