@@ -49,7 +49,7 @@ def test_a_scene_is_the_same_whatever_the_number_of_scenes_and_workers(tmp_path)
     assert contents(tmp_path / "more" / first) != contents(tmp_path / "more" / second)
 
 
-@pytest.mark.parametrize("other", [{"seed": 10}, {"split": "eval"}, {"map_name": "Elsewhere"}])
+@pytest.mark.parametrize("other", [{"seed": 10}, {"split": "eval"}, {"map_name": "SynthPark"}])
 def test_another_seed_or_folder_gives_another_scene(tmp_path, other):
     (first,) = synthesise(tmp_path / "first", SynthRequest(**SMALL))
     (second,) = synthesise(tmp_path / "second", SynthRequest(**(SMALL | other)))
