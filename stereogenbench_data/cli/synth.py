@@ -199,9 +199,14 @@ def synth(  # noqa: PLR0913 - one parameter an option
         _print(_report_json(shown), _table(shown), as_json=as_json)
         return
     folders = sorted({key.rpartition("/")[0] for key in keys})
+    where = (
+        f" in {', '.join(folders)}"
+        if folders
+        else f" (part {part} of {scenes} has none, or all are held out)"
+    )
     _print(
         {"root": str(out), "scenes": keys},
-        f"{out}: {counted(len(keys), 'scene')} in {', '.join(folders)}",
+        f"{out}: {counted(len(keys), 'scene')}{where}",
         as_json=as_json,
     )
 
@@ -230,7 +235,7 @@ def _require_options_agree(
 
 def _listed(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").split()
+        return [word.rstrip("/") for word in path.read_text(encoding="utf-8-sig").split()]
     except UnicodeDecodeError as error:
         raise typer.BadParameter(
             f"{path} is not text. List paths of scenes, one a line.", param_hint="--holdout"

@@ -102,6 +102,13 @@ def test_what_is_no_part_is_told(tmp_path, part):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_part_without_scenes_says_so(tmp_path):
+    result = CliRunner().invoke(app, [str(tmp_path), *SMALL, "--part", "2/2"])
+
+    assert result.exit_code == 0
+    assert "0 scenes (part 2/2 of 1 has none" in result.stdout
+
+
 @pytest.mark.parametrize(
     ("option", "name", "error"),
     [

@@ -379,7 +379,7 @@ def test_the_command_plans_reports_and_holds_out(tmp_path):
     (key,) = json.loads(drawn.stdout)["scenes"]
     assert len(list((out / "sheets").glob("*.png"))) == 1
     refused = tmp_path / "refused.txt"
-    refused.write_text(f"{key}\n")
+    refused.write_text(f"\ufeff{key}/\r\n", encoding="utf-8")
     held = CliRunner().invoke(app, [*small, "--holdout", str(refused)], catch_exceptions=False)
     assert "1 scene moved" in held.stdout
     assert not (out / key).exists()
