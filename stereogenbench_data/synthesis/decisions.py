@@ -2,6 +2,7 @@
 
     OUT/.generation/<request>/request.json       what was asked for, and of which renderer
     OUT/.generation/<request>/scene_000012.json  what scene 12 refused, and what it accepted
+    OUT/.generation/<folder>.1_of_2.lock         a process is drawing this part of a map's scenes
 
 Each file is written whole or not at all, and by one machine: the parts of a request share a folder.
 """

@@ -6,9 +6,10 @@ incomplete scenes, and the next run of the same request goes on with what is mis
 """
 
 import json
+import math
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -23,10 +24,11 @@ from stereogenbench_data.engine import (
     advance_of,
     require_workers,
 )
-from stereogenbench_data.errors import StorageError, SynthesisError, cure_of
+from stereogenbench_data.errors import StorageError, SynthesisError, cure_of, explain_os_errors
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
+from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.synthesis.camera_writer import write_cameras
 from stereogenbench_data.synthesis.checks import (
     CameraCheck,
@@ -125,9 +127,10 @@ def synthesise(  # noqa: PLR0913 - each names one thing that a user chooses
         The scenes' keys, by number. Scenes in the holdout are left out.
 
     Raises:
-        SynthesisError: If ``workers`` is below 1, there is no such part or map, a scene's folder
-            has other content, other scenes of the request had to pass another check, a file
-            cannot be written, all proposals of a scene are refused, or a worker process dies.
+        SynthesisError: If ``workers`` is below 1, there is no such part or map, another process
+            draws these scenes now, a scene's folder has other content, other scenes of the request
+            had to pass another check, a file cannot be written, all proposals of a scene are
+            refused, or a worker process dies.
     """
     work = _work(Path(out), request, renderer=renderer, workers=workers, engine=engine)
     indices = _of_part(request, part)
@@ -135,27 +138,30 @@ def synthesise(  # noqa: PLR0913 - each names one thing that a user chooses
         _require_drawable(work, indices)
         work.decisions.require_check(check)
         plans = _searched(work, indices)
-        accepted = {index: _proposed(work, index) for index in indices}
-        missing = [index for index, each in accepted.items() if _is_missing(work, each)]
-        per_scene = CAMERA_COUNT * request.frames
-        total = len(accepted) * per_scene
-        advance = advance_of(progress, done=total - len(missing) * per_scene, total=total)
-        advance(0)
-        while missing:
-            known = {index: plans[index] for index in missing if index in plans}
-            lost = {index: accepted[index].number for index in missing if index not in known}
-            for search in _search_all(work, lost):
-                known[search.plan.proposal.index] = _same_plan(work, search.plan)
-            refused = _rendered(work, known, check=check, advance=advance)
-            # A scene that failed its checks goes on with its next proposal.
-            before = {index: _refuse(work, index, why, indices) for index, why in refused.items()}
-            first = {index: drawn[-1].number + 1 for index, drawn in before.items()}
-            plans = {}
-            for search in _search_all(work, first):
-                index = search.plan.proposal.index
-                work.decisions.write(Decision.of(search, before=before[index], check=check))
-                plans[index], accepted[index] = search.plan, search.plan.proposal
-            missing = [index for index in sorted(plans) if _is_missing(work, accepted[index])]
+        with _alone(work, indices, part=part):
+            accepted = {index: _proposed(work, index) for index in indices}
+            missing = [index for index, each in accepted.items() if _is_missing(work, each)]
+            per_scene = CAMERA_COUNT * request.frames
+            total = len(accepted) * per_scene
+            advance = advance_of(progress, done=total - len(missing) * per_scene, total=total)
+            advance(0)
+            while missing:
+                known = {index: plans[index] for index in missing if index in plans}
+                lost = {index: accepted[index].number for index in missing if index not in known}
+                for search in _search_all(work, lost):
+                    known[search.plan.proposal.index] = _same_plan(work, search.plan)
+                refused = _rendered(work, known, check=check, advance=advance)
+                # A scene that failed its checks goes on with its next proposal.
+                before = {
+                    index: _refuse(work, index, why, indices) for index, why in refused.items()
+                }
+                first = {index: drawn[-1].number + 1 for index, drawn in before.items()}
+                plans = {}
+                for search in _search_all(work, first):
+                    index = search.plan.proposal.index
+                    work.decisions.write(Decision.of(search, before=before[index], check=check))
+                    plans[index], accepted[index] = search.plan, search.plan.proposal
+                missing = [index for index in sorted(plans) if _is_missing(work, accepted[index])]
     # Another process may have drawn other parts meanwhile.
     work.decisions.require_check(check)
     warn_if_stale(work.out)
@@ -255,6 +261,46 @@ def _work(
     limits = DEFAULT_LIMITS
     decisions = Decisions.at(out, request, renderer=renderer, limits=limits)
     return _Work(out, request, renderer, limits, decisions, workers, engine)
+
+
+@contextmanager
+def _alone(work: _Work, indices: list[int], *, part: tuple[int, int]) -> Iterator[None]:
+    """Keep other processes from drawing these scenes meanwhile, if one is missing.
+
+    Raises:
+        SynthesisError: If another process is drawing some of them.
+    """
+    with ExitStack() as held:
+        if any(_is_missing(work, _proposed(work, index)) for index in indices):
+            where = f"{work.decisions.folder.parent}: cannot write there"
+            with explain_os_errors(where, "Choose another output.", kind=SynthesisError):
+                for name in work.request.maps:
+                    _lock(work, name, part=part, held=held)
+        yield
+
+
+def _lock(work: _Work, map_name: str, *, part: tuple[int, int], held: ExitStack) -> None:
+    """Hold the lock of a part of a map's scenes, unless a part that shares scenes is locked."""
+    number, count = part
+    begin = work.request.folder(map_name).replace("/", "__")
+    folder = work.decisions.folder.parent
+    own = folder / f"{begin}.{number}_of_{count}.lock"
+    is_free = held.enter_context(try_locked(own))
+    if is_free:
+        held.callback(own.unlink, missing_ok=True)
+    for path in folder.glob(f"{begin}.*_of_*.lock"):
+        other, of = (int(word) for word in path.name.split(".")[-2].split("_of_"))
+        if path != own and (other - number) % math.gcd(of, count) == 0:
+            with try_locked(path) as is_left:
+                if is_left:  # Its process was killed.
+                    path.unlink(missing_ok=True)
+            is_free = is_free and is_left
+    if not is_free:
+        raise SynthesisError(
+            f"{work.out / work.request.folder(map_name)}: another process is drawing scenes of "
+            f"part {number}/{count} there now. Wait for it, or give each process a --part of its "
+            f"own, all of the same number."
+        )
 
 
 @contextmanager
