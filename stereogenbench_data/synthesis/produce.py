@@ -270,13 +270,18 @@ def _alone(work: _Work, indices: list[int], *, part: tuple[int, int]) -> Iterato
     Raises:
         SynthesisError: If another process is drawing some of them.
     """
-    with ExitStack() as held:
-        if any(_is_missing(work, _proposed(work, index)) for index in indices):
-            where = f"{work.decisions.folder.parent}: cannot write there"
-            with explain_os_errors(where, "Choose another output.", kind=SynthesisError):
-                for name in work.request.maps:
-                    _lock(work, name, part=part, held=held)
-        yield
+    folder = work.decisions.folder.parent
+    try:
+        with ExitStack() as held:
+            if any(_is_missing(work, _proposed(work, index)) for index in indices):
+                where = f"{folder}: cannot write there"
+                with explain_os_errors(where, "Choose another output.", kind=SynthesisError):
+                    for name in work.request.maps:
+                        _lock(work, name, part=part, held=held)
+            yield
+    finally:
+        with suppress(OSError):
+            folder.rmdir()  # It is empty if a refused request left no decisions.
 
 
 def _lock(work: _Work, map_name: str, *, part: tuple[int, int], held: ExitStack) -> None:
