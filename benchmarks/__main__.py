@@ -16,6 +16,7 @@ from benchmarks.derive import measure_derive
 from benchmarks.equality import differences
 from benchmarks.evaluation import measure_evaluation
 from benchmarks.ffmpeg_links import link_libraries
+from benchmarks.generation import measure_generation
 from benchmarks.material import Material, facts, prepared
 from benchmarks.network import DELAYS_MS, network_tables, run_network
 from benchmarks.network import Plan as NetworkPlan
@@ -39,6 +40,7 @@ OTHERS: Final = (
     "evaluation",
     "derive",
     "training",
+    "generation",
 )
 """Measurements beside the races; `--only` takes these names too."""
 
@@ -149,6 +151,7 @@ def measure_others(
             material, rounds=min(rounds, 3), workers=os.cpu_count() or 1, report=report
         ),
         "evaluation": lambda: measure_evaluation(rounds=min(rounds, 3), report=report),
+        "generation": lambda: measure_generation(size_px=options.size, report=report),
     }
     failed = []
     for name in names:

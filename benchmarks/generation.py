@@ -1,11 +1,11 @@
 """The time to generate scenes with the built-in renderer, stage by stage, beside encoding alone.
 
-``python -m benchmarks.generation [--size 1280] [--frames 4] [--maps SynthStage SynthHall] [--grow]
-[--out FILE]``. Each scene is proposed and filtered whole (81 frames); a few frames of one camera
-are rendered, encoded and checked, and stand for the 486 of a scene. It measures
-processor time of one process, which other work on the machine hardly changes. A scene needs no
-other one and a camera no other camera, so N cores take an N-th of the time, as long as the
-memory's speed lasts.
+It is part of the benchmark, and runs alone as ``python -m benchmarks.generation [--size 1280]
+[--frames 4] [--maps SynthStage SynthHall] [--grow] [--out FILE]``. Each scene is proposed and
+filtered whole (81 frames); a few frames of one camera are rendered, encoded and checked, and stand
+for the 486 of a scene. It measures processor time of one process, which other work on the machine
+hardly changes. A scene needs no other one and a camera no other camera, so N cores take an N-th of
+the time, as long as the memory's speed lasts.
 """
 
 import argparse
@@ -15,12 +15,14 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import av
 import torch
 
+from benchmarks.results import Report
 from stereogenbench_data.media.depth_packing import grey_frame
 from stereogenbench_data.schema.release import CAMERA_COUNT, FRAME_COUNT
 from stereogenbench_data.synthesis.camera_writer import depth_units, depth_video, picture_video
@@ -35,6 +37,46 @@ LIMIT = 3.0
 RELEASE_SCENES = 8493
 PAPER_SCENES_AN_HOUR = (16, 36)
 _CAMERA_FRAMES = CAMERA_COUNT * FRAME_COUNT
+FRAMES = 4
+"""Frames of one camera that are rendered and encoded by default."""
+SCENES = 2
+"""Scenes by default, of which medians are taken."""
+MAPS = ("SynthStage", "SynthHall")
+FAMILIES = ("IPD_Gaussian", "Uniform")
+
+
+def measure_generation(*, size_px: int, report: Report) -> dict[str, Any]:
+    """Return the section of the results on generation."""
+    report(f"generation: {SCENES} scenes of {', '.join(MAPS)}")
+    return measure(sizes_px=(size_px,), frames=FRAMES, scenes=SCENES)
+
+
+def measure(
+    *,
+    sizes_px: Sequence[int],
+    frames: int,
+    scenes: int,
+    maps: Sequence[str] = MAPS,
+    families: Sequence[str] = FAMILIES,
+) -> dict[str, Any]:
+    """Return the times of scenes of each size, map and family."""
+    torch.set_num_threads(1)
+    # The textures are made once a process.
+    warm = plan_scene(SynthRequest(size_px=64, frames=1), index=0).plan
+    list(RAY_CASTING.views(warm, cameras=(0,)))
+    return {
+        "cores": os.cpu_count(),
+        "paper_scenes_an_hour": PAPER_SCENES_AN_HOUR,
+        "frames": frames,
+        "scenes": scenes,
+        "limit": LIMIT,
+        "rows": [
+            measured(map_name, family, size_px=size_px, frames=frames, scenes=scenes)
+            for size_px in sizes_px
+            for map_name in maps
+            for family in families
+        ],
+    }
 
 
 def stages_s(request: SynthRequest, *, index: int, frames: int, folder: Path) -> dict[str, float]:
@@ -98,7 +140,6 @@ def measured(
         "scene_core_s": round(scene_s, 1),
         "encode_core_s": round(encode_s, 1),
         "times_encoding": round(scene_s / encode_s, 2),
-        "limit": LIMIT,
         "scenes_an_hour_a_core": round(3600 / scene_s, 1),
         "release_core_hours": round(RELEASE_SCENES * scene_s / 3600),
     }
@@ -108,28 +149,21 @@ def main() -> None:
     """Measure maps, and how the time grows with the size of the pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--size", type=int, default=1280)
-    parser.add_argument("--frames", type=int, default=4)
-    parser.add_argument("--scenes", type=int, default=2)
-    parser.add_argument("--maps", nargs="+", default=["SynthStage", "SynthHall"])
-    parser.add_argument("--families", nargs="+", default=["IPD_Gaussian", "Uniform"])
+    parser.add_argument("--frames", type=int, default=FRAMES)
+    parser.add_argument("--scenes", type=int, default=SCENES)
+    parser.add_argument("--maps", nargs="+", default=MAPS)
+    parser.add_argument("--families", nargs="+", default=FAMILIES)
     parser.add_argument("--grow", action="store_true", help="also at a half and a quarter")
     parser.add_argument("--out", type=Path)
     chosen = parser.parse_args()
-    torch.set_num_threads(1)
-    # The textures are made once a process.
-    warm = plan_scene(SynthRequest(size_px=64, frames=1), index=0).plan
-    list(RAY_CASTING.views(warm, cameras=(0,)))
-    sizes = [chosen.size, *((chosen.size // 2, chosen.size // 4) if chosen.grow else ())]
-    report = {
-        "cores": os.cpu_count(),
-        "paper_scenes_an_hour": PAPER_SCENES_AN_HOUR,
-        "rows": [
-            measured(map_name, family, size_px=size, frames=chosen.frames, scenes=chosen.scenes)
-            for size in sizes
-            for map_name in chosen.maps
-            for family in chosen.families
-        ],
-    }
+    sizes = (chosen.size, *((chosen.size // 2, chosen.size // 4) if chosen.grow else ()))
+    report = measure(
+        sizes_px=sizes,
+        frames=chosen.frames,
+        scenes=chosen.scenes,
+        maps=chosen.maps,
+        families=chosen.families,
+    )
     text = json.dumps(report, indent=2)
     if chosen.out:
         chosen.out.write_text(text)

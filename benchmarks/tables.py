@@ -26,7 +26,7 @@ def tables(sections: dict[str, Any]) -> str:
     for name, make in (
         ("start", _start), ("memory", _memory), ("accuracy", _accuracy), ("profile", _profile),
         ("tried", _tried), ("evaluation", _evaluation), ("derive", _derive),
-        ("training", _training),
+        ("training", _training), ("generation", _generation),
     ):  # fmt: skip
         if name in sections:
             parts.append(make(sections[name]))
@@ -238,6 +238,32 @@ def _evaluation(found: dict[str, Any]) -> str:
         f"{counted(found['rounds'], 'round')}.\n\n"
     )
     return text + table(("", "", "at most"), rows)
+
+
+def _generation(found: dict[str, Any]) -> str:
+    stages = list(found["rows"][0]["stages_s"])
+    rows = [
+        [
+            f"{row['map']}, {row['family']}, {row['size_px']} px",
+            *(f"{row['stages_s'][stage]:.1f}" for stage in stages),
+            f"{row['scene_core_s']:.0f}", f"{row['times_encoding']:.2f}",
+            at_most(row["times_encoding"], found["limit"]),
+            f"{row['scenes_an_hour_a_core']:.1f}", f"{row['release_core_hours']:,}",
+        ]
+        for row in found["rows"]
+    ]  # fmt: skip
+    low, high = found["paper_scenes_an_hour"]
+    text = (
+        "## Generating scenes\n\nSeconds of one core's time for a scene of 6 x 81 frames, "
+        f"by the built-in renderer; {counted(found['frames'], 'frame')} of one camera stand for "
+        f"all, medians of {counted(found['scenes'], 'scene')}. The paper names {low} to {high} "
+        "scenes an hour on a workstation with one GPU.\n\n"
+    )
+    head = (
+        "map, family", *stages, "in all", "times encoding", "at most", "scenes an hour, one core",
+        "core-hours of the release",
+    )  # fmt: skip
+    return text + table(head, rows)
 
 
 def _profile(profile: dict[str, Any]) -> str:

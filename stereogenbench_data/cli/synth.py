@@ -15,7 +15,7 @@ from stereogenbench_data.cli.options import (
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.writing import write_report
+from stereogenbench_data.cli.writing import require_writable, write_report
 from stereogenbench_data.schema.release import (
     FAMILIES,
     FRAME_COUNT,
@@ -149,8 +149,9 @@ def synth(  # noqa: PLR0913 - one parameter an option
     from stereogenbench_data.synthesis.report import report_of, report_of_tree
     from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 
-    if report is not None and report.suffix not in (".md", ".json"):
-        raise typer.BadParameter(f"{report} must end in .md or .json.", param_hint="--report")
+    _require_options_agree(
+        plan_only=plan_only, report=report, contact_sheets=contact_sheets, holdout=holdout
+    )
     if holdout is not None:
         moved = hold_out(out, _listed(holdout))
         _print(
@@ -198,16 +199,43 @@ def synth(  # noqa: PLR0913 - one parameter an option
         _print(_report_json(shown), _table(shown), as_json=as_json)
         return
     folders = sorted({key.rpartition("/")[0] for key in keys})
+    where = (
+        f" in {', '.join(folders)}"
+        if folders
+        else f" (part {part} of {scenes} has none, or all are held out)"
+    )
     _print(
         {"root": str(out), "scenes": keys},
-        f"{out}: {counted(len(keys), 'scene')} in {', '.join(folders)}",
+        f"{out}: {counted(len(keys), 'scene')}{where}",
         as_json=as_json,
     )
 
 
+def _require_options_agree(
+    *, plan_only: bool, report: Path | None, contact_sheets: Path | None, holdout: Path | None
+) -> None:
+    """Refuse options of which one would silently do nothing, and files that cannot be written."""
+    if report is not None and report.suffix not in (".md", ".json"):
+        raise typer.BadParameter(f"{report} must end in .md or .json.", param_hint="--report")
+    if holdout is not None and (plan_only or report or contact_sheets):
+        raise typer.BadParameter(
+            "it only moves scenes: leave out --plan-only, --report and --contact-sheets.",
+            param_hint="--holdout",
+        )
+    if plan_only and contact_sheets is not None:
+        raise typer.BadParameter(
+            "--plan-only renders no scenes to show: leave one of the two out.",
+            param_hint="--contact-sheets",
+        )
+    if report is not None:
+        require_writable(report, "file")
+    if contact_sheets is not None:
+        require_writable(contact_sheets, "folder")
+
+
 def _listed(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").split()
+        return [word.rstrip("/") for word in path.read_text(encoding="utf-8-sig").split()]
     except UnicodeDecodeError as error:
         raise typer.BadParameter(
             f"{path} is not text. List paths of scenes, one a line.", param_hint="--holdout"
@@ -216,9 +244,10 @@ def _listed(path: Path) -> list[str]:
 
 def _part_of(text: str) -> tuple[int, int]:
     number, _, count = text.partition("/")
-    if not (number.isdecimal() and count.isdecimal()):
+    if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
         raise typer.BadParameter(
-            f"{text!r} is not a part: write I/N, such as 1/4.", param_hint="--part"
+            f"{text!r} is not a part: write I/N with I from 1 to N, such as 1/4 to 4/4.",
+            param_hint="--part",
         )
     return int(number), int(count)
 

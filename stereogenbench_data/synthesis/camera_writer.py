@@ -23,9 +23,8 @@ from stereogenbench_data.synthesis.filters import Limits
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.ray_casting import View
 from stereogenbench_data.synthesis.renderer import RenderedView, Renderer
-from stereogenbench_data.synthesis.request import ExportContract
+from stereogenbench_data.synthesis.request import LARGEST_UNITS, ExportContract
 
-_LARGEST: Final = {"gray16le": 65535, "gray12le": 4095, "gray10le": 1023}
 _H264: Final = {"crf": "18", "x264-params": "cpu-independent=1"}
 _FFV1: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
 
@@ -140,5 +139,5 @@ def depth_units(
         right = view.right_of_axis(np.arange(width_px) + 0.5)
         below = view.below_axis(np.arange(height_px)[:, None] + 0.5)
         depth_m = depth_m * np.sqrt(1 + right**2 + below**2)
-    largest = _LARGEST[contract.depth_format]
+    largest = LARGEST_UNITS[contract.depth_format]
     return np.minimum(np.rint(depth_m / contract.depth_unit_m), largest).astype(np.uint16)

@@ -2,17 +2,18 @@
 
     OUT/.generation/<request>/request.json       what was asked for, and of which renderer
     OUT/.generation/<request>/scene_000012.json  what scene 12 refused, and what it accepted
+    OUT/.generation/<folder>.1_of_2.lock         a process is drawing this part of a map's scenes
 
 Each file is written whole or not at all, and by one machine: the parts of a request share a folder.
 """
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -29,6 +30,9 @@ from stereogenbench_data.synthesis.trajectory import steps
 
 FOLDER: Final = ".generation"
 _REQUEST: Final = "request.json"
+Check = Literal["pictures", "audit"]
+"""What rendered scenes must pass."""
+
 _VERSION: Final = 2
 """Raise it when the same request comes to other decisions."""
 
@@ -112,16 +116,24 @@ class Decision:
         refused: The proposals that were refused, in order.
         accepted: The one that was not.
         motion: How its cameras move.
+        check: What its pictures had to pass; "" as long as none were drawn.
     """
 
     index: int
     refused: tuple[Drawn, ...]
     accepted: Drawn
     motion: Motion
+    check: Check | Literal[""] = ""
 
     @classmethod
-    def of(cls, search: Search, *, before: tuple[Drawn, ...] = ()) -> "Decision":
-        """Return the decision of a search, given what was refused before it."""
+    def of(
+        cls,
+        search: Search,
+        *,
+        before: tuple[Drawn, ...] = (),
+        check: Check | Literal[""] = "",
+    ) -> "Decision":
+        """Return the decision of a search, given what was refused before it by what check."""
         plan = search.plan
         refused = [Drawn.of(each.proposal, each.refusal) for each in search.refused]
         return cls(
@@ -129,6 +141,7 @@ class Decision:
             refused=(*before, *refused),
             accepted=Drawn.of(plan.proposal, None),
             motion=Motion.of(plan),
+            check=check,
         )
 
 
@@ -170,9 +183,7 @@ class Decisions:
 
     def read(self, index: int) -> Decision | None:
         """Return a scene's decision; None if there is none, or it was cut short."""
-        with suppress(OSError, ValueError, KeyError, TypeError):
-            return _parsed(json.loads(self._path(index).read_text()))
-        return None
+        return _read(self._path(index))
 
     def write(self, decision: Decision) -> None:
         """Write a scene's decision.
@@ -190,6 +201,34 @@ class Decisions:
                 f"{self.folder}: cannot write there ({error}). "
                 + cure_of(error, "Choose an output that you may write to.")
             ) from error
+
+    def remove(self, indices: Iterable[int]) -> None:
+        """Remove the decisions on scenes, and the folders if they hold nothing else.
+
+        What cannot be removed stays.
+        """
+        with suppress(OSError):
+            for index in indices:
+                self._path(index).unlink(missing_ok=True)
+            if not any(self.folder.glob("scene_*.json")):
+                (self.folder / _REQUEST).unlink(missing_ok=True)
+                self.folder.rmdir()
+                self.folder.parent.rmdir()
+
+    def require_check(self, check: Check) -> None:
+        """Refuse another check than the one that the request's scenes passed so far.
+
+        Raises:
+            SynthesisError: If there is a scene that had to pass another one.
+        """
+        for path in sorted(self.folder.glob("scene_*.json")):
+            decision = _read(path)
+            if decision is not None and decision.check not in ("", check):
+                raise SynthesisError(
+                    f"{path}: this scene had to pass the check {decision.check!r}, and others of "
+                    f"the same request would have to pass {check!r}. Give the check "
+                    f"{decision.check!r} again, or choose another output."
+                )
 
     def _path(self, index: int) -> Path:
         return self.folder / f"scene_{index:06d}.json"
@@ -214,12 +253,19 @@ def _write(path: Path, document: dict[str, Any]) -> None:
         file.write(json.dumps(document).encode())
 
 
+def _read(path: Path) -> Decision | None:
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        return _parsed(json.loads(path.read_text()))
+    return None
+
+
 def _parsed(document: Any) -> Decision:
     return Decision(
         index=int(document["index"]),
         refused=tuple(_drawn(each) for each in document["refused"]),
         accepted=_drawn(document["accepted"]),
         motion=Motion(**document["motion"]),
+        check=document.get("check", ""),
     )
 
 

@@ -25,6 +25,7 @@ Reason = Literal[
     "border_occluder",
     "transition",
     "motion",
+    "subject_motion",
     "missing_frames",
     "invalid_depth",
     "dark",
@@ -61,6 +62,8 @@ class Limits:
         step_m: Largest way of any camera from frame to frame.
         turn_deg: Largest rotation from frame to frame.
         jerk_deg: Largest change of that rotation from frame to frame.
+        subject_step_m: Largest way of the subject's middle from frame to frame: 9 m/s at 15 Hz, a
+            fast run. What goes farther is a jump in the animation.
         invalid_share: Largest share of a rendered camera's pixels without depth, over all frames.
         dark_mean: Least mean brightness of a rendered frame, of 255.
         flat_sd: Least standard deviation of the brightness of a rendered frame.
@@ -83,6 +86,7 @@ class Limits:
     step_m: float = 0.25
     turn_deg: float = 2.5
     jerk_deg: float = 0.4
+    subject_step_m: float = 0.6
     invalid_share: float = 0.6
     dark_mean: float = 12.0
     flat_sd: float = 4.0
@@ -215,6 +219,24 @@ def check_spawn(
         return Refusal(
             "spawn_support", float(gap.max()), limits.support_gap_m,
             f"the ground is {gap.max():.2f} m from the soles at frame {_frame(gap, frames)}",
+        )  # fmt: skip
+    return None
+
+
+def check_subject_motion(
+    body_m: Float64[np.ndarray, "frames p 3"], *, limits: Limits
+) -> Refusal | None:
+    """Refuse a subject that jumps from one frame to the next.
+
+    Args:
+        body_m: Points of the subject's body at consecutive frames.
+        limits: The limits of the filters.
+    """
+    way_m = np.linalg.norm(np.diff(body_m.mean(axis=1), axis=0), axis=1)
+    if way_m.max(initial=0) > limits.subject_step_m:
+        return Refusal(
+            "subject_motion", float(way_m.max()), limits.subject_step_m,
+            f"the subject moves {way_m.max():.2f} m from frame {int(way_m.argmax())} to the next",
         )  # fmt: skip
     return None
 

@@ -2,8 +2,8 @@
 
 `SynthStage` is made for each proposal anew: a backdrop, crates, balls and poles whose sizes follow
 the picture, so that it is full at any focal length. The others are places of fixed size, the same
-in every scene: the smaller a place, the more proposals it refuses. A map of any other name is a
-stage.
+in every scene: the smaller a place, the more proposals it refuses. A map of the release is a stage
+in a folder of that name.
 """
 
 import colorsys
@@ -15,14 +15,17 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float64
 
-from stereogenbench_data.schema.release import FRAME_RATE_HZ
+from stereogenbench_data.schema.release import FRAME_RATE_HZ, TRAIN_MAPS, UNSEEN_MAPS
 from stereogenbench_data.synthesis.proposal import Proposal
+from stereogenbench_data.synthesis.renderer import unknown_map
 from stereogenbench_data.synthesis.scene import Figure, Material, SceneModel, Shape
 from stereogenbench_data.synthesis.world import Bounds, Spawn
 
 STAGE: Final = "SynthStage"
 CHARACTERS: Final = tuple(f"SK_Synth{number:02d}" for number in range(1, 20))
 ANIMATIONS: Final = ("AN_Walk", "AN_Stroll", "AN_March")
+
+_OF_RELEASE: Final = TRAIN_MAPS | UNSEEN_MAPS
 
 _GAITS: Final = {"AN_Walk": (0.65, 1.1), "AN_Stroll": (0.35, 1.5), "AN_March": (0.0, 1.2)}
 """Metres a second and seconds a stride."""
@@ -83,12 +86,21 @@ class RayWorld:
 
 
 def open_map(proposal: Proposal) -> RayWorld:
-    """Return the map of a proposal with its figure."""
-    place = PLACES.get(proposal.map_name)
-    if place is None:
+    """Return the map of a proposal with its figure.
+
+    Raises:
+        SynthesisError: If the map is neither built in nor one of the release.
+    """
+    name = proposal.map_name
+    if name in PLACES:
+        scene, bounds, spawn_bounds = _fixed_place(name)
+    elif name == STAGE or name in _OF_RELEASE:
         scene, bounds, spawn_bounds = _stage(proposal)
     else:
-        scene, bounds, spawn_bounds = _fixed_place(proposal.map_name)
+        raise unknown_map(
+            "ray-casting", name, (*MAPS, *sorted(_OF_RELEASE)),
+            choose=f"{', '.join(MAPS)}, all, or a map of the release for a stage of that name",
+        )  # fmt: skip
     return RayWorld(scene, bounds, spawn_bounds, _figure(proposal))
 
 

@@ -5,12 +5,14 @@ beside the splits, checked, and moved to its place when it is complete. An inter
 incomplete scenes, and the next run of the same request goes on with what is missing.
 """
 
+import json
+import math
 import shutil
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 import torch
 
@@ -22,10 +24,11 @@ from stereogenbench_data.engine import (
     advance_of,
     require_workers,
 )
-from stereogenbench_data.errors import StorageError, SynthesisError, cure_of
+from stereogenbench_data.errors import StorageError, SynthesisError, cure_of, explain_os_errors
 from stereogenbench_data.index.open import warn_if_stale
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
+from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.synthesis.camera_writer import write_cameras
 from stereogenbench_data.synthesis.checks import (
     CameraCheck,
@@ -33,7 +36,7 @@ from stereogenbench_data.synthesis.checks import (
     check_pictures,
     check_scene,
 )
-from stereogenbench_data.synthesis.decisions import Decision, Decisions, Drawn
+from stereogenbench_data.synthesis.decisions import Check, Decision, Decisions, Drawn
 from stereogenbench_data.synthesis.export import completion_text, metadata_texts
 from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS, Limits, Refusal
 from stereogenbench_data.synthesis.plan import ScenePlan
@@ -98,7 +101,7 @@ def synthesise(  # noqa: PLR0913 - each names one thing that a user chooses
     *,
     renderer: Renderer = RAY_CASTING,
     part: tuple[int, int] = (1, 1),
-    check: Literal["pictures", "audit"] = "pictures",
+    check: Check = "pictures",
     workers: int | None = 1,
     engine: Engine = LOCAL,
     progress: Progress | None = None,
@@ -124,33 +127,43 @@ def synthesise(  # noqa: PLR0913 - each names one thing that a user chooses
         The scenes' keys, by number. Scenes in the holdout are left out.
 
     Raises:
-        SynthesisError: If ``workers`` is below 1, a scene's folder has other content, a file
-            cannot be written, all proposals of a scene are refused, or a worker process dies.
+        SynthesisError: If ``workers`` is below 1, there is no such part or map, another process
+            draws these scenes now, a scene's folder has other content, other scenes of the request
+            had to pass another check, a file cannot be written, all proposals of a scene are
+            refused, or a worker process dies.
     """
     work = _work(Path(out), request, renderer=renderer, workers=workers, engine=engine)
+    indices = _of_part(request, part)
     with _as_synthesis_error():
-        plans = _searched(work, _of_part(request, part))
-        accepted = {index: _proposed(work, index) for index in _of_part(request, part)}
-        missing = [index for index, each in accepted.items() if _is_missing(work, each)]
-        per_scene = CAMERA_COUNT * request.frames
-        total = len(accepted) * per_scene
-        advance = advance_of(progress, done=total - len(missing) * per_scene, total=total)
-        advance(0)
-        while missing:
-            known = {index: plans[index] for index in missing if index in plans}
-            lost = {index: accepted[index].number for index in missing if index not in known}
-            for search in _search_all(work, lost):
-                known[search.plan.proposal.index] = _same_plan(work, search.plan)
-            refused = _rendered(work, known, check=check, advance=advance)
-            # A scene that failed its checks goes on with its next proposal.
-            before = {index: _refuse(work, index, why) for index, why in refused.items()}
-            first = {index: drawn[-1].number + 1 for index, drawn in before.items()}
-            plans = {}
-            for search in _search_all(work, first):
-                index = search.plan.proposal.index
-                work.decisions.write(Decision.of(search, before=before[index]))
-                plans[index], accepted[index] = search.plan, search.plan.proposal
-            missing = [index for index in sorted(plans) if _is_missing(work, accepted[index])]
+        _require_drawable(work, indices)
+        work.decisions.require_check(check)
+        plans = _searched(work, indices)
+        with _alone(work, indices, part=part):
+            accepted = {index: _proposed(work, index) for index in indices}
+            missing = [index for index, each in accepted.items() if _is_missing(work, each)]
+            per_scene = CAMERA_COUNT * request.frames
+            total = len(accepted) * per_scene
+            advance = advance_of(progress, done=total - len(missing) * per_scene, total=total)
+            advance(0)
+            while missing:
+                known = {index: plans[index] for index in missing if index in plans}
+                lost = {index: accepted[index].number for index in missing if index not in known}
+                for search in _search_all(work, lost):
+                    known[search.plan.proposal.index] = _same_plan(work, search.plan)
+                refused = _rendered(work, known, check=check, advance=advance)
+                # A scene that failed its checks goes on with its next proposal.
+                before = {
+                    index: _refuse(work, index, why, indices) for index, why in refused.items()
+                }
+                first = {index: drawn[-1].number + 1 for index, drawn in before.items()}
+                plans = {}
+                for search in _search_all(work, first):
+                    index = search.plan.proposal.index
+                    work.decisions.write(Decision.of(search, before=before[index], check=check))
+                    plans[index], accepted[index] = search.plan, search.plan.proposal
+                missing = [index for index in sorted(plans) if _is_missing(work, accepted[index])]
+    # Another process may have drawn other parts meanwhile.
+    work.decisions.require_check(check)
     warn_if_stale(work.out)
     keys = (each.key for each in accepted.values())
     return [key for key in keys if not (work.out / _HOLDOUT / key).exists()]
@@ -189,6 +202,7 @@ def plan_scenes(  # noqa: PLR0913 - the choices of `synthesise`
     work = _work(Path(out), request, renderer=renderer, workers=workers, engine=engine)
     indices = _of_part(request, part)
     with _as_synthesis_error():
+        _require_drawable(work, indices)
         _searched(work, indices, progress=progress)
     return [_decided(work, index) for index in indices]
 
@@ -250,6 +264,51 @@ def _work(
 
 
 @contextmanager
+def _alone(work: _Work, indices: list[int], *, part: tuple[int, int]) -> Iterator[None]:
+    """Keep other processes from drawing these scenes meanwhile, if one is missing.
+
+    Raises:
+        SynthesisError: If another process is drawing some of them.
+    """
+    folder = work.decisions.folder.parent
+    try:
+        with ExitStack() as held:
+            if any(_is_missing(work, _proposed(work, index)) for index in indices):
+                where = f"{folder}: cannot write there"
+                with explain_os_errors(where, "Choose another output.", kind=SynthesisError):
+                    for name in work.request.maps:
+                        _lock(work, name, part=part, held=held)
+            yield
+    finally:
+        with suppress(OSError):
+            folder.rmdir()  # It is empty if a refused request left no decisions.
+
+
+def _lock(work: _Work, map_name: str, *, part: tuple[int, int], held: ExitStack) -> None:
+    """Hold the lock of a part of a map's scenes, unless a part that shares scenes is locked."""
+    number, count = part
+    begin = work.request.folder(map_name).replace("/", "__")
+    folder = work.decisions.folder.parent
+    own = folder / f"{begin}.{number}_of_{count}.lock"
+    is_free = held.enter_context(try_locked(own))
+    if is_free:
+        held.callback(own.unlink, missing_ok=True)
+    for path in folder.glob(f"{begin}.*_of_*.lock"):
+        other, of = (int(word) for word in path.name.split(".")[-2].split("_of_"))
+        if path != own and (other - number) % math.gcd(of, count) == 0:
+            with try_locked(path) as is_left:
+                if is_left:  # Its process was killed.
+                    path.unlink(missing_ok=True)
+            is_free = is_free and is_left
+    if not is_free:
+        raise SynthesisError(
+            f"{work.out / work.request.folder(map_name)}: another process is drawing scenes of "
+            f"part {number}/{count} there now. Wait for it, or give each process a --part of its "
+            f"own, all of the same number."
+        )
+
+
+@contextmanager
 def _as_synthesis_error() -> Iterator[None]:
     try:
         yield
@@ -261,9 +320,53 @@ def _of_part(request: SynthRequest, part: tuple[int, int]) -> list[int]:
     number, count = part
     if not 1 <= number <= count:
         raise SynthesisError(
-            f"part {number}/{count} is none: it must be 1/{count}..{count}/{count}."
+            f"part {number}/{count} is none: the first number must be from 1 to the second."
         )
     return list(range(number - 1, request.scenes, count))
+
+
+def _require_drawable(work: _Work, indices: list[int]) -> None:
+    """Refuse, before anything is decided, a request that cannot be drawn into this tree."""
+    require_workers(work.workers)
+    for name in work.request.maps:
+        if name not in work.renderer.maps:
+            # The renderer has others, or says what it has.
+            alone = replace(work.request, map_name=name)
+            work.renderer.world(propose(alone, index=0, number=0, renderer=work.renderer))
+        folder = work.out / work.request.folder(name)
+        there = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        for index in indices:
+            key = work.request.key(index, map_name=name)
+            if key.rpartition("/")[2] in there:
+                _require_own(work, index, name, found=_marker(work.out / key))
+
+
+def _require_own(work: _Work, index: int, map_name: str, *, found: str) -> None:
+    """Refuse a scene of the tree whose marker belongs to no proposal of the request."""
+    with suppress(ValueError, KeyError, TypeError, OverflowError):
+        number = max(0, int(json.loads(found)["synthesis"]["proposal"]))
+        proposal = propose(work.request, index=index, number=number, renderer=work.renderer)
+        if found == completion_text(proposal, renderer=work.drawn_by):
+            return
+    raise _of_another_request(work.out / work.request.key(index, map_name=map_name))
+
+
+def _marker(folder: Path) -> str:
+    """Return the completion marker of a scene's folder."""
+    try:
+        return (folder / COMPLETE_JSON).read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SynthesisError(
+            f"{folder}: a scene belongs here, but the {COMPLETE_JSON} of this folder cannot be "
+            f"read ({error}). Move the folder away or choose another output."
+        ) from error
+
+
+def _of_another_request(folder: Path) -> SynthesisError:
+    return SynthesisError(
+        f"{folder}: another request wrote this scene (its {COMPLETE_JSON} differs). Choose "
+        f"another output or map_name, or move the folder away."
+    )
 
 
 def _searched(
@@ -342,30 +445,24 @@ def _is_missing(work: _Work, proposal: Proposal) -> bool:
     folder = work.out / proposal.key
     if (work.out / _HOLDOUT / proposal.key).exists():
         return False
-    try:
-        if not folder.exists():
-            return True
-        found = (folder / COMPLETE_JSON).read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SynthesisError(
-            f"{folder}: a scene belongs here, but the {COMPLETE_JSON} of this folder cannot be "
-            f"read ({error}). Move the folder away or choose another output."
-        ) from error
-    if found != completion_text(proposal, renderer=work.drawn_by):
-        raise SynthesisError(
-            f"{folder}: another request wrote this scene (its {COMPLETE_JSON} differs). Choose "
-            f"another output or map_name, or move the folder away."
-        )
+    if not folder.exists():
+        return True
+    if _marker(folder) != completion_text(proposal, renderer=work.drawn_by):
+        raise _of_another_request(folder)
     return False
 
 
-def _refuse(work: _Work, index: int, refusal: Refusal) -> tuple[Drawn, ...]:
-    """Return what was refused of a scene, with the accepted proposal as the last."""
+def _refuse(work: _Work, index: int, refusal: Refusal, indices: list[int]) -> tuple[Drawn, ...]:
+    """Return what was refused of a scene, with the accepted proposal as the last.
+
+    If too many were, the run ends, and leaves no decisions on scenes that are not drawn.
+    """
     decision = _decided(work, index)
     why = replace(refusal, rendered=True)
     drawn = (*decision.refused, replace(decision.accepted, refusal=why))
     rendered = [each.refusal for each in drawn if each.refusal and each.refusal.rendered]
     if len(rendered) >= _MOST_RENDERED:
+        work.decisions.remove(each for each in indices if not _is_drawn(work, each))
         raise SynthesisError(
             f"{work.request.stream}: {len(rendered)} rendered proposals of scene {index} fail "
             f"their checks, the last one with {refusal.reason} ({refusal.text}). Check the "
@@ -374,11 +471,20 @@ def _refuse(work: _Work, index: int, refusal: Refusal) -> tuple[Drawn, ...]:
     return drawn
 
 
+def _is_drawn(work: _Work, index: int) -> bool:
+    """Return whether the tree or its holdout has the accepted scene."""
+    decision = work.decisions.read(index)
+    if decision is None:
+        return False
+    key = work.request.key(index, map_name=decision.accepted.map_name)
+    return any((root / key).exists() for root in (work.out, work.out / _HOLDOUT))
+
+
 def _rendered(
     work: _Work,
     plans: dict[int, ScenePlan],
     *,
-    check: Literal["pictures", "audit"],
+    check: Check,
     advance: Advance,
 ) -> dict[int, Refusal]:
     """Render scenes, move those that pass to their places, and return why others are refused."""
@@ -459,11 +565,12 @@ def _finish(
     task: _RenderTask,
     checks: list[CameraCheck],
     *,
-    check: Literal["pictures", "audit"],
+    check: Check,
 ) -> Refusal | None:
     """Check a rendered scene and move it to its place, or return why it is refused.
 
-    The completion marker is written last. The scene appears whole, by one renaming.
+    The completion marker is written last. The scene appears whole, by one renaming, once its
+    decision says what it had to pass.
     """
     plan, folder = task.plan, task.folder
     refusal = check_pictures(checks, limits=work.limits) or check_files(
@@ -484,6 +591,7 @@ def _finish(
             )
             if refusal is not None:
                 return refusal
+        work.decisions.write(replace(_decided(work, plan.proposal.index), check=check))
         target.parent.mkdir(parents=True, exist_ok=True)
         folder.rename(target)
     except OSError as error:

@@ -23,7 +23,7 @@ class RayCasting:
     cameras_per_task: int = 1
 
     def world(self, proposal: Proposal) -> RayWorld:
-        """See `Renderer.world`. A map without a layout of its own is a stage."""
+        """See `Renderer.world`. A map of the release is a stage."""
         return open_map(proposal)
 
     def views(self, plan: ScenePlan, *, cameras: tuple[int, ...]) -> Iterator[RenderedView]:

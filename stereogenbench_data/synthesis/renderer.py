@@ -1,15 +1,19 @@
 """What a renderer gives to generation: maps to ask, and pictures of accepted plans."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from stereogenbench_data.errors import SynthesisError
+from stereogenbench_data.selection.options import nearest_first
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.world import World
+
+_NEAREST: Final = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +36,7 @@ class Renderer(Protocol):
 
     Attributes:
         name: What the command calls it.
-        maps: Names of the maps that it can open, as folders of the release.
+        maps: Names of its maps, as folders of the release.
         characters: Names of the subjects.
         animations: Names of the subjects' motions.
         sensors_mm: Width and height of the sensors to draw from; empty for that of the request.
@@ -72,3 +76,18 @@ class Renderer(Protocol):
 
     def description(self, plan: ScenePlan) -> dict[str, object]:
         """Return the document of ``scene_description_qwen_dataset_level.json``."""
+
+
+def unknown_map(where: str, name: str, known: Iterable[str], *, choose: str) -> SynthesisError:
+    """Return the error of a map that a renderer does not have.
+
+    Args:
+        where: What should have it.
+        name: The map.
+        known: The maps that may be meant; the three nearest are named.
+        choose: What there is to choose from.
+    """
+    near = ", ".join(nearest_first(name, known)[:_NEAREST])
+    return SynthesisError(
+        f"{where}: there is no map {name!r}. Nearest: {near}. Choose by --map {choose}."
+    )

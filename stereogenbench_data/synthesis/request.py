@@ -24,6 +24,16 @@ DepthFormat = Literal["gray16le", "gray12le", "gray10le"]
 SENSOR_MM: Final = (23.76, 23.76)
 _UNSEEN_MAP_FOLDER: Final = "MapUnseenInTrain"
 _LARGEST_PX: Final = 8192
+_FOCAL_RANGE_MM: Final = (4.0, 1000.0)
+"""Shorter lenses see 140 degrees and more; longer ones frame a subject beyond the depth's range."""
+_LEAST_RANGE_M: Final = 1.0
+_LARGEST_UNIT_M: Final = 1.0
+LARGEST_UNITS: Final[dict[DepthFormat, int]] = {
+    "gray16le": 65535,
+    "gray12le": 4095,
+    "gray10le": 1023,
+}
+"""The largest number of a depth format, which means "no depth"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +44,8 @@ class ExportContract:
         rotation: How ``trajectory.json`` records rotations.
         pair_form: "names" writes the primary pair as camera names, "indices" as two integers.
         primary_pair: Left and right camera of that pair.
-        depth_unit_m: Metres in one stored unit of depth.
+        depth_unit_m: Metres in one stored unit of depth, at most 1; such that the format reaches to
+            1 m at least.
         depth_tag: Container tag for the unit; None writes no tag.
         depth_kind: Depth along the optical axis, or along the ray.
         depth_format: FFV1's pixel format. Depth above its largest number, and the sky, are stored
@@ -66,6 +77,13 @@ class ExportContract:
         _require_choice("depth_kind", self.depth_kind, choices=get_args(DepthKind))
         _require_choice("depth_format", self.depth_format, choices=get_args(DepthFormat))
         _require_positive("depth_unit_m", self.depth_unit_m)
+        range_m = LARGEST_UNITS[self.depth_format] * self.depth_unit_m
+        if not (self.depth_unit_m <= _LARGEST_UNIT_M and range_m >= _LEAST_RANGE_M):
+            raise SynthesisError(
+                f"depth_unit_m {self.depth_unit_m:g}: depth would have steps of "
+                f"{self.depth_unit_m:g} m up to {range_m:g} m in {self.depth_format}. Choose a "
+                f"unit of at most {_LARGEST_UNIT_M:g} m that reaches to {_LEAST_RANGE_M:g} m."
+            )
         _require_positive("sensor_mm", *self.sensor_mm)
         if not 0 <= self.primary_pair[0] < self.primary_pair[1] < CAMERA_COUNT:
             raise SynthesisError(
@@ -84,10 +102,10 @@ class SynthRequest:
         size_px: Width of the pictures, even; ``height_px`` is the same where it is None.
         frames: The number of frames, at 15 Hz.
         seed: Determines all random choices, together with a scene's number and folder.
-        split: ``train`` or ``eval``; ``subset`` (of maps) applies only to eval.
+        split: ``train`` or ``eval``, of which ``subset`` says the kind of maps.
         map_name: The map of the scenes, which names their folder; or several, of which each
             proposal draws one.
-        focal_mm: The focal length; None for a random one in 18..85 mm per scene.
+        focal_mm: The focal length, 4 to 1,000; None for a random one in 18..85 mm per scene.
         world_offset_cm: The largest distance of a scene from the world's origin, along each axis.
         contract: How the files are written.
 
@@ -113,11 +131,7 @@ class SynthRequest:
         _require_choice("family", self.family, choices=FAMILIES)
         _require_choice("split", self.split, choices=get_args(Split))
         _require_choice("subset", self.subset, choices=get_args(Subset))
-        if self.split == "eval" and self.family == "Pairwise_Uniform":
-            raise SynthesisError(
-                "family Pairwise_Uniform exists only in train: choose split train, or family "
-                "IPD_Gaussian or Uniform."
-            )
+        _require_split(self)
         for name, value in (("scenes", self.scenes), ("frames", self.frames)):
             if value < 1:
                 raise SynthesisError(f"{name} must be at least 1, got {value}.")
@@ -132,6 +146,11 @@ class SynthRequest:
         _require_maps(self.maps)
         if self.focal_mm is not None:
             _require_positive("focal_mm", self.focal_mm)
+            shortest, longest = _FOCAL_RANGE_MM
+            if not shortest <= self.focal_mm <= longest:
+                raise SynthesisError(
+                    f"focal_mm must be in {shortest:g}..{longest:g}, got {self.focal_mm:g}."
+                )
         if not 0 <= self.world_offset_cm <= OFFSET_RANGE_CM:
             raise SynthesisError(
                 f"world_offset_cm must be in 0..{OFFSET_RANGE_CM:g}, got {self.world_offset_cm}."
@@ -162,6 +181,19 @@ class SynthRequest:
     def key(self, index: int, *, map_name: str | None = None) -> str:
         """Return the key of a scene, its whole path below the root; by default in the first map."""
         return f"{self.folder(map_name or self.maps[0])}/scene_{index:06d}"
+
+
+def _require_split(request: SynthRequest) -> None:
+    if request.split == "eval" and request.family == "Pairwise_Uniform":
+        raise SynthesisError(
+            "family Pairwise_Uniform exists only in train: choose split train, or family "
+            "IPD_Gaussian or Uniform."
+        )
+    if request.split == "train" and request.subset == "unseen_map":
+        raise SynthesisError(
+            "subset unseen_map is of maps that train does not have: choose split eval, or leave "
+            "out the subset."
+        )
 
 
 def _require_maps(names: tuple[str, ...]) -> None:

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from stereogenbench_data.engine import LOCAL, Advance, Engine, Progress, advance_of
 from stereogenbench_data.errors import SynthesisError, cure_of
 from stereogenbench_data.samples.picture import coloured, write_png
-from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name, rgb_name
+from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON, depth_name, rgb_name
 
 _TILE_PX: Final = 224
 _CAPTION_PX: Final = 18
@@ -35,7 +35,8 @@ def write_sheets(
     Args:
         out: Root of the tree.
         keys: The scenes' whole paths below it.
-        folder: Where the pictures go, one a scene, named after its path; those there are kept.
+        folder: Where the pictures go, one a scene, named after its path; those that are newer than
+            their scenes are kept.
         workers: The number of processes; None is one a core.
         engine: Where they run.
         progress: Called with the numbers of scenes done and in all.
@@ -48,7 +49,9 @@ def write_sheets(
     """
     paths = [Path(folder) / f"{key.replace('/', '__')}.png" for key in keys]
     tasks = [
-        (Path(out) / key, path) for key, path in zip(keys, paths, strict=True) if not path.exists()
+        (Path(out) / key, path)
+        for key, path in zip(keys, paths, strict=True)
+        if not _is_newer(path, than=Path(out) / key / COMPLETE_JSON)
     ]
     advance = advance_of(progress, done=len(keys) - len(tasks), total=len(keys))
     advance(0)
@@ -62,6 +65,13 @@ def write_sheets(
     for _ in engine.map(_write, tasks, name=lambda task: task[0].name, workers=workers):
         advance(1)
     return paths
+
+
+def _is_newer(path: Path, *, than: Path) -> bool:
+    try:
+        return path.stat().st_mtime_ns >= than.stat().st_mtime_ns
+    except OSError:
+        return False
 
 
 def _write(task: tuple[Path, Path], after_scene: Advance) -> None:

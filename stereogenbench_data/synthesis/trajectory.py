@@ -26,6 +26,7 @@ from stereogenbench_data.synthesis.filters import (
     Rig,
     check_poses,
     check_spawn,
+    check_subject_motion,
     find_spawn,
     obstructed,
 )
@@ -59,7 +60,9 @@ def examine(proposal: Proposal, *, world: World, limits: Limits) -> ScenePlan | 
         return spawn
     frames = proposal.request.frames
     body_m = np.stack([world.subject_points_m(spawn, frame=frame) for frame in range(frames)])
-    refusal = check_spawn(body_m, world=world, limits=limits)
+    refusal = check_spawn(body_m, world=world, limits=limits) or check_subject_motion(
+        body_m, limits=limits
+    )
     if refusal is not None:
         return refusal
     search = _Search(proposal, world=world, limits=limits, body_m=body_m)

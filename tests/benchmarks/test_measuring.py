@@ -16,6 +16,7 @@ from benchmarks import (
     clock,
     derive,
     evaluation,
+    generation,
     profile,
     race,
     start,
@@ -45,6 +46,10 @@ def results(material, tmp_path_factory):
     plan = race.Plan(rounds=1)
     found.put("tried", tried.measure_tried(material, rounds=1, report=str))
     found.put("evaluation", evaluation.measure(frames=1, size_px=64, workers=1))
+    found.put(
+        "generation",
+        generation.measure(sizes_px=(64,), frames=1, scenes=1, maps=("SynthHall",)),
+    )
     workloads = [TINY["all-frames"], TINY["all-frames-crf26"]]
     race.run_races(workloads, material, found, plan=plan, report=str)
     return found
@@ -193,6 +198,7 @@ def test_the_tables_and_the_plots_are_made_of_the_results(results, tmp_path):
     assert "float32 closed form" in text
     assert "each camera decoded once for all its pairs" in text
     assert "## Scoring" in text
+    assert "| SynthHall, Uniform, 64 px |" in text
     assert "| primary pair, all frames shuffled, 1280 | 26 |" in text
     assert {path.name for path in made} == {
         "speed.png", "contestants.png", "workers.png", "accuracy.png", "rates.png",

@@ -25,7 +25,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.unpack import unpack
 from stereogenbench_data.shards.verify import verify
-from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.evaluation.conftest import write_pngs
 from tests.servers.tools import require_module
@@ -191,6 +191,17 @@ def test_a_cluster_that_loses_a_worker_gives_what_this_process_gives(command, ma
 
     assert mark.exists()
     assert there == here
+
+
+@pytest.mark.usefixtures("ray")
+def test_a_cluster_finds_the_same_plans_of_eval_scenes(tmp_path):
+    request = SynthRequest(scenes=5, size_px=32, frames=2, split="eval", subset="unseen_map")
+
+    here = plan_scenes(tmp_path / "here", request)
+    there = plan_scenes(tmp_path / "there", request, engine=RayCluster(), workers=2)
+
+    assert there == here
+    assert bytes_of(tmp_path / "there") == bytes_of(tmp_path / "here")
 
 
 # What else Ray does.

@@ -11,12 +11,21 @@ SMALL = ("--size", "32", "--frames", "1", "--workers", "1")
 
 
 def test_the_command_writes_scenes_and_says_where(tmp_path):
-    arguments = [str(tmp_path), *SMALL, "--family", "Uniform", "--scenes", "2", "--map", "Downtown"]
+    arguments = [
+        str(tmp_path),
+        *SMALL,
+        "--family",
+        "Uniform",
+        "--scenes",
+        "2",
+        "--map",
+        "Downtown_West",
+    ]
 
     result = CliRunner().invoke(app, arguments, catch_exceptions=False)
 
     assert result.exit_code == 0
-    assert f"{tmp_path}: 2 scenes in train/Uniform/Downtown" in result.stdout
+    assert f"{tmp_path}: 2 scenes in train/Uniform/Downtown_West" in result.stdout
     assert "12/12" in result.stderr
     assert len(list(tmp_path.rglob("_scene_complete.json"))) == 2
 
@@ -63,6 +72,77 @@ def test_all_maps_and_a_map_of_its_own_contradict_each_other(tmp_path):
     assert result.exit_code == 2
     assert "give it alone" in result.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "near"),
+    [
+        ("SynthRom", "Nearest: SynthRoom, "),
+        ("synthhall", "Nearest: SynthHall, "),
+        ("Stylised_Egypt", "Nearest: Stylized_Egypt, "),
+    ],
+)
+@pytest.mark.parametrize("plan", [[], ["--plan-only"]])
+def test_a_misspelt_map_names_the_nearest_and_leaves_nothing(tmp_path, name, near, plan):
+    options = ["--map", "SynthStage", "--map", name, *plan]
+
+    with pytest.raises(SynthesisError, match=rf"no map '{name}'. {near}.*--map SynthStage, .*all"):
+        CliRunner().invoke(app, [str(tmp_path), *SMALL, *options], catch_exceptions=False)
+
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("part", ["0/0", "0/3", "3/2", "1/0", "a/b", "1", "1/2/3", "-1/2", ""])
+def test_what_is_no_part_is_told(tmp_path, part):
+    result = CliRunner().invoke(app, [str(tmp_path), *SMALL, "--part", part])
+
+    assert result.exit_code == 2
+    assert "--part" in result.stderr
+    assert f"{part!r} is not a part: write I/N" in " ".join(result.stderr.split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_part_without_scenes_says_so(tmp_path):
+    result = CliRunner().invoke(app, [str(tmp_path), *SMALL, "--part", "2/2"])
+
+    assert result.exit_code == 0
+    assert "0 scenes (part 2/2 of 1 has none" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "error"),
+    [
+        ("--report", "folder.md", IsADirectoryError),
+        ("--report", "file/report.md", NotADirectoryError),
+        ("--contact-sheets", "file", NotADirectoryError),
+        ("--contact-sheets", "file/sheets", NotADirectoryError),
+    ],
+)
+def test_where_nothing_can_be_written_is_told_before_the_work(tmp_path, option, name, error):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.md").mkdir()
+
+    with pytest.raises(error) as told:
+        CliRunner().invoke(
+            app, [f"{tmp_path}/out", *SMALL, option, f"{tmp_path}/{name}"], catch_exceptions=False
+        )
+
+    assert told.value.filename == f"{tmp_path}/{name}"
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_command_would_leave_out_silently_is_refused(tmp_path):
+    refused = tmp_path / "refused.txt"
+    refused.touch()
+    for options, option in (
+        (["--plan-only", "--contact-sheets", f"{tmp_path}/sheets"], "--contact-sheets"),
+        (["--holdout", str(refused), "--report", f"{tmp_path}/report.md"], "--holdout"),
+    ):
+        result = CliRunner().invoke(app, [f"{tmp_path}/out", *SMALL, *options])
+
+        assert result.exit_code == 2
+        assert option in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["refused.txt"]
 
 
 def test_a_holdout_list_that_is_no_text_is_told(tmp_path):

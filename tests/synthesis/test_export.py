@@ -261,6 +261,9 @@ def test_the_primary_pair_is_written_in_either_form(draw):
         ({"family": "Wide"}, "family must be one of IPD_Gaussian, .* got 'Wide'"),
         ({"family": "Pairwise_Uniform", "split": "eval"}, "Pairwise_Uniform exists only in train"),
         ({"map_name": "a.b"}, "map_name must be letters.* got 'a.b'"),
+        ({"focal_mm": 1e9}, r"focal_mm must be in 4\.\.1000, got 1e\+09"),
+        ({"focal_mm": 0.1}, r"focal_mm must be in 4\.\.1000, got 0\.1"),
+        ({"subset": "unseen_map"}, "unseen_map is of maps that train does not have"),
         ({"focal_mm": float("nan")}, "focal_mm must be a positive number, got nan"),
         ({"world_offset_cm": 2e6}, "world_offset_cm must be in 0..1e[+]06, got 2000000.0"),
     ],
@@ -273,6 +276,8 @@ def test_an_impossible_request_is_refused(changes, message):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"depth_unit_m": 1e-9}, r"depth_unit_m 1e-09: .* up to 6\.5535e-05 m in gray16le.*Choose"),
+        ({"depth_unit_m": 100.0}, r"depth_unit_m 100: .* steps of 100 m .*at most 1 m"),
         ({"depth_unit_m": 0.0}, "depth_unit_m must be a positive number, got 0.0"),
         ({"sensor_mm": (23.76, -1.0)}, "sensor_mm must be a positive number, got -1.0"),
         ({"primary_pair": (3, 3)}, "primary_pair must be two different cameras .* got .3, 3."),

@@ -253,6 +253,23 @@ def test_a_free_yard_accepts_and_every_frame_holds(frames):
         assert plan.subject_m.min() > 0.5
 
 
+def test_a_subject_that_jumps_from_one_frame_to_the_next_is_refused():
+    refusal = examine(proposal(), world=yard(walk_m=1.0, jump_m=1.0), limits=DEFAULT_LIMITS)
+
+    assert (refusal.reason, refusal.limit) == ("subject_motion", DEFAULT_LIMITS.subject_step_m)
+    assert refusal.value == pytest.approx(1.0 + 1 / 80)
+    assert "1.01 m from frame 3 to the next" in refusal.text
+
+
+def test_a_subject_may_run_and_the_limit_may_be_wider():
+    wide = replace(DEFAULT_LIMITS, subject_step_m=1.1)
+
+    run = examine(proposal(), world=yard(walk_m=80 * 0.5), limits=DEFAULT_LIMITS)
+    jump = examine(proposal(), world=yard(walk_m=1.0, jump_m=1.0), limits=wide)
+
+    assert "subject_motion" not in [getattr(each, "reason", "") for each in (run, jump)]
+
+
 def test_a_subject_that_runs_through_a_fence_between_frames_0_and_8_is_refused():
     fence = [
         ((-1.1, -1.1, 0), (-1.0, 1.1, 1)), ((1.0, -1.1, 0), (1.1, 1.1, 1)),

@@ -1,6 +1,7 @@
 """Generation as a whole: parts, resuming, what is refused after rendering, reports, the holdout."""
 
 import json
+import os
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,7 +17,7 @@ from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import FAMILIES
 from stereogenbench_data.synthesis.checks import check_files
 from stereogenbench_data.synthesis.decisions import FOLDER, all_decisions
-from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS, Rig, check_poses
+from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS, Refusal, Rig, check_poses
 from stereogenbench_data.synthesis.maps import MAPS, open_map
 from stereogenbench_data.synthesis.planning import plan_scene, propose
 from stereogenbench_data.synthesis.produce import hold_out, plan_scenes, synthesise
@@ -139,9 +140,9 @@ def test_decisions_that_were_cut_short_are_taken_again(tmp_path):
     assert plan_scenes(tmp_path, request) == [before]
 
 
-@pytest.mark.parametrize("part", [(0, 2), (3, 2)])
+@pytest.mark.parametrize("part", [(0, 2), (3, 2), (0, 0)])
 def test_a_part_that_is_none_is_refused(tmp_path, part):
-    with pytest.raises(SynthesisError, match=r"part ./2 is none: it must be 1/2\.\.2/2"):
+    with pytest.raises(SynthesisError, match=r"part ./. is none: .* from 1 to the second"):
         synthesise(tmp_path, SynthRequest(**SMALL), part=part)
 
 
@@ -210,15 +211,68 @@ def test_a_scene_that_fails_after_rendering_is_replaced_by_its_next_proposal(
     assert marker["synthesis"]["proposal"] == decision.accepted.number
 
 
-def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason(tmp_path, monkeypatch):
+def test_a_renderer_that_always_fails_its_checks_ends_with_the_reason_and_leaves_nothing(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr("stereogenbench_data.synthesis.produce._MOST_RENDERED", 2)
 
     with pytest.raises(SynthesisError, match=r"2 rendered proposals .* dark .* Check the renderer"):
         synthesise(
             tmp_path,
-            SynthRequest(map_name="SynthYard", **SMALL),
+            SynthRequest(scenes=2, map_name="SynthYard", **SMALL),
             renderer=Spoilt(number=9999, picture=lambda picture: picture // 64),
         )
+    assert not list(tmp_path.iterdir())
+
+
+# Another check, another request.
+
+
+@pytest.mark.parametrize(("first", "then"), [("audit", "pictures"), ("pictures", "audit")])
+def test_scenes_of_one_request_pass_one_check(tmp_path, monkeypatch, first, then):
+    monkeypatch.setattr("stereogenbench_data.synthesis.produce.check_scene", lambda root, **_: None)
+    request = SynthRequest(scenes=2, **SMALL)
+    plan_scenes(tmp_path, request)  # Planning settles no check.
+    (done,) = synthesise(tmp_path, request, check=first, part=(1, 2))
+    before = contents(tmp_path)
+
+    for part in ((1, 2), (2, 2)):
+        with pytest.raises(SynthesisError, match=rf"check '{first}'.*'{then}'.*Give .* output"):
+            synthesise(tmp_path, request, check=then, part=part)
+
+    assert contents(tmp_path) == before
+    assert done == synthesise(tmp_path, request, check=first)[0]
+
+
+def test_a_refusal_by_the_audit_is_not_taken_over_by_another_check(tmp_path, monkeypatch):
+    seen = []
+
+    def refuse_first(root, **_):
+        seen.append(root)
+        return Refusal("audit", 1, 0, "as the test wants") if len(seen) == 1 else None
+
+    def stop(done, total):
+        if seen:  # The next proposal is being drawn.
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("stereogenbench_data.synthesis.produce.check_scene", refuse_first)
+    request = SynthRequest(**SMALL)
+    with pytest.raises(KeyboardInterrupt):
+        synthesise(tmp_path, request, check="audit", progress=stop)
+
+    with pytest.raises(SynthesisError, match="check 'audit'"):
+        synthesise(tmp_path, request, check="pictures")
+
+
+def test_a_request_that_does_not_fit_the_tree_decides_nothing(tmp_path):
+    synthesise(tmp_path, SynthRequest(**SMALL))
+    before = sorted(tmp_path.rglob("*"))
+
+    for other in ({"frames": 3}, {"seed": 1}, {"scenes": 3, "focal_mm": 30.0}):
+        with pytest.raises(SynthesisError, match="another request wrote this scene"):
+            plan_scenes(tmp_path, SynthRequest(**(SMALL | other)))
+
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_missing_frames_and_broken_videos_are_found(tmp_path):
@@ -275,6 +329,9 @@ def test_contact_sheets_show_every_scene_once(tmp_path):
     before = path.stat().st_mtime_ns
     assert write_sheets(tmp_path, keys, folder=tmp_path / "sheets") == [path]
     assert path.stat().st_mtime_ns == before
+    os.utime(path, ns=(0, 0))  # As of a scene that was there before this one.
+    write_sheets(tmp_path, keys, folder=tmp_path / "sheets")
+    assert path.stat().st_mtime_ns >= before
 
 
 def test_held_out_scenes_leave_the_tree_and_do_not_come_back(tmp_path):
@@ -322,7 +379,7 @@ def test_the_command_plans_reports_and_holds_out(tmp_path):
     (key,) = json.loads(drawn.stdout)["scenes"]
     assert len(list((out / "sheets").glob("*.png"))) == 1
     refused = tmp_path / "refused.txt"
-    refused.write_text(f"{key}\n")
+    refused.write_text(f"\ufeff{key}/\r\n", encoding="utf-8")
     held = CliRunner().invoke(app, [*small, "--holdout", str(refused)], catch_exceptions=False)
     assert "1 scene moved" in held.stdout
     assert not (out / key).exists()

@@ -49,7 +49,7 @@ def test_a_scene_is_the_same_whatever_the_number_of_scenes_and_workers(tmp_path)
     assert contents(tmp_path / "more" / first) != contents(tmp_path / "more" / second)
 
 
-@pytest.mark.parametrize("other", [{"seed": 10}, {"split": "eval"}, {"map_name": "Elsewhere"}])
+@pytest.mark.parametrize("other", [{"seed": 10}, {"split": "eval"}, {"map_name": "SynthPark"}])
 def test_another_seed_or_folder_gives_another_scene(tmp_path, other):
     (first,) = synthesise(tmp_path / "first", SynthRequest(**SMALL))
     (second,) = synthesise(tmp_path / "second", SynthRequest(**(SMALL | other)))
@@ -150,6 +150,37 @@ def test_a_full_disk_is_an_error_that_names_scene_camera_and_cure(tmp_path, monk
     ):
         synthesise(tmp_path, SynthRequest(**SMALL))
     assert [path.name for path in tmp_path.iterdir()] == [".generation"]
+
+
+@pytest.mark.parametrize("other", [(1, 1), (1, 2), (1, 3), (3, 4)])
+def test_two_runs_do_not_draw_the_same_scenes_at_once(tmp_path, other):
+    request = SynthRequest(scenes=3, **SMALL)
+
+    def second_run(done, total):
+        if done == 6:
+            with pytest.raises(SynthesisError, match=r"another process is drawing .* --part"):
+                synthesise(tmp_path, request, part=other)
+
+    first = synthesise(tmp_path, request, part=(1, 2), progress=second_run)
+
+    assert [len(contents(tmp_path / key)) for key in first] == [17, 17]
+    assert not list(tmp_path.glob(".generation/*.lock"))
+
+
+def test_other_parts_and_what_killed_runs_left_do_not_keep_a_run_from_its_scenes(tmp_path):
+    request = SynthRequest(scenes=2, **SMALL)
+
+    def second_run(done, total):
+        if done == 6:
+            synthesise(tmp_path, request, part=(2, 2))
+            left = tmp_path / ".generation" / "train__IPD_Gaussian__SynthStage.1_of_1.lock"
+            left.touch()
+
+    synthesise(tmp_path, request, part=(1, 2), progress=second_run)
+
+    assert len(synthesise(tmp_path, request)) == 2
+    assert len(synthesise(tmp_path, SynthRequest(scenes=3, **SMALL))) == 3
+    assert not list(tmp_path.glob(".generation/*.lock"))
 
 
 def test_a_dead_worker_is_an_error_and_not_a_hang(tmp_path):

@@ -11,13 +11,14 @@ from stereogenbench_data.synthesis.world import Bounds
 class Blocks:
     """A world of axis-aligned solid blocks, ``(low, high)`` each; no ground by itself.
 
-    The subject is a post of points that stands still, or walks ahead.
+    The subject is a post of points that stands still, or walks ahead; it may jump at frame 4.
     """
 
     blocks: list
     size_m: tuple = ((-20.0, -20.0, 0.0), (20.0, 20.0, 12.0))
     spawn_m: tuple = ((-0.01, -0.01, 0.0), (0.01, 0.01, 2.5))
     walk_m: float = 0.0
+    jump_m: float = 0.0
     height_m: float = 1.75
     sunk_m: float = 0.0
     asked: list = field(default_factory=list)
@@ -55,7 +56,7 @@ class Blocks:
         yaw = np.radians(spawn.yaw_deg)
         ahead = np.array([np.cos(yaw), np.sin(yaw), 0.0])
         heights = np.linspace(-self.sunk_m, self.height_m - self.sunk_m, 12)
-        middle = spawn.place_m + ahead * self.walk_m * frame / 80
+        middle = spawn.place_m + ahead * (self.walk_m * frame / 80 + self.jump_m * (frame >= 4))
         post = middle + heights[:, None] * np.array([0.0, 0.0, 1.0])
         return np.concatenate([post, post[::4] + 0.15 * ahead])
 

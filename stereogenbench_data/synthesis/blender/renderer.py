@@ -20,7 +20,7 @@ from stereogenbench_data.synthesis.blender.assets import Assets, read_assets
 from stereogenbench_data.synthesis.blender.process import blender
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.renderer import RenderedView
+from stereogenbench_data.synthesis.renderer import RenderedView, unknown_map
 from stereogenbench_data.synthesis.world import Bounds, Spawn
 
 _VERSION: Final = 1
@@ -144,10 +144,10 @@ class BlenderRenderer:
         """
         assets = self.assets
         if proposal.map_name not in assets.maps:
-            raise SynthesisError(
-                f"{assets.path}: maps: there is no map {proposal.map_name!r}. Choose by --map one "
-                f"of {', '.join(self.maps)}."
-            )
+            raise unknown_map(
+                f"{assets.path}: maps", proposal.map_name, self.maps,
+                choose=f"one of {', '.join(self.maps)}, or all",
+            )  # fmt: skip
         the_map = assets.maps[proposal.map_name]
         character = assets.characters[proposal.character]
         animation = assets.animations[proposal.animation]
