@@ -185,7 +185,7 @@ def flat(folder):
 
 
 def frozen(folder):
-    rewrite_rgb(folder, 1, lambda pictures: pictures[[0, 1, 2, 3, 3, 3, 3]])
+    rewrite_rgb(folder, 1, lambda pictures: pictures[[0, 1, 2, 3, 3, 3, 3]], crf=0)
 
 
 def one_view_twice(folder):

@@ -103,7 +103,9 @@ def test_a_killed_run_goes_on_in_mid_epoch_and_takes_each_sample_once(
     runs, said = killed_and_resumed(tmp_path, example, ranks=ranks, after=after)
     before, going_on = runs
 
-    assert [len(of_rank) for of_rank in before] == [after] * ranks
+    # Where one rank dies, torchrun ends the others.
+    assert max(len(of_rank) for of_rank in before) == after
+    assert min(len(of_rank) for of_rank in before) >= saved
     assert [len(of_rank) for of_rank in going_on] == [2 * epoch - saved] * ranks
     whole = [old[:saved] + new for old, new in zip(before, going_on, strict=True)]
     for part in (slice(0, epoch), slice(epoch, None)):

@@ -210,7 +210,7 @@ def test_a_shard_beside_an_old_index_is_named_and_one_that_is_gone(shards):
 
 
 def test_synth_into_an_indexed_tree_says_so(tree):
-    request = SynthRequest(family="IPD_Gaussian", scenes=2, size_px=64, frames=7, seed=1)
+    request = SynthRequest(family="IPD_Gaussian", scenes=2, size_px=64, frames=7, seed=2)
 
     with pytest.warns(StaleIndexWarning, match=r"IPD_Gaussian/SynthStage/scene_000001\).*index"):
         synthesise(tree, request)
