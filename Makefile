@@ -23,9 +23,10 @@ shards/index.parquet:
 demo: shards/index.parquet $(READY)
 	$(BIN)/python examples/train.py
 
-# The processes of the tests fill the cores by themselves.
+# Tests wait for a quarter of their time, so there is a process more for every two cores; each
+# computes with one thread.
 test: shards/index.parquet lint
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS) --numprocesses auto --maxprocesses 8 --dist worksteal
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(PYTEST_ARGS) --numprocesses $$($(BIN)/python -c "import os; print(os.cpu_count() * 3 // 2)") --maxprocesses 8 --dist worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .
