@@ -105,26 +105,46 @@ def derive(
     # The meta device has no autocast to switch off.
     casts_on = "cpu" if where.type == "meta" else where.type
     with torch.no_grad(), torch.autocast(device_type=casts_on, enabled=False):
-        moved = {
-            name: batch[name].to(where, non_blocking=True)
-            for name in needed
-            if isinstance(batch[name], torch.Tensor)
-        }
-        made: dict[str, torch.Tensor] = {}
-        for contract, rows in _contracts(batch):
-            if len(rows) == len(depth):
-                made = _derived(_Moments.of(moved, contract), names, places)
-                break
-            chosen = {name: torch.stack([v[row] for row in rows]) for name, v in moved.items()}
-            part = _derived(_Moments.of(chosen, contract), names, places)
-            for name, values in part.items():
-                if name not in made:
-                    made[name] = values.new_empty((len(depth), *values.shape[1:]))
-                for place, row in enumerate(rows):
-                    made[name][row] = values[place]
-        if depth.ndim == 5:
-            made = {name: v.squeeze(2) if v.ndim > 4 else v for name, v in made.items()}
-        return made
+        moved = _moved(batch, needed, to=where)
+        return _of_contracts(moved, names, places, contracts=_contracts(batch))
+
+
+# torch.compile of torch 2.15 takes no comprehension within a `with` on Python 3.13.
+def _moved(
+    batch: Mapping[str, Any], needed: list[str], *, to: torch.device
+) -> dict[str, torch.Tensor]:
+    """Return the tensors that are needed, on a device."""
+    return {
+        name: batch[name].to(to, non_blocking=True)
+        for name in needed
+        if isinstance(batch[name], torch.Tensor)
+    }
+
+
+def _of_contracts(
+    moved: Mapping[str, torch.Tensor],
+    names: tuple[str, ...],
+    places: list[tuple[int, int]],
+    *,
+    contracts: list[tuple["_Contract", list[int]]],
+) -> dict[str, torch.Tensor]:
+    """Return the fields of all moments, those of each contract together."""
+    depth = moved["stored_depth"]
+    made: dict[str, torch.Tensor] = {}
+    for contract, rows in contracts:
+        if len(rows) == len(depth):
+            made = _derived(_Moments.of(moved, contract), names, places)
+            break
+        chosen = {name: torch.stack([v[row] for row in rows]) for name, v in moved.items()}
+        part = _derived(_Moments.of(chosen, contract), names, places)
+        for name, values in part.items():
+            if name not in made:
+                made[name] = values.new_empty((len(depth), *values.shape[1:]))
+            for place, row in enumerate(rows):
+                made[name][row] = values[place]
+    if depth.ndim == 5:
+        made = {name: v.squeeze(2) if v.ndim > 4 else v for name, v in made.items()}
+    return made
 
 
 def _require_views(batch: Mapping[str, Any], needed: list[str]) -> torch.Tensor:
