@@ -350,7 +350,7 @@ def test_shards_are_a_source_as_their_release_is(packed, release, tmp_path, form
     pack(tmp_path / "source", tmp_path / "out", training=SETTINGS, workers=1)
 
     one, other = document_of(tmp_path / "out", KEY), document_of(packed, KEY)
-    assert one.files == other.files
+    assert repr(one.files) == repr(other.files)  # from Python 3.13 on nan differs from itself
     assert one.source_digest != other.source_digest
 
 
@@ -360,7 +360,8 @@ def test_a_url_is_a_source_as_its_folder_is(packed, release, tmp_path, web):
     pack(web.url, tmp_path / "out", training=SETTINGS, rows=[0], workers=1)
 
     key = SceneIndex.open(release).scene(0).id.key
-    assert document_of(tmp_path / "out", key).files == document_of(packed, key).files
+    found, expected = document_of(tmp_path / "out", key), document_of(packed, key)
+    assert repr(found.files) == repr(expected.files)
 
 
 def test_some_cameras_and_scenes_are_kept(release, tmp_path):
