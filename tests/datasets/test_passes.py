@@ -271,7 +271,7 @@ def test_workers_that_could_not_start_leave_nothing_to_end(pairs):
         multiprocessing_context="spawn",
         worker_init_fn=lambda number: None,
     )
-    with pytest.raises((AttributeError, pickle.PicklingError), match="pickle|local object"):
+    with pytest.raises((AttributeError, pickle.PicklingError), match=r"pickle|local object"):
         next(iter(loader))
 
     loader.close()
