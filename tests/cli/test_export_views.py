@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from stereogenbench_data.cli.commands import app
 from tests.servers.tools import require_module
 
-EXPORT = typer.main.get_command(app).commands["export"]  # type: ignore[attr-defined]
+EXPORT = typer.main.get_command(app).commands["export"]
 VIEWS = ("colmap", "transforms", "ply", "moge")
 USUAL = ("--size", "16x16", "--workers", "1")
 
