@@ -25,6 +25,10 @@ _SOON: Final = 16
 _REFILLED_AT: Final = 0.5
 """The share of the limit below which more is planned: many samples together need fewer requests."""
 
+_FIRST_BYTES: Final = 32_000_000
+"""So many bytes are requested at first, and two more for each that was read: the first batch does
+not wait for what is needed much later."""
+
 
 class Step(NamedTuple):
     """A sample that will be read, and whether its videos are wanted no more after it."""
@@ -47,6 +51,14 @@ class NeededFiles(NamedTuple):
     texts: tuple[str, ...]
 
 
+class _Planned(NamedTuple):
+    """A planned sample, by its number, and the bytes planned for the order up to it."""
+
+    number: int
+    address: Address
+    up_to_bytes: int
+
+
 FilesOf = Callable[[Address], NeededFiles]
 
 
@@ -65,8 +77,10 @@ class ComingSamples:
         self._open_videos = 0
         self._kept_frames = 1
         self._steps: Iterator[Step] = iter(())
-        self._due: deque[tuple[int, Address]] = deque()
+        self._due: deque[_Planned] = deque()
+        self._waiting: deque[_Planned] = deque()  # for their requests
         self._number = self._begun = 0
+        self._planned_bytes = self._read_bytes = 0
         self._positions: OrderedDict[tuple[str, int, int], _Video] = OrderedDict()
         self._read_texts: set[str] = set()
         self._is_filling = True
@@ -99,11 +113,13 @@ class ComingSamples:
         with self._own_lock():
             if not self._due:
                 self._plan_next(files)
-            if self._due and self._due[0][1] != address:
+            if self._due and self._due[0].address != address:
                 self._begin_anew()
             if not self._due:
                 self._plan(Step(address, ends_run=False), files(address))
-            self._ahead.begin(max(self._due[0][0], self._begun))
+            first = self._due[0].number
+            self._begun = max(self._begun, first)
+            self._ahead.begin(self._begun)
             if not self._is_filling:
                 low = _REFILLED_AT * self._ahead.limit_bytes
                 self._is_filling = self._ahead.planned_bytes < low
@@ -113,15 +129,22 @@ class ComingSamples:
                 if not self._is_filling:
                     break
             # While more is planned, requests for later samples wait: they may grow.
-            soon = self._due[0][0] + _SOON if self._is_filling else self._number
-            self._begun = max(self._begun, soon)
+            last = first + _SOON if self._is_filling else self._number
+            up_to_bytes = _FIRST_BYTES + 2 * self._read_bytes
+            while self._waiting and (
+                self._waiting[0].number <= first
+                or (self._waiting[0].number <= last and self._waiting[0].up_to_bytes <= up_to_bytes)
+            ):
+                self._begun = self._waiting.popleft().number
             self._ahead.begin(self._begun)
 
     def end(self, address: Address) -> None:
         """Forget what a sample that was read needed alone."""
         with self._own_lock():
-            if self._due and self._due[0][1] == address:
-                self._ahead.release(self._due.popleft()[0])
+            if self._due and self._due[0].address == address:
+                read = self._due.popleft()
+                self._read_bytes = read.up_to_bytes
+                self._ahead.release(read.number)
 
     def close(self) -> None:
         """End all requests, and expect no sample."""
@@ -138,9 +161,11 @@ class ComingSamples:
         return self._lock
 
     def _begin_anew(self) -> None:
-        for number, _ in self._due:
-            self._ahead.release(number)
+        for planned in self._due:
+            self._ahead.release(planned.number)
         self._due.clear()
+        self._waiting.clear()
+        self._planned_bytes = self._read_bytes = 0
         self._steps = iter(())
         self._positions.clear()
         self._read_texts.clear()
@@ -167,8 +192,12 @@ class ComingSamples:
         if step.ends_run:
             for member in scene.members.values():
                 self._positions.pop((member.path, member.offset, step.address.run), None)
+        before_bytes = self._ahead.planned_bytes
         self._ahead.plan(self._number, wanted)
-        self._due.append((self._number, step.address))
+        self._planned_bytes += self._ahead.planned_bytes - before_bytes
+        planned = _Planned(self._number, step.address, self._planned_bytes)
+        self._due.append(planned)
+        self._waiting.append(planned)
 
     def _of_video(self, scene: Scene, name: str, frames: list[int], *, run: int) -> list[Wanted]:
         member = scene.member(name)

@@ -18,6 +18,7 @@ from stereogenbench_data import SceneIndex, StereoPairs, StereoPairStream
 from stereogenbench_data.datasets.mapped import SeekTableWarning
 from stereogenbench_data.errors import SelectionError, StorageError
 from stereogenbench_data.media.seek_table import packed_tables, parse_tables
+from stereogenbench_data.samples import coming
 from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.sources.cache import ShardCache
 from tests.servers.failing_server import Answer, serving
@@ -165,6 +166,23 @@ def test_what_is_planned_stays_within_the_bound(served, alone):
 
     of_one_sample = pairs.index.scene(0).members[rgb_name(0)].size
     assert bound < largest <= bound + of_one_sample
+
+
+def test_what_is_requested_grows_with_what_was_read(served, large_shards, monkeypatch, alone):
+    monkeypatch.setattr(coming, "_FIRST_BYTES", 1)
+    options = {"fields": ("left",), "frames": "all"}
+    loader = StereoPairs(served.url, **options).loader(1, start="beginning")
+    expected = [*StereoPairs(large_shards, **options).loader(1, start="beginning")]
+    served.asked.clear()
+    batches = iter(loader)
+    first = next(batches)
+    time.sleep(0.1)
+    asked = len(parts_asked(served))
+    whole = [first, *batches]
+    loader.close()
+
+    assert asked == 1
+    assert all(same(*each) for each in zip(whole, expected, strict=True))
 
 
 def test_nothing_is_planned_ahead_with_a_bound_of_0(served, alone):
