@@ -20,9 +20,10 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     depth_of,
     grouped,
+    out_folder,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.samples import SampleOptions, parse_picture_size
+from stereogenbench_data.cli.samples import SampleSelectionOptions, parse_picture_size
 from stereogenbench_data.evaluation.columns import METRICS, OFFLINE_METRICS, require_metrics
 from stereogenbench_data.schema.text import counted
 
@@ -62,7 +63,7 @@ PAPER_SIZE = "832x480"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScoredOptions(SampleOptions):
+class ScoredOptions(SampleSelectionOptions):
     """Which samples are scored: those of the eval split by default."""
 
     split: SplitOption = "eval"
@@ -198,10 +199,10 @@ class ControlsReportOptions(ReportOptions):
 @resumable()
 def export_inputs(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
-    out: Annotated[Path, typer.Argument(help="Folder to write into.")],
+    out: Annotated[Path, typer.Argument(parser=out_folder, help="Folder to write into.")],
     *,
     tier: TierOption,
-    chosen: SampleOptions,
+    chosen: SampleSelectionOptions,
     size: SizeOption = PAPER_SIZE,
     depth_unit_m: DepthUnitOption = None,
     work: WorkOptions,
@@ -243,7 +244,7 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     name: Annotated[
         str | None, typer.Option(help="Name of the method [the folder's name].")
     ] = None,
-    chosen: SampleOptions,
+    chosen: SampleSelectionOptions,
     scoring: ProtocolOptions,
     by: Annotated[
         list[str] | None,

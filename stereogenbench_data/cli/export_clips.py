@@ -17,6 +17,7 @@ from stereogenbench_data.cli.options import (
     complete_from,
     depth_of,
     grouped,
+    out_folder,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.samples import (
@@ -170,7 +171,7 @@ class ClipOptions(EncodingOptions):
 @resumable()
 def export_clips(  # noqa: PLR0913 - one parameter an option
     source: DataOptions,
-    out: Annotated[Path, typer.Argument(help="Folder to write into.")],
+    out: Annotated[Path, typer.Argument(parser=out_folder, help="Folder to write into.")],
     *,
     layout: Annotated[
         Literal["diffsynth", "finetrainers", "musubi", "stereocrafter"],

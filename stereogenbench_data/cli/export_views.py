@@ -15,6 +15,7 @@ from stereogenbench_data.cli.options import (
     WorkersOption,
     depth_of,
     grouped,
+    out_folder,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.samples import (
@@ -25,7 +26,7 @@ from stereogenbench_data.cli.samples import (
 )
 from stereogenbench_data.schema.text import counted
 
-OutArgument = Annotated[Path, typer.Argument(help="Folder to write into.")]
+OutArgument = Annotated[Path, typer.Argument(parser=out_folder, help="Folder to write into.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +70,7 @@ class ViewOptions(ExportedSceneOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ModelOptions(ViewOptions):
+class FolderOptions(ViewOptions):
     """The same, with what makes a folder and how many points are in it."""
 
     group: Annotated[
@@ -105,7 +106,7 @@ class ModelOptions(ViewOptions):
 
 @grouped
 @resumable()
-def export_colmap(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
+def export_colmap(source: DataOptions, out: OutArgument, *, chosen: FolderOptions) -> None:
     """Write COLMAP's text model with points from depth.
 
     COLMAP, gsplat and 3D Gaussians read it. In each folder: images/ and sparse/0/ (cameras.txt,
@@ -117,7 +118,7 @@ def export_colmap(source: DataOptions, out: OutArgument, *, chosen: ModelOptions
 
 @grouped
 @resumable()
-def export_transforms(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
+def export_transforms(source: DataOptions, out: OutArgument, *, chosen: FolderOptions) -> None:
     """Write transforms.json for nerfstudio, with depth and points.
 
     Cameras have OpenGL's axes, the world's z points up, depth is in millimetres in .npy files. A
@@ -128,7 +129,7 @@ def export_transforms(source: DataOptions, out: OutArgument, *, chosen: ModelOpt
 
 @grouped
 @resumable()
-def export_ply(source: DataOptions, out: OutArgument, *, chosen: ModelOptions) -> None:
+def export_ply(source: DataOptions, out: OutArgument, *, chosen: FolderOptions) -> None:
     """Write coloured point clouds from depth as PLY.
 
     Points are in metres, x right, y down, z forward. Each folder has points.ply, and

@@ -9,7 +9,7 @@ import typer
 
 from stereogenbench_data.cli.help import RARE, SCENES
 from stereogenbench_data.cli.options import DataOptions, JsonOption, grouped
-from stereogenbench_data.cli.samples import SampleOptions, parse_picture_size
+from stereogenbench_data.cli.samples import SampleSelectionOptions, parse_picture_size
 
 if TYPE_CHECKING:
     from stereogenbench_data.datasets.forecast import Forecast
@@ -22,7 +22,7 @@ _MACHINES: Final = "What trains"
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainedOptions(SampleOptions):
+class TrainedOptions(SampleSelectionOptions):
     """Which samples of which scenes are trained on: frames drawn at random and clips, too."""
 
     frames: Annotated[

@@ -172,6 +172,13 @@ EngineOption = Annotated[
 OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")]
 
 
+def out_folder(text: str) -> Path:
+    """Return the folder that a command writes, as it was typed; not the one of an empty text."""
+    if not text:
+        raise typer.BadParameter("the path is empty: name a folder, or . for this one.")
+    return Path(text)
+
+
 @dataclass(frozen=True, kw_only=True)
 class DataOptions:
     """The data that a command reads."""

@@ -18,6 +18,7 @@ from stereogenbench_data.cli.options import (
     ShardsOptions,
     WorkOptions,
     grouped,
+    out_folder,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted, plain_line
@@ -39,7 +40,9 @@ def pack(  # noqa: PLR0913 - one parameter an option
             help="Folder of scenes or its index file; with --size also shards or a URL."
         ),
     ],
-    out: Annotated[Path, typer.Argument(help="Folder for the shards and their index.")],
+    out: Annotated[
+        Path, typer.Argument(parser=out_folder, help="Folder for the shards and their index.")
+    ],
     *,
     data_root: RootOption = None,
     shard_size: Annotated[
@@ -261,7 +264,7 @@ def verify(
 @resumable()
 def unpack(
     source: ShardsOptions,
-    out: Annotated[Path, typer.Argument(help="Folder for the scenes.")],
+    out: Annotated[Path, typer.Argument(parser=out_folder, help="Folder for the scenes.")],
     *,
     work: WorkOptions,
     as_json: JsonOption = False,

@@ -23,7 +23,7 @@ BaselineOption = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-class SampleOptions(SceneOptions):
+class SampleSelectionOptions(SceneOptions):
     """Which pairs and frames of which scenes a command takes."""
 
     pairs: PairsOption = "primary"

@@ -13,6 +13,7 @@ from stereogenbench_data.cli.options import (
     WorkOptions,
     complete_from,
     grouped,
+    out_folder,
 )
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.cli.writing import require_writable, write_report
@@ -81,7 +82,9 @@ class RendererOptions:
 @grouped
 @resumable()
 def synth(  # noqa: PLR0913 - one parameter an option
-    out: Annotated[Path, typer.Argument(help="Folder to write train/ or eval/ into.")],
+    out: Annotated[
+        Path, typer.Argument(parser=out_folder, help="Folder to write train/ or eval/ into.")
+    ],
     *,
     family: Annotated[
         str,

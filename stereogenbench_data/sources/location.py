@@ -38,7 +38,13 @@ def is_web(location: str) -> bool:
 
 
 def local_path(location: str | Path) -> Path:
-    """Return a local location as an absolute path, ``~`` expanded; a ``file://`` URL is one too."""
+    """Return a local location as an absolute path, ``~`` expanded; a ``file://`` URL is one too.
+
+    Raises:
+        StorageError: If it is an empty text, as of a variable of a shell that is not set.
+    """
+    if location == "":
+        raise StorageError("the path is empty: name a file or folder, or . for this folder.")
     if _is_file_url(location):
         return Path(unquote(split_url(str(location)).path))
     return Path(location).expanduser().absolute()

@@ -165,3 +165,13 @@ def test_control_characters_of_a_name_are_escaped(tmp_path):
     assert shown.exit_code == 2
     assert "\x1b" not in shown.stderr + indexed.stderr + indexed.stdout
     assert r"a\x1b]0;title\x07\x1b[31m" in shown.stderr
+
+
+@pytest.mark.parametrize("words", [("synth", ""), ("pack", "scenes", ""), ("index", "")])
+def test_an_empty_path_is_refused_and_nothing_is_written(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    ended = invoke(*words)
+
+    assert ended.exit_code == 2
+    assert "the path is empty" in ended.stderr
+    assert list(tmp_path.iterdir()) == []

@@ -24,13 +24,13 @@ def test_the_first_scene_is_drawn_under_its_key(small_shards, tmp_path, monkeypa
         assert sheet.size[0] > 1500
 
 
-def test_a_part_of_a_key_a_pair_a_frame_and_a_size_are_taken(small_release, tmp_path):
+def test_a_part_of_a_key_a_pair_a_frame_and_a_size_are_taken(indexed_release, tmp_path):
     sheets = []
     for number, options in enumerate(
         ([], ["--pair", "0-5"], ["--frame", 6], ["--size", 256], ["--depth-unit-m", 0.01])
     ):
         out = tmp_path / f"{number}.png"
-        shown = invoke("show", small_release, "scene_000001", "-o", out, *options)
+        shown = invoke("show", indexed_release, "scene_000001", "-o", out, *options)
         assert (shown.exit_code, shown.stdout) == (0, f"{out}: {SCENE}\n")
         with Image.open(out) as sheet:
             sheets.append(np.asarray(sheet))

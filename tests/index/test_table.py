@@ -377,9 +377,11 @@ def test_a_root_that_is_no_folder_is_refused(scenes, tmp_path):
     path = written(scenes, tmp_path)
     (tmp_path / "tree").mkdir()
 
-    for root in (tmp_path / "gone", path, ""):
+    for root in (tmp_path / "gone", path):
         with pytest.raises(StorageError, match=r"not a folder, and was named as the root"):
             SceneIndex.open(path, root=root)
+    with pytest.raises(StorageError, match=r"the path is empty"):
+        SceneIndex.open(path, root="")
     with pytest.raises(StorageError, match=r"tree: has no index.parquet, and a root was named"):
         SceneIndex.open(tmp_path / "tree", root=tmp_path)
 

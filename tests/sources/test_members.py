@@ -302,3 +302,8 @@ def test_too_many_open_files_are_reported_as_such(kind, small_release, tmp_path)
     for line in told:
         assert "(Too many open files). Raise the limit of open files (`ulimit -n`)" in line
         assert "again" not in line
+
+
+def test_an_empty_text_is_no_folder():
+    with pytest.raises(StorageError, match="the path is empty: name a file or folder"):
+        local_path("")
