@@ -1,0 +1,371 @@
+"""Batch commands on Ray: a cluster of two nodes on this machine, the same results."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stereogenbench_data.audit.contract.doctor import diagnose
+from stereogenbench_data.audit.geometry.audit import AuditRequest, audit
+from stereogenbench_data.engine import Engine, RayCluster
+from stereogenbench_data.errors import ExtraError, ShardError, StorageError
+from stereogenbench_data.evaluation.evaluate import evaluate
+from stereogenbench_data.evaluation.inputs import export_inputs
+from stereogenbench_data.evaluation.protocol import EvaluationProtocol
+from stereogenbench_data.index.build import walk
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.shards.pack import pack
+from stereogenbench_data.shards.training import TrainingSettings
+from stereogenbench_data.shards.unpack import unpack
+from stereogenbench_data.shards.verify import verify
+from stereogenbench_data.synthesis.produce import plan_scenes, synthesise
+from stereogenbench_data.synthesis.request import SynthRequest
+from tests.evaluation.conftest import write_pngs
+from tests.servers.tools import require_module
+
+ONE_EACH = 250_000
+"""Of `small_release`, a shard for each scene."""
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """Return the address of a Ray cluster of two nodes, one core each.
+
+    They ignore Ctrl-C, as where a script started them in the background.
+    """
+    require_module("ray")
+    from ray.cluster_utils import Cluster
+
+    monkeypatch = pytest.MonkeyPatch()
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("PYTHONPATH", str(Path.cwd()))  # which workers get from their node
+    node = {"num_cpus": 1, "object_store_memory": 80_000_000, "include_dashboard": False}
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cluster = Cluster(initialize_head=True, head_node_args=node)
+    cluster.add_node(**node)
+    signal.signal(signal.SIGINT, before)
+    yield cluster.address
+    cluster.shutdown()
+    monkeypatch.undo()
+
+
+@pytest.fixture(scope="module")
+def ray(cluster):
+    """Keep one connection for most tests, so that workers import what they need once."""
+    module = require_module("ray")
+    module.init(address=cluster, log_to_driver=False)
+    yield module
+    module.shutdown()
+
+
+def bytes_of(folder):
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and ".parts" not in path.parts
+    }
+
+
+# Tasks that die.
+
+
+@dataclass(frozen=True)
+class DiesOnce:
+    """A task of which the first worker to report progress, on whatever item, is killed."""
+
+    task: Callable[..., Any]
+    mark: Path
+
+    def __call__(self, item, advance):
+        def advance_or_die(count):
+            advance(count)
+            try:
+                self.mark.touch(exist_ok=False)
+            except FileExistsError:
+                return
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        return self.task(item, advance_or_die)
+
+
+@dataclass(frozen=True)
+class LosesAWorker:
+    """An engine of which one worker is killed on the way."""
+
+    engine: Engine
+    mark: Path
+
+    def map(self, task, items, **how):
+        return self.engine.map(DiesOnce(task, self.mark), items, **how)
+
+
+# The batch commands.
+
+
+@dataclass(frozen=True)
+class Data:
+    """What commands work on, and a folder for what they write."""
+
+    release: Path
+    shards: Path
+    right_views: Path
+    out: Path
+
+
+def index_(data, **how):
+    return walk(data.release, **how)
+
+
+def pack_(data, **how):
+    pack(data.release, data.out, target_bytes=ONE_EACH, **how)
+    return bytes_of(data.out)
+
+
+def pack_training_(data, **how):
+    pack(data.release, data.out, training=TrainingSettings((32, 32)), **how)
+    return bytes_of(data.out)
+
+
+def verify_(data, **how):
+    return verify(data.shards, mode="decode", **how)
+
+
+def audit_(data, **how):
+    return repr(audit(data.release, AuditRequest(frames=2), **how))
+
+
+def evaluate_(data, **how):
+    protocol = EvaluationProtocol(metrics=("psnr", "ssim"), size=(48, 64))
+    scores = evaluate(
+        data.release, data.right_views, tier="G1", protocol=protocol, pairs=[(0, 1)],
+        frames=[0], **how,
+    )  # fmt: skip
+    return [(pair.scene, pair.pair, repr(sorted(pair.tallies.items()))) for pair in scores.pairs]
+
+
+def synth_(data, **how):
+    synthesise(data.out, SynthRequest(size_px=32, frames=2, seed=9), **how)
+    return bytes_of(data.out)
+
+
+def unpack_(data, **how):
+    unpack(data.shards, data.out, **how)
+    return bytes_of(data.out)
+
+
+def doctor_(data, **how):
+    return repr(diagnose(data.release, scenes=2, frames=2, **how))
+
+
+def export_inputs_(data, **how):
+    export_inputs(
+        data.release, data.out, tier="G0", size=(48, 64), pairs=[(0, 1)], frames=[0], **how
+    )
+    return bytes_of(data.out)
+
+
+@pytest.fixture(scope="module")
+def material(small_release, tmp_path_factory):
+    place = tmp_path_factory.mktemp("material")
+    pack(small_release, place / "shards", target_bytes=ONE_EACH, workers=1)
+    index = SceneIndex.open(small_release)
+    right_views = write_pngs(place / "right", index, frames=[0])
+    return small_release, place / "shards", right_views
+
+
+@pytest.mark.usefixtures("ray")
+@pytest.mark.parametrize(
+    "command",
+    [
+        index_, pack_, pack_training_, verify_, audit_, evaluate_, synth_, unpack_, doctor_,
+        export_inputs_,
+    ],
+    ids=lambda command: command.__name__.rstrip("_"),
+)  # fmt: skip
+def test_a_cluster_that_loses_a_worker_gives_what_this_process_gives(command, material, tmp_path):
+    mark = tmp_path / "died"
+
+    here = command(Data(*material, tmp_path / "here"), workers=1)
+    there = command(
+        Data(*material, tmp_path / "there"), workers=None, engine=LosesAWorker(RayCluster(), mark)
+    )
+
+    assert mark.exists()
+    assert there == here
+
+
+@pytest.mark.usefixtures("ray")
+def test_a_cluster_finds_the_same_plans_of_eval_scenes(tmp_path):
+    request = SynthRequest(scenes=5, size_px=32, frames=2, split="eval", subset="unseen_map")
+
+    here = plan_scenes(tmp_path / "here", request)
+    there = plan_scenes(tmp_path / "there", request, engine=RayCluster(), workers=2)
+
+    assert there == here
+    assert bytes_of(tmp_path / "there") == bytes_of(tmp_path / "here")
+
+
+# What else Ray does.
+
+
+def pid(item, advance):
+    time.sleep(0.3)
+    advance(item)
+    return os.getpid()
+
+
+def meet_another(item, advance):
+    """Return the process, when another one has begun too, or has had a minute to begin."""
+    number, folder = item
+    (folder / str(os.getpid())).touch()
+    for _ in range(600):
+        if len(list(folder.iterdir())) >= 2:
+            break
+        time.sleep(0.1)
+    advance(number)
+    return os.getpid()
+
+
+def refuse_three(item, advance):
+    if item == 3:
+        raise ShardError("three is refused")
+    return item
+
+
+def always_killed(item, advance):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def begin(mark, advance):
+    try:
+        mark.touch()
+        for _ in range(600):
+            time.sleep(0.1)
+    finally:
+        mark.unlink()
+
+
+def called(item):
+    return f"item {item}"
+
+
+@pytest.mark.usefixtures("ray")
+def test_both_nodes_work_and_all_is_counted(tmp_path):
+    counts = []
+    items = [(number, tmp_path) for number in range(6)]
+
+    pids = list(RayCluster().map(meet_another, items, name=called, advance=counts.append))
+
+    assert len(pids) == 6
+    assert len(set(pids)) >= 2
+    assert sum(counts) == 15
+
+
+@pytest.mark.usefixtures("ray")
+def test_one_worker_does_one_item_at_a_time():
+    began = time.monotonic()
+
+    list(RayCluster().map(pid, [1, 2, 3], name=called, workers=1))
+
+    assert time.monotonic() - began >= 0.9
+
+
+@pytest.mark.usefixtures("ray")
+def test_the_error_of_a_task_comes_as_it_is_with_the_name_of_its_item():
+    with pytest.raises(ShardError, match=r"^three is refused\n.*item 3"):
+        list(RayCluster().map(refuse_three, range(5), name=called))
+
+
+@pytest.mark.usefixtures("ray")
+def test_an_item_whose_workers_die_again_and_again_is_named():
+    with pytest.raises(StorageError, match=r"^item 7: Ray did not finish it in 3 tries .* fewer"):
+        list(RayCluster().map(always_killed, [7], name=called))
+
+
+@pytest.mark.usefixtures("ray")
+def test_closing_the_results_interrupts_tasks_that_run(tmp_path):
+    mark = tmp_path / "running"
+
+    def stop(count):
+        if mark.exists():
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(RayCluster().map(begin, [mark], name=called, advance=stop))
+
+    assert not mark.exists()
+
+
+@pytest.mark.usefixtures("ray")
+def test_a_task_that_needs_a_gpu_is_refused_where_there_is_none():
+    with pytest.raises(StorageError, match=r"has 0 GPUs, and each task needs 1.* device cpu"):
+        list(RayCluster(gpus=1).map(pid, [1], name=called))
+
+
+@pytest.mark.usefixtures("ray")
+def test_an_error_on_ray_is_the_one_of_packing(small_release, tmp_path):
+    tree = shutil.copytree(small_release, tmp_path / "tree")
+    index = SceneIndex.open(tree)
+    next(tree.glob("train/Uniform/*/scene_000001/cam_03_depth.mkv")).unlink()
+
+    with pytest.raises(ShardError, match=r"cam_03_depth\.mkv: cannot be read \(No such file"):
+        pack(index, tmp_path / "out", target_bytes=ONE_EACH, engine=RayCluster())
+
+    assert list((tmp_path / "out").glob("*.tmp")) == []
+
+
+def test_ray_and_processes_share_one_plan_and_ray_stays_connected(ray, material, tmp_path):
+    release, shards, _ = material
+    pack(release, tmp_path, target_bytes=ONE_EACH, part=(1, 2), workers=1)
+
+    report = pack(release, tmp_path, target_bytes=ONE_EACH, engine=RayCluster())
+
+    assert len(report.packed) == 2
+    assert bytes_of(tmp_path) == bytes_of(shards)
+    assert ray.is_initialized()
+
+
+def test_the_command_works_on_a_cluster_by_its_address_with_relative_paths(
+    cluster, material, tmp_path
+):
+    release, shards, _ = material
+    (tmp_path / "scenes").symlink_to(release)
+
+    ended = subprocess.run(
+        [sys.executable, "-m", "stereogenbench_data.cli.main", "pack", "scenes", "out",
+         "--shard-size", "250kB", "--engine", cluster],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+    assert ended.returncode == 0, ended.stderr
+    assert "4 shards packed, 0 were finished before" in ended.stdout
+    assert bytes_of(tmp_path / "out") == bytes_of(shards)
+
+
+def test_where_no_cluster_runs_none_is_started(monkeypatch):
+    module = require_module("ray")
+
+    def nowhere(**how):
+        assert how["address"] == "auto"
+        raise ConnectionError("Could not find any running Ray instance.")
+
+    monkeypatch.setattr(module, "is_initialized", lambda: False)
+    monkeypatch.setattr(module, "init", nowhere)
+
+    with pytest.raises(StorageError, match=r"auto: no Ray cluster .* Start one with `ray start"):
+        list(RayCluster().map(pid, [1], name=called))
+
+
+def test_without_ray_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+
+    with pytest.raises(ExtraError, match=r"pip install 'stereogenbench-data\[ray\]'"):
+        list(RayCluster().map(pid, [1], name=called))
