@@ -408,7 +408,7 @@ def _finished(
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class PackingEstimate:
     """What packing would take, by a timed sample.
 
     Attributes:
@@ -430,7 +430,7 @@ class Estimate:
 
 def estimate(
     index: SceneIndex, rows: Sequence[int], settings: TrainingSettings, *, folder: Path
-) -> Estimate:
+) -> PackingEstimate:
     """Return what deriving some scenes takes: one camera of some of them is derived and timed.
 
     Args:
@@ -470,7 +470,7 @@ def estimate(
             elif name in scene.members:
                 texts += scene.members[name].size
     size = texts + sum(made[kind] * wanted[kind] / max(frames[kind], 1) for kind in made)
-    return Estimate(
+    return PackingEstimate(
         scenes=len(scenes),
         videos=videos,
         bytes=round(size),

@@ -18,7 +18,7 @@ from jaxtyping import Float64, UInt16
 from stereogenbench_data.media.depth_packing import grey_frame
 from stereogenbench_data.media.encoder import VideoWriter
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_name
-from stereogenbench_data.synthesis.checks import CameraCheck, FrameStatistics
+from stereogenbench_data.synthesis.checks import CameraStatistics, FrameStatistics
 from stereogenbench_data.synthesis.filters import Limits
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.ray_casting import View
@@ -37,7 +37,7 @@ def write_cameras(
     folder: Path,
     limits: Limits,
     after_frame: Callable[[], None],
-) -> list[CameraCheck]:
+) -> list[CameraStatistics]:
     """Write the two videos of some cameras into a folder, and return what they look like.
 
     Args:

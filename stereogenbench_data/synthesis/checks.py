@@ -25,7 +25,7 @@ _LUMA: Final = np.array([0.299, 0.587, 0.114], np.float32)
 
 
 @dataclass(frozen=True, slots=True)
-class CameraCheck:
+class CameraStatistics:
     """What a camera's frames looked like while they were written.
 
     Attributes:
@@ -44,7 +44,7 @@ class CameraCheck:
 
 
 class FrameStatistics:
-    """Adds up the frames of a camera to a `CameraCheck`."""
+    """Adds up the frames of a camera to a `CameraStatistics`."""
 
     def __init__(self, plan: ScenePlan, *, camera: int, limits: Limits) -> None:
         self._plan, self._camera, self._limits = plan, camera, limits
@@ -72,10 +72,10 @@ class FrameStatistics:
             )
         )
 
-    def check(self) -> CameraCheck:
+    def check(self) -> CameraStatistics:
         """Return what the frames so far looked like."""
         invalid, mean, sd, near = np.array(self._rows).T
-        return CameraCheck(
+        return CameraStatistics(
             self._camera,
             float(invalid.mean()),
             float(mean.min()),
@@ -84,7 +84,7 @@ class FrameStatistics:
         )
 
 
-def check_pictures(checks: Sequence[CameraCheck], *, limits: Limits) -> Refusal | None:
+def check_pictures(checks: Sequence[CameraStatistics], *, limits: Limits) -> Refusal | None:
     """Return why the pictures or depths of a scene are refused, if they are."""
     for each in sorted(checks, key=lambda check: check.camera):
         where = f"camera {each.camera}"

@@ -20,9 +20,9 @@ import numpy as np
 from stereogenbench_data.errors import SynthesisError, cure_of
 from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.sources.files import open_output
-from stereogenbench_data.synthesis.filters import Limits, Refusal, Rig
+from stereogenbench_data.synthesis.filters import Limits, ProposedRig, Refusal
 from stereogenbench_data.synthesis.plan import ScenePlan
-from stereogenbench_data.synthesis.planning import Search
+from stereogenbench_data.synthesis.planning import PlanSearch
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.renderer import Renderer
 from stereogenbench_data.synthesis.request import SynthRequest
@@ -95,7 +95,7 @@ class Motion:
     def of(cls, plan: ScenePlan) -> "Motion":
         """Return the motion of a plan."""
         axes = rotation_from_rotator_deg(plan.rotators_deg)
-        step_m, turn_deg = steps(Rig.of(plan.proposal).eyes(plan.centres_m, axes), axes)
+        step_m, turn_deg = steps(ProposedRig.of(plan.proposal).eyes(plan.centres_m, axes), axes)
         if not len(step_m):
             return cls(0.0, 0.0, 0.0, 0.0, plan.splices)
         return cls(
@@ -128,7 +128,7 @@ class Decision:
     @classmethod
     def of(
         cls,
-        search: Search,
+        search: PlanSearch,
         *,
         before: tuple[Drawn, ...] = (),
         check: Check | Literal[""] = "",

@@ -268,7 +268,7 @@ _AROUND: Final = np.array(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rig:
+class ProposedRig:
     """The six cameras of a proposal, as filters need them.
 
     Attributes:
@@ -280,7 +280,7 @@ class Rig:
     picture_at_1m: tuple[float, float]
 
     @classmethod
-    def of(cls, proposal: Proposal) -> "Rig":
+    def of(cls, proposal: Proposal) -> "ProposedRig":
         """Return the rig of a proposal."""
         lateral_m = (proposal.places_cm - proposal.places_cm[-1] / 2) / 100
         return cls(lateral_m, proposal.picture_at_1m)
@@ -334,7 +334,7 @@ def check_poses(
     rotators_deg: Float64[np.ndarray, "n 3"],
     *,
     body_m: Float64[np.ndarray, "n p 3"],
-    rig: Rig,
+    rig: ProposedRig,
     world: World,
     limits: Limits,
 ) -> PoseChecks:
@@ -375,7 +375,7 @@ class _Poses:
     eyes: Array
     axes: Array
     body_m: Array
-    rig: Rig
+    rig: ProposedRig
 
     def projected(self) -> tuple[Array, Array, Array]:
         """Return depth of the subject's points, and their place, -1..1 across and up the pictures.

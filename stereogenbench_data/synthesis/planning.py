@@ -30,7 +30,7 @@ class Examined:
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class PlanSearch:
     """The search for one scene.
 
     Attributes:
@@ -63,7 +63,7 @@ def plan_scene(
     renderer: Renderer = RAY_CASTING,
     limits: Limits = DEFAULT_LIMITS,
     first: int = 0,
-) -> Search:
+) -> PlanSearch:
     """Return the first proposal of a scene that passes all filters.
 
     Args:
@@ -81,7 +81,7 @@ def plan_scene(
         proposal = propose(request, index=index, number=number, renderer=renderer)
         result = examine(proposal, world=renderer.world(proposal), limits=limits)
         if isinstance(result, ScenePlan):
-            return Search(result, tuple(refused))
+            return PlanSearch(result, tuple(refused))
         refused.append(Examined(proposal, result))
     reasons = [each.refusal.reason for each in refused]
     counted = sorted({(reasons.count(reason), reason) for reason in reasons}, reverse=True)

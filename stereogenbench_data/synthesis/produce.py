@@ -31,7 +31,7 @@ from stereogenbench_data.schema.release import CAMERA_COUNT, COMPLETE_JSON
 from stereogenbench_data.sources.files import try_locked
 from stereogenbench_data.synthesis.camera_writer import write_cameras
 from stereogenbench_data.synthesis.checks import (
-    CameraCheck,
+    CameraStatistics,
     check_files,
     check_pictures,
     check_scene,
@@ -40,7 +40,7 @@ from stereogenbench_data.synthesis.decisions import Check, Decision, Decisions, 
 from stereogenbench_data.synthesis.export import completion_text, metadata_texts
 from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS, Limits, Refusal
 from stereogenbench_data.synthesis.plan import ScenePlan
-from stereogenbench_data.synthesis.planning import Search, plan_scene, propose
+from stereogenbench_data.synthesis.planning import PlanSearch, plan_scene, propose
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
 from stereogenbench_data.synthesis.renderer import Renderer
@@ -384,7 +384,7 @@ def _searched(
     return plans
 
 
-def _search_all(work: _Work, first: dict[int, int]) -> Iterator[Search]:
+def _search_all(work: _Work, first: dict[int, int]) -> Iterator[PlanSearch]:
     """Yield the searches of scenes, each from one of its proposals on."""
     # To start processes takes longer than a few searches.
     few = len(first) <= _FEW
@@ -402,7 +402,7 @@ def _search_all(work: _Work, first: dict[int, int]) -> Iterator[Search]:
         yield from searches
 
 
-def _search(task: _SearchTask, after_proposals: Advance) -> Search:
+def _search(task: _SearchTask, after_proposals: Advance) -> PlanSearch:
     """Search for a scene's plan; a worker process calls this."""
     return plan_scene(
         task.request,
@@ -489,7 +489,7 @@ def _rendered(
 ) -> dict[int, Refusal]:
     """Render scenes, move those that pass to their places, and return why others are refused."""
     left = dict.fromkeys(plans, CAMERA_COUNT)
-    checks: dict[int, list[CameraCheck]] = {index: [] for index in plans}
+    checks: dict[int, list[CameraStatistics]] = {index: [] for index in plans}
     refused: dict[int, Refusal] = {}
     try:
         written = work.engine.map(
@@ -535,7 +535,7 @@ def _cameras(task: _RenderTask) -> str:
     return f"camera {', '.join(map(str, task.cameras))}"
 
 
-def _render(task: _RenderTask, after_frames: Advance) -> tuple[_RenderTask, list[CameraCheck]]:
+def _render(task: _RenderTask, after_frames: Advance) -> tuple[_RenderTask, list[CameraStatistics]]:
     """Write the videos of cameras; a worker process calls this."""
     plan = task.plan
     # Torch renders with one thread, because its rounding depends on the number of threads.
@@ -563,7 +563,7 @@ def _render(task: _RenderTask, after_frames: Advance) -> tuple[_RenderTask, list
 def _finish(
     work: _Work,
     task: _RenderTask,
-    checks: list[CameraCheck],
+    checks: list[CameraStatistics],
     *,
     check: Check,
 ) -> Refusal | None:

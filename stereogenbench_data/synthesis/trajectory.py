@@ -21,9 +21,9 @@ from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import FRAME_RATE_HZ
 from stereogenbench_data.synthesis.filters import (
     Limits,
+    ProposedRig,
     Reason,
     Refusal,
-    Rig,
     check_poses,
     check_spawn,
     check_subject_motion,
@@ -94,7 +94,7 @@ class _Search:
 
     def __init__(self, proposal: Proposal, *, world: World, limits: Limits, body_m: Array) -> None:
         self.proposal, self.world, self.limits, self.body_m = proposal, world, limits, body_m
-        self.rig = Rig.of(proposal)
+        self.rig = ProposedRig.of(proposal)
         self.rng = proposal.rng("path")
         self.frames = len(body_m)
         self.splices = 0

@@ -1,7 +1,7 @@
 """One scene's diagnosis: the declared contract, changed as little as the pictures ask for.
 
-`Search` fits each hypothesis once and returns the contract with the fewest changes that no further
-change clearly improves. `diagnose_scene` reports how well that contract fits.
+`ContractSearch` fits each hypothesis once and returns the contract with the fewest changes that no
+further change clearly improves. `diagnose_scene` reports how well that contract fits.
 """
 
 import math
@@ -186,7 +186,7 @@ class _Candidate:
         return self.score.hypothesis
 
 
-class Search:
+class ContractSearch:
     """The search for the best contract of a scene; fits each contract once."""
 
     def __init__(
@@ -440,7 +440,7 @@ def _freed(free: Free, length: str) -> Free:
 
 
 def _checked(
-    search: Search, best: _Candidate, *, depth_step: float
+    search: ContractSearch, best: _Candidate, *, depth_step: float
 ) -> tuple[_Candidate, CameraCheck]:
     """Return the contract to report, and how well each camera fits it.
 
@@ -496,7 +496,7 @@ def diagnose_scene(views: SceneFrames, *, frames: int) -> SceneDiagnosis:
     if basics["disparity_px"] < _LEAST_PARALLAX_PX:
         problem = f"too little parallax: disparities are of {basics['disparity_px']:.2f} px"
         return SceneDiagnosis(**basics, best=declared, problem=problem)
-    search = Search(views, matches, least_log_scale=allowed_log_scale(step))
+    search = ContractSearch(views, matches, least_log_scale=allowed_log_scale(step))
     best, check = _checked(search, search.best(), depth_step=step)
     share_explained = agreement(views, matches, best.score)
     parallax = search.without_parallax(best)
