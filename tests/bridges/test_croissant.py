@@ -11,6 +11,7 @@ from datetime import date
 from pathlib import Path
 from urllib.parse import urljoin
 
+import pyarrow.parquet as pq
 import pytest
 
 from stereogenbench_data import SceneIndex
@@ -157,7 +158,18 @@ def test_the_shipped_descriptors_are_those_of_make_descriptors(tmp_path, monkeyp
     written = {path.relative_to(copied) for path in copied.rglob("*") if path.is_file()}
     assert written == {path.relative_to(SHIPPED) for path in SHIPPED.rglob("*") if path.is_file()}
     for path in written:
-        assert (copied / path).read_bytes() == (SHIPPED / path).read_bytes(), path
+        assert contents(copied / path) == contents(SHIPPED / path), path
+
+
+def contents(path):
+    """The rows of a table, whose bytes depend on Arrow's version; a descriptor without those."""
+    if path.suffix == ".parquet":
+        return pq.read_table(path).to_pylist()
+    document = json.loads(path.read_text())
+    for file in document.get("distribution", []):  # the template is no descriptor yet
+        if str(file.get("contentUrl")).endswith(".parquet"):
+            del file["sha256"], file["contentSize"]
+    return document
 
 
 def test_absolute_addresses_pass_the_steps_of_the_conference_checker(web, index, tmp_path):
