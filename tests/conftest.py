@@ -5,12 +5,15 @@ SHARED_MATERIAL=none says that it is not available.
 """
 
 import os
+import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from stereogenbench_data.index.parquet import INDEX_NAME
+from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
@@ -101,6 +104,15 @@ def small_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ),
     ):  # fmt: skip
         synthesise(root, request, workers=1)
+    return root
+
+
+@pytest.fixture(scope="session")
+def indexed_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same tree with an index, which opens at once, for tests that only read it."""
+    root = tmp_path_factory.mktemp("indexed")
+    shutil.copytree(small_release, root, dirs_exist_ok=True, copy_function=os.link)
+    SceneIndex.open(root).write(root / INDEX_NAME)
     return root
 
 

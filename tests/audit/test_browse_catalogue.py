@@ -14,13 +14,13 @@ SCENE = "train/Uniform/SynthStage/scene_000001"
 
 
 @pytest.fixture(scope="module")
-def index(small_release):
-    return SceneIndex.open(small_release)
+def index(indexed_release):
+    return SceneIndex.open(indexed_release)
 
 
 @pytest.fixture(scope="module")
-def catalogue(index, small_release):
-    return Catalogue(index, shown_data=str(small_release))
+def catalogue(index, indexed_release):
+    return Catalogue(index, shown_data=str(indexed_release))
 
 
 QUERIES = [
@@ -50,7 +50,7 @@ def test_the_line_of_a_choice_selects_what_the_page_counts(catalogue, query):
     ].tolist()
 
 
-def test_the_line_of_a_sample_gives_it(catalogue, small_release):
+def test_the_line_of_a_sample_gives_it(catalogue, indexed_release):
     line = catalogue.sample_line(SCENE, pair=(1, 4), frame=5)
     sample = run(line)["sample"]
 
@@ -58,10 +58,10 @@ def test_the_line_of_a_sample_gives_it(catalogue, small_release):
     assert line.startswith("from stereogenbench_data import StereoPairs\n")
 
 
-def test_the_line_states_the_depth_contract_that_is_shown(index, small_release):
-    shown = Catalogue(index, shown_data=str(small_release), depth=DepthEncoding(unit_m=0.002))
+def test_the_line_states_the_depth_contract_that_is_shown(index, indexed_release):
+    shown = Catalogue(index, shown_data=str(indexed_release), depth=DepthEncoding(unit_m=0.002))
     mine = run(shown.sample_line(SCENE, pair=(0, 1), frame=0))["sample"]["disparity"]
-    stated = StereoPairs(small_release, scenes=SCENE)[0]["disparity"]
+    stated = StereoPairs(indexed_release, scenes=SCENE)[0]["disparity"]
 
     np.testing.assert_allclose(mine * 2, stated, rtol=1e-5)
 

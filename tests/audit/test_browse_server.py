@@ -25,9 +25,9 @@ MOMENT = urlencode({"key": SCENE, "left": 0, "right": 3, "frame": 2})
 
 
 @pytest.fixture(scope="module")
-def server(small_release):
-    index = SceneIndex.open(small_release)
-    with serving(index, small_release) as server:
+def server(indexed_release):
+    index = SceneIndex.open(indexed_release)
+    with serving(index, indexed_release) as server:
         yield server
 
 
@@ -59,11 +59,11 @@ def test_the_page_is_shipped_whole_and_loads_nothing_from_elsewhere(server, path
 
 @pytest.mark.parametrize("name", ["disparity", "depth"])
 def test_maps_are_the_datasets_own_numbers_with_nan_where_nothing_was_measured(
-    server, small_release, name
+    server, indexed_release, name
 ):
     status, content, _ = ask(server, f"/{name}.f32?{MOMENT}")
     found = np.frombuffer(content, dtype="<f4").reshape(64, 64)
-    sample = StereoPairs(small_release, scenes=SCENE, pairs=[(0, 3)], frames=2,
+    sample = StereoPairs(indexed_release, scenes=SCENE, pairs=[(0, 3)], frames=2,
                          fields=(name, "valid"))[0]  # fmt: skip
     valid = sample["valid"][0].numpy()
 
@@ -72,19 +72,21 @@ def test_maps_are_the_datasets_own_numbers_with_nan_where_nothing_was_measured(
     assert np.array_equal(found[valid], sample[name][0].numpy()[valid])
 
 
-def test_visibility_is_one_byte_a_pixel(server, small_release):
+def test_visibility_is_one_byte_a_pixel(server, indexed_release):
     _, content, _ = ask(server, f"/visible.u8?{MOMENT}")
-    sample = StereoPairs(small_release, scenes=SCENE, pairs=[(0, 3)], frames=2, fields=["visible"])
+    sample = StereoPairs(
+        indexed_release, scenes=SCENE, pairs=[(0, 3)], frames=2, fields=["visible"]
+    )
 
     assert content == sample[0]["visible"].numpy().astype(np.uint8).tobytes()
 
 
-def test_pictures_are_the_two_views(server, small_release):
+def test_pictures_are_the_two_views(server, indexed_release):
     import io
 
     from PIL import Image
 
-    sample = StereoPairs(small_release, scenes=SCENE, pairs=[(0, 3)], frames=2)[0]
+    sample = StereoPairs(indexed_release, scenes=SCENE, pairs=[(0, 3)], frames=2)[0]
     for name in ("left", "right"):
         _, content, headers = ask(server, f"/{name}.jpg?{MOMENT}")
         found = np.asarray(Image.open(io.BytesIO(content))).astype(int)
@@ -203,10 +205,10 @@ def test_only_the_loopback_interface_listens(server):
         assert other.connect_ex(("127.0.0.2", server.server_address[1])) != 0
 
 
-def test_a_broken_scene_is_reported_by_name(small_release, tmp_path):
+def test_a_broken_scene_is_reported_by_name(indexed_release, tmp_path):
     import shutil
 
-    shutil.copytree(small_release, tmp_path / "data")
+    shutil.copytree(indexed_release, tmp_path / "data")
     index = SceneIndex.open(tmp_path / "data")
     (tmp_path / "data" / SCENE / "cam_03_rgb.mp4").write_bytes(b"cut short")
     service = Service(Catalogue(index, shown_data="x"), SceneReader(index))
@@ -227,10 +229,10 @@ def test_a_broken_scene_is_reported_by_name(small_release, tmp_path):
     assert "cam_03_rgb.mp4: has 9 bytes" in told
 
 
-def test_many_threads_get_each_their_own_frame(server, small_release):
+def test_many_threads_get_each_their_own_frame(server, indexed_release):
     """Asked at once and in no order, every answer is that of its own question."""
     wanted = {}
-    pairs = StereoPairs(small_release, scenes=SCENE, pairs=[(0, 3), (2, 4)], frames="all",
+    pairs = StereoPairs(indexed_release, scenes=SCENE, pairs=[(0, 3), (2, 4)], frames="all",
                         fields=("disparity", "valid", "pair", "frame_index"))  # fmt: skip
     for sample in (pairs[number] for number in range(len(pairs))):
         left, right = sample["pair"].tolist()

@@ -50,9 +50,9 @@ THREE = AuditRequest(frames=3)
 
 
 @pytest.fixture(scope="module")
-def exact(small_release):
+def exact(indexed_release):
     """The audit of three frames of each of four scenes that are exact."""
-    return audit(small_release, THREE, workers=1)
+    return audit(indexed_release, THREE, workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +63,9 @@ def decidable_release(tmp_path_factory):
     return root
 
 
-def made_wrong(small_release, root, change):
+def made_wrong(indexed_release, root, change):
     """Return the audit of one scene after change(folder)."""
-    change(copied(small_release / SCENE, root))
+    change(copied(indexed_release / SCENE, root))
     return audit(root, THREE, workers=1)
 
 
@@ -87,9 +87,9 @@ def test_exact_scenes_agree_with_themselves_to_rounding(exact):
             assert pair.frames == 3
 
 
-def test_frames_units_and_payloads_are_those_that_were_written(exact, small_release):
+def test_frames_units_and_payloads_are_those_that_were_written(exact, indexed_release):
     for scene in exact.scenes:
-        units = read_depth(small_release / scene.key, 2)[0][[0, 3, 6]]
+        units = read_depth(indexed_release / scene.key, 2)[0][[0, 3, 6]]
         known = (units > 0) & (units < 65535)
         camera = scene.cameras[2]
 
@@ -106,8 +106,8 @@ def test_shards_give_the_same_figures_as_the_folder(exact, small_shards):
     assert packed.to_json() | {"root": ""} == exact.to_json() | {"root": ""}
 
 
-def test_depth_that_was_packed_by_blosc2_gives_the_same_figures(exact, small_release, tmp_path):
-    pack(small_release, tmp_path / "packed", depth_codec="blosc2", workers=1)
+def test_depth_that_was_packed_by_blosc2_gives_the_same_figures(exact, indexed_release, tmp_path):
+    pack(indexed_release, tmp_path / "packed", depth_codec="blosc2", workers=1)
 
     found = audit(tmp_path / "packed", THREE, workers=1, scenes=SCENE)
 
@@ -115,10 +115,10 @@ def test_depth_that_was_packed_by_blosc2_gives_the_same_figures(exact, small_rel
     assert found.to_json()["scenes"] == [expected]
 
 
-def test_a_tree_behind_a_url_is_walked_with_its_broken_scenes(small_release):
+def test_a_tree_behind_a_url_is_walked_with_its_broken_scenes(indexed_release):
     store = fsspec.filesystem("memory")
     key = "eval/MapSeenInTrain/Uniform/SynthStage/scene_000000"
-    for path in (small_release / key).iterdir():
+    for path in (indexed_release / key).iterdir():
         content = path.read_bytes()
         store.pipe(f"/tree/{key}/{path.name}", content)
         short = content[:-200] if path.name == "cam_04_depth.mkv" else content
@@ -144,8 +144,8 @@ def test_a_url_gives_the_same_figures_as_the_folder(exact, small_shards, web):
     assert found.to_json()["scenes"] == [expected]
 
 
-def test_worker_processes_give_the_same_report(small_release):
-    index = open_for_audit(small_release)
+def test_worker_processes_give_the_same_report(indexed_release):
+    index = open_for_audit(indexed_release)
     rows = {"workers": 2, "split": "train"}
 
     several = audit(index, AuditRequest(frames=1), **rows)
@@ -290,10 +290,10 @@ def contradicting(folder):
     ids=lambda value: getattr(value, "__name__", None),
 )  # fmt: skip
 def test_what_is_wrong_is_a_finding(
-    small_release, decidable_release, tmp_path, change, where, check, found
+    indexed_release, decidable_release, tmp_path, change, where, check, found
 ):
     tells_time = change in (late_pictures, reversed_pictures)
-    report = made_wrong(decidable_release if tells_time else small_release, tmp_path, change)
+    report = made_wrong(decidable_release if tells_time else indexed_release, tmp_path, change)
 
     (finding, *_) = [each for each in report.findings if each.check == check]
     assert (finding.scene, finding.member) == (SCENE, where)
@@ -328,9 +328,9 @@ def standing_still(folder):
     ids=lambda value: getattr(value, "__name__", None),
 )
 def test_what_the_content_does_not_tell_is_said_to_be_not_testable(
-    small_release, tmp_path, change, checks
+    indexed_release, tmp_path, change, checks
 ):
-    report = made_wrong(small_release, tmp_path, change)
+    report = made_wrong(indexed_release, tmp_path, change)
 
     told = {each["check"] for each in report.to_json()["untested"] if each["of"] == ""}
     rows = {row.check for row in report.rows if "not testable" in row.ours}
@@ -339,8 +339,8 @@ def test_what_the_content_does_not_tell_is_said_to_be_not_testable(
     assert f"## Not testable ({len(report.untested)})" in audit_markdown(report)
 
 
-def test_one_frame_tells_nothing_of_motion(small_release):
-    report = audit(small_release, AuditRequest(frames=1), workers=1, scenes=SCENE)
+def test_one_frame_tells_nothing_of_motion(indexed_release):
+    report = audit(indexed_release, AuditRequest(frames=1), workers=1, scenes=SCENE)
 
     untested = {each.check for each in report.untested}
     assert report.findings == ()
@@ -348,10 +348,10 @@ def test_one_frame_tells_nothing_of_motion(small_release):
     assert not {"depth consistency", "picture content"} & untested
 
 
-def test_agreement_of_the_outermost_cameras_has_a_limit(small_release):
+def test_agreement_of_the_outermost_cameras_has_a_limit(indexed_release):
     strict = AuditLimits(agreement_long=1.0)
 
-    report = audit(small_release, AuditRequest(frames=1, limits=strict), workers=1, scenes=SCENE)
+    report = audit(indexed_release, AuditRequest(frames=1, limits=strict), workers=1, scenes=SCENE)
 
     (row,) = [row for row in report.rows if row.quantity.startswith("0-5: pixels that")]
     assert row.limit == "100 %"
@@ -359,10 +359,10 @@ def test_agreement_of_the_outermost_cameras_has_a_limit(small_release):
     assert "hides from camera 5" in report.findings[0].found
 
 
-def test_8_bit_depth_is_a_finding_unless_it_is_meant(small_release, tmp_path):
+def test_8_bit_depth_is_a_finding_unless_it_is_meant(indexed_release, tmp_path):
     import av
 
-    folder = copied(small_release / SCENE, tmp_path)
+    folder = copied(indexed_release / SCENE, tmp_path)
     with av.open(str(folder / "cam_03_depth.mkv"), "w") as container:
         stream = container.add_stream("ffv1", rate=15)
         stream.width = stream.height = 64
@@ -383,12 +383,12 @@ def test_8_bit_depth_is_a_finding_unless_it_is_meant(small_release, tmp_path):
     assert meant.scenes[0].cameras[3].depth_levels == 64
 
 
-def test_scenes_that_cannot_be_indexed_are_findings_or_notes(small_release, tmp_path):
-    cut = copied(small_release / SCENE, tmp_path) / "cam_02_rgb.mp4"
+def test_scenes_that_cannot_be_indexed_are_findings_or_notes(indexed_release, tmp_path):
+    cut = copied(indexed_release / SCENE, tmp_path) / "cam_02_rgb.mp4"
     cut.write_bytes(cut.read_bytes()[:-500])
-    for path in copied(small_release / SCENE.replace("000000", "000001"), tmp_path).glob("cam*"):
+    for path in copied(indexed_release / SCENE.replace("000000", "000001"), tmp_path).glob("cam*"):
         path.unlink()
-    copied(small_release / "train/IPD_Gaussian/SynthStage/scene_000000", tmp_path)
+    copied(indexed_release / "train/IPD_Gaussian/SynthStage/scene_000000", tmp_path)
 
     report = audit(tmp_path, workers=1)
     of_family = audit(tmp_path, workers=1, family="IPD_Gaussian")
@@ -402,8 +402,8 @@ def test_scenes_that_cannot_be_indexed_are_findings_or_notes(small_release, tmp_
     assert (of_scene.findings, of_scene.scenes_audited) == ((finding,), 0)
 
 
-def test_a_file_that_changed_after_its_index_is_a_finding(small_release, tmp_path):
-    folder = copied(small_release / SCENE, tmp_path)
+def test_a_file_that_changed_after_its_index_is_a_finding(indexed_release, tmp_path):
+    folder = copied(indexed_release / SCENE, tmp_path)
     index = open_for_audit(tmp_path)
     (folder / "cam_00_rgb.mp4").unlink()
     (folder / "cam_01_depth.mkv").write_bytes(b"nothing")
@@ -421,16 +421,16 @@ def test_a_file_that_changed_after_its_index_is_a_finding(small_release, tmp_pat
     assert audit_markdown(report)
 
 
-def test_exchanged_cameras_disagree_in_depth(small_release, tmp_path):
-    report = made_wrong(small_release, tmp_path, lambda folder: exchange(folder, {1: 4, 4: 1}))
+def test_exchanged_cameras_disagree_in_depth(indexed_release, tmp_path):
+    report = made_wrong(indexed_release, tmp_path, lambda folder: exchange(folder, {1: 4, 4: 1}))
 
     assert {each.check for each in report.findings} >= {"agreement", "depth consistency"}
 
 
-def test_limits_decide_what_is_a_finding(exact, small_release):
+def test_limits_decide_what_is_a_finding(exact, indexed_release):
     strict = AuditLimits.parse(["frames=81", "brightness=256"])
 
-    report = audit(small_release, AuditRequest(frames=1, limits=strict), workers=1, scenes=SCENE)
+    report = audit(indexed_release, AuditRequest(frames=1, limits=strict), workers=1, scenes=SCENE)
 
     assert {each.check for each in report.findings} == {"missing frames", "too dark"}
     assert "has 7 frames of 81" in report.findings[0].found + report.findings[1].found
@@ -440,8 +440,8 @@ def test_limits_decide_what_is_a_finding(exact, small_release):
         AuditLimits.parse(["frames=many"])
 
 
-def test_a_sample_is_drawn_by_its_seed_and_filters_hold(small_release):
-    index = open_for_audit(small_release)
+def test_a_sample_is_drawn_by_its_seed_and_filters_hold(indexed_release):
+    index = open_for_audit(indexed_release)
 
     def keys(seed, **filters):
         request = AuditRequest(sample=2, frames=1, seed=seed)
@@ -457,9 +457,9 @@ def test_a_sample_is_drawn_by_its_seed_and_filters_hold(small_release):
 
 
 def test_an_audit_that_was_stopped_goes_on_where_it_was(
-    exact, small_release, tmp_path, monkeypatch
+    exact, indexed_release, tmp_path, monkeypatch
 ):
-    index, request = open_for_audit(small_release), THREE
+    index, request = open_for_audit(indexed_release), THREE
 
     def stop(done, total):
         if done >= 6:
@@ -481,8 +481,8 @@ def test_an_audit_that_was_stopped_goes_on_where_it_was(
     assert report.to_json() == exact.to_json()
 
 
-def test_a_journal_of_other_frames_or_changed_files_is_not_used(small_release, tmp_path):
-    folder = copied(small_release / SCENE, tmp_path / "data")
+def test_a_journal_of_other_frames_or_changed_files_is_not_used(indexed_release, tmp_path):
+    folder = copied(indexed_release / SCENE, tmp_path / "data")
     index = open_for_audit(tmp_path / "data")
 
     def run(frames):
@@ -503,8 +503,8 @@ def test_a_journal_of_other_frames_or_changed_files_is_not_used(small_release, t
     assert [each.check for each in changed[1].findings] == ["flat"]
 
 
-def test_a_damaged_journal_is_passed_over(exact, small_release, tmp_path):
-    index, request = open_for_audit(small_release), THREE
+def test_a_damaged_journal_is_passed_over(exact, indexed_release, tmp_path):
+    index, request = open_for_audit(indexed_release), THREE
     with audit_journal(tmp_path / "j", index, request) as journal:
         audit(index, request, workers=1, journal=journal, scenes=SCENE)
     text = (tmp_path / "j").read_text()
@@ -543,11 +543,11 @@ def test_the_record_of_a_scene_is_refused_if_it_has_another_form(exact, change):
         revived(SceneAudit, stored)
 
 
-def test_progress_counts_frames(small_release):
+def test_progress_counts_frames(indexed_release):
     told = []
 
     audit(
-        small_release, AuditRequest(frames=2), workers=1, scenes=SCENE,
+        indexed_release, AuditRequest(frames=2), workers=1, scenes=SCENE,
         progress=lambda done, total: told.append((done, total)),
     )  # fmt: skip
 
@@ -565,8 +565,8 @@ def test_data_that_are_not_there_are_an_error(tmp_path):
         audit(tmp_path / "nowhere")
 
 
-def test_opening_for_an_audit_does_not_warn_of_what_becomes_a_finding(small_release, tmp_path):
-    (copied(small_release / SCENE, tmp_path) / "_scene_complete.json").unlink()
+def test_opening_for_an_audit_does_not_warn_of_what_becomes_a_finding(indexed_release, tmp_path):
+    (copied(indexed_release / SCENE, tmp_path) / "_scene_complete.json").unlink()
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")

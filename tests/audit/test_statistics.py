@@ -51,9 +51,9 @@ def written_release(release):
 
 
 @pytest.fixture
-def three(small_release):
+def three(indexed_release):
     """Three scenes: one whose cameras stand at `PLACES_CM`, two like it twice as far apart."""
-    scene = SceneIndex.open(small_release).scene(0)
+    scene = SceneIndex.open(indexed_release).scene(0)
 
     def placed(number, factor, focal_mm):
         baselines = tuple(factor * (PLACES_CM[b] - PLACES_CM[a]) for a, b in CAMERA_PAIRS)
@@ -67,7 +67,7 @@ def three(small_release):
         )  # fmt: skip
 
     return SceneIndex.from_scenes(
-        [placed(0, 1.0, 20.0), placed(1, 2.0, 85.0), placed(2, 2.0, 90.0)], small_release
+        [placed(0, 1.0, 20.0), placed(1, 2.0, 85.0), placed(2, 2.0, 90.0)], indexed_release
     )
 
 
@@ -288,13 +288,13 @@ def test_the_command_writes_json_plots_and_files(small_shards, run, tmp_path):
     ]  # fmt: skip
 
 
-def test_names_of_the_data_are_no_markup_in_the_table(small_release):
-    scene = SceneIndex.open(small_release).scene(0)
+def test_names_of_the_data_are_no_markup_in_the_table(indexed_release):
+    scene = SceneIndex.open(indexed_release).scene(0)
     name = "<img src=x onerror=alert(1)>|[a](b)`"
     named = dataclasses.replace(
         scene, id=dataclasses.replace(scene.id, family=name, map_name=name, key=f"train/{name}")
     )
-    index = SceneIndex.from_scenes([dataclasses.replace(named, members={})], small_release)
+    index = SceneIndex.from_scenes([dataclasses.replace(named, members={})], indexed_release)
 
     text = statistics_markdown(statistics(index))
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.forecast import Point, expected_rate, forecast_table, measure_forecast
+from benchmarks.forecast import Point, expected_rate, forecast_section, measure_forecast
 from benchmarks.server import Network
 from stereogenbench_data.datasets.scaling import SampleCost
 
@@ -37,7 +37,7 @@ def test_points_are_measured_and_compared(material):
     rows = measure_forecast(
         material, scenes=2, points=points, seconds=0.5, rounds=1, report=lambda text: None
     )
-    text = forecast_table(rows)
+    text = forecast_section(rows)
 
     assert [row["kind"] for row in rows] == ["released", "training"]
     assert all(row["forecast"] > 0 and row["measured"] > 0 for row in rows)

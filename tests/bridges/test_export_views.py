@@ -364,10 +364,10 @@ def test_a_depth_contract_is_followed(detailed_release, tmp_path):
     np.testing.assert_allclose((world @ rotation)[:, 2], depth_m, rtol=1e-5)
 
 
-def test_every_moment_has_a_folder_of_its_own_or_a_scene_has_one(small_release, tmp_path):
+def test_every_moment_has_a_folder_of_its_own_or_a_scene_has_one(indexed_release, tmp_path):
     chosen = {"layout": "colmap", "frames": ("every", 3), "family": "Uniform", "points": 5}
-    moments = exported(small_release, tmp_path / "moments", **chosen)
-    scenes = exported(small_release, tmp_path / "scenes", group="scene", **chosen)
+    moments = exported(indexed_release, tmp_path / "moments", **chosen)
+    scenes = exported(indexed_release, tmp_path / "scenes", group="scene", **chosen)
     scene = tmp_path / "moments" / "train" / "Uniform" / "SynthStage" / "scene_000000"
 
     assert moments[:3] == [scene / f"frame_{frame:03d}" for frame in (0, 3, 6)]
@@ -383,11 +383,11 @@ def test_every_moment_has_a_folder_of_its_own_or_a_scene_has_one(small_release, 
             assert len({images[image][0][-7:] for image, _ in track.tolist()}) == 1
 
 
-def test_processes_write_the_same_files_as_one(small_release, tmp_path):
+def test_processes_write_the_same_files_as_one(indexed_release, tmp_path):
     counts = []
     for name, workers in (("one", 1), ("two", 2)):
         export_views(
-            small_release, tmp_path / name, layout="moge", workers=workers,
+            indexed_release, tmp_path / name, layout="moge", workers=workers,
             progress=lambda *done: counts.append(done), size=(32, 32),
         )  # fmt: skip
         assert counts[-1] == (18, 18)
@@ -396,9 +396,9 @@ def test_processes_write_the_same_files_as_one(small_release, tmp_path):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_what_was_exported_before_is_kept(small_release, tmp_path, layout):
+def test_what_was_exported_before_is_kept(indexed_release, tmp_path, layout):
     options = {"layout": layout, "frames": [0, 4], "size": (32, 32)}
-    folders = exported(small_release, tmp_path, **options)
+    folders = exported(indexed_release, tmp_path, **options)
     whole = files_of(tmp_path)
     kept = {folder: folder.stat().st_mtime_ns for folder in folders[1:]}
     shutil.rmtree(folders[0])
@@ -407,17 +407,19 @@ def test_what_was_exported_before_is_kept(small_release, tmp_path, layout):
     (leftover / "half").write_bytes(b"half")
 
     counts = []
-    again = exported(small_release, tmp_path, progress=lambda *done: counts.append(done), **options)
+    again = exported(
+        indexed_release, tmp_path, progress=lambda *done: counts.append(done), **options
+    )
     assert again == folders
     assert files_of(tmp_path) == whole
     assert {folder: folder.stat().st_mtime_ns for folder in folders[1:]} == kept
     assert counts[0] == (30, 36)
 
 
-def test_an_export_that_was_killed_goes_on_and_is_whole(small_release, tmp_path):
+def test_an_export_that_was_killed_goes_on_and_is_whole(indexed_release, tmp_path):
     options = {"layout": "transforms", "frames": "all", "points": 2000}
     expected = tmp_path / "expected"
-    exported(small_release, expected, **options)
+    exported(indexed_release, expected, **options)
     killed = tmp_path / "killed"
     code = (
         "import os, signal, sys\n"
@@ -428,7 +430,7 @@ def test_an_export_that_was_killed_goes_on_and_is_whole(small_release, tmp_path)
     )
     for pictures, whole in ((6, 0), (126, 20)):
         ended = subprocess.run(
-            [sys.executable, "-c", code, str(small_release), str(killed), str(pictures)],
+            [sys.executable, "-c", code, str(indexed_release), str(killed), str(pictures)],
             cwd=Path(__file__).resolve().parents[2], check=False,
         )  # fmt: skip
         assert ended.returncode == -signal.SIGKILL
@@ -437,14 +439,14 @@ def test_an_export_that_was_killed_goes_on_and_is_whole(small_release, tmp_path)
         for folder in killed.rglob("frame_*"):
             assert folder.suffix or (folder / "transforms.json").is_file()
 
-    folders = exported(small_release, killed, **options)
+    folders = exported(indexed_release, killed, **options)
     assert files_of(killed) == files_of(expected)
     assert len(folders) == 21
 
 
-def test_moges_index_keeps_what_was_exported_before(small_release, tmp_path):
-    exported(small_release, tmp_path, layout="moge", family="Uniform")
-    exported(small_release, tmp_path, layout="moge", family="IPD_Gaussian", frames=[2])
+def test_moges_index_keeps_what_was_exported_before(indexed_release, tmp_path):
+    exported(indexed_release, tmp_path, layout="moge", family="Uniform")
+    exported(indexed_release, tmp_path, layout="moge", family="IPD_Gaussian", frames=[2])
     names = (tmp_path / ".index.txt").read_text().splitlines()
 
     assert names == sorted(names)
@@ -454,23 +456,25 @@ def test_moges_index_keeps_what_was_exported_before(small_release, tmp_path):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_evaluation_scenes_are_exported_only_where_the_split_names_them(
-    small_release, tmp_path, layout
+    indexed_release, tmp_path, layout
 ):
-    usual = exported(small_release, tmp_path / "usual", layout=layout, size=(16, 16))
-    asked = exported(small_release, tmp_path / "asked", layout=layout, size=(16, 16), split="eval")
+    usual = exported(indexed_release, tmp_path / "usual", layout=layout, size=(16, 16))
+    asked = exported(
+        indexed_release, tmp_path / "asked", layout=layout, size=(16, 16), split="eval"
+    )
 
     assert {folder.relative_to(tmp_path).parts[1] for folder in usual} == {"train"}
     assert {folder.relative_to(tmp_path).parts[1] for folder in asked} == {"eval"}
     with pytest.raises(StorageError, match=r"other split: \['eval'\], where \['train'\] is asked"):
-        exported(small_release, tmp_path / "asked", layout=layout, size=(16, 16))
+        exported(indexed_release, tmp_path / "asked", layout=layout, size=(16, 16))
 
 
-def test_both_splits_and_a_contract_go_on_in_their_folder(small_release, tmp_path):
+def test_both_splits_and_a_contract_go_on_in_their_folder(indexed_release, tmp_path):
     contract = DepthEncoding(unit_m=0.05, accept=frozenset({"8-bit", "lossy", "chroma"}))
     options = {"split": ("train", "eval"), "depth": contract, "size": (16, 16), "layout": "moge"}
 
-    assert len(exported(small_release, tmp_path, **options)) == 4
-    assert len(exported(small_release, tmp_path, **options)) == 4
+    assert len(exported(indexed_release, tmp_path, **options)) == 4
+    assert len(exported(indexed_release, tmp_path, **options)) == 4
     assert json.loads((tmp_path / "export.json").read_text())["split"] == ["eval", "train"]
 
 
@@ -485,51 +489,51 @@ def test_both_splits_and_a_contract_go_on_in_their_folder(small_release, tmp_pat
         ({"depth": DepthEncoding(unit_m=0.5)}, "depth"),
     ],
 )
-def test_a_folder_holds_one_kind_of_export(small_release, tmp_path, changed, name):
+def test_a_folder_holds_one_kind_of_export(indexed_release, tmp_path, changed, name):
     options = {"layout": "colmap", "size": (16, 16), "points": 5}
-    exported(small_release, tmp_path, **options)
+    exported(indexed_release, tmp_path, **options)
 
     with pytest.raises(StorageError, match=rf"an export of other {name}: .*another folder"):
-        exported(small_release, tmp_path, **(options | changed))
+        exported(indexed_release, tmp_path, **(options | changed))
 
 
-def test_scenes_as_one_hold_the_same_frames(small_release, tmp_path):
+def test_scenes_as_one_hold_the_same_frames(indexed_release, tmp_path):
     options = {"layout": "ply", "size": (16, 16), "group": "scene"}
-    exported(small_release, tmp_path, frames=[0], **options)
+    exported(indexed_release, tmp_path, frames=[0], **options)
 
     with pytest.raises(StorageError, match=r"other frames: .*another folder"):
-        exported(small_release, tmp_path, frames=[0, 1], **options)
+        exported(indexed_release, tmp_path, frames=[0, 1], **options)
 
 
-def test_other_data_go_elsewhere(small_release, detailed_release, tmp_path):
-    exported(small_release, tmp_path, layout="ply", size=(16, 16))
+def test_other_data_go_elsewhere(indexed_release, detailed_release, tmp_path):
+    exported(indexed_release, tmp_path, layout="ply", size=(16, 16))
 
     with pytest.raises(StorageError, match=r"other data: .*another folder"):
         exported(detailed_release, tmp_path, layout="ply", size=(16, 16))
 
 
-def test_a_folder_of_something_else_is_left_alone(small_release, tmp_path):
+def test_a_folder_of_something_else_is_left_alone(indexed_release, tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
 
     with pytest.raises(StorageError, match=r"not empty and holds no export\.json.*a new folder"):
-        exported(small_release, tmp_path, layout="ply")
+        exported(indexed_release, tmp_path, layout="ply")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_a_description_that_is_none_is_named(small_release, tmp_path):
+def test_a_description_that_is_none_is_named(indexed_release, tmp_path):
     (tmp_path / "export.json").write_text("{")
 
     with pytest.raises(StorageError, match=r"export\.json: is not the description of an export"):
-        exported(small_release, tmp_path, layout="ply")
+        exported(indexed_release, tmp_path, layout="ply")
 
 
-def test_two_processes_do_not_export_into_one_folder(small_release, tmp_path):
-    exported(small_release, tmp_path, layout="ply", size=(16, 16), family="Uniform")
+def test_two_processes_do_not_export_into_one_folder(indexed_release, tmp_path):
+    exported(indexed_release, tmp_path, layout="ply", size=(16, 16), family="Uniform")
 
     with try_locked(tmp_path / ".lock") as is_ours:
         assert is_ours
         with pytest.raises(StorageError, match=r"another process exports into this folder"):
-            exported(small_release, tmp_path, layout="ply", size=(16, 16))
+            exported(indexed_release, tmp_path, layout="ply", size=(16, 16))
 
 
 @pytest.mark.parametrize(
@@ -549,16 +553,16 @@ def test_two_processes_do_not_export_into_one_folder(small_release, tmp_path):
     ],
 )
 def test_what_cannot_be_exported_is_refused_before_anything_is_written(
-    small_release, tmp_path, options, error, message
+    indexed_release, tmp_path, options, error, message
 ):
     with pytest.raises(error, match=message):
-        exported(small_release, tmp_path / "out", **options)
+        exported(indexed_release, tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_missing_video_is_named_and_nothing_half_is_left(small_release, tmp_path):
+def test_a_missing_video_is_named_and_nothing_half_is_left(indexed_release, tmp_path):
     release = tmp_path / "release"
-    shutil.copytree(small_release, release)
+    shutil.copytree(indexed_release, release)
     scene = release / "train" / "Uniform" / "SynthStage" / "scene_000001"
     index = SceneIndex.open(release)
     (scene / "cam_04_rgb.mp4").unlink()
@@ -568,17 +572,17 @@ def test_a_missing_video_is_named_and_nothing_half_is_left(small_release, tmp_pa
     assert not [*(tmp_path / "out").rglob("*.unfinished")]
 
 
-def test_a_full_disk_is_named_and_nothing_half_is_left(small_release, tmp_path):
+def test_a_full_disk_is_named_and_nothing_half_is_left(indexed_release, tmp_path):
     with small_disk(tmp_path / "disk", size="200k") as disk:
         with pytest.raises(StorageError, match=r"frame_000.*No space left.*Make room"):
-            exported(small_release, disk / "out", layout="transforms", frames="all")
+            exported(indexed_release, disk / "out", layout="transforms", frames="all")
         folders = [*(disk / "out").rglob("frame_*")]
         assert all((folder / "transforms.json").is_file() for folder in folders)
 
 
-def test_the_same_comes_out_of_shards_and_folders(small_release, small_shards, tmp_path):
+def test_the_same_comes_out_of_shards_and_folders(indexed_release, small_shards, tmp_path):
     found = []
-    for name, data in (("folders", small_release), ("shards", small_shards)):
+    for name, data in (("folders", indexed_release), ("shards", small_shards)):
         exported(data, tmp_path / name, layout="transforms", size=(32, 32))
         found.append(files_of(tmp_path / name))
         found[-1].pop("export.json")

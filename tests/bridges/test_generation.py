@@ -21,8 +21,8 @@ def item(detailed_release):
     return GenStereo(detailed_release)[0]
 
 
-def test_a_batch_of_genstereo_has_what_its_loop_reads(small_release):
-    batch = next(iter(GenStereo(small_release, split="train").loader(batch_size=2)))
+def test_a_batch_of_genstereo_has_what_its_loop_reads(indexed_release):
+    batch = next(iter(GenStereo(indexed_release, split="train").loader(batch_size=2)))
 
     assert {name: (tuple(value.shape), value.dtype) for name, value in batch.items()} == {
         "source": ((2, 3, 64, 64), torch.float32),
@@ -94,11 +94,11 @@ def test_clip_is_given_what_its_own_processor_makes(detailed_release, size):
 
 
 @pytest.mark.parametrize("layout", ["tchw", "cthw"])
-def test_clips_have_time_and_channels_in_the_order_asked(small_release, layout):
+def test_clips_have_time_and_channels_in_the_order_asked(indexed_release, layout):
     options = {"split": "train", "pairs": "adjacent", "frames": ("clips", 3)}
-    plain = StereoPairs(small_release, fields=FIELDS, **options)[4]
+    plain = StereoPairs(indexed_release, fields=FIELDS, **options)[4]
 
-    clip = StereoClips(small_release, layout=layout, **options)[4]
+    clip = StereoClips(indexed_release, layout=layout, **options)[4]
 
     shape = (3, 3, 64, 64)
     assert clip["source"].shape == clip["target"].shape == clip["warped"].shape == shape
@@ -114,22 +114,22 @@ def test_clips_have_time_and_channels_in_the_order_asked(small_release, layout):
     assert all(clip[name].is_contiguous() for name in as_stored)
 
 
-def test_clips_tell_their_caption_baseline_and_rate(small_release):
+def test_clips_tell_their_caption_baseline_and_rate(indexed_release):
     options = {"split": "train", "family": "Uniform", "frames": ("clips", 3, 2)}
     plain, told = (
-        StereoClips(small_release, captions=captions, **options)[0]
+        StereoClips(indexed_release, captions=captions, **options)[0]
         for captions in ("plain", "with baseline")
     )
 
-    scene = StereoPairs(small_release, **options).index.scene(1)
+    scene = StereoPairs(indexed_release, **options).index.scene(1)
     centimetres = float(plain["baseline_m"]) * 100
     assert plain["caption"].startswith("A figure walks")
     assert told["caption"] == f"{plain['caption']} Stereo baseline {centimetres:.1f} cm."
     assert float(plain["frame_rate_hz"]) == scene.frame_rate_hz / 2 > 0
 
 
-def test_a_batch_of_clips_has_captions_as_a_list(small_release):
-    clips = StereoClips(small_release, frames=("clips", 3), split="train")
+def test_a_batch_of_clips_has_captions_as_a_list(indexed_release):
+    clips = StereoClips(indexed_release, frames=("clips", 3), split="train")
 
     batch = next(iter(clips.loader(batch_size=3, num_workers=1)))
 
@@ -142,34 +142,34 @@ def test_a_pair_without_a_description_is_described_by_its_baseline():
     assert describe_pair("", baseline_m=0.1) == "Stereo baseline 10.0 cm."
 
 
-def test_what_cannot_be_is_refused(small_release):
+def test_what_cannot_be_is_refused(indexed_release):
     with pytest.raises(FieldError, match=r"layout must be one of .*'cthw'.*, got 'thwc'"):
-        StereoClips(small_release, layout="thwc", frames=("clips", 2))
+        StereoClips(indexed_release, layout="thwc", frames=("clips", 2))
     with pytest.raises(FieldError, match=r"captions must be one of .*'plain'.*, got 'long'"):
-        StereoClips(small_release, captions="long", frames=("clips", 2))
+        StereoClips(indexed_release, captions="long", frames=("clips", 2))
     with pytest.raises(SelectionError, match="StereoClips takes clips"):
-        StereoClips(small_release)
+        StereoClips(indexed_release)
     with pytest.raises(SelectionError, match="GenStereo takes frames"):
-        GenStereo(small_release, frames=("clips", 2))
+        GenStereo(indexed_release, frames=("clips", 2))
 
 
 @pytest.mark.parametrize(
     ("frames", "stride"), [("all", 1), ([3], 1), (("clips", 2, 3), 3), (("clips", 1), 1)]
 )
-def test_the_frame_rate_is_a_field(small_release, frames, stride):
+def test_the_frame_rate_is_a_field(indexed_release, frames, stride):
     from stereogenbench_data import SceneViews
 
-    pair = StereoPairs(small_release, fields=("frame_rate_hz",), frames=frames)
-    views = SceneViews(small_release, fields=("frame_rate_hz",), frames=frames)
+    pair = StereoPairs(indexed_release, fields=("frame_rate_hz",), frames=frames)
+    views = SceneViews(indexed_release, fields=("frame_rate_hz",), frames=frames)
 
     rate = pair.index.scene(0).frame_rate_hz / stride
     assert pair[0]["frame_rate_hz"].dtype == torch.float64
     assert float(pair[0]["frame_rate_hz"]) == float(views[0]["frame_rate_hz"]) == rate > 0
 
 
-def test_a_misspelled_option_is_answered_with_all_options_of_the_class(small_release):
+def test_a_misspelled_option_is_answered_with_all_options_of_the_class(indexed_release):
     with pytest.raises(SelectionError, match="StereoClips has no option 'layot'") as caught:
-        StereoClips(small_release, frames=("clips", 3), layot="cthw")
+        StereoClips(indexed_release, frames=("clips", 3), layot="cthw")
 
     message = str(caught.value)
     assert "did you mean 'layout'? It has layout, " in message

@@ -55,8 +55,8 @@ def visible_pixels(data, **options):
     return StereoPairs(data, fields=("visible",), **options)[0]["visible"]
 
 
-def test_the_loop_of_raft_stereo_unpacks_four_after_the_names(small_release):
-    train = RaftStereo(small_release, split="train", pairs="all", frames="all")
+def test_the_loop_of_raft_stereo_unpacks_four_after_the_names(indexed_release):
+    train = RaftStereo(indexed_release, split="train", pairs="all", frames="all")
 
     for _, (_, *data_blob) in enumerate(train.loader(batch_size=3, num_workers=1)):
         image1, image2, flow, valid = data_blob
@@ -87,12 +87,16 @@ def test_the_right_picture_fetched_by_the_flow_is_the_left_one(
     assert (valid[visible] == 1).all()
 
 
-def test_raft_stereo_names_both_pictures_and_the_ground_truth(small_release):
-    names = RaftStereo(small_release, family="Uniform", split="train", pairs=[(1, 4)], frames=[3])[
-        0
-    ][0]
+def test_raft_stereo_names_both_pictures_and_the_ground_truth(indexed_release):
+    names = RaftStereo(
+        indexed_release, family="Uniform", split="train", pairs=[(1, 4)], frames=[3]
+    )[0][0]
     flipped = RaftStereo(
-        small_release, family="Uniform", split="train", pairs=[(1, 4)], transform=HorizontalFlip(1)
+        indexed_release,
+        family="Uniform",
+        split="train",
+        pairs=[(1, 4)],
+        transform=HorizontalFlip(1),
     )[0][0]
 
     scene = "train/Uniform/SynthStage/scene_000000"
@@ -101,10 +105,10 @@ def test_raft_stereo_names_both_pictures_and_the_ground_truth(small_release):
 
 
 @pytest.mark.parametrize("adapter", [RaftStereo, IgevStereo])
-def test_pixels_of_large_disparity_are_not_valid(small_release, adapter):
-    largest = StereoPairs(small_release)[0]["disparity"].max()
-    whole = adapter(small_release)[0]
-    cut = adapter(small_release, valid_below_px=float(largest) / 2)[0]
+def test_pixels_of_large_disparity_are_not_valid(indexed_release, adapter):
+    largest = StereoPairs(indexed_release)[0]["disparity"].max()
+    whole = adapter(indexed_release)[0]
+    cut = adapter(indexed_release, valid_below_px=float(largest) / 2)[0]
 
     np.testing.assert_array_equal(cut[3], whole[3])
     assert torch.equal(cut[4], whole[4] * (whole[3][0].abs() < largest / 2))
@@ -120,9 +124,9 @@ def test_unmeasured_pixels_are_not_valid(shared_scenes):
     assert (flow[~sample["valid"]] == 0).all()
 
 
-def test_the_loop_of_unimatch_takes_normalised_tensors(small_release):
-    plain = StereoPairs(small_release)[0]
-    batch = next(iter(DataLoader(UniMatch(small_release), batch_size=2)))
+def test_the_loop_of_unimatch_takes_normalised_tensors(indexed_release):
+    plain = StereoPairs(indexed_release)[0]
+    batch = next(iter(DataLoader(UniMatch(indexed_release), batch_size=2)))
 
     assert {name: tuple(value.shape) for name, value in batch.items()} == {
         "left": (2, 3, 64, 64), "right": (2, 3, 64, 64), "disp": (2, 64, 64),
@@ -148,10 +152,10 @@ def test_the_right_picture_of_unimatch_fetched_by_its_disparity_is_the_left_one(
     assert psnr(right, left, visible) < 22
 
 
-def test_transforms_of_unimatch_get_arrays_of_height_width_channels(small_release):
-    plain = StereoPairs(small_release)[0]
+def test_transforms_of_unimatch_get_arrays_of_height_width_channels(indexed_release):
+    plain = StereoPairs(indexed_release)[0]
 
-    item = UniMatch(small_release, sample_transform=lambda sample: sample)[0]
+    item = UniMatch(indexed_release, sample_transform=lambda sample: sample)[0]
 
     assert {name: (value.shape, value.dtype) for name, value in item.items()} == {
         "left": ((64, 64, 3), np.float32),
@@ -162,8 +166,8 @@ def test_transforms_of_unimatch_get_arrays_of_height_width_channels(small_releas
     np.testing.assert_array_equal(item["disp"], plain["disparity"][0])
 
 
-def test_the_loop_of_dynamic_stereo_takes_clips_of_both_views(small_release):
-    clips = DynamicStereo(small_release, pairs="adjacent", frames=("clips", 3))
+def test_the_loop_of_dynamic_stereo_takes_clips_of_both_views(indexed_release):
+    clips = DynamicStereo(indexed_release, pairs="adjacent", frames=("clips", 3))
 
     batch = next(iter(clips.loader(batch_size=2)))
 
@@ -194,9 +198,9 @@ def test_both_views_of_dynamic_stereo_have_the_disparity_of_their_own_pixels(
 
 
 @pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
-def test_torchs_own_loader_and_ours_give_the_same_items(small_release, adapter, options):
+def test_torchs_own_loader_and_ours_give_the_same_items(indexed_release, adapter, options):
     dataset = adapter(
-        small_release, pairs="adjacent", transform=RandomCrop(32, 48), seed=3, **options
+        indexed_release, pairs="adjacent", transform=RandomCrop(32, 48), seed=3, **options
     )
 
     ours = next(iter(dataset.loader(2, order="sequential")))
@@ -216,8 +220,8 @@ def flat(batch):
 
 
 @pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
-def test_a_pass_draws_other_transforms_than_the_one_before(small_release, adapter, options):
-    dataset = adapter(small_release, transform=RandomCrop(16, 16), **options)
+def test_a_pass_draws_other_transforms_than_the_one_before(indexed_release, adapter, options):
+    dataset = adapter(indexed_release, transform=RandomCrop(16, 16), **options)
     loader = dataset.loader(4, order="sequential", drop_last=False)
 
     first, second = (flat(next(iter([*loader]))) for _ in range(2))
@@ -227,44 +231,46 @@ def test_a_pass_draws_other_transforms_than_the_one_before(small_release, adapte
 
 
 @pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
-def test_items_are_repeated_and_added_as_the_projects_own_datasets(small_release, adapter, options):
-    dataset = adapter(small_release, **options)
+def test_items_are_repeated_and_added_as_the_projects_own_datasets(
+    indexed_release, adapter, options
+):
+    dataset = adapter(indexed_release, **options)
 
     assert len(2 * dataset + dataset) == len(dataset * 3) == 3 * len(dataset)
     assert len((dataset * 3)[len(dataset)]) == len(dataset[0])
 
 
 @pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
-def test_a_dataset_can_be_pickled_for_other_processes(small_release, adapter, options):
-    dataset = pickle.loads(pickle.dumps(adapter(small_release, **options)))
+def test_a_dataset_can_be_pickled_for_other_processes(indexed_release, adapter, options):
+    dataset = pickle.loads(pickle.dumps(adapter(indexed_release, **options)))
 
-    assert len(dataset[0]) == len(adapter(small_release, **options)[0])
+    assert len(dataset[0]) == len(adapter(indexed_release, **options)[0])
     assert type(dataset).__name__ in repr(dataset)
 
 
 @pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
-def test_what_the_project_cannot_take_is_refused(small_release, adapter, options):
+def test_what_the_project_cannot_take_is_refused(indexed_release, adapter, options):
     name = adapter.__name__
 
     with pytest.raises(SelectionError, match=f"direction='right_to_left'.*{name}.*HorizontalFlip"):
-        adapter(small_release, direction="right_to_left", **options)
+        adapter(indexed_release, direction="right_to_left", **options)
     with pytest.raises(SelectionError, match=f"{name} takes single pairs, got pairs='sweep'"):
-        adapter(small_release, pairs="sweep", **options)
+        adapter(indexed_release, pairs="sweep", **options)
     with pytest.raises(FieldError, match=f"{name} takes no fields"):
-        adapter(small_release, fields=("left",), **options)
+        adapter(indexed_release, fields=("left",), **options)
     with pytest.raises(FieldError, match=f"{name} takes what StereoPairs takes, not the dataset"):
-        adapter(StereoPairs(small_release), **options)
+        adapter(StereoPairs(indexed_release), **options)
     with pytest.raises(SelectionError, match=f"tail='wrap'.*{name}.*tail='drop'"):
-        adapter(small_release, **options).loader(2, tail="wrap")
+        adapter(indexed_release, **options).loader(2, tail="wrap")
 
 
 @pytest.mark.parametrize(("adapter", "options"), ADAPTERS)
 def test_cameras_that_stand_from_right_to_left_need_the_other_direction(
-    small_release, adapter, options
+    indexed_release, adapter, options
 ):
-    scene = StereoPairs(small_release).index.scene(0)
+    scene = StereoPairs(indexed_release).index.scene(0)
     places_m = tuple(-place_m for place_m in scene.lateral_m)
-    index = SceneIndex.from_scenes([replace(scene, lateral_m=places_m)], small_release)
+    index = SceneIndex.from_scenes([replace(scene, lateral_m=places_m)], indexed_release)
 
     with pytest.raises(
         SelectionError,
@@ -275,11 +281,11 @@ def test_cameras_that_stand_from_right_to_left_need_the_other_direction(
     assert len(adapter(index, pairs="all", direction="right_to_left", **options)) > 0
 
 
-def test_clips_and_single_frames_are_not_mixed_up(small_release):
+def test_clips_and_single_frames_are_not_mixed_up(indexed_release):
     with pytest.raises(SelectionError, match=r"RaftStereo takes frames: .* got \('clips', 2\)"):
-        RaftStereo(small_release, frames=("clips", 2))
+        RaftStereo(indexed_release, frames=("clips", 2))
     with pytest.raises(SelectionError, match=r"DynamicStereo takes clips: .* got 'first'"):
-        DynamicStereo(small_release)
+        DynamicStereo(indexed_release)
 
 
 def test_a_batch_of_several_sizes_is_refused_with_the_cure(tmp_path):

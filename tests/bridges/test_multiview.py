@@ -110,10 +110,10 @@ def test_a_scene_far_from_the_origin_keeps_its_points_in_float32(moment, far_m):
         assert np.abs(found - points)[valid.numpy()].max() < 1e-5
 
 
-def test_pairs_are_those_of_the_selection(small_release):
+def test_pairs_are_those_of_the_selection(indexed_release):
     options = {"pairs": "all", "frames": "all", "baseline_cm": (0, 8)}
-    views = DUSt3RViews(small_release, **options)
-    pairs = StereoPairs(small_release, split="train", **options)
+    views = DUSt3RViews(indexed_release, **options)
+    pairs = StereoPairs(indexed_release, split="train", **options)
 
     assert (len(views), views.num_views) == (len(pairs), 2)
     for number in range(0, len(pairs), 5):
@@ -121,8 +121,8 @@ def test_pairs_are_those_of_the_selection(small_release):
         assert cameras == [f"cam_{camera:02d}" for camera in pairs[number]["pair"]]
 
 
-def test_several_cameras_make_one_list(small_release):
-    views = DUSt3RViews(small_release, cameras=(4, 0, 2), frames=[3], **UNIFORM)
+def test_several_cameras_make_one_list(indexed_release):
+    views = DUSt3RViews(indexed_release, cameras=(4, 0, 2), frames=[3], **UNIFORM)
 
     assert (len(views), views.num_views) == (2, 3)
     assert [view["instance"] for view in views[1]] == ["cam_04", "cam_00", "cam_02"]
@@ -130,20 +130,20 @@ def test_several_cameras_make_one_list(small_release):
 
 
 @pytest.fixture(scope="module")
-def evaluation_release(small_release, tmp_path_factory):
+def evaluation_release(indexed_release, tmp_path_factory):
     """The same tree without its training scenes."""
     root = tmp_path_factory.mktemp("evaluation")
-    (root / "eval").symlink_to(small_release / "eval")
+    (root / "eval").symlink_to(indexed_release / "eval")
     return root
 
 
 @pytest.mark.parametrize("views_of", [DUSt3RViews, VGGTViews])
 def test_evaluation_scenes_are_left_out_unless_they_are_asked_for(
-    small_release, evaluation_release, views_of
+    indexed_release, evaluation_release, views_of
 ):
-    assert len(views_of(small_release)) == 3
-    assert len(views_of(small_release, split="eval")) == 1
-    assert len(views_of(small_release, split=("train", "eval"))) == 4
+    assert len(views_of(indexed_release)) == 3
+    assert len(views_of(indexed_release, split="eval")) == 1
+    assert len(views_of(indexed_release, split=("train", "eval"))) == 4
     assert len(views_of(evaluation_release, split="eval")) == 1
     with pytest.raises(SelectionError, match=r"only evaluation scenes \(1\).*split='eval'"):
         views_of(evaluation_release)
@@ -164,13 +164,13 @@ def test_evaluation_scenes_are_left_out_unless_they_are_asked_for(
     ],
     ids=["fields", "clip", "sweep"],
 )
-def test_samples_of_another_form_are_refused(small_release, sample, message):
+def test_samples_of_another_form_are_refused(indexed_release, sample, message):
     with pytest.raises(FieldError, match=message):
-        posed_images(sample(small_release))
+        posed_images(sample(indexed_release))
 
 
-def test_a_single_view_is_a_list_of_one(small_release):
-    sample = SceneViews(small_release, cameras="each", fields=VIEW_FIELDS)[3]
+def test_a_single_view_is_a_list_of_one(indexed_release):
+    sample = SceneViews(indexed_release, cameras="each", fields=VIEW_FIELDS)[3]
     (image,) = posed_images(sample)
 
     assert (image.camera, image.name, image.size) == (3, "cam_03_frame_000", (64, 64))
@@ -201,8 +201,8 @@ class TrainedOnDUSt3R(DUSt3RMixin, DUSt3RBase):
     pass
 
 
-def test_dust3rs_base_class_crops_the_views(small_release):
-    views = DUSt3RViews(small_release, pairs="adjacent")
+def test_dust3rs_base_class_crops_the_views(indexed_release):
+    views = DUSt3RViews(indexed_release, pairs="adjacent")
     dataset = TrainedOnDUSt3R(views, split="train", resolution=(48, 32))
     whole, cropped = views[7], dataset[7]
 
@@ -214,8 +214,8 @@ def test_dust3rs_base_class_crops_the_views(small_release):
         assert after["camera_intrinsics"][0, 2] == before["camera_intrinsics"][0, 2] - 4
 
 
-def test_more_than_two_views_are_what_the_base_expects(small_release):
-    views = DUSt3RViews(small_release, cameras="all")
+def test_more_than_two_views_are_what_the_base_expects(indexed_release):
+    views = DUSt3RViews(indexed_release, cameras="all")
 
     assert len(TrainedOnDUSt3R(views, resolution=(16, 16))[0]) == 6
 
@@ -240,8 +240,8 @@ class TrainedOnCUT3R(DUSt3RMixin, CUT3RBase):
     pass
 
 
-def test_cut3r_is_given_as_many_views_of_a_moment_as_it_asks_for(small_release):
-    views = DUSt3RViews(small_release, cameras="all", frames="all")
+def test_cut3r_is_given_as_many_views_of_a_moment_as_it_asks_for(indexed_release):
+    views = DUSt3RViews(indexed_release, cameras="all", frames="all")
     dataset = TrainedOnCUT3R(views, num_views=4, resolution=(16, 16))
     drawn = [dataset[number, 3] for number in range(8)]
 
@@ -255,9 +255,9 @@ def test_cut3r_is_given_as_many_views_of_a_moment_as_it_asks_for(small_release):
         assert found[0]["quantile"].dtype == np.float32
 
 
-def test_more_views_than_there_are_cannot_be_asked_for(small_release):
+def test_more_views_than_there_are_cannot_be_asked_for(indexed_release):
     with pytest.raises(SelectionError, match=r"num_views=3, but the views are lists of 2"):
-        TrainedOnCUT3R(DUSt3RViews(small_release), num_views=3, resolution=(16, 16))
+        TrainedOnCUT3R(DUSt3RViews(indexed_release), num_views=3, resolution=(16, 16))
 
 
 @pytest.mark.parametrize("centre_px", [0.0, 0.5])
@@ -276,8 +276,8 @@ def test_vggt_unprojects_to_the_points_of_the_record(detailed_release, moment, c
             assert np.abs(found - points)[mask].max() < 1e-5
 
 
-def test_a_record_of_vggt_stacks_as_its_composed_dataset_stacks_it(small_release):
-    record = VGGTViews(small_release, size=(32, 48)).get_data(seq_index=1, img_per_seq=4)
+def test_a_record_of_vggt_stacks_as_its_composed_dataset_stacks_it(indexed_release):
+    record = VGGTViews(indexed_release, size=(32, 48)).get_data(seq_index=1, img_per_seq=4)
     expected = {
         "images": ((4, 32, 48, 3), np.uint8),
         "depths": ((4, 32, 48), np.float32),
@@ -298,8 +298,10 @@ def test_a_record_of_vggt_stacks_as_its_composed_dataset_stacks_it(small_release
     assert record["seq_name"] == "StereoGenBench_train/Uniform/SynthStage/scene_000000/000"
 
 
-def test_views_are_drawn_by_torchs_generator_without_repeats_while_there_are_enough(small_release):
-    views = VGGTViews(small_release)
+def test_views_are_drawn_by_torchs_generator_without_repeats_while_there_are_enough(
+    indexed_release,
+):
+    views = VGGTViews(indexed_release)
     draws = []
     for seed in (0, 0, 1):
         torch.manual_seed(seed)
@@ -311,10 +313,10 @@ def test_views_are_drawn_by_torchs_generator_without_repeats_while_there_are_eno
     assert len(views.get_data(seq_index=0, img_per_seq=9)["ids"]) == 9
 
 
-def test_the_views_of_a_record_are_those_of_its_ids(small_release):
-    views = VGGTViews(small_release, sequence="scene", frames=[1, 5], **UNIFORM)
+def test_the_views_of_a_record_are_those_of_its_ids(indexed_release):
+    views = VGGTViews(indexed_release, sequence="scene", frames=[1, 5], **UNIFORM)
     record = views.get_data(seq_index=1, ids=[7, 0, 7])
-    expected = SceneViews(small_release, frames=[1, 5], split="train", **UNIFORM)
+    expected = SceneViews(indexed_release, frames=[1, 5], split="train", **UNIFORM)
 
     np.testing.assert_array_equal(record["images"][1], expected[2]["image"][0].permute(1, 2, 0))
     for place in (0, 2):
@@ -324,9 +326,9 @@ def test_the_views_of_a_record_are_those_of_its_ids(small_release):
     assert np.abs(centre).max() < 1e-12
 
 
-def test_a_scene_as_a_sequence_has_all_its_frames(small_release):
-    scenes = VGGTViews(small_release, sequence="scene", frames="all", cameras=(0, 5))
-    moments = VGGTViews(small_release, frames="all", cameras=(0, 5))
+def test_a_scene_as_a_sequence_has_all_its_frames(indexed_release):
+    scenes = VGGTViews(indexed_release, sequence="scene", frames="all", cameras=(0, 5))
+    moments = VGGTViews(indexed_release, frames="all", cameras=(0, 5))
 
     assert (len(scenes), scenes.view_count(0), len(moments), moments.view_count(0)) == (
         3,
@@ -339,8 +341,8 @@ def test_a_scene_as_a_sequence_has_all_its_frames(small_release):
 
 
 @pytest.mark.parametrize("sequence", ["moment", "scene"])
-def test_a_sequence_is_found_by_its_name(small_release, sequence):
-    views = VGGTViews(small_release, sequence=sequence, frames=[0, 3, 5])
+def test_a_sequence_is_found_by_its_name(indexed_release, sequence):
+    views = VGGTViews(indexed_release, sequence=sequence, frames=[0, 3, 5])
 
     for number in range(len(views)):
         by_number = views.get_data(seq_index=number, ids=[2])
@@ -349,8 +351,8 @@ def test_a_sequence_is_found_by_its_name(small_release, sequence):
         np.testing.assert_array_equal(by_name["images"][0], by_number["images"][0])
 
 
-def test_numbers_beyond_the_last_sequence_begin_anew(small_release):
-    views = VGGTViews(small_release)
+def test_numbers_beyond_the_last_sequence_begin_anew(indexed_release):
+    views = VGGTViews(indexed_release)
 
     assert (
         views.get_data(seq_index=3, ids=[0])["seq_name"]
@@ -370,9 +372,9 @@ def test_numbers_beyond_the_last_sequence_begin_anew(small_release):
         ({}, r"give seq_index or seq_name"),
     ],
 )
-def test_what_a_sequence_does_not_have_is_refused(small_release, asked, message):
+def test_what_a_sequence_does_not_have_is_refused(indexed_release, asked, message):
     with pytest.raises(SelectionError, match=message):
-        VGGTViews(small_release).get_data(**asked)
+        VGGTViews(indexed_release).get_data(**asked)
 
 
 @pytest.mark.parametrize(
@@ -383,27 +385,29 @@ def test_what_a_sequence_does_not_have_is_refused(small_release, asked, message)
         ({"cameras": (0, 9)}, r"cameras must be"),
     ],
 )
-def test_sequences_that_cannot_be_made_are_refused(small_release, options, message):
+def test_sequences_that_cannot_be_made_are_refused(indexed_release, options, message):
     with pytest.raises(SelectionError, match=message):
-        VGGTViews(small_release, **options)
+        VGGTViews(indexed_release, **options)
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.5])
-def test_the_pixel_centre_is_that_of_the_vggt_that_is_installed(small_release, monkeypatch, shift):
+def test_the_pixel_centre_is_that_of_the_vggt_that_is_installed(
+    indexed_release, monkeypatch, shift
+):
     geometry = ModuleType("vggt.utils.geometry")
     geometry.depth_to_cam_coords_points = lambda depth, k: points_at(shift, depth, k)
     for name in ("vggt", "vggt.utils"):
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
     monkeypatch.setitem(sys.modules, "vggt.utils.geometry", geometry)
-    record = VGGTViews(small_release).get_data(seq_index=0, ids=[0])
+    record = VGGTViews(indexed_release).get_data(seq_index=0, ids=[0])
 
     assert record["intrinsics"][0][0, 2] == 32 - 0.5 + shift
 
 
-def test_without_an_installed_vggt_pixel_centres_are_whole_numbers(small_release, monkeypatch):
+def test_without_an_installed_vggt_pixel_centres_are_whole_numbers(indexed_release, monkeypatch):
     monkeypatch.setitem(sys.modules, "vggt.utils.geometry", None)
 
-    record = VGGTViews(small_release).get_data(seq_index=0, ids=[0])
+    record = VGGTViews(indexed_release).get_data(seq_index=0, ids=[0])
     assert record["intrinsics"][0][0, 2] == 31.5
 
 
@@ -448,8 +452,8 @@ def configuration(**changed):
     return SimpleNamespace(**(usual | changed))
 
 
-def test_vggts_base_class_crops_the_views(small_release):
-    views = VGGTViews(small_release)
+def test_vggts_base_class_crops_the_views(indexed_release):
+    views = VGGTViews(indexed_release)
     dataset = TrainedOnVGGT(configuration(), views=views, len_train=100)
     record = dataset[17, 3, 0.5]
     plain = views.get_data(seq_index=17, ids=record["ids"])
@@ -464,8 +468,8 @@ def test_vggts_base_class_crops_the_views(small_release):
         assert record["original_sizes"][number].tolist() == [64, 64]
 
 
-def test_vggts_configuration_decides_whether_views_are_drawn_twice(small_release):
-    views = VGGTViews(small_release)
+def test_vggts_configuration_decides_whether_views_are_drawn_twice(indexed_release):
+    views = VGGTViews(indexed_release)
     once = TrainedOnVGGT(configuration(allow_duplicate_img=False), views=views)
 
     assert sorted(once[0, 6, 1.0]["ids"].tolist()) == [0, 1, 2, 3, 4, 5]
@@ -475,14 +479,14 @@ def test_vggts_configuration_decides_whether_views_are_drawn_twice(small_release
     assert len(twice[0, 24, 1.0]["ids"]) == 24
 
 
-def test_vggts_configuration_decides_whether_the_number_of_a_sequence_counts(small_release):
-    dataset = TrainedOnVGGT(configuration(inside_random=True), views=VGGTViews(small_release))
+def test_vggts_configuration_decides_whether_the_number_of_a_sequence_counts(indexed_release):
+    dataset = TrainedOnVGGT(configuration(inside_random=True), views=VGGTViews(indexed_release))
     torch.manual_seed(0)
 
     assert len({dataset[0, 1, 1.0]["seq_name"] for _ in range(30)}) == 3
 
 
-def test_workers_of_a_loader_draw_different_views(small_release):
+def test_workers_of_a_loader_draw_different_views(indexed_release):
     class Numbered(torch.utils.data.Dataset):
         def __len__(self):
             return 8
@@ -490,7 +494,7 @@ def test_workers_of_a_loader_draw_different_views(small_release):
         def __getitem__(self, number):
             return views.get_data(seq_index=0, img_per_seq=4)["ids"]
 
-    views = VGGTViews(small_release)
+    views = VGGTViews(indexed_release)
     loader = torch.utils.data.DataLoader(
         Numbered(), batch_size=4, num_workers=2, multiprocessing_context="fork"
     )
@@ -500,8 +504,8 @@ def test_workers_of_a_loader_draw_different_views(small_release):
 
 
 @pytest.mark.parametrize("views_of", [DUSt3RViews, VGGTViews])
-def test_views_travel_to_processes_that_are_started_afresh(small_release, views_of):
-    views = views_of(small_release, frames=[0, 1])
+def test_views_travel_to_processes_that_are_started_afresh(indexed_release, views_of):
+    views = views_of(indexed_release, frames=[0, 1])
     travelled = ForkingPickler.loads(ForkingPickler.dumps(views))
 
     assert len(travelled) == len(views) == 6

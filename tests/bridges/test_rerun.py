@@ -39,11 +39,11 @@ def read_back(path):
 
 
 @pytest.fixture(scope="module")
-def recorded(rerun, small_release, tmp_path_factory):
+def recorded(rerun, indexed_release, tmp_path_factory):
     path = tmp_path_factory.mktemp("recording") / "scene.rrd"
     done = []
     key = bridge.write_recording(
-        path, small_release, "scene_000001", frames=[0, 4], pair=(1, 4),
+        path, indexed_release, "scene_000001", frames=[0, 4], pair=(1, 4),
         progress=lambda *counts: done.append(counts),
     )  # fmt: skip
     assert (key, done[-1]) == (SCENE, (2, 2))
@@ -51,8 +51,8 @@ def recorded(rerun, small_release, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def views(small_release):
-    return SceneViews(small_release, scenes=SCENE, frames=[0, 4])
+def views(indexed_release):
+    return SceneViews(indexed_release, scenes=SCENE, frames=[0, 4])
 
 
 def image_of(value, frame_format, dtype):
@@ -106,8 +106,8 @@ def test_pictures_are_those_of_the_cameras(recorded, views):
             assert np.abs(picture - expected).mean() < 6
 
 
-def test_disparity_is_that_of_the_pair(recorded, small_release):
-    pairs = StereoPairs(small_release, scenes=SCENE, pairs=[(1, 4)], frames=[0, 4])
+def test_disparity_is_that_of_the_pair(recorded, indexed_release):
+    pairs = StereoPairs(indexed_release, scenes=SCENE, pairs=[(1, 4)], frames=[0, 4])
     formats = recorded["/pair/disparity", "DepthImage:format"]
 
     for number, frame in enumerate((0, 4)):
@@ -123,9 +123,9 @@ def test_a_text_says_what_is_shown(recorded):
         assert fact.replace("_", "\\_") in text or fact in text
 
 
-def test_the_time_of_a_frame_follows_from_its_rate(rerun, small_release, tmp_path):
+def test_the_time_of_a_frame_follows_from_its_rate(rerun, indexed_release, tmp_path):
     chunks = require_module("rerun.chunk")
-    bridge.write_recording(tmp_path / "a.rrd", small_release, frames=[3], size=(16, 16))
+    bridge.write_recording(tmp_path / "a.rrd", indexed_release, frames=[3], size=(16, 16))
     times = set()
     for chunk in chunks.RrdReader(tmp_path / "a.rrd").stream():
         batch = chunk.to_record_batch()
@@ -137,12 +137,12 @@ def test_the_time_of_a_frame_follows_from_its_rate(rerun, small_release, tmp_pat
 
 
 def test_wide_pictures_are_made_smaller_unless_a_size_is_asked_for(
-    rerun, small_release, tmp_path, monkeypatch
+    rerun, indexed_release, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(bridge, "USUAL_WIDTH_PX", 40)
     sizes = []
     for size in (None, (50, 60)):
-        bridge.write_recording(tmp_path / "a.rrd", small_release, frames="first", size=size)
+        bridge.write_recording(tmp_path / "a.rrd", indexed_release, frames="first", size=size)
         (resolution,) = read_back(tmp_path / "a.rrd")[
             "/world/cam_00", "Pinhole:resolution"
         ].values()
@@ -151,10 +151,10 @@ def test_wide_pictures_are_made_smaller_unless_a_size_is_asked_for(
     assert sizes == [[40, 40], [60, 50]]
 
 
-def test_a_recording_of_ones_own_takes_a_scene(rerun, small_release, tmp_path):
+def test_a_recording_of_ones_own_takes_a_scene(rerun, indexed_release, tmp_path):
     recording = rerun.RecordingStream("mine")
     recording.save(tmp_path / "mine.rrd")
-    key = bridge.log_scene(recording, small_release, SCENE, frames="first", size=(16, 16))
+    key = bridge.log_scene(recording, indexed_release, SCENE, frames="first", size=(16, 16))
     recording.disconnect()
 
     assert key == SCENE
@@ -171,58 +171,58 @@ def test_a_recording_of_ones_own_takes_a_scene(rerun, small_release, tmp_path):
     ],
 )
 def test_what_a_scene_does_not_have_is_refused_and_the_file_that_was_there_stays(
-    rerun, small_release, tmp_path, asked, message
+    rerun, indexed_release, tmp_path, asked, message
 ):
     path = tmp_path / "a.rrd"
     path.write_bytes(b"before")
 
     with pytest.raises(SelectionError, match=message):
-        bridge.write_recording(path, small_release, **asked)
+        bridge.write_recording(path, indexed_release, **asked)
     assert [each.name for each in tmp_path.iterdir()] == ["a.rrd"]
     assert path.read_bytes() == b"before"
 
 
-def test_a_full_disk_is_named_and_the_file_that_was_there_stays(rerun, small_release, tmp_path):
+def test_a_full_disk_is_named_and_the_file_that_was_there_stays(rerun, indexed_release, tmp_path):
     with small_disk(tmp_path / "disk", size="100k") as disk:
         (disk / "a.rrd").write_bytes(b"before")
         with pytest.raises(StorageError, match=r"a\.rrd: cannot be written .*Make room"):
-            bridge.write_recording(disk / "a.rrd", small_release)
+            bridge.write_recording(disk / "a.rrd", indexed_release)
         assert [each.name for each in disk.iterdir()] == ["a.rrd"]
         assert (disk / "a.rrd").read_bytes() == b"before"
 
 
-def test_a_folder_that_is_not_there_is_named(rerun, small_release, tmp_path):
+def test_a_folder_that_is_not_there_is_named(rerun, indexed_release, tmp_path):
     with pytest.raises(StorageError, match=r"a\.rrd: cannot be written .*another place"):
-        bridge.write_recording(tmp_path / "none" / "a.rrd", small_release, frames="first")
+        bridge.write_recording(tmp_path / "none" / "a.rrd", indexed_release, frames="first")
 
 
-def test_without_rerun_the_extra_is_named(small_release, tmp_path, monkeypatch):
+def test_without_rerun_the_extra_is_named(indexed_release, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
 
     for call in (
-        lambda: bridge.write_recording(tmp_path / "a.rrd", small_release),
-        lambda: bridge.view_live(small_release),
-        lambda: bridge.log_scene(None, small_release),
+        lambda: bridge.write_recording(tmp_path / "a.rrd", indexed_release),
+        lambda: bridge.view_live(indexed_release),
+        lambda: bridge.log_scene(None, indexed_release),
     ):
         with pytest.raises(ExtraError, match=r"stereogenbench-data\[rerun\]"):
             call()
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_viewer_that_does_not_start_is_named(rerun, small_release, monkeypatch):
+def test_a_viewer_that_does_not_start_is_named(rerun, indexed_release, monkeypatch):
     def refuse(**_options):
         raise RuntimeError("Failed to find Rerun Viewer executable in PATH.\nInstall it ...")
 
     monkeypatch.setattr(rerun, "spawn", refuse)
     with pytest.raises(ExtraError, match=r"viewer cannot be reached \(Failed .*an \.rrd file"):
-        bridge.view_live(small_release)
+        bridge.view_live(indexed_release)
 
 
-def test_the_viewer_is_sent_the_scene(rerun, small_release, tmp_path, monkeypatch):
+def test_the_viewer_is_sent_the_scene(rerun, indexed_release, tmp_path, monkeypatch):
     def save_instead(*, recording, executable_path):
         recording.save(tmp_path / "live.rrd")
 
     monkeypatch.setattr(rerun, "spawn", save_instead)
-    bridge.view_live(small_release, SCENE, frames=[1], size=(16, 16))
+    bridge.view_live(indexed_release, SCENE, frames=[1], size=(16, 16))
 
     assert 1 in read_back(tmp_path / "live.rrd")["/world/cam_05/depth", "DepthImage:buffer"]

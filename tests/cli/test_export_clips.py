@@ -18,8 +18,8 @@ def records(out):
     return [json.loads(line) for line in (out / "clips.jsonl").read_text().splitlines()]
 
 
-def test_it_says_what_was_written_and_what_was_there(small_release, tmp_path):
-    words = [small_release, tmp_path / "out", "--layout", "musubi", "--split", "train"]
+def test_it_says_what_was_written_and_what_was_there(indexed_release, tmp_path):
+    words = [indexed_release, tmp_path / "out", "--layout", "musubi", "--split", "train"]
     words += ["--workers", "1", "--preset", "ultrafast"]
 
     first, again = run(*words), run(*words, "--json")
@@ -31,9 +31,9 @@ def test_it_says_what_was_written_and_what_was_there(small_release, tmp_path):
     assert told["manifests"] == ["clips.jsonl", "dataset.toml"]
 
 
-def test_every_option_reaches_the_export(small_release, tmp_path):
+def test_every_option_reaches_the_export(indexed_release, tmp_path):
     shown = run(
-        small_release, tmp_path / "out", "--layout", "diffsynth", "--family", "Uniform",
+        indexed_release, tmp_path / "out", "--layout", "diffsynth", "--family", "Uniform",
         "--split", "train", "--pairs", "0-1,1-2", "--baseline-cm", "0", "500", "--length", "3",
         "--stride", "2", "--step", "1", "--any-length", "--size", "48x32", "--fit", "crop",
         "--rate-hz", "16",
@@ -57,8 +57,8 @@ def test_every_option_reaches_the_export(small_release, tmp_path):
     assert "unit_m=0.2" in settings["depth"]
 
 
-def test_evaluation_scenes_are_left_out_unless_their_split_is_named(small_release, tmp_path):
-    words = [small_release, tmp_path / "out", "--layout", "stereocrafter", "--workers", "1"]
+def test_evaluation_scenes_are_left_out_unless_their_split_is_named(indexed_release, tmp_path):
+    words = [indexed_release, tmp_path / "out", "--layout", "stereocrafter", "--workers", "1"]
     words += ["--preset", "ultrafast"]
 
     plain = run(*words)
@@ -88,8 +88,8 @@ def test_evaluation_scenes_are_left_out_unless_their_split_is_named(small_releas
         (["--family", "Narrow"], ["family", "Narrow", "Uniform"]),
     ],
 )
-def test_what_cannot_be_is_refused_with_its_cure(small_release, tmp_path, words, said):
-    shown = run(small_release, tmp_path / "out", "--layout", "musubi", "--split", "train", *words)
+def test_what_cannot_be_is_refused_with_its_cure(indexed_release, tmp_path, words, said):
+    shown = run(indexed_release, tmp_path / "out", "--layout", "musubi", "--split", "train", *words)
 
     assert shown.exit_code == 2, shown.output
     text = " ".join(shown.stderr.replace("│", " ").split())

@@ -40,9 +40,9 @@ def test_every_layout_has_an_example_that_parses_and_says_what_its_options_are(n
     ],
 )
 def test_training_scenes_are_exported_and_those_left_out_are_counted(
-    small_release, tmp_path, name, file
+    indexed_release, tmp_path, name, file
 ):
-    done = run("export", name, small_release, tmp_path, *USUAL)
+    done = run("export", name, indexed_release, tmp_path, *USUAL)
 
     assert done.exit_code == 0, done.output
     assert done.stdout == f"{tmp_path}: 3 folders\n"
@@ -51,17 +51,17 @@ def test_training_scenes_are_exported_and_those_left_out_are_counted(
     assert (folder / file).is_file()
 
 
-def test_evaluation_scenes_are_exported_if_the_split_names_them(small_release, tmp_path):
-    done = run("export", "ply", small_release, tmp_path, *USUAL, "--split", "eval")
+def test_evaluation_scenes_are_exported_if_the_split_names_them(indexed_release, tmp_path):
+    done = run("export", "ply", indexed_release, tmp_path, *USUAL, "--split", "eval")
 
     assert done.stdout == f"{tmp_path}: 1 folder\n"
     assert "left out" not in done.stderr
 
 
-def test_filters_cameras_frames_group_and_points_are_taken(small_release, tmp_path):
+def test_filters_cameras_frames_group_and_points_are_taken(indexed_release, tmp_path):
     done = run(
-        "export", "ply", small_release, tmp_path, *USUAL, "--family", "Uniform", "--cameras", "0,5",
-        "--frames", "every:3", "--group", "scene", "--points", "all",
+        "export", "ply", indexed_release, tmp_path, *USUAL, "--family", "Uniform",
+        "--cameras", "0,5", "--frames", "every:3", "--group", "scene", "--points", "all",
     )  # fmt: skip
     settings = json.loads((tmp_path / "export.json").read_text())
 
@@ -72,16 +72,16 @@ def test_filters_cameras_frames_group_and_points_are_taken(small_release, tmp_pa
     assert settings["frames"] == [[0, 3, 6]]
 
 
-def test_evaluation_scenes_that_would_not_match_are_not_counted(small_release, tmp_path):
-    done = run("export", "ply", small_release, tmp_path, *USUAL, "--family", "IPD_Gaussian")
+def test_evaluation_scenes_that_would_not_match_are_not_counted(indexed_release, tmp_path):
+    done = run("export", "ply", indexed_release, tmp_path, *USUAL, "--family", "IPD_Gaussian")
 
     assert done.stdout == f"{tmp_path}: 1 folder\n"
     assert "left out" not in done.stderr
 
 
-def test_the_same_command_again_finds_all_done(small_release, tmp_path):
-    first = run("export", "colmap", small_release, tmp_path, *USUAL, "--points", "5")
-    again = run("export", "colmap", small_release, tmp_path, *USUAL, "--points", "5")
+def test_the_same_command_again_finds_all_done(indexed_release, tmp_path):
+    first = run("export", "colmap", indexed_release, tmp_path, *USUAL, "--points", "5")
+    again = run("export", "colmap", indexed_release, tmp_path, *USUAL, "--points", "5")
 
     assert first.stdout == again.stdout == f"{tmp_path}: 3 folders\n"
 
@@ -95,8 +95,8 @@ def test_the_same_command_again_finds_all_done(small_release, tmp_path):
         (["--size", "big"], "size must be WIDTHxHEIGHT"),
     ],
 )
-def test_a_text_that_is_not_understood_is_named(small_release, tmp_path, options, message):
-    done = run("export", "ply", small_release, tmp_path / "out", *options)
+def test_a_text_that_is_not_understood_is_named(indexed_release, tmp_path, options, message):
+    done = run("export", "ply", indexed_release, tmp_path / "out", *options)
 
     assert done.exit_code == 2
     assert message in " ".join(done.output.replace("│", " ").split())
@@ -106,12 +106,12 @@ def test_a_text_that_is_not_understood_is_named(small_release, tmp_path, options
 @pytest.mark.parametrize(
     "options", [["--rerun"], ["-o", "scene_000001.rrd"]], ids=["by its key", "by its ending"]
 )
-def test_a_recording_is_written(small_release, tmp_path, monkeypatch, options):
+def test_a_recording_is_written(indexed_release, tmp_path, monkeypatch, options):
     require_module("rerun")
     monkeypatch.chdir(tmp_path)
     key = "train/Uniform/SynthStage/scene_000001"
     name = options[1] if "-o" in options else f"{key.replace('/', '_')}.rrd"
-    done = run("show", small_release, "scene_000001", "--size", "16", "--pair", "0-2", *options)
+    done = run("show", indexed_release, "scene_000001", "--size", "16", "--pair", "0-2", *options)
 
     assert (done.exit_code, done.stdout) == (0, f"{name}: {key}\n"), done.output
     assert (tmp_path / name).read_bytes().startswith(b"RRF")
@@ -124,8 +124,8 @@ def test_a_recording_is_written(small_release, tmp_path, monkeypatch, options):
         (["--rerun", "--live", "-o", "a.rrd"], "a.rrd: --live writes no file"),
     ],
 )
-def test_a_file_that_is_no_recording_is_refused(small_release, options, message):
-    done = run("show", small_release, *options)
+def test_a_file_that_is_no_recording_is_refused(indexed_release, options, message):
+    done = run("show", indexed_release, *options)
 
     assert done.exit_code == 2
     assert message in " ".join(done.output.replace("│", " ").split())

@@ -414,17 +414,17 @@ def test_pairs_must_be_of_two_views_of_the_batch(pairs):
     ],
     ids=["resized", "cropped, of late depth"],
 )
-def test_batches_of_a_loader_become_the_pairs_of_the_dataset(small_release, options):
+def test_batches_of_a_loader_become_the_pairs_of_the_dataset(indexed_release, options):
     fields = (
         "left", "right", "disparity", "valid", "visible", "warped_right", "baseline_m", "pair",
     )  # fmt: skip
     options |= {"split": "train", "family": "Uniform"}
-    moments = SceneViews(small_release, fields=DERIVE_FIELDS, **options)
+    moments = SceneViews(indexed_release, fields=DERIVE_FIELDS, **options)
     loader = moments.loader(batch_size=2, num_workers=1, order="sequential")
 
     made = [derive(batch, fields=fields) for batch in loader]
 
-    pairs = StereoPairs(small_release, fields=fields, pairs="all", **options)
+    pairs = StereoPairs(indexed_release, fields=fields, pairs="all", **options)
     for name in fields:
         found = torch.cat([batch[name] for batch in made]).flatten(0, 1)
         expected = torch.stack([pairs[number][name] for number in range(len(pairs))])
@@ -432,17 +432,17 @@ def test_batches_of_a_loader_become_the_pairs_of_the_dataset(small_release, opti
 
 
 @pytest.mark.parametrize("transform", [Letterbox(48, 96), Eraser(probability=1)], ids=repr)
-def test_stored_depth_cannot_tell_what_a_transform_hid(small_release, transform):
-    moments = SceneViews(small_release, fields=("stored_depth",), transform=transform)
+def test_stored_depth_cannot_tell_what_a_transform_hid(indexed_release, transform):
+    moments = SceneViews(indexed_release, fields=("stored_depth",), transform=transform)
 
     with pytest.raises(FieldError, match=r"/scene_\d+: stored_depth does not tell.*StereoPairs"):
         moments[0]
 
 
-def test_a_contract_without_a_number_for_no_depth_is_refused_where_it_needs_one(small_release):
+def test_a_contract_without_a_number_for_no_depth_is_refused_where_it_needs_one(indexed_release):
     depth = DepthEncoding(no_depth=(), frame_lag=1)
     moments = SceneViews(
-        small_release, fields=("stored_depth", "no_depth"), depth=depth, frames=[5, 6]
+        indexed_release, fields=("stored_depth", "no_depth"), depth=depth, frames=[5, 6]
     )
 
     assert moments[0]["no_depth"].tolist() == [-1] * 6

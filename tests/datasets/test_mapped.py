@@ -52,9 +52,9 @@ def shape_of(field, *, height, width, views=1):
 
 
 @pytest.mark.parametrize("name", EVERY_FIELD)
-def test_a_pair_field_alone_is_as_its_table_says(small_release, name):
+def test_a_pair_field_alone_is_as_its_table_says(indexed_release, name):
     field = PAIR_FIELDS[name]
-    value = StereoPairs(small_release, fields=[name], size=(40, 48))[0][name]
+    value = StereoPairs(indexed_release, fields=[name], size=(40, 48))[0][name]
 
     if field.dtype == "str":
         assert isinstance(value, str)
@@ -64,10 +64,10 @@ def test_a_pair_field_alone_is_as_its_table_says(small_release, name):
 
 
 @pytest.mark.parametrize("name", VIEW_FIELDS)
-def test_a_view_field_is_as_its_table_says_with_the_views_in_front(small_release, name):
+def test_a_view_field_is_as_its_table_says_with_the_views_in_front(indexed_release, name):
     field = VIEW_FIELDS[name]
-    stacked = SceneViews(small_release, cameras=(0, 3, 5), fields=[name], size=(40, 48))[0][name]
-    alone = SceneViews(small_release, cameras="each", fields=[name], size=(40, 48))[2][name]
+    stacked = SceneViews(indexed_release, cameras=(0, 3, 5), fields=[name], size=(40, 48))[0][name]
+    alone = SceneViews(indexed_release, cameras="each", fields=[name], size=(40, 48))[2][name]
 
     if field.dtype == "str":
         assert isinstance(stacked, str)
@@ -79,10 +79,10 @@ def test_a_view_field_is_as_its_table_says_with_the_views_in_front(small_release
 
 
 @pytest.mark.parametrize("name", EVERY_FIELD)
-def test_clips_have_a_time_axis_and_sweeps_an_axis_of_targets(small_release, name):
+def test_clips_have_a_time_axis_and_sweeps_an_axis_of_targets(indexed_release, name):
     field = PAIR_FIELDS[name]
-    clip = StereoPairs(small_release, fields=[name], frames=("clips", 4))[0][name]
-    sweep = StereoPairs(small_release, fields=[name], pairs="sweep", frames=("clips", 4))[0][name]
+    clip = StereoPairs(indexed_release, fields=[name], frames=("clips", 4))[0][name]
+    sweep = StereoPairs(indexed_release, fields=[name], pairs="sweep", frames=("clips", 4))[0][name]
 
     if field.dtype != "str":
         shape = shape_of(field, height=64, width=64)
@@ -91,13 +91,13 @@ def test_clips_have_a_time_axis_and_sweeps_an_axis_of_targets(small_release, nam
         assert tuple(sweep.shape) == ((5, *timed) if field.per_target else timed)
 
 
-def test_a_clip_holds_the_frames_that_single_samples_hold(small_release):
+def test_a_clip_holds_the_frames_that_single_samples_hold(indexed_release):
     options = {
         "fields": [name for name in EVERY_FIELD if not name.startswith("__")],
         "pairs": [(1, 4)],
     }
-    clip = StereoPairs(small_release, frames=("clips", 3, 2), **options)[0]
-    singles = [StereoPairs(small_release, frames=frame, **options)[0] for frame in (0, 2, 4)]
+    clip = StereoPairs(indexed_release, frames=("clips", 3, 2), **options)[0]
+    singles = [StereoPairs(indexed_release, frames=frame, **options)[0] for frame in (0, 2, 4)]
 
     for name, field in PAIR_FIELDS.items():
         if name in clip and field.dtype != "str" and field.per_frame:
@@ -105,17 +105,17 @@ def test_a_clip_holds_the_frames_that_single_samples_hold(small_release):
             assert torch.equal(clip[name], expected), name
 
 
-def test_a_sweep_holds_the_pairs_that_single_samples_hold(small_release):
-    sweep = StereoPairs(small_release, fields=EVERY_FIELD, pairs="sweep")[0]
+def test_a_sweep_holds_the_pairs_that_single_samples_hold(indexed_release):
+    sweep = StereoPairs(indexed_release, fields=EVERY_FIELD, pairs="sweep")[0]
     for place, right in enumerate(range(1, 6)):
-        single = StereoPairs(small_release, fields=EVERY_FIELD, pairs=[(0, right)])[0]
+        single = StereoPairs(indexed_release, fields=EVERY_FIELD, pairs=[(0, right)])[0]
         for name, field in PAIR_FIELDS.items():
             if field.per_target:
                 assert torch.equal(sweep[name][place], single[name]), name
 
 
-def test_the_primary_pair_of_the_first_frame_is_the_default(small_release):
-    pairs = StereoPairs(small_release)
+def test_the_primary_pair_of_the_first_frame_is_the_default(indexed_release):
+    pairs = StereoPairs(indexed_release)
 
     assert len(pairs) == 4
     assert [pairs[number]["pair"].tolist() for number in range(4)] == [[0, 1]] * 4
@@ -124,8 +124,8 @@ def test_the_primary_pair_of_the_first_frame_is_the_default(small_release):
     assert pairs[0]["__key__"].endswith("/00-01/000")
 
 
-def test_torchs_own_collate_takes_every_field(small_release):
-    pairs = StereoPairs(small_release, fields=EVERY_FIELD, pairs="adjacent")
+def test_torchs_own_collate_takes_every_field(indexed_release):
+    pairs = StereoPairs(indexed_release, fields=EVERY_FIELD, pairs="adjacent")
     batch = next(iter(DataLoader(pairs, batch_size=3)))
 
     assert batch["left"].shape == (3, 3, 64, 64)
@@ -134,9 +134,9 @@ def test_torchs_own_collate_takes_every_field(small_release):
 
 
 @pytest.mark.parametrize("context", ["fork", "spawn", "forkserver"])
-def test_workers_of_every_kind_give_what_the_main_process_gives(small_release, context):
+def test_workers_of_every_kind_give_what_the_main_process_gives(indexed_release, context):
     pairs = StereoPairs(
-        small_release,
+        indexed_release,
         pairs="adjacent",
         frames=("every", 3),
         transform=Compose([HorizontalFlip(), RandomCrop(32, 48), ColorJitter(), Eraser(1.0)]),
@@ -154,18 +154,18 @@ def test_workers_of_every_kind_give_what_the_main_process_gives(small_release, c
     pairs.close()
 
 
-def test_random_access_gives_what_reading_in_order_gives(small_release):
-    pairs = StereoPairs(small_release, pairs="all", frames="all", fields=("left", "depth_right"))
+def test_random_access_gives_what_reading_in_order_gives(indexed_release):
+    pairs = StereoPairs(indexed_release, pairs="all", frames="all", fields=("left", "depth_right"))
     order = np.random.default_rng(0).permutation(len(pairs))[:60]
     forwards = {int(number): pairs[int(number)] for number in sorted(order)}
 
-    with closing(StereoPairs(small_release, pairs="all", frames="all",
+    with closing(StereoPairs(indexed_release, pairs="all", frames="all",
                              fields=("left", "depth_right"))) as again:  # fmt: skip
         assert all(same(again[int(number)], forwards[int(number)]) for number in order)
 
 
-def test_a_batch_comes_in_the_order_requested_though_it_is_read_forwards(small_release):
-    pairs = StereoPairs(small_release, frames="all", fields=("frame_index", "__key__"))
+def test_a_batch_comes_in_the_order_requested_though_it_is_read_forwards(indexed_release):
+    pairs = StereoPairs(indexed_release, frames="all", fields=("frame_index", "__key__"))
     numbers = [9, 2, 20, 2, 0]
 
     found = [sample["__key__"] for sample in pairs.__getitems__(numbers)]
@@ -173,8 +173,8 @@ def test_a_batch_comes_in_the_order_requested_though_it_is_read_forwards(small_r
     assert found == [pairs[number]["__key__"] for number in numbers]
 
 
-def test_workers_that_persist_follow_set_epoch(small_release):
-    pairs = StereoPairs(small_release, frames=("random", 2), fields=("frame_index",), seed=5)
+def test_workers_that_persist_follow_set_epoch(indexed_release):
+    pairs = StereoPairs(indexed_release, frames=("random", 2), fields=("frame_index",), seed=5)
     loader = DataLoader(pairs, batch_size=None, num_workers=2, persistent_workers=True)
     epochs = []
     for epoch in range(3):
@@ -186,10 +186,10 @@ def test_workers_that_persist_follow_set_epoch(small_release):
     assert epochs[0] != epochs[1] != epochs[2]
 
 
-def test_transforms_draw_anew_each_epoch_and_the_same_for_the_same_seed(small_release):
+def test_transforms_draw_anew_each_epoch_and_the_same_for_the_same_seed(indexed_release):
     def crops(seed, epoch):
         pairs = StereoPairs(
-            small_release, fields=("intrinsics",), transform=RandomCrop(8, 8), seed=seed
+            indexed_release, fields=("intrinsics",), transform=RandomCrop(8, 8), seed=seed
         )
         pairs.set_epoch(epoch)
         return [tuple(pairs[number]["intrinsics"][:2, 2].tolist()) for number in range(4)]
@@ -199,15 +199,15 @@ def test_transforms_draw_anew_each_epoch_and_the_same_for_the_same_seed(small_re
     assert crops(0, 0) != crops(1, 0)
 
 
-def test_a_dataset_survives_pickling_with_videos_open(small_release):
-    pairs = StereoPairs(small_release, fields=EVERY_FIELD)
+def test_a_dataset_survives_pickling_with_videos_open(indexed_release):
+    pairs = StereoPairs(indexed_release, fields=EVERY_FIELD)
     first = pairs[0]
 
     assert same(pickle.loads(pickle.dumps(pairs))[0], first)
 
 
-def test_what_a_user_writes_into_a_sample_stays_there(small_release):
-    pairs = StereoPairs(small_release, fields=EVERY_FIELD)
+def test_what_a_user_writes_into_a_sample_stays_there(indexed_release):
+    pairs = StereoPairs(indexed_release, fields=EVERY_FIELD)
     untouched = pairs[0]
     for value in pairs[0].values():
         if isinstance(value, torch.Tensor):
@@ -216,8 +216,8 @@ def test_what_a_user_writes_into_a_sample_stays_there(small_release):
     assert same(pairs[0], untouched)
 
 
-def test_a_forked_child_reads_on_without_disturbing_its_parent(small_release):
-    pairs = StereoPairs(small_release, frames="all", fields=("left",))
+def test_a_forked_child_reads_on_without_disturbing_its_parent(indexed_release):
+    pairs = StereoPairs(indexed_release, frames="all", fields=("left",))
     expected = [pairs[number]["left"] for number in range(7)]
     pairs[0]
     child = os.fork()
@@ -230,8 +230,8 @@ def test_a_forked_child_reads_on_without_disturbing_its_parent(small_release):
     assert parent_right
 
 
-def test_an_error_in_a_worker_keeps_its_class_and_its_words(small_release, tmp_path):
-    broken = _copied(small_release, tmp_path)
+def test_an_error_in_a_worker_keeps_its_class_and_its_words(indexed_release, tmp_path):
+    broken = _copied(indexed_release, tmp_path)
     index = SceneIndex.open(broken)
     victim = next(broken.glob("train/IPD_Gaussian/*/*/cam_01_rgb.mp4"))
     victim.write_bytes(victim.read_bytes()[:-900] + bytes(900))
@@ -241,8 +241,8 @@ def test_an_error_in_a_worker_keeps_its_class_and_its_words(small_release, tmp_p
         list(DataLoader(pairs, num_workers=1, batch_size=2))
 
 
-def test_a_killed_worker_ends_the_loader_with_an_error(small_release):
-    pairs = StereoPairs(small_release, frames="all")
+def test_a_killed_worker_ends_the_loader_with_an_error(indexed_release):
+    pairs = StereoPairs(indexed_release, frames="all")
     batches = iter(DataLoader(pairs, num_workers=1, batch_size=1, prefetch_factor=1))
     next(batches)
     os.kill(batches._workers[0].pid, signal.SIGKILL)
@@ -283,27 +283,27 @@ def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():
     ids=str,
 )
 def test_what_cannot_be_had_is_refused_before_anything_is_read(
-    small_release, options, error, message
+    indexed_release, options, error, message
 ):
     with pytest.raises(error, match=message):
-        StereoPairs(small_release, **options)
+        StereoPairs(indexed_release, **options)
 
 
 @pytest.mark.parametrize("cameras", [(), (0, 0), (6,), "some", (0, "1")])
-def test_views_of_cameras_that_do_not_exist_are_refused(small_release, cameras):
+def test_views_of_cameras_that_do_not_exist_are_refused(indexed_release, cameras):
     with pytest.raises(SelectionError, match="cameras must be"):
-        SceneViews(small_release, cameras=cameras)
+        SceneViews(indexed_release, cameras=cameras)
 
 
-def test_views_refuse_a_flip(small_release):
+def test_views_refuse_a_flip(indexed_release):
     with pytest.raises(FieldError, match=r"SceneViews .*got HorizontalFlip"):
-        SceneViews(small_release, transform=HorizontalFlip())
+        SceneViews(indexed_release, transform=HorizontalFlip())
 
 
-def test_the_users_depth_contract_overrides_the_files(small_release):
-    stated = StereoPairs(small_release, fields=("depth", "disparity", "valid"))[0]
+def test_the_users_depth_contract_overrides_the_files(indexed_release):
+    stated = StereoPairs(indexed_release, fields=("depth", "disparity", "valid"))[0]
     doubled = StereoPairs(
-        small_release, fields=("depth", "disparity", "valid"), depth=DepthEncoding(unit_m=0.002)
+        indexed_release, fields=("depth", "disparity", "valid"), depth=DepthEncoding(unit_m=0.002)
     )[0]
 
     assert torch.equal(stated["valid"], doubled["valid"])
@@ -312,15 +312,15 @@ def test_the_users_depth_contract_overrides_the_files(small_release):
 
 
 @pytest.mark.parametrize("contract", [DepthEncoding(), DepthEncoding(accept=frozenset({"8-bit"}))])
-def test_a_contract_that_states_no_unit_keeps_the_files(small_release, contract):
-    stated = StereoPairs(small_release, fields=("depth",))[0]
+def test_a_contract_that_states_no_unit_keeps_the_files(indexed_release, contract):
+    stated = StereoPairs(indexed_release, fields=("depth",))[0]
 
-    assert torch.equal(StereoPairs(small_release, fields=("depth",), depth=contract)[0]["depth"],
+    assert torch.equal(StereoPairs(indexed_release, fields=("depth",), depth=contract)[0]["depth"],
                        stated["depth"])  # fmt: skip
 
 
-def test_threads_that_share_a_dataset_get_what_one_thread_gets(small_release):
-    pairs = StereoPairs(small_release, pairs="all", frames="all", fields=("left", "depth"))
+def test_threads_that_share_a_dataset_get_what_one_thread_gets(indexed_release):
+    pairs = StereoPairs(indexed_release, pairs="all", frames="all", fields=("left", "depth"))
     numbers = np.random.default_rng(0).integers(0, len(pairs), 600).tolist()
     expected = {number: pairs[number] for number in sorted(set(numbers))}
 
@@ -330,24 +330,24 @@ def test_threads_that_share_a_dataset_get_what_one_thread_gets(small_release):
     assert all(same(one, expected[number]) for one, number in zip(found, numbers, strict=True))
 
 
-def test_a_dataset_goes_on_after_a_change_of_folder(small_release, monkeypatch, tmp_path):
-    monkeypatch.chdir(small_release.parent)
-    pairs = StereoPairs(small_release.name, fields=("left", "__url__"))
+def test_a_dataset_goes_on_after_a_change_of_folder(indexed_release, monkeypatch, tmp_path):
+    monkeypatch.chdir(indexed_release.parent)
+    pairs = StereoPairs(indexed_release.name, fields=("left", "__url__"))
     monkeypatch.chdir(tmp_path)
 
-    assert pairs[0]["__url__"].startswith(str(small_release))
+    assert pairs[0]["__url__"].startswith(str(indexed_release))
 
 
 @pytest.mark.parametrize("number", [2.7, "0", slice(0, 2), [0, 1], None])
-def test_a_sample_is_requested_by_a_whole_number(small_release, number):
+def test_a_sample_is_requested_by_a_whole_number(indexed_release, number):
     with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
-        StereoPairs(small_release)[number]
+        StereoPairs(indexed_release)[number]
 
 
-def test_a_frame_lag_takes_depth_from_another_frame_and_none_beyond_the_last(small_release):
+def test_a_frame_lag_takes_depth_from_another_frame_and_none_beyond_the_last(indexed_release):
     options = {"frames": "all", "family": "IPD_Gaussian", "fields": ("left", "depth", "valid")}
-    plain = StereoPairs(small_release, **options)
-    lagged = StereoPairs(small_release, depth=DepthEncoding(frame_lag=1), **options)
+    plain = StereoPairs(indexed_release, **options)
+    lagged = StereoPairs(indexed_release, depth=DepthEncoding(frame_lag=1), **options)
 
     assert torch.equal(lagged[2]["depth"], plain[3]["depth"])
     assert torch.equal(lagged[2]["left"], plain[2]["left"])

@@ -74,8 +74,8 @@ def bytes_of_primary_pair(folder):
     return sum(scene.members[name].size for name in names)
 
 
-def test_shards_give_what_the_released_files_give(root, small_release):
-    expected = StereoPairs(small_release, fields=FIELDS, pairs="adjacent", frames=[0, 3])
+def test_shards_give_what_the_released_files_give(root, indexed_release):
+    expected = StereoPairs(indexed_release, fields=FIELDS, pairs="adjacent", frames=[0, 3])
     pairs = StereoPairs(root, fields=FIELDS, pairs="adjacent", frames=[0, 3])
 
     assert len(pairs) == len(expected)
@@ -90,8 +90,8 @@ def test_a_sample_names_the_shard_that_it_comes_from(root):
     assert pairs[0]["__url__"] == f"{root}/train-IPD_Gaussian-000000.tar"
 
 
-def test_views_come_from_a_url_too(shards_served, small_release):
-    expected = SceneViews(small_release, cameras=(0, 5), frames=2)[1]
+def test_views_come_from_a_url_too(shards_served, indexed_release):
+    expected = SceneViews(indexed_release, cameras=(0, 5), frames=2)[1]
     views = SceneViews(shards_served.url, cameras=(0, 5), frames=2)
 
     assert same(views[1], expected)
@@ -135,8 +135,8 @@ def test_the_first_frame_alone_transfers_a_part(large_shards):
 @pytest.mark.parametrize(
     ("context", "place"), [("fork", "web"), ("spawn", "web"), ("fork", "hub"), ("fork", "s3")]
 )
-def test_workers_read_over_connections_of_their_own(context, place, root_of, small_release):
-    expected = StereoPairs(small_release, fields=FIELDS, frames=[0, 1])
+def test_workers_read_over_connections_of_their_own(context, place, root_of, indexed_release):
+    expected = StereoPairs(indexed_release, fields=FIELDS, frames=[0, 1])
     pairs = StereoPairs(root_of(place), fields=FIELDS, frames=[0, 1])
     assert same(pairs[0], expected[0])
     loader = DataLoader(
@@ -150,9 +150,11 @@ def test_workers_read_over_connections_of_their_own(context, place, root_of, sma
     expected.close()
 
 
-def test_a_server_that_fails_now_and_then_changes_nothing(shards_served, small_release, impatient):
+def test_a_server_that_fails_now_and_then_changes_nothing(
+    shards_served, indexed_release, impatient
+):
     expected = StereoPairs(
-        small_release, frames="all", scenes="train/Uniform/SynthStage/scene_000000"
+        indexed_release, frames="all", scenes="train/Uniform/SynthStage/scene_000000"
     )
     pairs = StereoPairs(
         shards_served.url, frames="all", scenes="train/Uniform/SynthStage/scene_000000"
@@ -227,9 +229,9 @@ def test_a_shard_that_is_missing_is_reported(shards_served):
         pairs[0]
 
 
-def test_a_second_pass_comes_from_the_cache(shards_served, small_release, tmp_path):
+def test_a_second_pass_comes_from_the_cache(shards_served, indexed_release, tmp_path):
     cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
-    expected = StereoPairs(small_release, fields=FIELDS, frames="first")
+    expected = StereoPairs(indexed_release, fields=FIELDS, frames="first")
     for _ in range(2):
         pairs = StereoPairs(shards_served.url, fields=FIELDS, frames="first", cache=cache)
         assert all(same(pairs[number], expected[number]) for number in range(len(pairs)))
@@ -241,9 +243,9 @@ def test_a_second_pass_comes_from_the_cache(shards_served, small_release, tmp_pa
     expected.close()
 
 
-def test_workers_share_a_cache(shards_served, small_release, tmp_path):
+def test_workers_share_a_cache(shards_served, indexed_release, tmp_path):
     cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
-    expected = StereoPairs(small_release, frames="first")
+    expected = StereoPairs(indexed_release, frames="first")
     pairs = StereoPairs(shards_served.url, frames="first", cache=cache)
     loader = DataLoader(pairs, batch_size=None, num_workers=2, timeout=60)
 
@@ -259,9 +261,9 @@ def damage(path: Path) -> None:
     path.write_bytes(data)
 
 
-def test_a_cache_that_was_damaged_on_disk_is_filled_again(shards_served, small_release, tmp_path):
+def test_a_cache_that_was_damaged_on_disk_is_filled_again(shards_served, indexed_release, tmp_path):
     cache = ShardCache(tmp_path / "cache", limit_bytes=10**8)
-    expected = StereoPairs(small_release, frames="all", family="IPD_Gaussian")
+    expected = StereoPairs(indexed_release, frames="all", family="IPD_Gaussian")
     pairs = StereoPairs(shards_served.url, frames="all", family="IPD_Gaussian", cache=cache)
     assert same(pairs[0], expected[0])
     pairs.close()

@@ -24,14 +24,14 @@ PAIRS = 20
 
 
 @pytest.fixture(scope="module")
-def ranks(small_release, tmp_path_factory):
+def ranks(indexed_release, tmp_path_factory):
     """What two real processes found, by rank."""
     out = tmp_path_factory.mktemp("ranks")
     script = "import runpy; runpy.run_module('tests.frameworks.ranks', run_name='__main__')"
     (out / "run.py").write_text(script)
     ended = subprocess.run(
         [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2",
-         out / "run.py", small_release, out],
+         out / "run.py", indexed_release, out],
         capture_output=True, text=True, timeout=240, check=False,
         env={**__import__("os").environ, "PYTHONPATH": str(Path(__file__).parents[2])},
     )  # fmt: skip
@@ -88,9 +88,9 @@ def test_shares_are_not_shared_again(ranks):
 
 
 @pytest.mark.parametrize("stop", [4, 15, 22], ids=["mid-epoch", "last batch", "second epoch"])
-def test_lightning_goes_on_as_if_it_had_not_stopped(small_release, tmp_path, stop):
+def test_lightning_goes_on_as_if_it_had_not_stopped(indexed_release, tmp_path, stop):
     def loader():
-        return runs.random_frames(small_release).loader(4, num_workers=1)
+        return runs.random_frames(indexed_release).loader(4, num_workers=1)
 
     whole = runs.lightning(loader(), tmp_path)
     before = runs.lightning(loader(), tmp_path, stop_at=stop)
@@ -104,10 +104,10 @@ def test_lightning_goes_on_as_if_it_had_not_stopped(small_release, tmp_path, sto
 @pytest.mark.parametrize("stop", [15, 22], ids=["last batch", "second epoch"])
 @pytest.mark.parametrize("given", ["loader", "dataset"])
 def test_hugging_faces_trainer_goes_on_as_if_it_had_not_stopped(
-    small_release, tmp_path, stop, given
+    indexed_release, tmp_path, stop, given
 ):
     def run(**options):
-        pairs = runs.random_frames(small_release)
+        pairs = runs.random_frames(indexed_release)
         loader = pairs.loader(4, num_workers=1) if given == "loader" else None
         return runs.hugging_face(pairs, tmp_path / "run", loader=loader, **options)
 
@@ -121,15 +121,15 @@ def test_hugging_faces_trainer_goes_on_as_if_it_had_not_stopped(
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_lightning_predicts_each_sample_once(small_release, workers):
-    pairs = runs.random_frames(small_release)
+def test_lightning_predicts_each_sample_once(indexed_release, workers):
+    pairs = runs.random_frames(indexed_release)
     keys = runs.predicted(pairs.loader(8, num_workers=workers, tail="uneven"))
 
     assert len(keys) == len(set(keys)) == 60
 
 
-def test_accelerates_skipped_batches_are_followed_by_the_next_epoch(small_release):
-    pairs = runs.random_frames(small_release)
+def test_accelerates_skipped_batches_are_followed_by_the_next_epoch(indexed_release):
+    pairs = runs.random_frames(indexed_release)
     loader = pairs.loader(4, num_workers=1)
     expected = [pairs.set_epoch(epoch) or keys_of(pairs.loader(4)) for epoch in (0, 1)]
     pairs.set_epoch(0)

@@ -20,8 +20,8 @@ def test_colours_run_from_zero_to_the_largest_and_grey_is_not_measured():
     assert picture[0, 3].tolist() == [96, 96, 96]
 
 
-def test_a_sheet_has_a_row_for_each_sample_and_a_tile_for_each_picture(small_release, tmp_path):
-    pairs = StereoPairs(small_release, fields=("left", "right", "disparity", "visible", "scene"))
+def test_a_sheet_has_a_row_for_each_sample_and_a_tile_for_each_picture(indexed_release, tmp_path):
+    pairs = StereoPairs(indexed_release, fields=("left", "right", "disparity", "visible", "scene"))
     sheet = contact_sheet([pairs[0], pairs[1], pairs[2]])
     write_png(tmp_path / "sheet.png", sheet)
 
@@ -33,13 +33,13 @@ def test_a_sheet_has_a_row_for_each_sample_and_a_tile_for_each_picture(small_rel
         assert np.array_equal(np.asarray(written), sheet)
 
 
-def test_a_clip_is_not_a_row_of_tiles(small_release):
-    clip = StereoPairs(small_release, frames=("clips", 2))[0]
+def test_a_clip_is_not_a_row_of_tiles(indexed_release):
+    clip = StereoPairs(indexed_release, frames=("clips", 2))[0]
 
     with pytest.raises(FieldError, match="show one pair of one frame"):
         contact_sheet([clip])
 
 
-def test_nothing_to_show_says_what_could_be(small_release):
+def test_nothing_to_show_says_what_could_be(indexed_release):
     with pytest.raises(FieldError, match="needs one of the fields left, right, disparity"):
-        contact_sheet([StereoPairs(small_release, fields=["scene"])[0]])
+        contact_sheet([StereoPairs(indexed_release, fields=["scene"])[0]])

@@ -7,8 +7,8 @@ import pytest
 
 from stereogenbench_data.synthesis.filters import (
     DEFAULT_LIMITS,
+    ProposedRig,
     Refusal,
-    Rig,
     check_poses,
     check_spawn,
     find_spawn,
@@ -39,7 +39,7 @@ def looking(world, *, eye, rig=None, yaw=180.0, pitch=0.0):
         np.array([eye], float),
         np.array([[pitch, yaw, 0.0]]),
         body_m=world.subject_points_m(HERE, frame=0)[None],
-        rig=rig or Rig(np.linspace(-0.16, 0.16, 6), (0.99, 0.99)),
+        rig=rig or ProposedRig(np.linspace(-0.16, 0.16, 6), (0.99, 0.99)),
         world=world,
         limits=DEFAULT_LIMITS,
     )
@@ -131,7 +131,7 @@ def test_a_wall_before_the_subject_hides_it_whatever_the_camera_sees():
 
 def test_a_post_before_one_of_six_cameras_is_enough():
     """The rig is 2 m wide; the post is between camera 0 and the subject only."""
-    wide = Rig(np.linspace(-1, 1, 6), (0.99, 0.99))
+    wide = ProposedRig(np.linspace(-1, 1, 6), (0.99, 0.99))
     side = -1 / 2  # Looking along -x, the camera's right is at -y: camera 0 is at +y.
     post = ((1.9, -side - 0.25, 0), (2.1, -side + 0.25, 3))
 
@@ -177,7 +177,7 @@ def test_a_camera_keeps_its_distance_from_a_wall(gap_m, passes):
 
 
 def test_the_outermost_camera_alone_can_collide():
-    wide = Rig(np.linspace(-1, 1, 6), (0.99, 0.99))
+    wide = ProposedRig(np.linspace(-1, 1, 6), (0.99, 0.99))
     block = ((3.7, -1.2, 0.7), (4.3, -0.9, 1.3))
 
     assert looking(yard(block), eye=(4, 0, 1.0)).passed.all()
@@ -193,7 +193,7 @@ def test_a_camera_outside_the_map_collides_though_nothing_is_near_it():
 
 
 def test_a_camera_inside_the_subject_collides():
-    near = Rig(np.linspace(-0.01, 0.01, 6), (8.0, 8.0))
+    near = ProposedRig(np.linspace(-0.01, 0.01, 6), (8.0, 8.0))
 
     assert looking(yard(), eye=(0.45, 0, 0.9), rig=near).reasons[0] == "collision"
 
@@ -225,7 +225,7 @@ def test_a_picture_full_of_sky_has_too_little_depth():
 def test_a_near_block_over_a_side_of_the_picture_is_an_occluder():
     """A slab 40 cm before the cameras covers the right third, beside the subject."""
     slab = ((3.5, -2, 0), (3.6, -0.05, 3))
-    narrow = Rig(np.linspace(-0.01, 0.01, 6), (1.2, 1.2))
+    narrow = ProposedRig(np.linspace(-0.01, 0.01, 6), (1.2, 1.2))
 
     assert looking(yard(slab), eye=(4, 0.05, 1.0), rig=narrow).reasons[0] == "border_occluder"
 
@@ -312,7 +312,7 @@ def test_walls_that_cut_a_yard_make_the_path_go_another_way():
         if isinstance(plan, Refusal):
             continue
         splices += plan.splices
-        rig = Rig.of(drawn)
+        rig = ProposedRig.of(drawn)
         body_m = np.stack([world.subject_points_m(plan.spawn, frame=t) for t in range(81)])
         assert check_poses(
             plan.centres_m, plan.rotators_deg,

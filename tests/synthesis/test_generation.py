@@ -17,7 +17,7 @@ from stereogenbench_data.geometry.pose import rotation_from_rotator_deg
 from stereogenbench_data.schema.release import FAMILIES
 from stereogenbench_data.synthesis.checks import check_files
 from stereogenbench_data.synthesis.decisions import FOLDER, all_decisions
-from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS, Refusal, Rig, check_poses
+from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS, ProposedRig, Refusal, check_poses
 from stereogenbench_data.synthesis.maps import MAPS, open_map
 from stereogenbench_data.synthesis.planning import plan_scene, propose
 from stereogenbench_data.synthesis.produce import hold_out, plan_scenes, synthesise
@@ -46,7 +46,7 @@ def contents(root):
 def test_every_accepted_frame_passes_all_filters_and_moves_little(map_name):
     for index in range(2):
         plan = plan_scene(SynthRequest(map_name=map_name, size_px=64), index=index).plan
-        world, rig = open_map(plan.proposal), Rig.of(plan.proposal)
+        world, rig = open_map(plan.proposal), ProposedRig.of(plan.proposal)
         frames = range(plan.request.frames)
         body_m = np.stack([world.subject_points_m(plan.spawn, frame=frame) for frame in frames])
 
