@@ -318,12 +318,14 @@ def _training(found: dict[str, Any]) -> str:
         rows.append(
             [row["title"], *(f"{cost_s * 1e3:.1f}" for cost_s in cost.values()),
              f"{to_released:.1f}", _reached(to_released, row["mark"]),
-             f"{to_own:.2f}", _reached(to_own, MARK_OWN)]
+             f"{to_own:.2f}", _reached(to_own, MARK_OWN),
+             f"{cost['training'] / cost['ours, in order']:.2f}"]
         )  # fmt: skip
     head = (
         "832x480, processor ms a sample", "bare loop, released", "bare loop, training shards",
-        "ours, released", "ours, training shards", "to the released limit", "target",
-        "to their own limit", "target",
+        "ours, released", "ours, training shards", "the same, not shuffled",
+        "to the released limit", "target", "to their own limit", "target",
+        "to their own limit, not shuffled",
     )  # fmt: skip
     return "\n".join(["## Training shards\n", table(head, rows)])
 
