@@ -37,7 +37,7 @@ from stereogenbench_data.media.depth_frames import blosc2_module
 from stereogenbench_data.media.picture_encoding import QUALITIES, write_pictures
 from stereogenbench_data.media.video import VideoReader, read_rgb
 from stereogenbench_data.samples.size import parse_size
-from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.schema.records import DepthEncoding, Scene
 
 FRAMES: Final = 24
 """Frames of a scene that are encoded: several groups of pictures of the longest kind."""
@@ -86,7 +86,7 @@ def codecs() -> Iterator[Codec]:
     """Yield what is compared: the qualities of training shards, and ways beside them."""
     for quality in QUALITIES:
         yield Codec(f"quality {quality}", "quality", "", {"quality": quality})
-    for gop in (1, 2, 8):
+    for gop in (1, 2, 8, 16):
         for rate in (10, 14, 18, 23, 28):
             for tune in ("fastdecode", "") if gop == 8 else ("fastdecode",):
                 options = {"crf": str(rate), "preset": "medium"}
@@ -243,9 +243,16 @@ def compared(codec: Codec, pictures: Pictures, *, rounds: int) -> dict[str, Any]
     }
 
 
+def _within(size: tuple[int, int], scene: Scene) -> tuple[int, int]:
+    """Return the training size, or that of the scene's pictures if those are smaller."""
+    own = scene.rig.image_height_px, scene.rig.image_width_px
+    return own if own[0] < size[0] or own[1] < size[1] else size
+
+
 def drawn(data: Path, *, size: tuple[int, int]) -> Pictures:
-    """Return the primary pair of the first scene of some data, at training size."""
+    """Return the primary pair of the first scene of some data, at training size or its own."""
     index = SceneIndex.open(data)
+    size = _within(size, index.scene(0))
     pairs = StereoPairs(
         index,
         frames="all",
@@ -321,6 +328,7 @@ def depth_rows(data: Path, *, size: tuple[int, int], rounds: int) -> list[dict[s
     """Return the rows of the ways to store depth without loss."""
     index = SceneIndex.open(data)
     scene = index.scene(0)
+    size = _within(size, scene)
     name = "cam_00_depth.mkv"
     path = Path(index.root, scene.members[name].path)
     count = min(FRAMES, scene.frames)
@@ -434,46 +442,44 @@ def _grey_png(units: np.ndarray) -> list[bytes]:
     return files
 
 
-def _moving(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the rows of videos, not of stills, averaged over them."""
-    names = dict.fromkeys(row["codec"] for row in rows if row["codec"] != "original")
-    found = []
-    for name in names:
-        same = [row for row in rows if row["codec"] == name and row["released_ms"] > 0]
-        found.append(
-            {
-                "codec": name,
-                **{
-                    key: statistics.mean(row[key] for row in same)
-                    for key, value in same[0].items()
-                    if isinstance(value, float)
-                },
-            }
-        )
+def _videos(rows: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of each video, not those of stills."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        if row["codec"] != "original" and row["released_ms"] > 0:
+            found.setdefault(row["material"], []).append(row)
     return found
 
 
 def table(content: dict[str, Any]) -> str:
-    """Return what was measured as Markdown: means over the videos, then the stills by name."""
+    """Return what was measured as Markdown: the videos one by one, then the stills."""
     rows = content["pictures"]
     lines = [
         f"# Codecs for training shards at {content['size']}",
         "",
         "Processor time of one thread; speed is a multiple of decoding and scaling the released",
-        "video. Made by `python -m benchmarks.codecs`.",
-        "",
-        "| pictures | speed in order | random | ms | kB a frame | of released | PSNR dB | worst |"
-        " SSIM | warp error | SGBM px | over 1 px |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "video. A scene whose pictures are smaller keeps their size. Made by",
+        "`python -m benchmarks.codecs`.",
     ]
-    lines += [
-        f"| {row['codec']} | {row['released_ms'] / row['ms']:.1f} "
-        f"| {row['released_random_ms'] / row['random_ms']:.0f} | {row['ms']:.1f} "
-        f"| {row['bytes_a_frame'] / 1e3:.0f} | {row['bytes_a_frame'] / row['released_bytes']:.2f} "
-        f"| {row['psnr_db']:.1f} | {row['worst_psnr_db']:.1f} | {row['ssim']:.4f} "
-        f"| {row['warp_error']:.2f} | {row['sgbm_epe_px']:.3f} | {row['sgbm_bad1']:.1%} |"
-        for row in _moving(rows)
-    ]
+    for name, found in _videos(rows).items():
+        lines += [
+            "",
+            f"## {name}",
+            "",
+            "| pictures | speed in order | random | ms | kB a frame | of released | PSNR dB |"
+            " worst | SSIM | warp error | SGBM px | over 1 px |",
+            "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        ]
+        lines += [
+            f"| {row['codec']} | {row['released_ms'] / row['ms']:.1f} "
+            f"| {row['released_random_ms'] / row['random_ms']:.0f} | {row['ms']:.1f} "
+            f"| {row['bytes_a_frame'] / 1e3:.0f} "
+            f"| {row['bytes_a_frame'] / row['released_bytes']:.2f} "
+            f"| {row['psnr_db']:.1f} | {row['worst_psnr_db']:.1f} | {row['ssim']:.4f} "
+            f"| {row['warp_error']:.2f} | {row['sgbm_epe_px']:.3f} | {row['sgbm_bad1']:.1%} |"
+            for row in found
+        ]
+    lines += ["", "## Originals and stills"]
     lines += [
         "",
         "| pictures | material | PSNR dB | warp error | SGBM px |",
@@ -485,7 +491,13 @@ def table(content: dict[str, Any]) -> str:
         for row in rows
         if row["codec"] == "original" or not row["released_ms"] > 0
     ]
-    lines += ["", "| depth | material | ms | kB a frame |", "|---|---|---|---|"]
+    lines += [
+        "",
+        "## Depth, lossless",
+        "",
+        "| depth | material | ms | kB a frame |",
+        "|---|---|---|---|",
+    ]
     lines += [
         f"| {row['codec']} | {row['material']} | {row['ms']:.2f} "
         f"| {row['bytes_a_frame'] / 1e3:.0f} |"
@@ -495,31 +507,42 @@ def table(content: dict[str, Any]) -> str:
 
 
 def plot(rows: list[dict[str, Any]], place: Path) -> None:
-    """Draw error against bytes and against time, a line for each kind of codec."""
-    figure, axes = plt.subplots(1, 2, figsize=(11, 4.5), sharey=True, layout="constrained")
-    kinds: dict[str, list[dict[str, Any]]] = {}
-    for row in _moving(rows):
-        kind = row["codec"].replace(" fast", "").rsplit(" crf", 1)[0].rsplit(" q", 1)[0]
-        if " fast" in row["codec"]:
-            kind += ", fast decode"
-        kinds.setdefault(kind, []).append(row)
-    for number, (kind, found) in enumerate(kinds.items()):
-        style = {"marker": "osv^D<>pP*"[number % 10], "color": f"C{number % 10}", "label": kind}
-        style |= {"linestyle": "--" if "fast" in kind else "-", "markersize": 4}
-        for axis, key, unit in ((axes[0], "bytes_a_frame", 1e3), (axes[1], "ms", 1)):
-            axis.plot(
-                [row[key] / unit for row in found], [row["sgbm_epe_px"] for row in found], **style
-            )
-    original = statistics.mean(
-        row["sgbm_epe_px"] for row in rows if row["codec"] == "original" and row["moves"]
-    )
-    for axis, name in zip(axes, ("kB a frame", "processor time a frame, ms"), strict=True):
-        axis.axhline(original, color="grey", linewidth=0.8)
-        axis.set_xscale("log")
-        axis.set_xlabel(name)
-    axes[0].set_ylabel("SGBM end-point error, px")
-    axes[0].annotate("original", (axes[0].get_xlim()[0], original), va="bottom", color="grey")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
+    """Draw error against bytes and against time for each video, a line for each kind of codec."""
+    videos = _videos(rows)
+    figure, axes = plt.subplots(
+        len(videos), 2, figsize=(11, 4.2 * len(videos)), sharey="row", squeeze=False,
+        layout="constrained",
+    )  # fmt: skip
+    for (name, found), (in_bytes, in_time) in zip(videos.items(), axes, strict=True):
+        kinds: dict[str, list[dict[str, Any]]] = {}
+        for row in found:
+            kind = row["codec"].replace(" fast", "").rsplit(" crf", 1)[0].rsplit(" q", 1)[0]
+            kind = kind.replace("quality ", "--quality ")
+            if " fast" in row["codec"]:
+                kind += ", fast decode"
+            kinds.setdefault(kind, []).append(row)
+        for number, (kind, same) in enumerate(kinds.items()):
+            style = {"marker": "osv^D<>pP*"[number % 10], "color": f"C{number % 10}"}
+            style |= {"linestyle": "--" if "fast" in kind else "-", "label": kind}
+            style |= {"markersize": 9 if "--quality" in kind else 4}
+            for axis, key, unit in ((in_bytes, "bytes_a_frame", 1e3), (in_time, "ms", 1)):
+                axis.plot(
+                    [row[key] / unit for row in same],
+                    [row["sgbm_epe_px"] for row in same],
+                    **style,
+                )
+        original = next(
+            row["sgbm_epe_px"]
+            for row in rows
+            if row["codec"] == "original" and row["material"] == name
+        )
+        for axis, label in ((in_bytes, "kB a frame"), (in_time, "processor time a frame, ms")):
+            axis.axhline(original, color="grey", linewidth=0.8)
+            axis.set_xscale("log")
+            axis.set_xlabel(label)
+        in_bytes.set_ylabel("SGBM end-point error, px")
+        in_bytes.set_title(f"{name}; grey: original pictures", fontsize=10, loc="left")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center", fontsize=8)
     figure.savefig(place, dpi=110)
 
 
