@@ -104,6 +104,7 @@ class EpochBatch(list[int]):
             ever does (all tails but "wrap").
         ends_of_runs: The samples after which their videos are wanted no more for now.
         number: Its number among the batches of all ranks; None where it is none of an epoch's.
+        group: The shuffle group that it is of.
     """
 
     def __init__(
@@ -114,6 +115,7 @@ class EpochBatch(list[int]):
         is_padding: list[bool] | None = None,
         ends_of_runs: Collection[int] = (),
         number: int | None = None,
+        group: int = 0,
     ) -> None:
         """Hold the numbers."""
         super().__init__(numbers)
@@ -121,6 +123,7 @@ class EpochBatch(list[int]):
         self.is_padding = is_padding
         self.ends_of_runs = ends_of_runs
         self.number = number
+        self.group = group
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return what a worker process makes the same batch from."""
@@ -128,7 +131,7 @@ class EpochBatch(list[int]):
         return partial(EpochBatch, **options), (list(self),)
 
 
-_BATCH_OPTIONS: Final = ("epoch", "is_padding", "ends_of_runs", "number")
+_BATCH_OPTIONS: Final = ("epoch", "is_padding", "ends_of_runs", "number", "group")
 
 
 class EpochBatches(Sampler[list[int]]):
@@ -349,10 +352,15 @@ class EpochBatches(Sampler[list[int]]):
     def batch(self, number: int, *, epoch: int) -> EpochBatch:
         """Return the samples of a global batch."""
         is_wrapped = self.tail == "wrap"
-        samples, ends = batch_samples(self.order(epoch), number, tail=self.tail)
-        is_padding = self.is_padding(number).tolist() if is_wrapped else None
+        order = self.order(epoch)
+        samples, ends = batch_samples(order, number, tail=self.tail)
         return EpochBatch(
-            samples, epoch=epoch, is_padding=is_padding, ends_of_runs=ends, number=number
+            samples,
+            epoch=epoch,
+            is_padding=self.is_padding(number).tolist() if is_wrapped else None,
+            ends_of_runs=ends,
+            number=number,
+            group=number % order.groups,
         )
 
     def is_padding(self, number: int) -> np.ndarray:

@@ -282,7 +282,8 @@ def _steps(pairs: StereoPairs, batches: Any, numbers: Iterable[int]) -> Iterable
     for number in numbers:
         samples, ends = batch_samples(order, number, tail=batches.tail)
         for each in samples:
-            yield Step(pairs.plan.locate(each, epoch=0), each in ends)
+            address = pairs.plan.locate(each, epoch=0, group=number % order.groups)
+            yield Step(address, each in ends)
 
 
 def _far(index: SceneIndex) -> SceneIndex:

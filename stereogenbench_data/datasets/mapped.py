@@ -186,18 +186,20 @@ class _MappedScenes(Dataset[Sample]):
         known, number = self._known_order, batch.number
         samples: Sequence[int] = batch
         ends: Collection[int] = batch.ends_of_runs
+        group = batch.group
         while True:
             for each in sorted(samples) if read == "by number" else samples:
                 if -len(self.plan) <= each < len(self.plan):
-                    yield Step(self._address(each, batch.epoch), each in ends)
+                    yield Step(self._address(each, batch.epoch, group=group), each in ends)
             if number is None or known is None or number + known.step >= known.stop:
                 return
             number += known.step
             order = known.order(self.plan.runs, batch.epoch)
             samples, ends = batch_samples(order, number, tail=known.tail)
+            group = number % order.groups
 
-    def _address(self, number: int, epoch: int) -> Address:
-        address = self.plan.locate(number % len(self.plan), epoch=epoch)
+    def _address(self, number: int, epoch: int, *, group: int) -> Address:
+        address = self.plan.locate(number % len(self.plan), epoch=epoch, group=group)
         return address._replace(run=0) if self._access == "random" else address
 
     def _load_into(
@@ -223,7 +225,7 @@ class _MappedScenes(Dataset[Sample]):
         if not -count <= number < count:
             raise IndexError(f"no sample {number}: there are {count}")
         number %= count
-        address = self._address(number, batch.epoch)
+        address = self._address(number, batch.epoch, group=batch.group)
         seeds = np.random.SeedSequence((self.plan.seed, batch.epoch, number))
         sample = self._loader.load(
             address,

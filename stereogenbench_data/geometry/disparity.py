@@ -188,19 +188,21 @@ def write_disparity(
     product, factor, dtype = _exact_quotient(shift_units)
     dtype = "float64" if form == "inverse" else dtype
     rows = max(1, BLOCK_PIXELS // max(1, out.shape[-1]))
-    scratch = np.empty((rows, out.shape[-1]), dtype=np.float64) if dtype == "float64" else None
+    scratch = np.empty((rows, out.shape[-1]), dtype=dtype)
     blocks = [slice(top, top + rows) for top in range(0, out.shape[-2], rows)]
     with np.errstate(divide="ignore"):
         for here in ((*place, block) for place in np.ndindex(out.shape[:-2]) for block in blocks):
             found, known = out[here], measured[here]
-            work = found if scratch is None else scratch[: len(found)]
+            work = scratch[: len(found)]
+            # `out` is as large as a picture and not in the cache: it is written once.
+            result = found if dtype == "float32" else work
             np.copyto(work, units[here])
             if form == "inverse":
-                np.multiply(work, shift_units, out=work)
+                np.multiply(work, shift_units, out=result)
             else:
                 np.multiply(work, work.dtype.type(factor), out=work)
-                np.divide(work.dtype.type(product), work, out=work)
-            if scratch is not None:
+                np.divide(work.dtype.type(product), work, out=result)
+            if result is work:
                 np.copyto(found, work, casting="same_kind")
             if not known.all():
                 np.copyto(found, 0, where=~known)

@@ -128,8 +128,14 @@ class Plan:
         pairs: Int64[np.ndarray, "*n"] = self.first_pair[scenes + 1] - self.first_pair[scenes]
         return pairs
 
-    def locate(self, number: int, *, epoch: int) -> Address:
+    def locate(self, number: int, *, epoch: int, group: int = 0) -> Address:
         """Return where a sample comes from; only random frames depend on the epoch.
+
+        Args:
+            number: The sample.
+            epoch: The epoch that it is read in.
+            group: The shuffle group that reads it. A run that is parted between two groups is
+                decoded in each: a process that reads both would go to and fro in one.
 
         Raises:
             IndexError: If there is no such sample.
@@ -150,7 +156,9 @@ class Plan:
             source=int(self.pairs.source[first + pair]),
             targets=tuple(int(target) for target in targets if target >= 0),
             frames=frames,
-            run=int(np.searchsorted(self.runs.first_sample, number, side="right")) - 1,
+            run=group * len(self.runs.pairs)
+            + int(np.searchsorted(self.runs.first_sample, number, side="right"))
+            - 1,
         )
 
 

@@ -425,6 +425,28 @@ def test_each_video_is_opened_once_and_each_frame_decoded_once(
     assert set(map(tuple, frames.values())) == {tuple(range(7))}
 
 
+def test_a_scene_that_is_parted_between_groups_is_read_forwards_in_each(small_index, monkeypatch):
+    """One process reads both groups; one decoder for them would go to and fro."""
+    read = {}
+
+    class Counting(streams.VideoReader):
+        def frame(self, index):
+            read.setdefault(id(self), (self, []))[1].append(index)
+            return super().frame(index)
+
+    monkeypatch.setattr(streams, "VideoReader", Counting)
+    pairs = StereoPairs(small_index, frames="all", fields=("left",))
+    loader = pairs.loader(6, tail="uneven", start="beginning")
+    assert loader.batches.order(0).groups == 2
+    for _ in loader:
+        pass
+
+    frames = [found for _, found in read.values()]
+    assert all(found == sorted(found) for found in frames)
+    assert len(frames) == 4 + 1
+    assert sum(map(len, frames)) == 4 * 7
+
+
 def test_a_scene_that_is_started_inside_is_decoded_to_its_end_and_then_its_beginning(
     small_index, opened
 ):
