@@ -107,8 +107,10 @@ def measure(options: argparse.Namespace, *, report: Callable[[str], None]) -> li
         if options.check:
             print(json.dumps(differences(material), indent=1))  # noqa: T201
             return failed
-        results.put("machine", machine())
-        results.put("data", facts(material))
+        here = machine()
+        if not options.only or results.sections.get("machine", here)["cpu"] == here["cpu"]:
+            results.put("machine", here)
+            results.put("data", facts(material))
         rounds = 1 if options.quick else options.rounds
         workloads, others = chosen(options)
         plan = Plan(rounds=rounds, resume=options.resume)

@@ -499,40 +499,39 @@ _COLOURS: Final = {
 
 
 def network_plot(section: dict[str, Any]) -> Any:
-    """Return a figure: the speed of each contestant against the delay, for each workload."""
+    """Return a figure: the speed of each contestant as a share of ours from the local disk."""
     import matplotlib.pyplot as plt
 
     shown = [each for each in WORKLOADS if _groups(section, each.name)]
-    limits = sorted({race["connection_mb_s"] for race in section["races"]})
-    figure, grid = plt.subplots(
-        len(shown), len(limits), squeeze=False, sharey="row",
-        figsize=(5.5 * len(limits), 3.0 * len(shown)),
+    bars = {
+        workload.title: [
+            (_named(group.network), name, found)
+            for group in _groups(section, workload.name)
+            for name in (OURS, *RIVALS)
+            if (found := group.spread(name, lambda turn, own: _rate(turn) / _rate(own)))
+        ]
+        for workload in shown
+    }
+    inches = 0.6 + 0.26 * sum(map(len, bars.values()))
+    figure, column = plt.subplots(
+        len(shown), 1, squeeze=False, sharex=True, figsize=(8, inches),
+        height_ratios=[len(found) + 2 for found in bars.values()], layout="constrained",
     )  # fmt: skip
-    for line, workload in zip(grid, shown, strict=True):
-        for axes, mb_s in zip(line, limits, strict=True):
-            groups = [
-                group
-                for group in _groups(section, workload.name)
-                if group.network == Network(group.network.delay_s, connection_mb_s=mb_s)
-            ]
-            for name in (LOCAL, OURS, *RIVALS):
-                found = {group.network.delay_s * 1e3: group.rate(name) for group in groups}
-                points = sorted((ms, each) for ms, each in found.items() if each is not None)
-                axes.errorbar(
-                    [ms for ms, _ in points], [each.median for _, each in points],
-                    yerr=[
-                        [each.median - each.low for _, each in points],
-                        [each.high - each.median for _, each in points],
-                    ],
-                    color=_COLOURS[name], marker="o", capsize=3, label=name,
-                    linestyle="--" if name == LOCAL else "-",
-                )  # fmt: skip
-            limit = f"{mb_s:g} MB/s a connection" if mb_s else "unlimited bandwidth"
-            axes.set_title(f"{workload.title}, {limit}", fontsize=9)
-            axes.set_xlabel("delay of each response, ms")
-        line[0].set_ylim(bottom=0)
-        line[0].set_ylabel("samples a second")
-    named = grid[0][0].get_legend_handles_labels()
-    figure.legend(*named, frameon=False, fontsize=8, ncol=len(named[1]), loc="upper left")
-    figure.tight_layout(rect=(0, 0, 1, 1 - 0.1 / len(shown)))
+    for axes, (title, found) in zip(column[:, 0], bars.items(), strict=True):
+        places = range(len(found))
+        medians = [spread.median for _, _, spread in found]
+        axes.barh(
+            places, medians, color=[_COLOURS[name] for _, name, _ in found],
+            xerr=[
+                [spread.median - spread.low for _, _, spread in found],
+                [spread.high - spread.median for _, _, spread in found],
+            ],
+        )  # fmt: skip
+        for place, median in zip(places, medians, strict=True):
+            axes.annotate(f"{median:.2f}", (0.01, place), va="center", color="white", fontsize=8)
+        axes.set_yticks(places, [f"{network}: {name}" for network, name, _ in found], fontsize=8)
+        axes.invert_yaxis()
+        axes.axvline(1, color=_COLOURS[LOCAL], linewidth=0.8)
+        axes.set_title(title, fontsize=9)
+    column[-1, 0].set_xlabel("samples a second, to ours from the local disk")
     return figure

@@ -311,7 +311,7 @@ def _derive(found: dict[str, Any]) -> str:
 
 def _training(found: dict[str, Any]) -> str:
     rows = []
-    for row in found.values():
+    for row in found["rows"].values():
         cost = row["cpu_s"]
         to_released = cost["released"] / cost["ours, training"]
         to_own = cost["training"] / cost["ours, training"]
@@ -327,7 +327,8 @@ def _training(found: dict[str, Any]) -> str:
         "to the released limit", "target", "to their own limit", "target",
         "to their own limit, not shuffled",
     )  # fmt: skip
-    return "\n".join(["## Training shards\n", table(head, rows)])
+    measured = f"Measured {found['machine']['when']} on {found['machine']['cpu']}, one process."
+    return "\n".join([f"## Training shards\n\n{measured}\n", table(head, rows)])
 
 
 def headlines(races: dict[str, Any]) -> str:

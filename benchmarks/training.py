@@ -22,7 +22,7 @@ from av.video.reformatter import Interpolation, VideoReformatter
 from benchmarks.clock import in_a_fork
 from benchmarks.contestants import limit, ours
 from benchmarks.material import Material
-from benchmarks.results import Report
+from benchmarks.results import Report, machine
 from benchmarks.workloads import Job, Workload
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frames import DepthFrames
@@ -143,7 +143,7 @@ class _Shards:
 def measure_training(
     material: Material, *, rounds: int, workers: int, report: Report
 ) -> dict[str, Any]:
-    """Return the section of the results: seconds a sample, by workload and contestant.
+    """Return the section of the results: the machine, and seconds a sample by workload.
 
     Each contestant runs in a process of its own, in turn, and the fastest of its runs counts.
     """
@@ -174,7 +174,7 @@ def measure_training(
             "mark": mark,
             "cpu_s": {name: min(took) for name, took in found.items()},
         }
-    return rows
+    return {"machine": machine(), "rows": rows}
 
 
 def _cpu_s(way: Callable[[], Iterable[Any]]) -> float:

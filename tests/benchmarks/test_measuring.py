@@ -159,8 +159,8 @@ def test_training_shards_are_compared_with_bare_loops_over_the_same_samples(mate
     monkeypatch.setattr(training, "WORKLOADS", chosen)
     found = training.measure_training(material, rounds=1, workers=1, report=str)
 
-    assert found.keys() == {"random frames", "random clip"}
-    assert all(cost_s > 0 for row in found.values() for cost_s in row["cpu_s"].values())
+    assert found["rows"].keys() == {"random frames", "random clip"}
+    assert all(cost_s > 0 for row in found["rows"].values() for cost_s in row["cpu_s"].values())
     text = tables.tables({"training": found})
     assert "| 8 random frames a scene |" in text
     shards = material.root / "training"
