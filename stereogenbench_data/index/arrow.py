@@ -49,7 +49,10 @@ def one_array(values: Any) -> Any:
 
 def _stored_numbers(values: Any) -> np.ndarray:
     """Return the numbers of a column as a read-only view, with any value where one is null."""
-    dtype = np.dtype(values.type.to_pandas_dtype())
+    kind = values.type
+    floats, unsigned = pa.types.is_floating(kind), pa.types.is_unsigned_integer(kind)
+    letter = "f" if floats else "u" if unsigned else "i"
+    dtype = np.dtype(f"{letter}{kind.bit_width // 8}")
     if len(values) == 0:
         return np.empty(0, dtype=dtype)
     start = values.offset * dtype.itemsize
