@@ -17,7 +17,7 @@ from multiprocessing import connection, get_context
 from multiprocessing.context import BaseContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.queues import Queue
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stereogenbench_data.errors import WorkerError
 
@@ -125,7 +125,13 @@ class _LocklessEvent:
             self._byte.value = 1
 
 
-class _ClosableQueue(Queue):  # type: ignore[type-arg]  # no generic at run time
+if TYPE_CHECKING:
+    _Queue = Queue[Any]
+else:
+    _Queue = Queue  # generic only in the stubs of Python 3.11
+
+
+class _ClosableQueue(_Queue):
     """A queue that can be ended though a dead process holds its lock or wrote half a message."""
 
     _is_ended = False

@@ -15,7 +15,7 @@ from stereogenbench_data.cli.synth import RotationForm
 from stereogenbench_data.schema.release import FAMILIES
 from tests.cli.command import invoke, one_line, run
 
-COMMANDS = typer.main.get_command(app).commands  # type: ignore[attr-defined]  # a group has commands
+COMMANDS = typer.main.get_command(app).commands
 
 
 def shown(*arguments):
