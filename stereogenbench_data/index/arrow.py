@@ -32,17 +32,42 @@ def as_numpy(values: Any) -> np.ndarray:
     if pa.types.is_boolean(kind):
         return as_numpy(values.cast(pa.uint8())).astype(bool)
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-        return np.array(values.to_pylist(), dtype=object)
+        texts, which = as_categories(values)
+        choices: np.ndarray = np.array([*texts, None], dtype=object)
+        return choices.take(which)
     numbers = _stored_numbers(values)
     if not values.null_count:
         return numbers
     return np.where(as_numpy(values.is_valid()), numbers.astype(np.float64), np.nan)
 
 
+def as_categories(values: Any) -> tuple[list[str], np.ndarray]:
+    """Return the different values of a column of strings, or of lists of a fixed length of them.
+
+    Args:
+        values: A `pyarrow.Array`, or a `pyarrow.ChunkedArray`.
+
+    Returns:
+        The values, and for each row, or (n, length), the place of its value among them as int32;
+        -1 where it is null.
+    """
+    values = one_array(values)
+    if pa.types.is_fixed_size_list(values.type):
+        texts, which = as_categories(values.flatten())
+        return texts, which.reshape(-1, values.type.list_size)
+    encoded = values.dictionary_encode()
+    which = _stored_numbers(encoded.indices)
+    if encoded.null_count:
+        which = np.where(as_numpy(encoded.is_valid()), which, np.int32(-1))
+    return encoded.dictionary.to_pylist(), which
+
+
 def one_array(values: Any) -> Any:
     """Return a column as one `pyarrow.Array`."""
     if not isinstance(values, pa.ChunkedArray):
         return values
+    if values.num_chunks == 1:
+        return values.chunk(0)  # Arrow would copy it
     values = values.combine_chunks()
     return values.chunk(0) if isinstance(values, pa.ChunkedArray) else values
 
@@ -59,7 +84,7 @@ def _stored_numbers(values: Any) -> np.ndarray:
     return np.frombuffer(values.buffers()[1], dtype=dtype, count=len(values), offset=start)
 
 
-def _stored_strings(values: Any) -> tuple[np.ndarray, bytes]:
+def _stored_strings(values: Any) -> tuple[np.ndarray, bytes | pa.Buffer]:
     """Return the strings of a column: lengths in bytes, (n,) int32, 0 for null, and all bytes."""
     if len(values) == 0:
         return np.empty(0, dtype=np.int32), b""
@@ -71,7 +96,7 @@ def _stored_strings(values: Any) -> tuple[np.ndarray, bytes]:
         return np.array([len(text) for text in encoded], dtype=np.int32), b"".join(encoded)
     if content is None:
         return lengths, b""
-    return lengths, content.slice(int(ends[0]), int(ends[-1] - ends[0])).to_pybytes()
+    return lengths, content.slice(int(ends[0]), int(ends[-1] - ends[0]))
 
 
 def table_digest(table: pa.Table) -> str:
@@ -117,4 +142,5 @@ def _feed_numbers(digest: "hashlib._Hash", values: Any) -> None:
 
 
 def _feed_array(digest: "hashlib._Hash", numbers: np.ndarray) -> None:
-    digest.update(numbers.astype(numbers.dtype.newbyteorder("<")).tobytes())
+    stored = numbers.astype(numbers.dtype.newbyteorder("<"), order="C", copy=False)
+    digest.update(stored.data)

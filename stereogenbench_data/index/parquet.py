@@ -74,7 +74,7 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
         StorageError: If it is not an index of this version, or was altered.
     """
     try:
-        with pq.ParquetFile(file) as parquet:
+        with pq.ParquetFile(file, pre_buffer=True) as parquet:
             metadata = (parquet.schema_arrow.metadata or {}).get(_METADATA_KEY)
             head = _parse_head(metadata, where=where)
             names = [name for name in parquet.schema_arrow.names if name != SEEK_COLUMN]

@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from stereogenbench_data.errors import SchemaError
+from stereogenbench_data.index.arrow import one_array
 from stereogenbench_data.index.parquet import IndexHead
 from stereogenbench_data.index.tree import ListedTree
 from stereogenbench_data.schema.parse import parse_scene_key
@@ -81,7 +82,7 @@ def _describe(names: list[str], what: str, why: str, *, is_more: bool = False) -
 
 def _folders_of(table: pa.Table) -> list[str]:
     """Return the folder of each scene's first file, below the root."""
-    members = table.column("members").combine_chunks()
+    members = one_array(table.column("members"))
     first = pc.struct_field(members.values, "path").take(members.offsets[:-1])
     return [path.rpartition("/")[0] for path in first.to_pylist()]
 

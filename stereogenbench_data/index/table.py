@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from stereogenbench_data.errors import StorageError
-from stereogenbench_data.index.arrow import as_numpy, one_array, table_digest
+from stereogenbench_data.index.arrow import as_categories, as_numpy, one_array, table_digest
 from stereogenbench_data.index.build import TreeReport
 from stereogenbench_data.index.open import SeekTables, open_table
 from stereogenbench_data.index.parquet import (
@@ -223,6 +223,15 @@ class SceneIndex:
             self._columns[name] = as_numpy(self._table.column(name))
             self._columns[name].setflags(write=False)
         return self._columns[name]
+
+    def categories(self, name: str) -> tuple[list[str], np.ndarray]:
+        """Return the different values of a column of texts, and which each scene has.
+
+        Returns:
+            The values, and (n,) int32, or (n, 6) for the columns with one value per camera, the
+            place of each scene's value among them; -1 where it is unknown.
+        """
+        return as_categories(self._table.column(name))
 
     def key_frames(self) -> tuple[list[tuple[int, ...]], np.ndarray]:
         """Return the different lists of key frames that scenes have, and which each scene has.

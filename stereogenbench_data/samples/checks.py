@@ -78,17 +78,12 @@ def _require_videos(index: SceneIndex, plan: Plan, request: Request) -> None:
 def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> None:
     encoding = request.depth or DepthEncoding()
     units_known = index.column("depth_unit_source") != "unreadable"
-    stored = np.stack([index.column("depth_codec"), index.column("depth_pixel_format")], axis=-1)
-    whole = np.zeros(units_known.shape, dtype=bool)
-    for codec, pixel_format in set(map(tuple, stored.reshape(-1, 2))):
-        try:
-            require_depth_stream(
-                codec=codec, pixel_format=pixel_format, encoding=encoding, name="depth"
-            )
-        except MediaError:
-            continue
-        whole |= (stored == (codec, pixel_format)).all(axis=-1)
-    usable = whole & (units_known | (encoding.unit_m is not None))
+    codecs, codec = index.categories("depth_codec")
+    pixel_formats, pixel_format = index.categories("depth_pixel_format")
+    keeps_depth = np.array(
+        [[_keeps_depth(each, other, encoding) for other in pixel_formats] for each in codecs]
+    )
+    usable = keeps_depth[codec, pixel_format] & (units_known | (encoding.unit_m is not None))
     if usable.all():
         return
     pairs = plan.pairs
@@ -101,6 +96,16 @@ def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> Non
             pair, place = refused[0]
             scene = index.scene(int(pairs.row[pair]))
             _refuse_depth(scene, int(cameras[pair, place]), encoding=encoding)
+
+
+def _keeps_depth(codec: str, pixel_format: str, encoding: DepthEncoding) -> bool:
+    try:
+        require_depth_stream(
+            codec=codec, pixel_format=pixel_format, encoding=encoding, name="depth"
+        )
+    except MediaError:
+        return False
+    return True
 
 
 def _refuse_depth(scene: Scene, camera: int, *, encoding: DepthEncoding) -> NoReturn:
