@@ -65,7 +65,7 @@ def _parameters(command: Any) -> list[str]:
         if parameter.param_type_name == "argument":
             names = f"`{parameter.name.upper()}`"
         default = parameter.default
-        is_shown = default is not None and default is not False and default != ()
+        is_shown = default is not False and default not in (None, (), "")
         shown = f"`{default}`" if is_shown and not callable(default) else ""
         if parameter.required:
             shown = "required"
