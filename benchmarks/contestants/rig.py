@@ -1,6 +1,5 @@
 """What a careful user of any library adds to its decoder: the numbers of a pair, and disparity."""
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -20,16 +19,6 @@ class PairNumbers:
 
     fx_px: float
     baseline_m: float
-
-
-def camera_number(name: str | int) -> int:
-    """Return a camera's number from its name (or, in the older form, itself)."""
-    if isinstance(name, int):
-        return name
-    found = re.search(r"[Cc]am_?(\d+)$", name)
-    if found is None:
-        raise ValueError(f"cannot parse camera index from {name!r}")
-    return int(found[1])
 
 
 def pair_numbers(document: dict[str, Any], *, left: int, right: int, width_px: int) -> PairNumbers:

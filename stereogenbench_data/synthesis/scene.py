@@ -166,10 +166,6 @@ class SceneModel:
     sun: Float64[np.ndarray, "3"]
     shadow_range_m: float
 
-    def ground_m(self, x_m: float, y_m: float) -> float:
-        """Return the ground's height at a place."""
-        return float(self.slope @ (x_m, y_m))
-
     def distances(
         self, origins_m: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, " n"]:
