@@ -4,6 +4,7 @@ If the material is missing, pytest's first and last lines say so. In CI its test
 SHARED_MATERIAL=none says that it is not available.
 """
 
+import gc
 import os
 import shutil
 import signal
@@ -50,6 +51,12 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_line(
             f"Tests with {' and '.join(missing)} did not run: {_CURE}.", red=True
         )
+
+
+def pytest_collection_finish() -> None:
+    """Leave all that was imported to no later garbage collection, which forks would copy it for."""
+    gc.collect()
+    gc.freeze()
 
 
 def _shared_folder(name: str) -> Path:
