@@ -8,6 +8,7 @@ import gc
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -55,8 +56,9 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 def pytest_collection_finish() -> None:
     """Leave all that was imported to no later garbage collection, which forks would copy it for."""
-    gc.collect()
-    gc.freeze()
+    if "hypothesis" in sys.modules:  # When imported, it looks for what freezing hides from it.
+        gc.collect()
+        gc.freeze()
 
 
 def _shared_folder(name: str) -> Path:

@@ -46,7 +46,7 @@ def test_a_block_of_python_runs(folder_with_scenes, monkeypatch, block):
     monkeypatch.chdir(folder_with_scenes)
     before = BLOCKS[BLOCKS.index(block) - 1] if "import" not in block else ""
 
-    exec(compile(before + block, README.name, "exec"), {})
+    exec(compile(before + block, README.name, "exec"), {"__name__": "__main__"})
 
 
 @pytest.mark.filterwarnings(
@@ -60,7 +60,7 @@ def test_a_block_of_python_runs(folder_with_scenes, monkeypatch, block):
 def test_a_block_of_the_documentation_runs_by_itself(folder_with_scenes, monkeypatch, path, block):
     monkeypatch.chdir(folder_with_scenes)
 
-    exec(compile(block, path.name, "exec"), {})
+    exec(compile(block, path.name, "exec"), {"__name__": "__main__"})
     # Webdataset leaves its files to the garbage collector, which warns of them.
     gc.collect()
 

@@ -116,7 +116,7 @@ class AdaptedPairs(Dataset[Item], Generic[Item]):
     __rmul__ = __mul__
 
     def loader(
-        self, batch_size: int, *, num_workers: int = 0, **options: Unpack[LoaderOptions]
+        self, batch_size: int = 1, *, num_workers: int = 0, **options: Unpack[LoaderOptions]
     ) -> PairsLoader:
         """Return a loader of batches of items, as torch's ``default_collate`` makes them.
 

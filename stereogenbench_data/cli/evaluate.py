@@ -275,6 +275,8 @@ def evaluate(  # noqa: PLR0913 - one parameter an option
     called = name or predictions.resolve().name
     folder = report.out or Path("evaluation") / f"{called}-{tier}"
     index = source.open()
+    for column in strata:
+        index.column(column)  # refuses an unknown one before the work
     with progress_bar("scoring", unit="frames") as progress:
         scores = evaluated(
             index,

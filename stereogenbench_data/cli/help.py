@@ -16,6 +16,7 @@ from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 from rich.console import Console
 from rich.text import Text
+from typer import BadParameter
 from typer.core import TyperCommand, TyperGroup
 
 SCENES: Final = "Which scenes"
@@ -45,6 +46,14 @@ class HelpedCommand(TyperCommand):
         super().__init__(name, **settings)
         _name_values(self.params, self.callback)
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read what was typed; an error quotes it, whatever library checked it for typer."""
+        try:
+            return super().parse_args(ctx, args)
+        except BadParameter as error:
+            error.message = _quoting_typed(error)
+            raise
+
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the arguments and the options that must be given, then ``[OPTIONS]``."""
         return [*_required(self.get_params(ctx)), "[OPTIONS]"]
@@ -67,6 +76,17 @@ class HelpedGroup(TyperGroup):
             for title, panel in panels.items()
         }
         _print_page(self, ctx, commands=rows)
+
+
+def _quoting_typed(error: BadParameter) -> str:
+    """Return the message of an error; typer 0.25 and later have values checked by pydantic."""
+    found: list[Any] = getattr(error.__cause__, "errors", list)()
+    kind = {"int_parsing": "integer", "float_parsing": "number"}.get(
+        found[0]["type"] if found else ""
+    )
+    if kind:
+        return f"{found[0]['input']!r} is not a valid {kind}."
+    return error.message.removeprefix("Value error, ").replace("%Y-%m-%d", "YYYY-MM-DD")
 
 
 def _name_values(params: Iterable[Any], callback: Callable[..., Any] | None) -> None:

@@ -11,7 +11,7 @@ import typer
 
 from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.help import RARE
-from stereogenbench_data.cli.options import DataOptions, JsonOption, RootOption, grouped
+from stereogenbench_data.cli.options import JsonOption, RootOption, ShardsOptions, grouped
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
 
@@ -164,7 +164,7 @@ def _check(data: str | None, mapping: list[str], *, as_json: bool) -> None:
 
 @grouped
 def card(
-    source: DataOptions,
+    source: ShardsOptions,
     repository: RepositoryArgument,
     *,
     out: Annotated[
@@ -182,7 +182,7 @@ def card(
     from stereogenbench_data.bridges.card import write_card
     from stereogenbench_data.index.table import SceneIndex
 
-    index = SceneIndex.open(source.data, root=source.data_root)
+    index = SceneIndex.open(source.shards, root=source.data_root)
     if out is None:
         typer.echo(card_text(index, repository=repository, about=about), nl=False)
         return

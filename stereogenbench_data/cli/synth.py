@@ -133,7 +133,8 @@ def synth(  # noqa: PLR0913 - one parameter an option
         typer.Option(help="File for a report on all proposals of OUT so far: .md or .json."),
     ] = None,
     contact_sheets: Annotated[
-        Path | None, typer.Option(help="Folder for a picture of each scene, to look through.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Folder for a picture of each scene, to look through."),
     ] = None,
     holdout: Annotated[
         Path | None,

@@ -238,7 +238,7 @@ class _MappedScenes(Dataset[Sample]):
         return sample
 
     def loader(
-        self, batch_size: int, *, num_workers: int = 0, **options: Unpack[LoaderOptions]
+        self, batch_size: int = 1, *, num_workers: int = 0, **options: Unpack[LoaderOptions]
     ) -> PairsLoader:
         """Return a torch `DataLoader` whose order is the same for any number of ranks and workers.
 
@@ -403,7 +403,7 @@ class StereoPairs(_MappedScenes):
             MediaError: If depth that a field needs cannot have been stored whole (8 bits, a lossy
                 codec, chroma) and the depth contract does not accept it.
         """
-        of_loader = ["batch_size", *options_of(self.loader)]
+        of_loader = options_of(self.loader)
         require_options(StereoPairs, selection, elsewhere={"loader": of_loader})
         index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
         plan = plan_pairs(index, seed=seed, **selection)
@@ -477,7 +477,7 @@ class SceneViews(_MappedScenes):
             FieldError: If a field does not exist, or the transform swaps views.
             StorageError: If the data are not there, or hold broken scenes (all are named).
         """
-        of_loader = ["batch_size", *options_of(self.loader)]
+        of_loader = options_of(self.loader)
         require_options(SceneViews, filters, elsewhere={"loader": of_loader})
         each = isinstance(cameras, str) and cameras == "each"
         request = parse_request(

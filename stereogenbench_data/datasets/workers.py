@@ -84,13 +84,19 @@ class WorkerContext:
             return None
         self.dead.join(_NOTICED_AFTER_S)
         code = self.dead.exitcode
-        how = f"exited with status {code}"
+        how, cure = f"exited with status {code}", "Its traceback is above."
+        method = getattr(self.dead, "_start_method", "fork")
         if code is not None and code < 0:
             how = f"was killed by {signal.Signals(-code).name}"
+            cure = "If memory ran out, use fewer workers or open_scenes."
+        elif method != "fork":
+            cure += (
+                f" Workers of the start method {method!r} import the script again: its loop must "
+                "stand below `if __name__ == '__main__':`."
+            )
         return WorkerError(
             f"a DataLoader worker (pid {self.dead.pid}) {how} in the middle of a pass "
-            f"({type(noticed).__name__}: {noticed}). If the system killed it because memory ran "
-            "out, use fewer workers or open_scenes. Load the last state_dict() to go on."
+            f"({type(noticed).__name__}: {noticed}). {cure} Load the last state_dict() to go on."
         )
 
     def _wait(self) -> None:

@@ -48,14 +48,14 @@ class PartialResults:
         try:
             (folder / _SCENES).mkdir(parents=True, exist_ok=True)
             theirs = _read_json(folder / STATE_JSON)
-            if theirs is None:
-                if any((folder / _SCENES).iterdir()):
-                    raise EvaluationError(
-                        f"{folder}: holds scenes without {STATE_JSON}, which says what they "
-                        f"belong to. Remove the folder, or choose another."
-                    )
+            if not any((folder / _SCENES).iterdir()):  # An evaluation may have failed at once.
                 write_atomic(folder / STATE_JSON, json.dumps(ours, indent=1).encode())
                 return
+            if theirs is None:
+                raise EvaluationError(
+                    f"{folder}: holds scenes without {STATE_JSON}, which says what they "
+                    f"belong to. Remove the folder, or choose another."
+                )
         except OSError as error:
             what = f"{folder}: partial results cannot be kept there"
             raise StorageError(describe_os_error(what, error, _OTHER_OUT)) from error
@@ -69,8 +69,8 @@ class PartialResults:
         if theirs != ours:
             name, there, here = next(_differences(theirs, ours))
             raise EvaluationError(
-                f"{folder}: holds results of another evaluation: {name} was {there} there and is "
-                f"{here} now. Choose another folder with --out, or remove this one."
+                f"{folder}: holds results of another evaluation: {name} was {_shown(there)} there "
+                f"and is {_shown(here)} now. Choose another folder with --out, or remove this one."
             )
 
     def write(self, scene: str, scores: SceneScores, *, stamps: Stamps) -> None:
@@ -203,6 +203,13 @@ def _read_json(path: Path) -> Any:
     except (FileNotFoundError, ValueError):
         return None
     return found if isinstance(found, dict) else None
+
+
+def _shown(value: Any) -> str:
+    """Return a setting for a message."""
+    if value is None:
+        return "not set"
+    return "set" if isinstance(value, dict) else str(value)
 
 
 def _differences(theirs: Any, ours: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:

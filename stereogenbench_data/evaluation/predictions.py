@@ -402,8 +402,9 @@ class CalledMethod:
                 f"expected {(count, *expected)}."
             ) from error
         if array.ndim != 4 or len(array) != count or array.size == 0:
+            what = "None" if given is None else f"{array.dtype} {array.shape}"
             raise PredictionError(
-                f"{where} was given {count} frames and returned {array.dtype} {array.shape}; "
+                f"{where} was given {count} frames and returned {what}; "
                 f"expected {(count, *expected)}."
             )
         if array.dtype.kind == "f":

@@ -185,7 +185,9 @@ def require_range(name: str, wanted: Any) -> Range:
     except (TypeError, ValueError):
         raise SelectionError(f"{name} must be a pair (low, high), got {wanted!r}.") from None
     if not low <= high:
-        raise SelectionError(f"{name} must be (low, high) with low <= high, got {wanted!r}.")
+        raise SelectionError(
+            f"{name}: {low:g} to {high:g} is no range: put the lower number first."
+        )
     return low, high
 
 

@@ -109,7 +109,8 @@ def require_pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
     """
     if isinstance(pairs, str):
         raise SelectionError(
-            f"pairs must be 'primary', 'adjacent', 'all', 'sweep' or camera pairs, got {pairs!r}."
+            "pairs must be 'primary', 'adjacent', 'all', 'sweep' or camera pairs such as "
+            f"[(0, 5)], got {pairs!r}."
         )
     found = []
     for pair in pairs.tolist() if isinstance(pairs, np.ndarray) else pairs:

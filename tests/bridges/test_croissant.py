@@ -311,6 +311,22 @@ def test_a_tree_of_ones_own_needs_the_url_of_its_repository(small_release, tmp_p
         write_descriptor(SceneIndex.open(small_release), tmp_path / "data.json", publication=DAY)
 
 
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({"version": "one"}, "'one' is not a version: it must be MAJOR.MINOR.PATCH"),
+        ({"data_url": "packed"}, "'packed' is not a URL"),
+        ({"tables_url": "packed/tables"}, "'packed/tables' is not a URL"),
+    ],
+)
+def test_what_the_check_would_refuse_is_not_written(small_shards, tmp_path, stated, message):
+    with pytest.raises(DescriptorError, match=message):
+        write_descriptor(
+            SceneIndex.open(small_shards), tmp_path / "a.json", publication=Publication(**stated)
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("name", ["data_url", "tables_url"])
 def test_no_login_is_published(small_shards, tmp_path, name):
     publication = Publication(**{name: "https://me:word@host/data?key=word"})

@@ -130,6 +130,18 @@ MUTATIONS = {
         lambda d: node(d, "pairs/camera_left").update(dataType="sc:Text"),
         r"pairs/camera_left: .*holds int64",
     ),
+    "number as a day": (
+        lambda d: node(d, "scenes/frames").update(dataType="sc:Date"),
+        r"scenes/frames: has the data type sc:Date \(days\), but .* holds int64",
+    ),
+    "name as a number": (
+        lambda d: node(d, "baseline_json/scene_id").update(dataType="sc:Float"),
+        "baseline_json/scene_id: is an sc:Float, but the regex .* of a name",
+    ),
+    "file as a number": (
+        lambda d: node(d, "rgb_videos/content").update(dataType="sc:Integer"),
+        "rgb_videos/content: has the data type sc:Integer, but the content of a file is none",
+    ),
     "list as a value": (
         lambda d: node(d, "scenes/depth_unit_m").pop("isArray"),
         "scenes/depth_unit_m: has no isArray, but .* holds list",

@@ -13,7 +13,7 @@ import typer
 
 from stereogenbench_data.cli.errors import ErrorsReported
 from stereogenbench_data.errors import ExtraError, SelectionError
-from tests.cli.command import COMMAND, invoke, run
+from tests.cli.command import COMMAND, invoke, one_line, run
 
 
 def reported(error, capsys):
@@ -175,3 +175,19 @@ def test_an_empty_path_is_refused_and_nothing_is_written(words, tmp_path, monkey
     assert ended.exit_code == 2
     assert "the path is empty" in ended.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "quoted"),
+    [
+        (["synth", "out", "--size", "128x128"], "'128x128' is not a valid integer"),
+        (["synth", "out", "--split", "test"], "'test' is not one of 'train', 'eval'"),
+        (["stats", "data", "--focal-mm", "wide", "35"], "'wide' is not a valid"),
+        (["croissant", "data", "--published", "today"], "'today' does not match"),
+    ],
+)
+def test_a_value_of_another_type_is_quoted_as_it_was_typed(words, quoted):
+    ended = invoke(*words)
+
+    assert ended.exit_code == 2
+    assert f"Invalid value for '{words[2]}': {quoted}" in one_line(ended.stderr)

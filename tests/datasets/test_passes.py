@@ -6,7 +6,9 @@ import itertools
 import multiprocessing
 import os
 import pickle
+import re
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -330,6 +332,23 @@ class DieAt:
                 frame.f_locals["index_queue"]._rlock.acquire()
             os.kill(os.getpid(), signal.SIGKILL)
         return views
+
+
+@pytest.mark.parametrize("method", ["forkserver", "spawn"])
+def test_a_script_without_a_main_guard_is_told_to_have_one(small_index, tmp_path, method):
+    small_index.write(tmp_path / "index.parquet")
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from stereogenbench_data import SceneIndex, StereoPairs\n"
+        f"index = SceneIndex.open({str(tmp_path / 'index.parquet')!r}, root={small_index.root!r})\n"
+        f"pairs = StereoPairs(index, fields={FIELDS!r})\n"
+        f"list(pairs.loader(2, num_workers=1, multiprocessing_context={method!r}))\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
+
+    assert done.returncode == 1
+    last = done.stderr.strip().splitlines()[-1]
+    assert re.search(r"WorkerError: .* below `if __name__ == '__main__':`", last)
 
 
 @pytest.mark.parametrize("pin_memory", [False, True])

@@ -61,6 +61,17 @@ def test_a_missing_prediction_ends_with_2_and_is_named(scenes, tmp_path):
     assert "3 predictions missing or unusable, and 0 allowed" in shown.stderr
 
 
+def test_an_evaluation_that_scored_nothing_does_not_hinder_another_one(
+    scenes, right_views, tmp_path
+):
+    (tmp_path / "none").mkdir()
+    out = ("--name", "views", "--tier", "G0", "--no-plots", "--out", tmp_path / "out")
+    failed = run("evaluate", scenes, tmp_path / "none", *out, *SMALL)
+    again = run("evaluate", scenes, right_views, *out, "--metrics", "psnr", *SMALL[2:])
+
+    assert (failed.exit_code, again.exit_code) == (2, 0), again.output
+
+
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
@@ -68,6 +79,7 @@ def test_a_missing_prediction_ends_with_2_and_is_named(scenes, tmp_path):
         ("--frames", "some", "is not all, first, every:K"),
         ("--pairs", "0_1", "is not primary, adjacent, all or pairs"),
         ("--by", "focal_mm:wide", "are not numbers"),
+        ("--by", "nope", "has no column 'nope'"),
         ("--metrics", "mse", "there is no metric 'mse'"),
         ("--stereo-matcher", "eyes", "'eyes'"),
         ("--tier", "G9", "there is no tier 'G9'"),

@@ -75,7 +75,7 @@ def test_a_range_that_nothing_meets_says_what_the_numbers_span(index):
 
 @pytest.mark.parametrize("focal_mm", [(30, 20), 20, ("a", "b"), (1, 2, 3), (np.nan, 2)])
 def test_a_range_that_is_none_is_refused(index, focal_mm):
-    with pytest.raises(SelectionError, match="focal_mm must be"):
+    with pytest.raises(SelectionError, match=r"focal_mm must be|focal_mm: .* is no range"):
         keys(index, focal_mm=focal_mm)
 
 

@@ -27,6 +27,7 @@ from stereogenbench_data.bridges.croissant.nodes import (
     RAI,
     TAR,
     TEXT,
+    VERSION,
     Node,
 )
 from stereogenbench_data.bridges.dataset_facts import blanks, listed
@@ -90,13 +91,22 @@ _ARROW_TYPES: Final[dict[str, tuple[str, tuple[Callable[[pa.DataType], bool], ..
     "sc:Integer": ("whole numbers", (pa.types.is_integer,)),
     "sc:Float": ("numbers", (pa.types.is_floating, pa.types.is_integer)),
     "sc:Boolean": ("true or false", (pa.types.is_boolean,)),
+    "sc:Date": ("days", (pa.types.is_date, *_IS_TEXT)),
+    "sc:DateTime": ("times", (pa.types.is_timestamp, *_IS_TEXT)),
 }
 """What a column of each data type holds, and the tests of Arrow's types for it."""
+_NAMED: Final[dict[str, re.Pattern[str]]] = {
+    "sc:Integer": re.compile(r"\d+"),
+    "sc:Float": re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?"),
+    "sc:Boolean": re.compile("true|false", re.IGNORECASE),
+    "sc:Date": re.compile(r"\d{4}-\d\d-\d\d"),
+    "sc:DateTime": re.compile(r"\d{4}-\d\d-\d\d[T ].+"),
+}
+"""What a part of a file's name must look like to be of a data type."""
 _INLINE_TYPES: Final[dict[str, type | tuple[type, ...]]] = {
     "sc:Text": str, "sc:URL": str, "sc:Integer": int, "sc:Float": (int, float), "sc:Boolean": bool,
 }  # fmt: skip
 _MONTH: Final = re.compile(r"\d{4}(-(0[1-9]|1[0-2]))?")
-_VERSION: Final = re.compile(r"\d+\.\d+\.\d+")
 _SHA256: Final = re.compile(r"[0-9a-f]{64}")
 _MOVING: Final = re.compile(r"/(?:resolve|raw|blob|tree)/(?:main|master|HEAD)(?:/|$)")
 _DATA_SUFFIXES: Final = (".tar", ".parquet", ".txt")
@@ -287,7 +297,7 @@ class _Check:
                     f"rai:{local}", "has several values, but readers keep only the first: join them"
                 )
         version = self._node.get("version")
-        if not _VERSION.fullmatch(str(version or "")):
+        if not VERSION.fullmatch(str(version or "")):
             self.report("version", f"is {version!r}, and must be MAJOR.MINOR.PATCH")
         self._check_date(str(self._node.get("datePublished") or ""))
 
@@ -543,6 +553,9 @@ class _Check:
             self.report(
                 name, f"reads {wanted!r} of each file; must be one of {', '.join(_PROPERTIES)}"
             )
+        kinds = [kind for kind in listed(node.get("dataType")) if kind in _NAMED]
+        if kinds and wanted == "content" and not source.get("transform"):
+            self.report(name, f"has the data type {kinds[0]}, but the content of a file is none")
         regex = source.get("transform", {}).get("regex")
         paths = self._files_of_set(files)
         if not paths or wanted not in {"fullpath", "filename"} or not _has_group(regex or ""):
@@ -551,12 +564,15 @@ class _Check:
         found = {text: re.match(regex, text) for text in texts}
         missed = [text for text, match in found.items() if match is None]
         taken = [each[1] or "" for each in found.values() if each]
-        no_number = [text for text in taken if not text.isdigit()]
+        odd = {kind: [text for text in taken if not _NAMED[kind].fullmatch(text)] for kind in kinds}
+        other_kind = next((kind for kind in kinds if odd[kind]), None)
         if missed:
             self.report(name, f"has the regex {regex!r}, which does not match {missed[0]}")
-        elif "sc:Integer" in listed(node.get("dataType")) and no_number:
+        elif other_kind is not None:
             self.report(
-                name, f"is an sc:Integer, but the regex {regex!r} takes {no_number[0]!r} of a name"
+                name,
+                f"is an {other_kind}, but the regex {regex!r} takes {odd[other_kind][0]!r} of a "
+                "name",
             )
         elif "references" in node and not _is_kept(regex, texts[0]):
             self.report(

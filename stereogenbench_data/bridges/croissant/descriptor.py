@@ -22,6 +22,7 @@ from stereogenbench_data.bridges.croissant.nodes import (
     CONTEXT,
     CROISSANT,
     RAI,
+    VERSION,
     Node,
     suffixes_of,
 )
@@ -30,7 +31,7 @@ from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards.companion_files import derivation_facts
 from stereogenbench_data.sources.files import write_atomic
-from stereogenbench_data.sources.location import shown
+from stereogenbench_data.sources.location import is_remote, shown
 
 _HUB_FILE: Final = re.compile(r"(https?://[^/]+/datasets/[^/]+/[^/]+)/(?:resolve|tree|blob|raw)/")
 """A URL of files of a dataset on the Hub; the group is the dataset's page."""
@@ -78,12 +79,22 @@ def write_descriptor(
         The descriptor as written.
 
     Raises:
-        DescriptorError: If a file cannot be written, ``data_url`` is None but shards are behind a
-            URL or a tree is not the release's, a URL contains a login or a query, or who made the
-            scenes is not known.
+        DescriptorError: If a file cannot be written, the version or a URL is none, ``data_url``
+            is None but shards are behind a URL or a tree is not the release's, a URL contains a
+            login or a query, or who made the scenes is not known.
     """
     publication = publication or Publication()
+    if publication.version is not None and not VERSION.fullmatch(publication.version):
+        raise DescriptorError(
+            f"{publication.version!r} is not a version: it must be MAJOR.MINOR.PATCH, such as "
+            "1.0.0."
+        )
     for url in (publication.data_url, publication.tables_url):
+        if url is not None and not is_remote(url):
+            raise DescriptorError(
+                f"{url!r} is not a URL, under which others find the data: give one such as "
+                "https://HOST/PATH, or leave it out."
+            )
         if url is not None and shown(url) != url:
             raise DescriptorError(
                 f"{shown(url)}: the URL contains a login or a query, which must not be published. "

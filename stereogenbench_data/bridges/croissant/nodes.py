@@ -7,6 +7,7 @@ the narrower form is written.
 Source: the Croissant 1.1 and RAI 1.0 specifications.
 """
 
+import re
 from typing import Any, Final
 
 from stereogenbench_data.index.table import SceneIndex
@@ -52,6 +53,8 @@ CONTEXT: Final[Node] = dict(
 """The terms of a descriptor, in alphabetical order."""
 
 TAR: Final = "application/x-tar"
+VERSION: Final = re.compile(r"\d+\.\d+\.\d+")
+"""The form of a dataset's version: MAJOR.MINOR.PATCH."""
 PARQUET: Final = "application/x-parquet"
 GIT: Final = "git+https"
 TEXT: Final = "text/plain"
