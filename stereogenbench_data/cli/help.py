@@ -79,7 +79,7 @@ class HelpedGroup(TyperGroup):
 
 
 def _quoting_typed(error: BadParameter) -> str:
-    """Return the message of an error; typer 0.25 and later have values checked by pydantic."""
+    """Return the message of an error; newer typer has values checked by pydantic."""
     found: list[Any] = getattr(error.__cause__, "errors", list)()
     kind = {"int_parsing": "integer", "float_parsing": "number"}.get(
         found[0]["type"] if found else ""

@@ -80,9 +80,9 @@ def _require_whole_depth(index: SceneIndex, plan: Plan, request: Request) -> Non
     units_known = index.column("depth_unit_source") != "unreadable"
     codecs, codec = index.categories("depth_codec")
     pixel_formats, pixel_format = index.categories("depth_pixel_format")
-    keeps_depth = np.array(
-        [[_keeps_depth(each, other, encoding) for other in pixel_formats] for each in codecs]
-    )
+    keeps_depth = np.zeros((len(codecs) + 1, len(pixel_formats) + 1), dtype=bool)
+    for row, column in np.ndindex(len(codecs), len(pixel_formats)):  # -1 is unknown: not kept
+        keeps_depth[row, column] = _keeps_depth(codecs[row], pixel_formats[column], encoding)
     usable = keeps_depth[codec, pixel_format] & (units_known | (encoding.unit_m is not None))
     if usable.all():
         return

@@ -186,7 +186,7 @@ def require_range(name: str, wanted: Any) -> Range:
         raise SelectionError(f"{name} must be a pair (low, high), got {wanted!r}.") from None
     if not low <= high:
         raise SelectionError(
-            f"{name}: {low:g} to {high:g} is no range: put the lower number first."
+            f"{name}: {low:g} to {high:g} is no range: give two numbers, the lower first."
         )
     return low, high
 

@@ -183,7 +183,7 @@ class _HubWeb(WebTransport):
         self, file: HubFile, revision: str, *, where: str, expected_size: int | None
     ) -> None:
         with require_installed(where, extra="hub"):
-            from huggingface_hub.utils import build_hf_headers  # type: ignore[attr-defined]  # re-exported there without saying so to mypy
+            from huggingface_hub.utils import build_hf_headers
         endpoint, token = _settings()
         headers = build_hf_headers(token=token, library_name="stereogenbench-data")
         url = f"{endpoint}/{file.web_path(revision)}"
