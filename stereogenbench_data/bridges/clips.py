@@ -599,7 +599,7 @@ def _write_clip(work: _ClipWork, advance: Advance) -> None:
 def _frames(work: _ClipWork, loader: SampleLoader) -> Iterator[Sample]:
     for frame in work.address.frames:
         address = Address(0, work.address.source, work.address.targets, (frame,))
-        yield loader.load(address, clip="frame", generator=np.random.default_rng(0))
+        yield loader.load(address, clip="frame")
 
 
 @contextmanager

@@ -236,7 +236,7 @@ class PosedImageReader:
             SchemaError: If the trajectory does not follow the format.
         """
         address = Address(row, camera, (), (frame,))
-        sample = self._loader.load(address, clip="frame", generator=np.random.default_rng(0))
+        sample = self._loader.load(address, clip="frame")
         return posed_images(sample)[0]
 
     def close(self) -> None:

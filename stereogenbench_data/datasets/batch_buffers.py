@@ -58,13 +58,13 @@ class BatchArrays:
 
     Attributes:
         count: How many samples there are.
-        tensors: The whole fields so far.
     """
 
     def __init__(self, count: int, take: Callable[[str, int], torch.Tensor]) -> None:
         """Begin without fields; ``take`` returns so many bytes for a field, by its name."""
         self.count = count
-        self.tensors: dict[str, torch.Tensor] = {}
+        self._arrays: dict[str, np.ndarray] = {}
+        self._slices: dict[str, tuple[torch.Tensor, ...]] = {}
         self._take = take
 
     def of_sample(self, number: int) -> Allocate:
@@ -72,16 +72,16 @@ class BatchArrays:
 
         def allocate(name: str, shape: tuple[int, ...], dtype: Any) -> Any:
             whole = self._whole(name, shape, np.dtype(dtype))
-            if tuple(whole.shape[1:]) != shape:
+            if whole.shape[1:] != shape:
                 return np.empty(shape, dtype=dtype)
-            return whole[number].numpy()
+            return whole[number, ...]
 
         return allocate
 
     def put(self, number: int, name: str, value: torch.Tensor) -> torch.Tensor:
         """Return a value as a sample's slice of the field, written there."""
-        place = self._whole(name, tuple(value.shape), value.numpy().dtype)[number]
-        return place.copy_(value)
+        self._whole(name, tuple(value.shape), value.numpy().dtype)
+        return self._slices[name][number].copy_(value)
 
     def as_tensors(self, number: int, sample: Sample) -> Sample:
         """Return a sample with tensors for arrays, slices of the batch's where it was written."""
@@ -90,17 +90,17 @@ class BatchArrays:
             if isinstance(value, str):
                 tensors[name] = value
             else:
-                whole = self.tensors[name]
-                same = tuple(whole.shape[1:]) == value.shape
-                tensors[name] = whole[number] if same else torch.from_numpy(value)
+                same = self._arrays[name].shape[1:] == value.shape
+                tensors[name] = self._slices[name][number] if same else torch.from_numpy(value)
         return tensors
 
-    def _whole(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> torch.Tensor:
-        if name not in self.tensors:
+    def _whole(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> np.ndarray:
+        if name not in self._arrays:
             flat = self._take(name, self.count * math.prod(shape) * dtype.itemsize)
             kind = torch.from_numpy(np.empty(0, dtype=dtype)).dtype
-            self.tensors[name] = flat.view(kind).view(self.count, *shape)
-        return self.tensors[name]
+            whole = flat.view(kind).view(self.count, *shape)
+            self._arrays[name], self._slices[name] = whole.numpy(), whole.unbind()
+        return self._arrays[name]
 
 
 class BatchBuffers:

@@ -226,11 +226,10 @@ class _MappedScenes(Dataset[Sample]):
             raise IndexError(f"no sample {number}: there are {count}")
         number %= count
         address = self._address(number, batch.epoch, group=batch.group)
-        seeds = np.random.SeedSequence((self.plan.seed, batch.epoch, number))
         sample = self._loader.load(
             address,
             clip="clip" if self.plan.windows.is_clip else "frame",
-            generator=np.random.default_rng(seeds),
+            seeds=(self.plan.seed, batch.epoch, number),
             allocate=allocate,
         )
         if number in batch.ends_of_runs:

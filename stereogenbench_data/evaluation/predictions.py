@@ -126,10 +126,9 @@ def open_frames(
         depth: A depth contract instead of the one that files and release state.
     """
     request = Request(kind="pairs", fields=fields, layout="single", size=size, depth=depth)
-    unused = np.random.default_rng(0)  # transforms draw from it, and the request has none
     with closing(SampleLoader(index, request)) as loader:
         yield lambda row, pair, frame: loader.load(
-            Address(row, pair[0], (pair[1],), (frame,)), clip="frame", generator=unused
+            Address(row, pair[0], (pair[1],), (frame,)), clip="frame"
         )
 
 

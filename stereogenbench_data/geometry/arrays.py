@@ -8,16 +8,13 @@ trace its cached checks without warnings.
 """
 
 import math
-from typing import Any, Final
+from typing import Any
 
 import array_api_compat
 import numpy as np
 
 Array = Any
 """A numpy array or a torch tensor; jaxtyping checks its shape and dtype under test."""
-
-BLOCK_PIXELS: Final = 64 * 1280
-"""How many pixels of float maps stay in a processor's cache from one step to the next."""
 
 
 def is_torch_array(values: Array) -> bool:

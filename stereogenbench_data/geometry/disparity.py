@@ -16,7 +16,6 @@ from jaxtyping import Bool, Float, Float32, Float64, Integer
 
 from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.arrays import (
-    BLOCK_PIXELS,
     array_namespace,
     as_float64,
     device,
@@ -31,6 +30,9 @@ _EXACT_FACTORS: Final = (128.0, 256.0)
 """From the first to below the second: whole numbers whose product with a 16-bit number is exact in
 the 24 bits of float32. Smaller ones are these divided by a power of two, and round in the same way.
 """
+
+_BLOCK_PIXELS: Final = 128 * 1024
+"""How many pixels of a disparity map stay in a processor's cache from one step to the next."""
 
 _NEARLY_EXACT: Final = 2.0**-29
 """A relative error that is at most 1/32 ulp of a float32."""
@@ -187,22 +189,20 @@ def write_disparity(
     """
     product, factor, dtype = _exact_quotient(shift_units)
     dtype = "float64" if form == "inverse" else dtype
-    rows = max(1, BLOCK_PIXELS // max(1, out.shape[-1]))
-    scratch = np.empty((rows, out.shape[-1]), dtype=dtype)
+    rows = max(1, _BLOCK_PIXELS // max(1, out.shape[-1]))
     blocks = [slice(top, top + rows) for top in range(0, out.shape[-2], rows)]
     with np.errstate(divide="ignore"):
         for here in ((*place, block) for place in np.ndindex(out.shape[:-2]) for block in blocks):
             found, known = out[here], measured[here]
-            work = scratch[: len(found)]
-            # `out` is as large as a picture and not in the cache: it is written once.
-            result = found if dtype == "float32" else work
+            # New memory costs as much as a step: float32 is computed in place.
+            work = found if dtype == "float32" else np.empty(found.shape, dtype=dtype)
             np.copyto(work, units[here])
             if form == "inverse":
-                np.multiply(work, shift_units, out=result)
+                np.multiply(work, shift_units, out=work)
             else:
                 np.multiply(work, work.dtype.type(factor), out=work)
-                np.divide(work.dtype.type(product), work, out=result)
-            if result is work:
+                np.divide(work.dtype.type(product), work, out=work)
+            if work is not found:
                 np.copyto(found, work, casting="same_kind")
             if not known.all():
                 np.copyto(found, 0, where=~known)

@@ -6,14 +6,13 @@ column floor(u). Camera axes are x right, y down, z forward; lengths are metres.
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
 from stereogenbench_data.errors import GeometryError
 from stereogenbench_data.geometry.arrays import (
-    BLOCK_PIXELS,
     array_namespace,
     as_float64,
     device,
@@ -23,6 +22,9 @@ from stereogenbench_data.geometry.arrays import (
     whole_where,
 )
 from stereogenbench_data.geometry.camera import Intrinsics, require_picture_size
+
+_BLOCK_PIXELS: Final = 64 * 1280
+"""How many pixels of float maps stay in a processor's cache from one step to the next."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,7 +50,7 @@ def row_blocks(projection: Projection, *, height_px: int) -> list[slice]:
     """
     *images, rows, columns = projection.u_px.shape
     apart = is_numpy_array(projection.u_px) and projection.v_px is None and rows == height_px
-    step = max(1, BLOCK_PIXELS // max(1, columns * math.prod(images)) if apart else rows)
+    step = max(1, _BLOCK_PIXELS // max(1, columns * math.prod(images)) if apart else rows)
     return [slice(top, top + step) for top in range(0, max(1, rows), step)]
 
 

@@ -3,14 +3,14 @@
 import copy
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, Literal, Self
 
 import numpy as np
 
 from stereogenbench_data.errors import MediaError, SchemaError, ShardError
-from stereogenbench_data.geometry.camera import rig_intrinsics
+from stereogenbench_data.geometry.camera import Intrinsics, rig_intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import depth_frame_index
@@ -35,7 +35,22 @@ KEPT_POSES: Final = 32
 """Of how many scenes the poses are kept (46 kB a scene of 81 frames)."""
 
 KEPT_SCENES: Final = 256
-"""Of how many scenes the row of the index is kept."""
+"""Of how many scenes what the index says is kept."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _KnownScene:
+    """What is known of a scene from its row of the index.
+
+    Attributes:
+        scene: The row.
+        intrinsics: Of its pictures, as large as they are wanted.
+        encodings: The depth contract of each camera.
+    """
+
+    scene: Scene
+    intrinsics: Intrinsics
+    encodings: dict[int, DepthEncoding]
 
 
 class SampleDecoder:
@@ -90,7 +105,7 @@ class SampleDecoder:
         self._coming = self._new_coming()
         if self._coming is not None:
             self._coming.keep(OPEN_STREAMS, frames=1)
-        self._scenes: OrderedDict[int, Scene] = OrderedDict()
+        self._scenes: OrderedDict[int, _KnownScene] = OrderedDict()
         self._poses: OrderedDict[str, CameraPoses] = OrderedDict()
         self._depths: OrderedDict[tuple[int, ...], StoredDepth] = OrderedDict()
         self._encodings: dict[tuple[float, str], DepthEncoding] = {}
@@ -176,15 +191,25 @@ class SampleDecoder:
 
     def scene(self, row: int) -> Scene:
         """Return a scene of the index; those of the last rows asked for are kept."""
-        scene = self._scenes.get(row)
-        if scene is None:
+        return self._known_scene(row).scene
+
+    def _known_scene(self, row: int) -> _KnownScene:
+        known = self._scenes.get(row)
+        if known is None:
             scene = self._index.scene(row)
             if self._coming is not None:
                 scene = replace(scene, seek_tables=self._index.seek_tables(row))
-            self._scenes[row] = scene
+            intrinsics = rig_intrinsics(scene.rig)
+            if self._request.size is not None:
+                height, width = self._request.size
+                intrinsics = intrinsics.resized(width_px=width, height_px=height)
+            encodings = {
+                camera: self._encoding(scene, camera) for camera in range(len(scene.depth_unit_m))
+            }
+            known = self._scenes[row] = _KnownScene(scene, intrinsics, encodings)
             if len(self._scenes) > KEPT_SCENES:
                 self._scenes.popitem(last=False)
-        return scene
+        return known
 
     def decode(
         self, address: Address, *, frames: slice, out: Mapping[int, Any]
@@ -204,10 +229,11 @@ class SampleDecoder:
             MediaError: If a video does not decode to what the index says.
             SchemaError: If the trajectory does not follow the format.
         """
-        scene = self.scene(address.row)
+        known = self._known_scene(address.row)
         try:
-            return self._decode(scene, address, frames=frames, out=out)
+            return self._decode(known, address, frames=frames, out=out)
         except (MediaError, SchemaError, ShardError):
+            scene = known.scene
             names = [
                 *(rgb_name(camera) for camera in self._cameras(address, "rgb")),
                 *(depth_name(camera) for camera in self._cameras(address, "depth")),
@@ -216,19 +242,13 @@ class SampleDecoder:
             if not self._source.drop_damaged(scene, map(scene.held_name, names)):
                 raise
             self.close()
-            return self._decode(scene, address, frames=frames, out=out)
+            return self._decode(known, address, frames=frames, out=out)
 
     def _decode(
-        self, scene: Scene, address: Address, *, frames: slice, out: Mapping[int, Any]
+        self, known: _KnownScene, address: Address, *, frames: slice, out: Mapping[int, Any]
     ) -> tuple[Views, SceneFacts]:
+        scene, intrinsics, encodings = known.scene, known.intrinsics, known.encodings
         numbers = address.frames[frames]
-        encodings = {
-            camera: self._encoding(scene, camera) for camera in {address.source, *address.targets}
-        }
-        intrinsics = rig_intrinsics(scene.rig)
-        if self._request.size is not None:
-            height, width = self._request.size
-            intrinsics = intrinsics.resized(width_px=width, height_px=height)
         views = Views(
             source=address.source,
             targets=address.targets,
@@ -251,7 +271,7 @@ class SampleDecoder:
             scene,
             encodings,
             self._camera_poses(scene),
-            url=self._source.url(scene, rgb_name(address.source)),
+            url=partial(self._source.url, scene, rgb_name(address.source)),
             frames=address.frames,
         )
 
@@ -271,10 +291,11 @@ class SampleDecoder:
 
     def _needed_files(self, address: Address) -> NeededFiles:
         """Return what a sample is read from."""
-        scene = self.scene(address.row)
+        known = self._known_scene(address.row)
+        scene = known.scene
         frames = {rgb_name(camera): [*address.frames] for camera in self._cameras(address, "rgb")}
         for camera in self._cameras(address, "depth"):
-            encoding = self._encoding(scene, camera)
+            encoding = known.encodings[camera]
             lagged = [
                 depth_frame_index(frame, encoding=encoding, frames=scene.frames)
                 for frame in address.frames

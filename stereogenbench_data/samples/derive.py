@@ -1,5 +1,6 @@
 """Geometry of a pair from its decoded views: each map is computed once, when first needed."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Literal
@@ -46,14 +47,14 @@ class SceneFacts:
         scene: The row of the index.
         encodings: The depth contract of each camera.
         poses: The poses, or None where nothing needs them.
-        url: The file or folder that holds the scene.
+        url: Returns the file or folder that holds the scene.
         frames: All frames of the sample.
     """
 
     scene: Scene
     encodings: dict[int, DepthEncoding]
     poses: CameraPoses | None
-    url: str
+    url: Callable[[], str]
     frames: tuple[int, ...]
 
     @property

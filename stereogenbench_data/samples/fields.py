@@ -200,7 +200,7 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
     ),
     Field(
         "__url__", "str", "", "file or folder that holds the scene",
-        make=lambda s: s.facts.url, per_frame=False,
+        make=lambda s: s.facts.url(), per_frame=False,
     ),
 )  # fmt: skip
 

@@ -18,7 +18,7 @@ class SampleLoader(SampleDecoder):
         address: Address,
         *,
         clip: Clip,
-        generator: np.random.Generator,
+        seeds: tuple[int, ...] = (0,),
         allocate: Allocate = new_array,
     ) -> Sample:
         """Return one sample.
@@ -26,7 +26,7 @@ class SampleLoader(SampleDecoder):
         Args:
             address: Where it comes from.
             clip: "clip" where the fields have a time axis, else "frame".
-            generator: The random numbers of the transform.
+            seeds: The seeds of the random numbers that a transform draws.
             allocate: Returns the array that a field is written into; called once for each.
 
         Raises:
@@ -46,7 +46,7 @@ class SampleLoader(SampleDecoder):
                 out = writer.pictures(frames, size=size) if self.decodes_in_place else {}
                 views, facts = self.decode(address, frames=frames, out=out)
                 if request.transform is not None:
-                    views = request.transform(views, generator)
+                    views = request.transform(views, np.random.default_rng(seeds))
                 writer.write(views, facts, frames)
         except (StorageError, MediaError, SchemaError) as error:
             raise type(error)(f"{scene.id.key}, frames {address.frames}: {error}") from error

@@ -142,7 +142,7 @@ class Plan:
         """
         if not 0 <= number < len(self):
             raise IndexError(f"no sample {number}: there are {len(self)}")
-        scene = int(np.searchsorted(self.first_sample, number, side="right")) - 1
+        scene = int(self.first_sample.searchsorted(number, side="right")) - 1
         first, last = int(self.first_pair[scene]), int(self.first_pair[scene + 1])
         window, pair = divmod(number - int(self.first_sample[scene]), last - first)
         frames = self.windows.window(
@@ -157,7 +157,7 @@ class Plan:
             targets=tuple(int(target) for target in targets if target >= 0),
             frames=frames,
             run=group * len(self.runs.pairs)
-            + int(np.searchsorted(self.runs.first_sample, number, side="right"))
+            + int(self.runs.first_sample.searchsorted(number, side="right"))
             - 1,
         )
 

@@ -275,7 +275,7 @@ def test_written_disparity_equals_the_returned_one_and_is_0_where_not_measured(
 def test_blocks_of_rows_change_nothing(monkeypatch, rows):
     rng = np.random.default_rng(1)
     units = rng.integers(0, 65536, (2, 7, 5)).astype(np.uint16)
-    monkeypatch.setattr(disparity_module, "BLOCK_PIXELS", rows * 5)
+    monkeypatch.setattr(disparity_module, "_BLOCK_PIXELS", rows * 5)
     out = np.empty(units.shape, dtype=np.float32)
     write_disparity(out, units, measured=units > 9, shift_units=123.456)
 

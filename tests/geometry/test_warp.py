@@ -179,7 +179,7 @@ def test_blocks_of_rows_give_the_result_of_one_block(monkeypatch, quantum):
         )  # fmt: skip
 
     whole = all_of_it()
-    monkeypatch.setattr(projection_module, "BLOCK_PIXELS", 2 * 2 * 16)
+    monkeypatch.setattr(projection_module, "_BLOCK_PIXELS", 2 * 2 * 16)
     assert len(projection_module.row_blocks(projection, height_px=9)) == 5
 
     for one, other in zip(whole, all_of_it(), strict=True):

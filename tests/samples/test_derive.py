@@ -52,7 +52,7 @@ def facts(encoding, *, residual_px=0.0, order=1.0, yaw_deg=(0.0,) * 6):
         members={},
     )  # fmt: skip
     poses = CameraPoses.from_trajectory(Trajectory(centres, 0.01, rotations, "rotator_deg"))
-    return SceneFacts(scene, dict.fromkeys(range(6), encoding), poses, "url", (0,))
+    return SceneFacts(scene, dict.fromkeys(range(6), encoding), poses, lambda: "url", (0,))
 
 
 def geometry(units, encoding, *, source=0, target=1, world="as recorded", padded=None, **scene):

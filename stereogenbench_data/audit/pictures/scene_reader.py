@@ -93,4 +93,4 @@ class SceneReader:
                 self._loaders[fields] = (loader, threading.Lock())
             loader, turn = self._loaders[fields]
         with turn:
-            return loader.load(address, clip="frame", generator=np.random.default_rng(0))
+            return loader.load(address, clip="frame")
