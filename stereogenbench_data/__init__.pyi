@@ -15,6 +15,7 @@ from stereogenbench_data.datasets.open_videos import OpenVideosWarning as OpenVi
 from stereogenbench_data.datasets.open_videos import (
     RepeatedDecodingWarning as RepeatedDecodingWarning,
 )
+from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning as RepeatedEpochWarning
 from stereogenbench_data.datasets.streamed import StereoPairStream as StereoPairStream
 from stereogenbench_data.datasets.tensors import collate as collate
 from stereogenbench_data.datasets.tensors import to_device as to_device

@@ -96,9 +96,7 @@ class _ScenesOfEpoch(_Scenes):
 
 
 def _samples(pairs: StereoPairs, scenes: list[int], epoch: int | None = None) -> Iterator[Sample]:
-    drawn = pairs if epoch is None else pairs._copy()
-    if epoch is not None:
-        drawn.set_epoch(epoch)
+    drawn = pairs if epoch is None else pairs.with_own_videos(epoch=epoch)
     first: Any = pairs.plan.first_sample
     try:
         for scene in scenes:

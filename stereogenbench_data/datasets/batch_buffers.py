@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from torch.utils.data import get_worker_info
 
-from stereogenbench_data.datasets.shared_epoch import shared_full
+from stereogenbench_data.datasets.shared_epoch import SharedNumbers
 from stereogenbench_data.datasets.tensors import collate
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.fields import Sample
@@ -229,7 +229,7 @@ class _WorkerSlots:
 
     def __init__(self) -> None:
         self._owner = SlotOwner(os.getpid(), os.urandom(8))
-        self._status = shared_full((SLOTS,), _WORKERS)
+        self._status = SharedNumbers([_WORKERS] * SLOTS).tensor
         self._memory: list[torch.Tensor | None] = [None] * SLOTS
         self._is_known = [False] * SLOTS
         self._views: list[Callable[[], Any]] = [lambda: None] * SLOTS

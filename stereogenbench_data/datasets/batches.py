@@ -1,5 +1,6 @@
-"""The batches of an epoch for one rank, and positions in them that can be saved."""
+"""The batches of an epoch for one rank, as a torch sampler, and saved positions in them."""
 
+import copy
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -11,6 +12,7 @@ import torch.distributed
 from torch.utils.data import Sampler
 
 from stereogenbench_data.datasets.open_videos import fitting_rule
+from stereogenbench_data.datasets.passes import Pass, Passes, Position
 from stereogenbench_data.datasets.shared_epoch import SharedEpoch
 from stereogenbench_data.errors import SelectionError, StateError
 from stereogenbench_data.index.table import SceneIndex
@@ -20,7 +22,6 @@ from stereogenbench_data.selection.order import (
     EpochOrder,
     OrderKind,
     OrderRule,
-    Start,
     Tail,
     last_batch,
     rank_share,
@@ -43,15 +44,15 @@ class EpochOptions(TypedDict, total=False):
         rank: Whose batches these are, from 0. By default torch.distributed's rank, or 0 where it is
             not initialised.
         world_size: How many ranks there are. By default torch.distributed's world size, or 1.
-        drop_last: As in torch: True is ``tail="drop"``, the default; False is ``tail="uneven"``,
-            and refused for several ranks, which must choose between "uneven" and "wrap".
+        drop_last: As in torch: True is ``tail="drop"``; False is ``tail="uneven"``, and refused for
+            several ranks, which must choose between "uneven" and "wrap".
         shuffle: As in torch: True is ``order="shuffled"``, the default; False is "sequential".
-        tail: What happens to the epoch's last batches. "drop" (the default): each rank gets as
-            many batches, all of them full; what is left over is dropped (see
-            `EpochBatches.left_out`). "wrap": each rank gets as many full batches and no sample is
-            left out; samples from the epoch's start fill up, marked in the field ``is_padding``
-            (batch,) bool. "uneven": every sample exactly once; the last batch may be short, and
-            ranks may differ by one batch. Validate with "uneven" (or "wrap", less its padding).
+        tail: What happens to the epoch's last batches. "drop", the default of a shuffled order:
+            each rank gets as many batches, all of them full; what is left over is dropped (see
+            `EpochBatches.left_out`). "uneven", the default of a sequential order: every sample
+            exactly once; the last batch may be short, and ranks may differ by one batch. "wrap":
+            each rank gets as many full batches and no sample is left out; samples from the epoch's
+            start fill up, marked in the field ``is_padding`` (batch,) bool.
         shuffle_groups: How many groups of scenes are shuffled separately; batch n belongs to group
             n mod shuffle_groups. By default 4, but 2 where scenes are so large that a group has
             fewer than 16 open; selections too small for so many groups have fewer. Each video is
@@ -67,10 +68,6 @@ class EpochOptions(TypedDict, total=False):
             and depth stay in memory. If left out, as many as a batch has samples of an open scene,
             within 0.5 GB a group: 3 with all pairs of 1280x1280 pixels and a batch of 16, 1 with
             one pair a scene.
-        start: Where in its first scene each of the interleaved streams starts. "anywhere" (the
-            default): else the first batches would show first frames alone, and where scenes are
-            as long as one another, all batches frames of one number. What lies before is decoded
-            twice, once an epoch for each open scene. "beginning" spares that.
         order: "shuffled" (the default) or "sequential".
     """
 
@@ -83,7 +80,6 @@ class EpochOptions(TypedDict, total=False):
     shuffle_groups: int
     open_scenes: int
     open_frames: int
-    start: Start
     order: OrderKind
 
 
@@ -92,7 +88,7 @@ class Numbered(Protocol):
 
     index: SceneIndex
     plan: Plan
-    _epoch: SharedEpoch
+    shared_epoch: SharedEpoch
 
 
 class EpochBatch(list[int]):
@@ -137,8 +133,8 @@ _BATCH_OPTIONS: Final = ("epoch", "is_padding", "ends_of_runs", "number", "group
 class EpochBatches(Sampler[list[int]]):
     """A batch sampler: the samples of each batch of an epoch, for one rank.
 
-    Its passes are of the same epoch until `set_epoch` is called, as with torch's samplers; a
-    ``loader(...)`` goes to the next epoch by itself. The order depends only on the selection, the
+    Its passes are of the same epoch until `set_epoch` is called, as with torch's samplers; each
+    pass of a ``loader(...)`` is of the next epoch. The order depends only on the selection, the
     seed, the epoch, the batch size, the shuffle groups and the open scenes; rank r gets the global
     batches n with n mod world_size = r. torchdata's ``StatefulDataLoader`` can save and load its
     position. torch's own `DataLoader` reads ahead: use the dataset's ``loader(...)``, which counts
@@ -151,6 +147,14 @@ class EpochBatches(Sampler[list[int]]):
     [4, 3]
     >>> sorted(sum([*shares[0], *shares[1]], [])) == list(range(28))
     True
+
+    Attributes:
+        dataset: The samples.
+        rule: What the order depends on.
+        rank: Whose batches these are.
+        world_size: How many ranks there are.
+        tail: What happens to the epoch's last batches.
+        passes: Where its passes are: the position.
     """
 
     def __init__(self, dataset: Numbered, batch_size: int, **options: Unpack[EpochOptions]) -> None:
@@ -167,11 +171,9 @@ class EpochBatches(Sampler[list[int]]):
         """
         require_options(EpochBatches, options)
         self.dataset = dataset
-        self._epoch = dataset._epoch
         rule = OrderRule(
             batch_size=batch_size,
             seed=options.get("seed", dataset.plan.seed),
-            start=options.get("start", "anywhere"),
             kind=_order_kind(options),
         )
         rule = fitting_rule(
@@ -183,13 +185,11 @@ class EpochBatches(Sampler[list[int]]):
             open_frames=options.get("open_frames", rule.open_frames),
         )
         self.rank, self.world_size = _require_group(options.get("rank"), options.get("world_size"))
-        self.tail = _tail(options, world_size=self.world_size)
+        self.tail = _tail(options, kind=rule.kind, world_size=self.world_size)
         self._follows_the_group = "rank" not in options
-        self._resumed = (0, 0)
-        self._completed: tuple[int, tuple[int, ...]] | None = None
         self._order: EpochOrder | None = None
-        self._latest: BatchPass | None = None
-        if self._end() == 0:
+        self.passes = Passes(dataset.shared_epoch, then="same epoch")
+        if self.end() == 0:
             raise SelectionError(
                 f"tail='drop' drops all of {len(dataset.plan)} samples: they fill no batch of "
                 f"{batch_size} for each of {self.world_size} ranks. Take a smaller batch_size, "
@@ -209,11 +209,11 @@ class EpochBatches(Sampler[list[int]]):
     @property
     def left_out(self) -> int:
         """How many samples of an epoch no rank gets: of ``tail="drop"`` only."""
-        return max(0, len(self.dataset.plan) - self._end() * self.rule.batch_size)
+        return max(0, len(self.dataset.plan) - self.end() * self.rule.batch_size)
 
     def __len__(self) -> int:
         """The number of this rank's batches in a whole epoch."""
-        return len(self._share(0))
+        return len(self.share(0))
 
     def __repr__(self) -> str:
         """Return a summary."""
@@ -223,24 +223,38 @@ class EpochBatches(Sampler[list[int]]):
             f"batch, rank {self.rank} of {self.world_size}, {kind}, tail={self.tail!r}>"
         )
 
-    def __iter__(self) -> "BatchPass":
+    def __iter__(self) -> "SamplerPass":
         """Return this rank's batches of the current epoch, or what a loaded state left of it.
 
         Raises:
             SelectionError: If Accelerate would share these batches among ranks a second time.
         """
-        self._require_shared_once(self)
-        epoch, start = self._next_position()
-        return BatchPass(self, epoch=epoch, start=start)
+        self.require_shared_once(self)
+        return SamplerPass(self)
+
+    def next_pass(self) -> Pass:
+        """Return the pass that begins at the next position; it begins with its first batch."""
+        epoch, start = self.passes.next_position
+        return self.pass_from(epoch, start)
+
+    def pass_from(self, epoch: int, start: int) -> Pass:
+        """Return a pass over this rank's batches of an epoch from a global batch on."""
+        share, end = self.share(start), self.end(start)
+        return Pass(epoch, share, start=start, end=end, world_size=self.world_size)
 
     def set_epoch(self, epoch: int) -> None:
-        """Go to another epoch, which begins at its beginning; the dataset goes with it."""
-        self._epoch.set(epoch)
+        """Go to another epoch, which begins at its beginning; the dataset goes with it.
+
+        With the epoch of a state just loaded it changes nothing.
+
+        Raises:
+            SelectionError: If it is not a whole number from 0.
+        """
+        self.passes.set_epoch(epoch)
 
     def state_dict(self) -> State:
         """Return the position after the last batch that was given out."""
-        latest = self._latest
-        return self.state_at(*(self._next_position() if latest is None else latest.position))
+        return self.state_at(*self.passes.position)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go to a saved position: the next pass begins there, all later ones at the beginning.
@@ -248,43 +262,9 @@ class EpochBatches(Sampler[list[int]]):
         Raises:
             StateError: If it belongs to other samples or another order, naming what differs.
         """
-        self._go_to(*self._position_in(state))
+        self.passes.set(*self.position_in(state))
 
-    def _go_to(self, epoch: int, start: int) -> None:
-        """Begin the next pass at a global batch of an epoch."""
-        self._epoch.set(epoch)
-        self._resumed = (epoch, start)
-        self._latest = None
-
-    def _next_position(self) -> tuple[int, int]:
-        """Return the epoch and the global batch at which the next pass begins."""
-        epoch, start = self._resumed
-        return (epoch, start) if epoch == self._epoch.value else (self._epoch.value, 0)
-
-    def _begin(self, latest: "BatchPass | None" = None) -> None:
-        """Record that a pass has begun: the next one begins its epoch at the first batch."""
-        self._resumed = (0, 0)
-        self._latest = latest
-
-    def _complete(self, epoch: int) -> None:
-        """Record that a pass over an epoch gave its last batch."""
-        self._completed = (epoch, self._epoch.version)
-
-    def _require_no_other_reader(self) -> None:
-        """Require that no other `DataLoader` is in the middle of these batches.
-
-        Raises:
-            StateError: If one is: its workers read ahead, so nobody knows what its loop has taken.
-        """
-        if self._latest is not None and not self._latest.is_complete:
-            raise StateError(
-                "these batches are read by another DataLoader than the loader that is asked for "
-                "its position, as after skip_first_batches of Accelerate, and nobody counts what "
-                "its loop takes. Go on from a saved state with load_state_dict (Accelerate: "
-                "load_state), without skip_first_batches."
-            )
-
-    def _end(self, start: int = 0) -> int:
+    def end(self, start: int = 0) -> int:
         """Return the global number at which an epoch ends for ranks that go on from ``start``."""
         return last_batch(
             len(self.dataset.plan),
@@ -294,7 +274,7 @@ class EpochBatches(Sampler[list[int]]):
             start=start,
         )
 
-    def _share(self, start: int) -> range:
+    def share(self, start: int) -> range:
         """Return the global numbers of this rank's batches from ``start`` on.
 
         Raises:
@@ -302,10 +282,10 @@ class EpochBatches(Sampler[list[int]]):
         """
         group = _group()
         if group is not None:
-            self._require_group(*group)
-        return rank_share(start, self._end(start), rank=self.rank, world_size=self.world_size)
+            self.require_group(*group)
+        return rank_share(start, self.end(start), rank=self.rank, world_size=self.world_size)
 
-    def _require_group(self, rank: int, world_size: int) -> None:
+    def require_group(self, rank: int, world_size: int) -> None:
         """Require that the batches were made for a rank of so many, unless the user chose another.
 
         Raises:
@@ -319,7 +299,7 @@ class EpochBatches(Sampler[list[int]]):
                 "data module), or give rank= and world_size=."
             )
 
-    def _require_shared_once(self, data: object) -> None:
+    def require_shared_once(self, data: object) -> None:
         """Require that Accelerate does not divide these batches among processes a second time.
 
         Args:
@@ -379,11 +359,11 @@ class EpochBatches(Sampler[list[int]]):
         return {
             "version": ORDER_VERSION,
             "epoch": epoch,
-            "batches_consumed": min(batches, self._batches_of_all),
+            "batches_consumed": min(batches, self.batches_of_all),
             **self._identity,
         }
 
-    def _position_in(self, state: Mapping[str, Any]) -> tuple[int, int]:
+    def position_in(self, state: Mapping[str, Any]) -> Position:
         """Return the epoch and the number of global batches that a state says are consumed.
 
         Raises:
@@ -400,6 +380,9 @@ class EpochBatches(Sampler[list[int]]):
                 "version of the package that saved it."
             )
         own = {"version": ORDER_VERSION, **self._identity}
+        if "start_of_streams" in state:
+            # Of states that were saved while there was a choice.
+            own["start_of_streams"] = "anywhere"
         missing = sorted({*own, "epoch", "batches_consumed"} - state.keys())
         if missing:
             raise StateError(
@@ -417,10 +400,10 @@ class EpochBatches(Sampler[list[int]]):
                 "data with the same selection and options, or begin the epoch anew without it."
             )
         epoch = require_count(state, "epoch")
-        return epoch, require_count(state, "batches_consumed", most=self._batches_of_all)
+        return epoch, require_count(state, "batches_consumed", most=self.batches_of_all)
 
     @property
-    def _batches_of_all(self) -> int:
+    def batches_of_all(self) -> int:
         """How many batches hold all samples of an epoch, whatever ranks and tail there are."""
         return -(-len(self.dataset.plan) // self.rule.batch_size)
 
@@ -434,7 +417,6 @@ class EpochBatches(Sampler[list[int]]):
             "shuffle_groups": rule.shuffle_groups,
             "open_scenes": rule.open_scenes,
             "open_frames": rule.open_frames,
-            "start_of_streams": rule.start,
             "order": rule.kind,
             "tail": self.tail,
             "selection": self.dataset.plan.digest,
@@ -443,7 +425,12 @@ class EpochBatches(Sampler[list[int]]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs; it computes the order itself."""
-        return self.__dict__ | {"_order": None, "_latest": None}
+        return self.__dict__ | {"_order": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Become a copy, with passes of its own."""
+        self.__dict__.update(state)
+        self.passes = copy.copy(self.passes)
 
 
 def batch_samples(order: EpochOrder, number: int, *, tail: Tail) -> tuple[list[int], list[int]]:
@@ -453,43 +440,41 @@ def batch_samples(order: EpochOrder, number: int, *, tail: Tail) -> tuple[list[i
     return (order.full_batch(number) if tail == "wrap" else samples).tolist(), ends
 
 
-class BatchPass(Iterator[list[int]]):
-    """One pass over a rank's batches."""
+class SamplerPass(Iterator[list[int]]):
+    """One pass over the numbers of a rank's batches, for torch's own `DataLoader`."""
 
-    def __init__(self, batches: EpochBatches, *, epoch: int, start: int) -> None:
-        """Begin an epoch at a global batch."""
+    def __init__(self, batches: EpochBatches) -> None:
+        """Represent the next pass; it begins with its first batch."""
         self._batches = batches
-        self._epoch, self._start, self._given = epoch, start, 0
-        self._end = batches._end(start)
-        share = batches._share(start)
-        self._left, self._count = iter(share), len(share)
-        if not share:
+        self._pass: Pass | None = None
+        if batches.next_pass().is_complete:
             # torchdata's loader asks for no batch of a pass that it saved at its end.
-            batches._begin(self)
+            self._begin()
+
+    def _begin(self) -> Pass:
+        self._pass = self._batches.next_pass()
+        self._pass.is_read_ahead = True
+        self._batches.passes.begin(self._pass)
+        return self._pass
 
     def __next__(self) -> EpochBatch:
         """Return the next batch: the numbers of its samples."""
-        self._batches._begin(self)
-        number = next(self._left)
-        self._given += 1
-        if self.is_complete:
-            self._batches._complete(self._epoch)
-        return self._batches.batch(number, epoch=self._epoch)
+        begun = self._pass or self._begin()
+        if begun.is_complete:
+            self._batches.passes.end(begun)
+            raise StopIteration
+        number = begun.share[begun.taken]
+        begun.taken += 1
+        if begun.is_complete:
+            self._batches.passes.end(begun)
+        return self._batches.batch(number, epoch=begun.epoch)
 
     def __repr__(self) -> str:
         """Return a summary."""
-        return f"<BatchPass: {self._given} of {self._count} batches of epoch {self._epoch}>"
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether the last batch was given out."""
-        return self._given >= self._count
-
-    @property
-    def position(self) -> tuple[int, int]:
-        """The epoch, and how many global batches are consumed after the last one given out."""
-        given = self._start + self._given * self._batches.world_size
-        return self._epoch, min(given, self._end)
+        if self._pass is None:
+            return "<SamplerPass: not begun>"
+        taken, count = self._pass.taken, len(self._pass.share)
+        return f"<SamplerPass: {taken} of {count} batches of epoch {self._pass.epoch}>"
 
 
 def _order_kind(options: EpochOptions) -> OrderKind:
@@ -499,9 +484,9 @@ def _order_kind(options: EpochOptions) -> OrderKind:
     return "shuffled" if options["shuffle"] else "sequential"
 
 
-def _tail(options: EpochOptions, *, world_size: int) -> Tail:
+def _tail(options: EpochOptions, *, kind: OrderKind, world_size: int) -> Tail:
     if "drop_last" not in options:
-        return options.get("tail", "drop")
+        return options.get("tail", "drop" if kind == "shuffled" else "uneven")
     _require_one_of_two(options, "drop_last", "tail")
     if not options["drop_last"] and world_size > 1:
         raise SelectionError(

@@ -257,7 +257,7 @@ def planned_bytes(
     whole = len(plan) <= _MOST_PLANNED
     requests = count = samples = 0
     for worker in range(workers if whole else 1):
-        numbers = range(worker, batches._end(), workers)
+        numbers = range(worker, batches.end(), workers)
         most = len(plan) if whole else _MOST_PLANNED
         # What is open from the start to the end counts too much in a part of an epoch.
         before = 0 if whole else most // 4

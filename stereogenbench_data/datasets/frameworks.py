@@ -78,7 +78,7 @@ class AcceleratedLoader:
         if states is None:
             return False
         state = states.PartialState()
-        self.batches._require_group(state.process_index, state.num_processes)
+        self.batches.require_group(state.process_index, state.num_processes)
         self._device = state.device
         self._gradient_state = states.GradientState()
         return True
@@ -100,7 +100,8 @@ class AcceleratedLoader:
         if self._gradient_state is not None:
             self._gradient_state._remove_dataloader(self)
 
-    def _on_device(self, batch: Any) -> Any:
+    def on_device(self, batch: Any) -> Any:
+        """Return a batch on the device of Accelerate's process; as it is without Accelerate."""
         if self._device is None:
             return batch
         from accelerate.utils import send_to_device

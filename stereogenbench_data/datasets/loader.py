@@ -1,11 +1,16 @@
-"""A torch `DataLoader` over the batches of an epoch, which counts what its loop has consumed."""
+"""A torch `DataLoader` over the batches of an epoch, which counts what its loop has taken.
 
+The loader starts passes. A `LoaderPass` owns its position, its workers and their memory.
+"""
+
+import copy
 import os
 import sys
 import threading
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cached_property, partial
-from typing import Any, Final, NamedTuple, Protocol, cast
+from typing import Any, Final, NamedTuple, Protocol, Self, SupportsIndex, cast
 from weakref import WeakSet
 
 import torch
@@ -20,11 +25,13 @@ from stereogenbench_data.datasets.batches import (
     State,
 )
 from stereogenbench_data.datasets.frameworks import AcceleratedLoader, ShareSampler
+from stereogenbench_data.datasets.passes import Pass
 from stereogenbench_data.datasets.shared_epoch import FetchedCounts
 from stereogenbench_data.datasets.workers import WorkerContext
 from stereogenbench_data.errors import (
     PassError,
     SelectionError,
+    StateError,
     StereoGenBenchError,
     WorkerError,
 )
@@ -60,17 +67,14 @@ class LoaderOptions(EpochOptions, total=False):
 class Loadable(Numbered, Protocol):
     """A numbered dataset that a loader loads."""
 
-    _buffers: BatchBuffers
+    buffers: BatchBuffers
+    fetched: FetchedCounts
 
-    def _keep_open(self, batches: EpochBatches, *, processes: int) -> None:
+    def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Keep videos open for the scenes that one of so many processes reads at a time."""
 
-    def _stop_fetching(self) -> None:
+    def stop_fetching(self) -> None:
         """End the requests of this process for coming samples."""
-
-    @property
-    def _fetched(self) -> FetchedCounts:
-        """What its processes have fetched."""
 
     def stats(self) -> StreamStats:
         """Return how many videos this process has open."""
@@ -113,15 +117,19 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     It is a torch `DataLoader`. `state_dict` counts the batches that the loop has taken, not those
     that workers have read ahead, so that it can be saved after any batch and loaded under other
-    numbers of ranks and workers. After a whole pass the next pass is of the next epoch, unless an
-    epoch was set since. So training loops need not call `set_epoch`. To repeat a pass, as for
-    validation on random frames, call ``set_epoch(0)`` before it.
+    numbers of ranks and workers.
 
-    A pass owns its workers and their memory, so several passes over one loader can run at a time.
-    Workers that persist serve one pass at a time: a new pass ends the previous one, which then
-    raises `PassError`. If a worker dies, the loop ends with `WorkerError`, or with torch's own
-    `RuntimeError` if it dies while the body of the loop runs: catch `RuntimeError`, the base of
-    `WorkerError`. Threads that share a pass take turns.
+    Each pass is of the next epoch, unless an epoch was set since: after a whole pass, and after one
+    whose loop was left. So training loops need not call `set_epoch`, and a loop of so many steps an
+    epoch sees other samples in each. Only `load_state_dict` goes on inside an epoch. To repeat a
+    pass, as for validation on random frames, call ``set_epoch(0)`` before it.
+
+    A pass owns its workers and their memory, so several passes over one loader can run at a time;
+    one that begins while another runs is of the same epoch. Workers that persist serve one pass at
+    a time: a new pass ends the previous one, which then raises `PassError`. If a worker dies, the
+    loop ends with `WorkerError`, or with torch's own `RuntimeError` if it dies while the body of
+    the loop runs: catch `RuntimeError`, the base of `WorkerError`. Threads that share a pass take
+    turns.
 
     Its epoch follows that of its dataset until the first `set_epoch` or `load_state_dict`. Its open
     videos are its own. So a loader to train and a loader to validate may share a dataset.
@@ -156,7 +164,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             **options: Those of `DataLoader`.
         """
         if options.get("collate_fn") is None:
-            options["collate_fn"] = dataset._buffers.collate
+            options["collate_fn"] = dataset.buffers.collate
         super().__init__(
             # A protocol: torch asks for len and [] alone.
             cast("Dataset[Any]", dataset),
@@ -166,20 +174,20 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         )
         self.batches = batches
         self._loadable = dataset
-        self._position = batches._next_position()
-        self._unfinished: WeakSet[LoaderPass] = WeakSet()
         self._workers: WeakSet[_Workers] = WeakSet()
-        self._running = 0
-        self._clock = 0
+        self._begun_passes = 0
         self._persistent: _Workers | None = None
+        self._set_sampler()
+        dataset.keep_open(batches, processes=batches.world_size * max(1, num_workers))
+
+    def _set_sampler(self) -> None:
         # Past torch's guard against another sampler: it says that the batches are a rank's share.
-        object.__setattr__(self, "sampler", ShareSampler(batches))
-        dataset._keep_open(batches, processes=batches.world_size * max(1, num_workers))
+        object.__setattr__(self, "sampler", ShareSampler(self.batches))
 
     @property
     def epoch(self) -> int:
         """The current epoch, from 0: until the next pass begins, that of the last one."""
-        return self._loadable._epoch.value
+        return self.batches.passes.position[0]
 
     def set_epoch(self, epoch: int) -> None:
         """Go to an epoch: another order, other random frames and transforms.
@@ -194,10 +202,9 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         self.batches.set_epoch(epoch)
 
     def __iter__(self) -> "LoaderPass":  # type: ignore[override]  # torch names a private class
-        """Return a pass over the current epoch, or over what a loaded state left of it.
+        """Return a pass over the next epoch, or over what a loaded state left of its own.
 
-        After a whole pass it is the next epoch, unless an epoch was set since. The pass begins with
-        its first batch, because trainers set the epoch in between.
+        The pass begins with its first batch, because trainers set the epoch in between.
         """
         return LoaderPass(self)
 
@@ -207,9 +214,15 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         Raises:
             StateError: If the loop runs over another DataLoader, made of this one's parts.
         """
-        self.batches._require_no_other_reader()
-        epoch, consumed = self._position
-        return self.batches.state_at(self.epoch, consumed if epoch == self.epoch else 0)
+        latest = self.batches.passes.latest
+        if latest is not None and latest.is_read_ahead and not latest.is_complete:
+            raise StateError(
+                "these batches are read by another DataLoader than the loader that is asked for "
+                "its position, as after skip_first_batches of Accelerate, and nobody counts what "
+                "its loop takes. Go on from a saved state with load_state_dict (Accelerate: "
+                "load_state), without skip_first_batches."
+            )
+        return self.batches.state_dict()
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go to a saved position. Nothing is replayed; later epochs are whole again.
@@ -219,22 +232,20 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
         Raises:
             StateError: If it belongs to other samples or another order, naming what differs.
         """
-        epoch, start = self.batches._position_in(state)
-        if start > 0 and start >= self.batches._end(start):
+        epoch, start = self.batches.position_in(state)
+        if start > 0 and start >= self.batches.end(start):
             epoch, start = epoch + 1, 0
-        self.batches._go_to(epoch, start)
-        self._position = epoch, start
-        self._unfinished.clear()
+        self.batches.passes.set(epoch, start)
 
     def stats(self) -> LoaderStats:
         """Return what the loader has and holds now: open videos, workers, batches."""
         pids = {pid for each in self._workers for pid in each.pids}
         videos = self._loadable.stats()
-        epoch, taken = self._position
-        requests, bytes_fetched = self._loadable._fetched.total
+        requests, bytes_fetched = self._loadable.fetched.total
+        epoch, taken = self.batches.passes.position
         return LoaderStats(
-            epoch=self.epoch,
-            batches_taken=taken if epoch == self.epoch else 0,
+            epoch=epoch,
+            batches_taken=taken,
             workers=len(pids),
             videos_open=videos.videos_open,
             videos_limit=videos.videos_limit,
@@ -266,14 +277,16 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy needs: it has passes and workers of its own."""
-        return self.__dict__ | {
-            "_unfinished": None, "_workers": None, "_persistent": None, "_running": 0,
-        }  # fmt: skip
+        own = {"_workers": None, "_persistent": None, "_begun_passes": 0, "sampler": None}
+        return self.__dict__ | own | {"batches": copy.copy(self.batches)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Become a copy."""
         self.__dict__.update(state)
-        self._unfinished, self._workers = WeakSet(), WeakSet()
+        self._workers = WeakSet()
+        if isinstance(self.batch_sampler, EpochBatches):
+            self.__dict__["batch_sampler"] = self.batches
+        self._set_sampler()
 
     def _forget(self, workers: "_Workers") -> None:
         """End workers; the next pass starts others."""
@@ -281,46 +294,28 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
             self._persistent = None
         workers.end()
 
-    def _next_position(self) -> tuple[int, int]:
-        """Return the epoch and the global batch at which a pass begins now."""
-        epoch, start = self.batches._next_position()
-        if start == 0 and self.batches._completed == (epoch, self._loadable._epoch.version):
-            epoch += 1
-        return epoch, start
+    def _workers_of_a_pass(self) -> "_Workers":
+        """Return the workers of a pass that begins: those that persist, or new ones."""
+        if not self.persistent_workers:
+            return _Workers(self)
+        if self._persistent is None or not self._persistent.is_of_this_process:
+            self._persistent = _Workers(self)
+        return self._persistent
 
-    def _begun(self, begun: "LoaderPass") -> None:
+    def _begin(self, begun: Pass) -> None:
         """Record that a pass begins."""
-        if begun.epoch != self.epoch:
-            self._loadable._epoch.advance(begun.epoch)
-        self.batches._begin()
-        self._unfinished.add(begun)
-        self._running += 1
-        if self._running == 1:
-            self._enter_loop()
+        self.batches.passes.begin(begun)
         self.end_of_dataloader = False
+        self._begun_passes += 1
+        if self._begun_passes == 1:
+            self._enter_loop()
 
-    def _taken(self, by: "LoaderPass") -> None:
-        """Record that a pass gives a batch."""
-        self.end_of_dataloader = by.is_complete
-        if by not in self._unfinished:
-            return
-        self._position = by._position
-        self._clock += 1
-        by._last_taken = self._clock
-        if by.is_complete:
-            self.batches._complete(by.epoch)
-            self._unfinished.discard(by)
-
-    def _ended(self, ended: "LoaderPass") -> None:
-        """Record that a pass is over; the position becomes that of a pass that it ran within."""
-        self._running -= 1
-        if self._running == 0:
+    def _end(self, ended: Pass) -> None:
+        """Record that a pass is over."""
+        self.batches.passes.end(ended)
+        self._begun_passes -= 1
+        if self._begun_passes == 0:
             self._leave_loop()
-        if ended in self._unfinished:
-            self._unfinished.discard(ended)
-            if self._unfinished and self._position == ended._position:
-                latest = max(self._unfinished, key=lambda each: each._last_taken)
-                self._position = latest._position
 
 
 _NOTHING: Final = object()
@@ -329,67 +324,41 @@ _NOTHING: Final = object()
 class LoaderPass(Iterator[Any]):
     """One pass over the batches of a loader: what ``iter(loader)`` returns.
 
-    Attributes:
-        epoch: The epoch of its batches.
-        taken: How many batches it has given.
+    It owns its position and its workers; no reference to it is kept elsewhere, so it ends when its
+    loop is left.
     """
 
     def __init__(self, loader: PairsLoader) -> None:
         """Represent the next pass of a loader; workers start with the first batch."""
-        self._workers: _Workers | None = None
         self._loader = loader
-        self.epoch = loader.epoch
-        self._position = self.epoch, 0
-        self.taken = 0
-        self._last_taken = 0
-        self._share: range | None = None
+        self._pass: Pass | None = None
+        self._workers: _Workers | None = None
+        self._loaded: Iterator[Any] = iter(())
+        self._is_closed = False
+        self._error: str | None = None
         self._pid = os.getpid()
-        self._over: str | None = None
-        self._loaded: Any = _NOTHING
         # Threads that share a pass take turns.
         self._lock = threading.RLock()
 
-    def _begin(self) -> None:
-        """Begin at the position that the loader is at now."""
-        loader, batches = self._loader, self._loader.batches
-        self.epoch, start = self._position = loader._next_position()
-        self._end = batches._end(start)
-        share = batches._share(start)
-        # No reference to this pass in it: without a cycle, a pass that is left ends at once.
-        numbers: Iterator[Any] = map(partial(batches.batch, epoch=self.epoch), share)
-        if loader.batch_sampler is not batches:
-            numbers = iter(loader.batch_sampler or ())
-        if loader.persistent_workers:
-            if loader._persistent is None or not loader._persistent.is_of_this_process:
-                loader._persistent = _Workers(loader)
-            self._workers = loader._persistent
-        else:
-            self._workers = _Workers(loader)
-        loader._begun(self)
-        self._share = share
-        try:
-            self._loaded = self._workers.begin(numbers)
-        finally:
-            self._number = self._workers.passes
-            if self._loaded is _NOTHING:
-                self.close()
+    @property
+    def epoch(self) -> int:
+        """The epoch of its batches."""
+        return (self._pass or self._loader.batches.next_pass()).epoch
 
     @property
-    def is_complete(self) -> bool:
-        """Whether its last batch was given."""
-        return self._share is not None and self.taken >= len(self._share)
+    def taken(self) -> int:
+        """How many batches it has given."""
+        return 0 if self._pass is None else self._pass.taken
 
     def __len__(self) -> int:
         """Return how many batches it has in all."""
-        if self._share is None:
-            return len(self._loader.batches._share(self._loader._next_position()[1]))
-        return len(self._share)
+        return len((self._pass or self._loader.batches.next_pass()).share)
 
     def __repr__(self) -> str:
         """Return a summary."""
-        if self._share is None:
+        if self._pass is None:
             return "<LoaderPass: not begun>"
-        return f"<LoaderPass: {self.taken} of {len(self._share)} batches of epoch {self.epoch}>"
+        return f"<LoaderPass: {self.taken} of {len(self)} batches of epoch {self.epoch}>"
 
     def __next__(self) -> Any:
         """Return the next batch.
@@ -409,57 +378,101 @@ class LoaderPass(Iterator[Any]):
             return self._next()
 
     def _next(self) -> Any:
-        if self._over is not None:
-            raise PassError(self._over)
-        if self._share is None:
+        if self._error is not None:
+            raise PassError(self._error)
+        if self._pass is None and not self._is_closed:
             self._begin()
-        workers = self._workers
-        if workers is None:
+        begun, workers = self._pass, self._workers
+        if begun is None or workers is None:
             raise StopIteration
-        if workers.passes != self._number:
+        if workers.serves is not begun:
             raise PassError(
                 f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
                 "batches, as another one was begun: workers that persist serve one pass at a time. "
                 "Use a loader for each, or persistent_workers=False."
             )
-        self._over = (
-            f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} batches "
-            "with an error: begin another one, or load a state."
-        )
-        batch: Any = _NOTHING
+        with self._ended_by_errors():
+            batch = self._load(workers)
+        begun.taken += 1
+        if begun.is_complete:
+            self._loader.batches.passes.end(begun)
+        self._loader.end_of_dataloader = begun.is_complete
+        return self._loader.on_device(batch)
+
+    def _begin(self) -> None:
+        """Begin at the position that the loader is at now."""
+        loader, batches = self._loader, self._loader.batches
+        begun = batches.next_pass()
+        # No reference to this pass in it: without a cycle, a pass that is left ends at once.
+        numbers: Iterator[Any] = map(partial(batches.batch, epoch=begun.epoch), begun.share)
+        if loader.batch_sampler is not batches:
+            numbers = iter(loader.batch_sampler or ())
+        workers = loader._workers_of_a_pass()
+        if workers.serves is not None:
+            batches.passes.end(workers.serves)
+        loader._begin(begun)
+        self._pass, self._workers = begun, workers
+        with self._ended_by_errors():
+            self._loaded = workers.begin(begun, numbers)
+
+    def _load(self, workers: "_Workers") -> Any:
+        """Return what the workers have next; an error that a dead worker caused names it."""
         try:
-            batch = next(self._loaded)
-        except StopIteration:
-            self._over = None
-            raise
+            return next(self._loaded)
         except (RuntimeError, OSError, EOFError) as error:
             death = None if isinstance(error, StereoGenBenchError) else workers.death(error)
             if death is None:
                 raise
             self._loader._forget(workers)
             raise death from error
-        finally:
-            if batch is _NOTHING:
-                self.close()
-        self._over = None
-        self.taken += 1
-        consumed = self._position[1] + self._loader.batches.world_size
-        self._position = self.epoch, min(consumed, self._end)
-        self._loader._taken(self)
-        return self._loader._on_device(batch)
+
+    @contextmanager
+    def _ended_by_errors(self) -> Iterator[None]:
+        """Close the pass where an error is raised, and keep what is said to who asks on."""
+        try:
+            yield
+        except BaseException as error:
+            if isinstance(error, StopIteration) and self._pass is not None:
+                self._pass.exhaust()
+            else:
+                self._error = (
+                    f"this pass over epoch {self.epoch} ended after {self.taken} of {len(self)} "
+                    "batches with an error: begin another one, or load a state."
+                )
+            self.close()
+            raise
 
     def close(self) -> None:
         """End the pass, begun or not; its workers end, too, unless they persist."""
+        self._is_closed = True
         workers, self._workers = self._workers, None
-        self._share = range(0) if self._share is None else self._share
-        if workers is None:
+        if self._pass is None or workers is None:
             return
         self._loaded = iter(())
-        self._loader._ended(self)
+        self._loader._end(self._pass)
         if self._pid == os.getpid() and self._loader.num_workers == 0:
-            self._loader._loadable._stop_fetching()
+            self._loader._loadable.stop_fetching()
         if workers is not self._loader._persistent:
             workers.end()
+
+    def __copy__(self) -> Self:
+        """Refuse: two passes would take batches from the same workers.
+
+        Raises:
+            PassError: Always.
+        """
+        raise PassError(
+            f"{self!r} cannot be copied: its workers serve one loop. Call iter(loader) for "
+            "another pass, or copy the loader."
+        )
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
+        """Refuse, as `copy.copy` is: for `copy.deepcopy` and pickle.
+
+        Raises:
+            PassError: Always.
+        """
+        return self.__copy__()
 
     def __del__(self) -> None:
         """End the pass when no reference is left."""
@@ -474,7 +487,7 @@ class _Workers:
         self._batches: Iterator[Any] = iter(())
         _running.add(self)
         loader._workers.add(self)
-        self.passes = 0
+        self.serves: Pass | None = None
         self._numbers = _Numbers()
         self._context = None
         if loader.num_workers > 0:
@@ -503,14 +516,14 @@ class _Workers:
         """The numbers of the processes that run."""
         return set() if self._context is None or self._torch is None else self._context.pids
 
-    def begin(self, numbers: Iterator[Any]) -> Iterator[Any]:
+    def begin(self, begun: Pass, numbers: Iterator[Any]) -> Iterator[Any]:
         """Return the batches of a pass; the pass that these workers served before has ended."""
         if self._torch is None:
             raise PassError("these workers have ended: call iter(loader) again.")
-        self.passes += 1
+        are_new, self.serves = self.serves is None, begun
         self._numbers.due = numbers
         self._batches = iter(self._torch)
-        if self._context is not None and self.passes == 1:
+        if self._context is not None and are_new:
             self._context.watch()
         return self._batches
 

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal, Self, Unpack, get_args
 
 import numpy as np
 import torch
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, get_worker_info
 
 from stereogenbench_data.datasets.batch_buffers import BatchArrays, BatchBuffers, Buffers
 from stereogenbench_data.datasets.batches import EpochBatch, EpochBatches, batch_samples
@@ -21,7 +21,8 @@ from stereogenbench_data.datasets.loader import (
     split_options,
 )
 from stereogenbench_data.datasets.open_videos import videos_to_keep
-from stereogenbench_data.datasets.shared_epoch import FetchedCounts, SharedEpoch
+from stereogenbench_data.datasets.passes import Passes
+from stereogenbench_data.datasets.shared_epoch import DrawnSamples, FetchedCounts, SharedEpoch
 from stereogenbench_data.datasets.tensors import to_tensors
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
@@ -35,6 +36,7 @@ from stereogenbench_data.samples.fields import (
 from stereogenbench_data.samples.load import SampleLoader
 from stereogenbench_data.samples.request import Request, Transform, parse_request
 from stereogenbench_data.samples.streams import StreamStats
+from stereogenbench_data.samples.transforms import Compose, Crop, Letterbox, Resize
 from stereogenbench_data.samples.writer import Allocate, new_array
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.text import counted
@@ -42,7 +44,7 @@ from stereogenbench_data.selection.filters import SceneFilters
 from stereogenbench_data.selection.options import options_of, require_options
 from stereogenbench_data.selection.order import EpochOrder, OrderRule, Runs, Tail
 from stereogenbench_data.selection.plan import Address, Plan, Selection, plan_pairs, plan_views
-from stereogenbench_data.selection.windows import FramesSpec
+from stereogenbench_data.selection.windows import FramesSpec, Random
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import CONNECTIONS, FETCH_AHEAD_BYTES, FetchAhead
 from stereogenbench_data.sources.location import is_remote
@@ -102,18 +104,24 @@ class _MappedScenes(Dataset[Sample]):
             frames="shared" if (np.diff(plan.first_pair) > 1).any() else "used once",
             ahead=ahead if is_remote(index.root) else None,
         )
-        self._buffers = BatchBuffers(buffers)
+        self.buffers = BatchBuffers(buffers)
         self._streams = request.streams
         self._access: Literal["random", "in order"] = "random"
-        self._epoch = SharedEpoch()
+        self.shared_epoch = SharedEpoch()
+        self._drawn = DrawnSamples(len(plan)) if _is_random(plan, request) else None
         self._known_order: KnownOrder | None = None
         self._next_batch: tuple[int, int] | None = None
-        self._fetched = FetchedCounts()
+        self.fetched = FetchedCounts()
 
     @property
     def epoch(self) -> int:
-        """The epoch that random frames and transforms are drawn for."""
-        return self._epoch.value
+        """The epoch that random frames and transforms are drawn for.
+
+        It is the one that was set; or the pass that Accelerate makes over this dataset, which it
+        counts without telling.
+        """
+        accelerates = accelerates_epoch(self)
+        return self.shared_epoch.value if accelerates is None else accelerates
 
     def set_epoch(self, epoch: int) -> None:
         """Draw random frames and transforms anew, in this process and in running workers.
@@ -126,14 +134,10 @@ class _MappedScenes(Dataset[Sample]):
         Raises:
             SelectionError: If it is negative.
         """
-        self._epoch.set(epoch)
+        self.shared_epoch.set(epoch)
 
     def __len__(self) -> int:
         """Return the number of samples."""
-        # Samplers ask for it when a pass begins.
-        epoch = accelerates_epoch(self)
-        if epoch is not None and epoch != self.epoch:
-            self.set_epoch(epoch)
         return len(self.plan)
 
     def __getitem__(self, number: int) -> Sample:
@@ -144,7 +148,10 @@ class _MappedScenes(Dataset[Sample]):
             StorageError: If a file is missing or altered.
             MediaError: If a video does not decode to what the index says.
         """
-        return to_tensors(self._sample(number, EpochBatch((), epoch=self.epoch)))
+        batch = EpochBatch([number], epoch=self.epoch)
+        if get_worker_info() is not None:
+            self._mark_drawn(batch)
+        return to_tensors(self._sample(number, batch))
 
     def __getitems__(self, numbers: Sequence[int]) -> list[Sample]:
         """Return several samples in the order asked, each stream read forwards on the way.
@@ -156,19 +163,33 @@ class _MappedScenes(Dataset[Sample]):
         `EpochBatches` gives is drawn for its own epoch, and has the field ``is_padding`` where its
         tail is "wrap".
         """
-        arrays = self._buffers.allocate(len(numbers))
+        arrays = self.buffers.allocate(len(numbers))
         batch = (
             numbers if isinstance(numbers, EpochBatch) else EpochBatch(numbers, epoch=self.epoch)
         )
+        self._mark_drawn(batch)
         loaded: dict[int, Sample] = {}
         reading = list(enumerate(numbers))
         if not isinstance(numbers, EpochBatch):
             reading.sort(key=operator.itemgetter(1))
         self._expect(batch, read="as they come" if isinstance(numbers, EpochBatch) else "by number")
         for place, number in reading:
-            loaded[place] = self._load_into(arrays, place, number, batch=batch)
-        self._fetched.publish(self._loader.fetched)
+            loaded[place] = self.load_into(arrays, place, number, batch=batch)
+        self.fetched.publish(self._loader.fetched)
         return [loaded[place] for place in range(len(numbers))]
+
+    def _mark_drawn(self, batch: EpochBatch) -> None:
+        """Warn once where torch's own `DataLoader` draws random samples of an epoch again."""
+        if self._drawn is not None:
+            fills_up = batch.is_padding or [False] * len(batch)
+            own = [number for number, is_again in zip(batch, fills_up, strict=True) if not is_again]
+            epoch = batch.epoch, self.shared_epoch.times_set
+            self._drawn.mark(own, epoch=epoch, where=repr(self))
+
+    def expect(self, batch: EpochBatch) -> None:
+        """Let the bytes of a batch's samples, and of those after it, be fetched ahead."""
+        self.fetched.publish(self._loader.fetched)
+        self._expect(batch, read="as they come")
 
     def _expect(self, batch: EpochBatch, *, read: Literal["by number", "as they come"]) -> None:
         """Let the bytes of a batch's samples, and of the batches after it, be fetched ahead."""
@@ -202,7 +223,7 @@ class _MappedScenes(Dataset[Sample]):
         address = self.plan.locate(number % len(self.plan), epoch=epoch, group=group)
         return address._replace(run=0) if self._access == "random" else address
 
-    def _load_into(
+    def load_into(
         self, arrays: BatchArrays | None, place: int, number: int, *, batch: EpochBatch
     ) -> Sample:
         """Return a sample of a batch, as slices of the batch's arrays if they are given."""
@@ -259,20 +280,28 @@ class _MappedScenes(Dataset[Sample]):
         require_no_sampler(options)
         require_options(self.loader, options)
         ordering, others = split_options(options)
-        own = self._copy()
+        own = self.with_own_videos()
+        own._drawn = None  # a loader's passes are each of the next epoch
         batches = EpochBatches(own, batch_size, **ordering)
+        batches.passes = Passes(self.shared_epoch, then="next epoch")
         return PairsLoader(own, batches, num_workers=num_workers, **others)
 
-    def _copy(self) -> Self:
-        """Return the same samples with an epoch, videos and buffers of their own."""
+    def with_own_videos(self, *, epoch: int | None = None) -> Self:
+        """Return the same samples with open videos and buffers of their own.
+
+        Args:
+            epoch: An epoch of their own; None goes with this dataset.
+        """
         twin = copy.copy(self)
-        twin._loader, twin._buffers = self._loader.copy(), BatchBuffers(self._buffers.kind)
-        twin._epoch = SharedEpoch(self._epoch)
+        twin._loader, twin.buffers = self._loader.copy(), BatchBuffers(self.buffers.kind)
+        if epoch is not None:
+            twin.shared_epoch = SharedEpoch(epoch)
+            twin._drawn = None
         twin._known_order = twin._next_batch = None
-        twin._fetched = FetchedCounts()
+        twin.fetched = FetchedCounts()
         return twin
 
-    def _keep_open(self, batches: EpochBatches, *, processes: int) -> None:
+    def keep_open(self, batches: EpochBatches, *, processes: int) -> None:
         """Read by these batches, in one of so many processes: each video is opened once.
 
         Videos are kept open for as many runs as the batches interleave, and closed after a run's
@@ -285,11 +314,11 @@ class _MappedScenes(Dataset[Sample]):
             self._loader.keep_open(videos, frames=batches.rule.open_frames)
         self._access = "in order"
         self._known_order = KnownOrder(
-            batches.rule, batches.tail, step=processes, stop=batches._end()
+            batches.rule, batches.tail, step=processes, stop=batches.end()
         )
         self._next_batch = None
 
-    def _stop_fetching(self) -> None:
+    def stop_fetching(self) -> None:
         """End the requests of this process for coming samples."""
         self._next_batch = None
         self._loader.stop_fetching()
@@ -499,6 +528,14 @@ class SceneViews(_MappedScenes):
             fetch_ahead_bytes=fetch_ahead_bytes,
             connections=connections,
         )
+
+
+def _is_random(plan: Plan, request: Request) -> bool:
+    """Return whether the samples of an epoch may differ from those of another."""
+    transform = request.transform
+    steps = transform.transforms if isinstance(transform, Compose) else [transform]
+    fixed = (type(None), Crop, Letterbox, Resize)
+    return isinstance(plan.windows, Random) or not all(isinstance(step, fixed) for step in steps)
 
 
 def _opens_checked(check: Check, plan: Plan) -> bool:

@@ -5,6 +5,8 @@ which is freed when the last of them ends.
 """
 
 import os
+import warnings
+from collections.abc import Sequence
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, Final
 from weakref import WeakKeyDictionary
@@ -17,67 +19,141 @@ from torch.utils.data import get_worker_info
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 
-_FOLLOWS: Final = -1
-"""Stands for the epoch that is followed."""
-
 _COUNTED: Final = 255
 """Workers with a place of their own in `FetchedCounts`."""
+
+_WATCHED: Final = 1 << 14
+"""Of so many samples `DrawnSamples` knows whether they were drawn."""
 
 _rows: Final[WeakKeyDictionary[SceneIndex, torch.Tensor]] = WeakKeyDictionary()
 """The rows of each index that was sent to other processes, laid out once."""
 
 
-def shared_full(size: tuple[int, ...], value: int) -> torch.Tensor:
-    """Return an int64 tensor of which workers see every change."""
-    numbers = torch.full(size, value, dtype=torch.int64)
-    numbers.share_memory_()
-    return numbers
+class RepeatedEpochWarning(UserWarning):
+    """A second pass draws the same random frames and transforms, or has the same order."""
+
+
+class SharedNumbers:
+    """Whole numbers of which running workers see every change.
+
+    Workers get the same numbers, however they are started. Any other copy, by `copy` or by pickle,
+    has numbers of its own, which its own workers share.
+    """
+
+    def __init__(self, numbers: Sequence[int]) -> None:
+        """Begin with these numbers."""
+        self.tensor = torch.tensor(numbers, dtype=torch.int64)
+        self.tensor.share_memory_()
+
+    def __getitem__(self, place: int) -> int:
+        """Return a number."""
+        return int(self.tensor[place])
+
+    def __setitem__(self, place: int, number: int) -> None:
+        """Change a number for all processes."""
+        self.tensor[place] = number
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return what a copy is made from: numbers of its own."""
+        return SharedNumbers, (self.tensor.tolist(),)
+
+    @classmethod
+    def over(cls, tensor: torch.Tensor) -> "SharedNumbers":
+        """Return the numbers that lie in shared memory."""
+        numbers = cls.__new__(cls)
+        numbers.tensor = tensor
+        return numbers
+
+
+def _sent_to_worker(numbers: SharedNumbers) -> tuple[Any, ...]:
+    return SharedNumbers.over, (numbers.tensor,)
+
+
+# Of processes of this machine alone, such as workers that are spawned.
+ForkingPickler.register(SharedNumbers, _sent_to_worker)
 
 
 class SharedEpoch:
-    """The current epoch of a dataset, in memory that all its workers see.
+    """The epoch that a dataset draws random frames and transforms for, as all its workers see it.
 
-    Datasets, batches, loaders and streams read it. A loader's epoch follows that of its dataset
-    until it is set itself.
+    A copy has an epoch of its own.
     """
 
-    def __init__(self, followed: "SharedEpoch | None" = None) -> None:
-        """Begin at epoch 0, or follow another one."""
-        # The epoch, and how often it was set.
-        self._own = shared_full((2,), 0 if followed is None else _FOLLOWS)
-        self._own[1] = 0
-        self._followed = self._own if followed is None else followed._own
-        self._advanced_from: int | None = None
+    def __init__(self, epoch: int = 0) -> None:
+        """Begin at an epoch."""
+        self._numbers = SharedNumbers([epoch, 0])
 
     @property
     def value(self) -> int:
         """The epoch, from 0."""
-        own, followed = int(self._own[0]), int(self._followed[0])
-        if own == _FOLLOWS or self._advanced_from not in (None, int(self._followed[1])):
-            return followed
-        return own
+        return self._numbers[0]
 
     @property
-    def version(self) -> tuple[int, int]:
-        """What differs after each `set`, whatever epoch it sets."""
-        return int(self._own[1]), int(self._followed[1])
+    def times_set(self) -> int:
+        """How often it was set."""
+        return self._numbers[1]
 
     def set(self, epoch: int) -> None:
-        """Go to an epoch at the user's request.
+        """Go to an epoch.
 
         Raises:
             SelectionError: If it is not a whole number from 0.
         """
-        if not isinstance(epoch, int | np.integer) or not 0 <= epoch < 2**63:
-            raise SelectionError(f"an epoch is a whole number from 0, got {epoch!r}.")
-        self._own[0] = int(epoch)
-        self._own[1] += 1
-        self._advanced_from = None
+        self._numbers[0] = require_epoch(epoch)
+        self._numbers[1] += 1
 
-    def advance(self, epoch: int) -> None:
-        """Go to an epoch because a pass is over: until `set` is called, here or on the followed."""
-        self._own[0] = epoch
-        self._advanced_from = int(self._followed[1])
+
+def require_epoch(epoch: int) -> int:
+    """Return the number of an epoch.
+
+    Raises:
+        SelectionError: If it is not a whole number from 0.
+    """
+    if not isinstance(epoch, int | np.integer) or not 0 <= epoch < 2**63:
+        raise SelectionError(f"an epoch is a whole number from 0, got {epoch!r}.")
+    return int(epoch)
+
+
+class DrawnSamples:
+    """Which samples torch's own `DataLoader` has drawn in an epoch, so that a second pass is told.
+
+    Its passes are of the same epoch until ``set_epoch`` is called, so each would draw the same
+    random frames and transforms. All processes mark what they draw, the first 16,384 samples of a
+    dataset at most; the first worker, or the process itself where it has none, warns once.
+    """
+
+    def __init__(self, samples: int) -> None:
+        """Begin without any; the first number is the epoch that is marked, the second the word."""
+        self._numbers = SharedNumbers([-1, 0])
+        self._drawn = SharedNumbers([0] * min(samples, _WATCHED))
+
+    def mark(self, numbers: Sequence[int], *, epoch: tuple[int, int], where: str) -> None:
+        """Mark the samples of a batch, and warn if one of them was marked before.
+
+        Args:
+            numbers: The samples.
+            epoch: Their epoch, and how often it was set.
+            where: What draws them, for the warning.
+        """
+        marked = hash(epoch)
+        if self._numbers[0] != marked:
+            self._drawn.tensor.zero_()
+            self._numbers[0] = marked
+        watched = len(self._drawn.tensor)
+        places = torch.tensor([number for number in numbers if 0 <= number < watched])
+        info = get_worker_info()
+        speaks = (info is None or info.id == 0) and not self._numbers[1]
+        if len(places) and speaks and self._drawn.tensor[places].any():
+            self._numbers[1] = 1
+            warnings.warn(
+                f"{where} is read by torch's own DataLoader, and samples of epoch {epoch[0]} come "
+                "a second time: with the same random frames and transforms. Call set_epoch(epoch) "
+                "of the dataset before each pass, or use its loader(...), whose every pass is of "
+                "the next epoch.",
+                RepeatedEpochWarning,
+                stacklevel=3,
+            )
+        self._drawn.tensor[places] = 1
 
 
 class FetchedCounts:
@@ -85,7 +161,7 @@ class FetchedCounts:
 
     def __init__(self) -> None:
         """Begin with nothing."""
-        self._of_worker = shared_full((_COUNTED + 1, 2), 0)
+        self._of_worker = SharedNumbers([0] * 2 * (_COUNTED + 1))
         self._before: tuple[int, torch.Tensor] | None = None
 
     def publish(self, fetched: tuple[int, int]) -> None:
@@ -93,16 +169,20 @@ class FetchedCounts:
         if fetched == (0, 0):
             return
         info = get_worker_info()
-        row = 0 if info is None else 1 + info.id % _COUNTED
+        row = self._rows[0 if info is None else 1 + info.id % _COUNTED]
         if self._before is None or self._before[0] != os.getpid():
-            self._before = os.getpid(), self._of_worker[row].clone()
-        self._of_worker[row] = self._before[1] + torch.tensor(fetched)
+            self._before = os.getpid(), row.clone()
+        row[:] = self._before[1] + torch.tensor(fetched)
 
     @property
     def total(self) -> tuple[int, int]:
         """Requests and bytes of all processes, after the last batch that each has made."""
-        requests, count = self._of_worker.sum(dim=0).tolist()
+        requests, count = self._rows.sum(dim=0).tolist()
         return requests, count
+
+    @property
+    def _rows(self) -> torch.Tensor:
+        return self._of_worker.tensor.view(-1, 2)
 
 
 def _parted(index: SceneIndex) -> tuple[Any, ...]:

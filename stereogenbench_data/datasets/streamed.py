@@ -1,5 +1,6 @@
 """An iterable dataset with the order of the map-style ones, for trainers that want one."""
 
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Unpack
 
@@ -15,7 +16,7 @@ from stereogenbench_data.datasets.batches import (
 )
 from stereogenbench_data.datasets.loader import split_options
 from stereogenbench_data.datasets.mapped import Check, Data, StereoPairs
-from stereogenbench_data.datasets.shared_epoch import shared_full
+from stereogenbench_data.datasets.shared_epoch import RepeatedEpochWarning, SharedNumbers
 from stereogenbench_data.errors import StateError
 from stereogenbench_data.samples.fields import Sample
 from stereogenbench_data.samples.request import Transform
@@ -78,8 +79,11 @@ class StereoPairStream(IterableDataset[Sample]):
             others["seed"] = ordering["seed"]
         self.pairs = StereoPairs(data, **others)
         self.batches = EpochBatches(self.pairs, batch_size, **ordering)
-        # Which worker has begun since a state was loaded: workers may be new copies every epoch.
-        self._begun = shared_full((MOST_WORKERS,), 0)
+        # The position loaded last, and how many passes each worker has begun since: workers may be
+        # new copies in every epoch.
+        self._loaded = SharedNumbers([0, 0])
+        self._begun = SharedNumbers([0] * MOST_WORKERS)
+        self._was_told = SharedNumbers([0])
         self._latest: SamplePass | None = None
 
     def collate(self, samples: Sequence[Sample]) -> Any:
@@ -92,7 +96,7 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             FieldError: If a field has another shape in one sample than in the first.
         """
-        return self.pairs._buffers.collate(samples)
+        return self.pairs.buffers.collate(samples)
 
     @property
     def epoch(self) -> int:
@@ -106,11 +110,12 @@ class StereoPairStream(IterableDataset[Sample]):
             SelectionError: If it is negative.
         """
         self.pairs.set_epoch(epoch)
+        self._was_told[0] = 1
 
     def __len__(self) -> int:
         """Return how many samples this rank has in a whole epoch."""
         batches = self.batches
-        share, size = batches._share(0), batches.rule.batch_size
+        share, size = batches.share(0), batches.rule.batch_size
         short = len(self.pairs) % size
         has_short = batches.tail == "uneven" and short > 0 and len(self.pairs) // size in share
         return len(share) * size - (size - short if has_short else 0)
@@ -125,14 +130,20 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             SelectionError: If Accelerate would share these samples among ranks a second time.
         """
-        self.batches._require_shared_once(self)
+        self.batches.require_shared_once(self)
         info = get_worker_info()
         worker, workers = (0, 1) if info is None else (info.id, info.num_workers)
-        epoch, start = self.batches._next_position()
-        if self._begun[worker % MOST_WORKERS]:
-            start = 0
-        self._begun[worker % MOST_WORKERS] = 1
-        self.pairs._keep_open(self.batches, processes=self.batches.world_size * workers)
+        epoch, place = self.epoch, worker % MOST_WORKERS
+        start = self._loaded[1] if self._loaded[0] == epoch and not self._begun[place] else 0
+        if self._begun[place] == 1 and worker == 0 and not self._was_told[0]:
+            warnings.warn(
+                f"{self!r} begins epoch {epoch} a second time: with the same order, random frames "
+                "and transforms. Call set_epoch(epoch) of the stream before each pass.",
+                RepeatedEpochWarning,
+                stacklevel=2,
+            )
+        self._begun[place] += 1
+        self.pairs.keep_open(self.batches, processes=self.batches.world_size * workers)
         self._latest = SamplePass(self, epoch=epoch, start=start, worker=worker, workers=workers)
         return self._latest
 
@@ -147,19 +158,20 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             StateError: If the number is needed and not given.
         """
-        epoch, start = self.batches._next_position()
         if self._latest is not None and batches is None:
             return self._latest.state_dict()
         if batches is None:
-            if self._begun.any():
+            if self._begun.tensor.any():
                 raise StateError(
                     "worker processes iterate this stream and read ahead: pass the number of "
                     "batches the loop has taken, state_dict(batches=...), or use the loader of "
                     "StereoPairs or torchdata's StatefulDataLoader, which count them."
                 )
             batches = 0
-        consumed = min(start + batches * self.batches.world_size, self.batches._end(start))
-        return self.batches.state_at(epoch, consumed)
+        epoch = self.epoch
+        taken = self.batches.pass_from(epoch, self._loaded[1] if self._loaded[0] == epoch else 0)
+        taken.taken = batches
+        return self.batches.state_at(*taken.position)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go to a saved position: the next pass begins there, all later ones at the beginning.
@@ -167,8 +179,13 @@ class StereoPairStream(IterableDataset[Sample]):
         Raises:
             StateError: If it belongs to other samples or another order, naming what differs.
         """
-        self.batches.load_state_dict(state)
-        self._begun.zero_()
+        epoch, start = self.batches.position_in(state)
+        self.set_epoch(epoch)
+        if get_worker_info() is not None:
+            # torchdata's: it gives the position of each worker to its pass.
+            return
+        self._loaded[0], self._loaded[1] = epoch, start
+        self._begun.tensor.zero_()
         self._latest = None
 
     def close(self) -> None:
@@ -177,7 +194,7 @@ class StereoPairStream(IterableDataset[Sample]):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what a copy in another process needs."""
-        self.batches._require_shared_once(self)
+        self.batches.require_shared_once(self)
         return self.__dict__ | {"_latest": None}
 
 
@@ -190,17 +207,13 @@ class SamplePass(Iterator[Sample]):
         """Begin an epoch at a global batch."""
         self._stream = stream
         self._place = {"worker": worker, "workers": workers}
-        self._left: Iterator[int] = iter(())
-        self._batch = EpochBatch((), epoch=epoch)
-        self._arrays: BatchArrays | None = None
-        self._at = 0
         self._go_to(epoch, start, given=0)
 
     def __next__(self) -> Sample:
         """Return the next sample."""
         if self._at == len(self._batch):
             self._next_batch()
-        sample = self._stream.pairs._load_into(
+        sample = self._stream.pairs.load_into(
             self._arrays, self._at, self._batch[self._at], batch=self._batch
         )
         self._at += 1
@@ -210,9 +223,12 @@ class SamplePass(Iterator[Sample]):
     def state_dict(self) -> State:
         """Return the position: for all ranks, and for this worker in its own samples."""
         batches = self._stream.batches
-        taken = self._given // batches.rule.batch_size * batches.world_size
+        whole = batches.pass_from(self._epoch, self._start)
+        whole.taken, part = divmod(self._given, batches.batch_size)
+        if part > 0 and self._at == len(self._batch):
+            whole.taken += 1  # the epoch's last batch is short
         return {
-            **batches.state_at(self._epoch, min(self._start + taken, batches._end(self._start))),
+            **batches.state_at(*whole.position),
             "start": self._start,
             "samples_given": self._given,
             **self._own_place,
@@ -225,7 +241,7 @@ class SamplePass(Iterator[Sample]):
             StateError: If it belongs to other samples, another order, or another worker.
         """
         batches = self._stream.batches
-        epoch, _ = batches._position_in(state)
+        epoch, _ = batches.position_in(state)
         differing = [
             f"{name} is {value} here and {state.get(name)} there"
             for name, value in self._own_place.items()
@@ -236,9 +252,9 @@ class SamplePass(Iterator[Sample]):
                 f"the position is that of another worker: {'; '.join(differing)}. Load it under "
                 "the same ranks and workers; the state of a stream itself goes with any."
             )
-        start = require_count(state, "start", most=batches._batches_of_all)
-        share = len(batches._share(start)[self._place["worker"] :: self._place["workers"]])
-        given = require_count(state, "samples_given", most=share * batches.rule.batch_size)
+        start = require_count(state, "start", most=batches.batches_of_all)
+        share = len(self._share(start))
+        given = require_count(state, "samples_given", most=share * batches.batch_size)
         self._stream.set_epoch(epoch)
         self._go_to(epoch, start, given=given)
 
@@ -247,13 +263,17 @@ class SamplePass(Iterator[Sample]):
         batches = self._stream.batches
         return {"rank": batches.rank, "world_size": batches.world_size, **self._place}
 
+    def _share(self, start: int) -> range:
+        """Return the global numbers of this worker's batches from a global batch on."""
+        share: range = self._stream.batches.share(start)
+        return share[self._place["worker"] :: self._place["workers"]]
+
     def _go_to(self, epoch: int, start: int, *, given: int) -> None:
-        batches = self._stream.batches
         self._epoch, self._start, self._given = epoch, start, given
-        share = batches._share(start)[self._place["worker"] :: self._place["workers"]]
-        whole, part = divmod(given, batches.rule.batch_size)
-        self._left = iter(share[whole:])
+        whole, part = divmod(given, self._stream.batches.batch_size)
+        self._left = iter(self._share(start)[whole:])
         self._batch, self._at = EpochBatch((), epoch=epoch), 0
+        self._arrays: BatchArrays | None = None
         if part > 0:
             self._next_batch()
             self._at = part
@@ -261,7 +281,6 @@ class SamplePass(Iterator[Sample]):
     def _next_batch(self) -> None:
         self._batch = self._stream.batches.batch(next(self._left), epoch=self._epoch)
         self._at = 0
-        buffers = self._stream.pairs._buffers
+        buffers = self._stream.pairs.buffers
         self._arrays = buffers.allocate(len(self._batch)) if buffers.makes_batches else None
-        self._stream.pairs._fetched.publish(self._stream.pairs._loader.fetched)
-        self._stream.pairs._expect(self._batch, read="as they come")
+        self._stream.pairs.expect(self._batch)

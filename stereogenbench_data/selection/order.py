@@ -54,7 +54,6 @@ _MIX: Final = np.uint64(0x9E3779B97F4A7C15)
 """Fibonacci hashing: 2**64 over the golden ratio (Knuth, TAOCP 3, 6.4)."""
 
 OrderKind = Literal["shuffled", "sequential"]
-Start = Literal["anywhere", "beginning"]
 Tail = Literal["drop", "wrap", "uneven"]
 Numbers = Int64[np.ndarray, " n"]
 
@@ -96,8 +95,6 @@ class OrderRule:
             than twice as many, so that its streams are equally long and batches equally mixed.
         open_frames: How many neighbouring moments of a run are interleaved, where several samples
             show a moment.
-        start: Where in its first run each stream starts: "anywhere", at a moment drawn at random,
-            which is reached by decoding what lies before it twice; or at its "beginning".
         kind: "shuffled", or "sequential": by the samples' numbers.
     """
 
@@ -106,11 +103,10 @@ class OrderRule:
     shuffle_groups: int = SHUFFLE_GROUPS
     open_scenes: int = OPEN_SCENES
     open_frames: int = 1
-    start: Start = "anywhere"
     kind: OrderKind = "shuffled"
 
     def __post_init__(self) -> None:
-        """Require numbers in their ranges, and a known kind and start."""
+        """Require numbers in their ranges, and a known kind."""
         least_of = {
             "batch_size": 1,
             "seed": 0,
@@ -124,8 +120,6 @@ class OrderRule:
                 raise SelectionError(f"{name} must be a whole number from {least}, got {value!r}.")
         if self.kind not in ("shuffled", "sequential"):
             raise SelectionError(f"order must be 'shuffled' or 'sequential', got {self.kind!r}.")
-        if self.start not in ("anywhere", "beginning"):
-            raise SelectionError(f"start must be 'anywhere' or 'beginning', got {self.start!r}.")
 
     def groups_of(self, lengths: Numbers) -> int:
         """Return into how many groups runs of so many samples are parted.
@@ -160,7 +154,6 @@ class OrderRule:
             shuffle_groups=self.groups_of(lengths),
             open_scenes=len(lengths) if all_are_open else self.open_scenes,
             open_frames=self.open_frames if shares_moments and has_later_moments else 1,
-            start=self.start if has_later_moments else "anywhere",
         )
 
     def streams_of(self, runs: int) -> int:
@@ -321,16 +314,14 @@ class _Group:
         self._offset, self._drift = draws[0], DRIFT * (2 * draws[1] - 1)
         self._salt = int(order.raw(1, part=-1)[0])
         streams = [pieces.take(found) for found in _dealt(pieces, streams=count)]
-        if order.rule.start == "anywhere":
-            # Evenly spread over the streams, so that few streams are apart, too. Cubes spread
-            # nearly as wide as the shares themselves, with a quarter before them instead of half.
-            starts = ((np.argsort(draws[2]) + draws[2]) / max(1, count)) ** 3
-            streams = [
-                self._started(stream, share)
-                for stream, share in zip(streams, starts.tolist(), strict=True)
-            ]
-        self._streams = streams
-        self._ends = [np.cumsum(stream.stop - stream.begin) for stream in streams]
+        # Evenly spread over the streams, so that few streams are apart, too. Cubes spread nearly as
+        # wide as the shares themselves, with a quarter before them instead of half.
+        starts = ((np.argsort(draws[2]) + draws[2]) / max(1, count)) ** 3
+        self._streams = [
+            self._started(stream, share)
+            for stream, share in zip(streams, starts.tolist(), strict=True)
+        ]
+        self._ends = [np.cumsum(stream.stop - stream.begin) for stream in self._streams]
         self._lengths = np.array([int(ends[-1]) for ends in self._ends], dtype=np.int64)
         self._before = self._samples_before()
         self._starts = self._before.sum(axis=1)

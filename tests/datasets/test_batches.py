@@ -98,7 +98,6 @@ def test_a_position_is_flat_json_and_says_what_it_belongs_to(keyed):
         "shuffle_groups": 2,
         "open_scenes": 4,
         "open_frames": 1,
-        "start_of_streams": "anywhere",
         "order": "shuffled",
         "tail": "drop",
         "selection": keyed.plan.digest,
@@ -122,7 +121,6 @@ def test_what_is_loaded_goes_on_once_and_then_epochs_are_whole(keyed):
         ({"seed": 1}, "seed is 1 here and 0 there"),
         ({"batch_size": 1, "shuffle_groups": 2}, "shuffle_groups is 2 here and 4 there"),
         ({"batch_size": 1, "open_scenes": 1}, "open_scenes is 1 here and 4 there"),
-        ({"start": "beginning"}, "start_of_streams is 'beginning' here and 'anywhere' there"),
         ({"order": "sequential"}, "order is 'sequential' here and 'shuffled' there"),
         ({"tail": "wrap"}, "tail is 'wrap' here and 'drop' there"),
         ({"tail": "wrap", "seed": 2}, "seed is 2 here.*; tail is 'wrap' here"),
@@ -135,6 +133,16 @@ def test_a_position_in_another_order_is_refused_by_name(keyed, options, message)
 
     with pytest.raises(StateError, match=message):
         EpochBatches(keyed, **({"batch_size": size} | options)).load_state_dict(state)
+
+
+def test_a_position_of_an_earlier_version_is_read_unless_its_streams_started_otherwise(keyed):
+    """As `state_dict` wrote it while there was a choice of where streams start."""
+    batches = EpochBatches(keyed, 4)
+    batches.load_state_dict(batches.state_at(0, 30) | {"start_of_streams": "anywhere"})
+
+    assert batches.state_dict()["batches_consumed"] == 30
+    with pytest.raises(StateError, match="start_of_streams is 'anywhere' here and 'beginning'"):
+        batches.load_state_dict(batches.state_at(0, 30) | {"start_of_streams": "beginning"})
 
 
 def test_a_position_of_an_earlier_order_is_refused_by_its_version(keyed):

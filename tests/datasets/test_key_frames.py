@@ -1,7 +1,7 @@
 """Videos with several key frames: what lies between two of them is shuffled by itself."""
 
 import shutil
-from collections import Counter, defaultdict
+from collections import defaultdict
 from fractions import Fraction
 
 import av
@@ -103,12 +103,12 @@ def test_a_run_begins_decoding_at_its_key_frame(keyed_release, monkeypatch):
 
     monkeypatch.setattr(streams, "VideoReader", Counting)
     loader = StereoPairs(keyed_release, frames="all", fields=("left",)).loader(
-        4, tail="uneven", start="beginning", shuffle_groups=1
+        4, tail="uneven", shuffle_groups=1
     )
     for _ in loader:
         pass
 
-    assert Counter(index for _, index in first.values()) == {0: 3, 8: 3}
+    assert {index for _, index in first.values()} == {0, 8}
 
 
 @pytest.mark.parametrize("open_frames", [1, 3])
@@ -122,9 +122,7 @@ def test_interleaved_frames_of_all_pairs_are_decoded_once(keyed_release, monkeyp
 
     monkeypatch.setattr(streams, "VideoReader", Counting)
     pairs = StereoPairs(keyed_release, frames="all", pairs="all", fields=("left", "right"))
-    loader = pairs.loader(
-        4, tail="uneven", start="beginning", shuffle_groups=1, open_frames=open_frames
-    )
+    loader = pairs.loader(4, tail="uneven", shuffle_groups=1, open_frames=open_frames)
     for _ in loader:
         pass
 

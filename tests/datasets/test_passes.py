@@ -135,6 +135,20 @@ def test_a_copy_of_a_loader_has_passes_of_its_own(pairs, truth, copied):
     other.close()
 
 
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("begun", [False, True])
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+@pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
+def test_a_pass_is_not_copied(pairs, workers, begun, copied):
+    batches = iter(pairs.loader(9, num_workers=workers))
+    taken = [next(batches)] if begun else []
+    with pytest.raises(PassError, match=r"LoaderPass: (1 of 15|not begun).* cannot be copied"):
+        copied(batches)
+    gc.collect()
+
+    assert len(taken) + len(list(batches)) == 15
+
+
 def fork_and(act):
     """Run a function in a fork of this process, which then ends; return its exit status."""
     child = os.fork()

@@ -1,11 +1,33 @@
 """What worker processes share with the process that starts them."""
 
+import copy
 import pickle
+import subprocess
+import sys
+import warnings
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
 import numpy as np
 import pytest
+from torch.utils.data import DataLoader
+
+from stereogenbench_data import (
+    Crop,
+    EpochBatches,
+    RandomCrop,
+    RepeatedEpochWarning,
+    StereoPairs,
+    StereoPairStream,
+)
+from tests.datasets.conftest import flat, keys_of
+
+pytestmark = pytest.mark.filterwarnings("ignore:This DataLoader will create")
+COPIES = {
+    "deep": copy.deepcopy,
+    "pickled": lambda each: pickle.loads(pickle.dumps(each)),
+    "shallow": copy.copy,
+}
 
 
 def lies_in_shared_memory(index):
@@ -32,3 +54,120 @@ def test_an_index_that_travels_is_the_same(small_index, pickler):
 
 def test_a_plain_pickle_of_an_index_holds_its_rows(small_index):
     assert len(pickle.dumps(small_index)) > 0.9 * small_index.parted()[0].nbytes
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.parametrize("how", COPIES)
+def test_running_workers_of_a_copied_dataset_follow_its_epoch(small_index, how, method):
+    """Hydra, Ray, joblib and trainers copy what they are given."""
+    pairs = StereoPairs(small_index, fields=("__key__",), frames=("random", 2))
+    expected = [
+        pairs.set_epoch(epoch) or [pairs[n]["__key__"] for n in range(8)] for epoch in (0, 1, 2)
+    ]
+    copied = COPIES[how](pairs)
+    loader = DataLoader(
+        copied, batch_size=2, num_workers=2, persistent_workers=True, multiprocessing_context=method
+    )
+
+    assert [copied.set_epoch(epoch) or flat(keys_of(loader)) for epoch in (0, 1, 2)] == expected
+
+
+def test_a_copy_has_an_epoch_of_its_own(small_index):
+    pairs = StereoPairs(small_index, fields=("__key__",), frames=("random", 2))
+    pairs.set_epoch(3)
+    deep, pickled = COPIES["deep"](pairs), COPIES["pickled"](pairs)
+    deep.set_epoch(5)
+
+    assert [pairs.epoch, deep.epoch, pickled.epoch] == [3, 5, 3]
+
+
+@pytest.mark.parametrize("how", COPIES)
+@pytest.mark.parametrize("persistent", [False, True])
+def test_a_copied_stream_goes_on_at_a_loaded_position_once(small_index, how, persistent):
+    options = {"fields": ("__key__",), "pairs": "adjacent", "frames": "all", "tail": "uneven"}
+    stream = StereoPairStream(small_index, 2, **options)
+    stream.load_state_dict(stream.batches.state_at(0, 10))
+    loader = DataLoader(
+        COPIES[how](stream),
+        batch_size=2,
+        num_workers=2,
+        multiprocessing_context="fork",
+        persistent_workers=persistent,
+    )
+
+    assert [len(list(loader)) for _ in range(3)] == [60, 70, 70]
+
+
+LOOP = """
+import sys
+import torch
+from stereogenbench_data import SceneIndex, StereoPairs, StereoPairStream, collate
+from torch.utils.data import DataLoader
+
+def main():
+    kind, workers, persistent, told = sys.argv[3], *map(int, sys.argv[4:])
+    index = SceneIndex.open(sys.argv[1], root=sys.argv[2])
+    options = dict(fields=("__key__",), frames=("random", 2))
+    if kind == "stream":
+        data = StereoPairStream(index, 2, **options)
+        options = {}
+    else:
+        data, options = StereoPairs(index, **options), {"shuffle": True, "collate_fn": collate}
+    loader = DataLoader(
+        data, batch_size=2, num_workers=workers, persistent_workers=bool(persistent), **options
+    )
+    for epoch in range(3):
+        if told:
+            data.set_epoch(epoch)
+        for batch in loader:
+            pass
+
+if __name__ == "__main__":
+    main()
+"""
+
+
+@pytest.mark.parametrize("kind", ["map-style", "stream"])
+@pytest.mark.parametrize(
+    ("workers", "persistent", "told"),
+    [(0, 0, 0), (2, 0, 0), (2, 1, 0), (0, 0, 1), (2, 1, 1)],
+    ids=["in this process", "workers", "that persist", "epoch set", "epoch set for workers"],
+)
+def test_passes_that_repeat_an_epoch_are_warned_of_once(
+    small_index, tmp_path, kind, workers, persistent, told
+):
+    small_index.write(tmp_path / "index.parquet")
+    script = tmp_path / "loop.py"
+    script.write_text(LOOP)
+    arguments = [tmp_path / "index.parquet", small_index.root, kind, workers, persistent, told]
+    done = subprocess.run(
+        [sys.executable, script, *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("RepeatedEpochWarning") == (0 if told else 1), done.stderr
+
+
+def test_equal_passes_are_no_matter_where_nothing_is_random(small_index):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for transform in (None, Crop(0, 0, 32, 32)):
+            pairs = StereoPairs(small_index, fields=("__key__",), transform=transform)
+            loader = DataLoader(pairs, batch_size=2)
+            assert keys_of(loader) == keys_of(loader)
+
+
+@pytest.mark.parametrize("ordered_by", ["torch", "EpochBatches"])
+def test_an_epoch_that_was_set_again_may_be_repeated(small_index, ordered_by):
+    pairs = StereoPairs(small_index, fields=("__key__",), transform=RandomCrop(32, 32))
+    options = {"batch_size": 2}
+    if ordered_by == "EpochBatches":
+        options = {"batch_sampler": EpochBatches(pairs, 3, tail="wrap")}
+    loader = DataLoader(pairs, **options)
+    for _ in range(2):
+        pairs.set_epoch(0)
+        list(loader)
+
+    with pytest.warns(RepeatedEpochWarning, match="4 samples of 4 scenes.* epoch 0 come a second"):
+        list(loader)
+    assert keys_of(loader) == keys_of(loader)

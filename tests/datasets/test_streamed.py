@@ -159,6 +159,15 @@ def test_a_stream_iterated_in_this_process_counts_by_itself(stream_of, keyed):
     assert keys_of(loader) == keys_of(batches)
 
 
+def test_after_a_short_last_batch_the_next_epoch_begins(stream_of, keyed):
+    stream = stream_of()
+    assert len(list(loaded(stream))) == 16
+    loader = keyed.loader(9, tail="uneven")
+    loader.load_state_dict(stream.state_dict())
+
+    assert loader.epoch == 1
+
+
 def test_a_stream_iterated_by_workers_asks_how_far_the_loop_is(stream_of):
     stream = stream_of()
     assert stream.state_dict()["batches_consumed"] == 0

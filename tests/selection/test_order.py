@@ -68,7 +68,6 @@ rules = st.fixed_dictionaries(
         "open_scenes": st.integers(1, 20),
         "open_frames": st.integers(1, 5),
         "pairs": st.sampled_from([1, 1, 3, 15]),
-        "start": st.sampled_from(["anywhere", "beginning"]),
         "seed": st.integers(0, 2**70),
         "epoch": st.integers(0, 9),
         "kind": st.sampled_from(KINDS),
@@ -88,10 +87,21 @@ def test_every_sample_is_in_one_batch_and_only_the_last_batch_is_short(lengths, 
 
 
 def pieces_of(order, group):
-    """Return the places of the group's samples, part by part of its runs, in order."""
+    """Return the group's samples, part by part of its runs, in order."""
     numbers = order.group(group)
     runs = run_of(order, numbers)
     return {run: numbers[runs == run] for run in set(runs.tolist())}
+
+
+def parts_of(order, group, *, pairs):
+    """Return the same where a run that a stream starts inside is two: to its end, and from it."""
+    for run, numbers in pieces_of(order, group).items():
+        blocks = (numbers - order.runs.first_sample[run]) // pairs
+        if pairs > 1:
+            blocks = blocks // order.rule.open_frames
+        yield from (
+            (run, part) for part in np.split(numbers, 1 + np.flatnonzero(np.diff(blocks) < 0))
+        )
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
@@ -107,28 +117,24 @@ def test_moments_of_a_run_ascend_but_for_where_a_stream_starts(lengths, rule):
             parts += 1
 
     streams = order.groups * order.rule.most_open(order.runs.lengths)
-    assert goes_back <= (streams if rule["start"] == "anywhere" else 0)
+    assert goes_back <= streams
     assert parts - len(lengths) <= order.groups - 1
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
 @settings(deadline=None, max_examples=60)
 def test_a_block_of_moments_is_finished_before_the_next_begins(lengths, rule):
-    rule = rule | {"kind": "shuffled", "start": "beginning"}
-    order = order_of(lengths, **rule)
+    order = order_of(lengths, **(rule | {"kind": "shuffled"}))
     for group in range(order.groups):
-        for run, numbers in pieces_of(order, group).items():
-            moments = (numbers - order.runs.first_sample[run]) // rule["pairs"]
-            if rule["pairs"] > 1:
-                moments = moments // rule["open_frames"]
+        parts = [run for run, _ in parts_of(order, group, pairs=rule["pairs"])]
 
-            assert (np.diff(moments) >= 0).all()
+        assert all(parts.count(run) <= 2 for run in set(parts))
 
 
 @given(lengths=lengths_of_scenes, rule=rules)
 @settings(deadline=None, max_examples=60)
 def test_the_last_sample_of_each_part_of_a_run_is_marked(lengths, rule):
-    order = order_of(lengths, **(rule | {"start": "beginning"}))
+    order = order_of(lengths, **rule)
     seen, wanted = set(), set()
     for number in range(order.batches):
         seen |= set(order.batch(number)[order.ends_run(number)].tolist())
@@ -136,7 +142,8 @@ def test_the_last_sample_of_each_part_of_a_run_is_marked(lengths, rule):
         wanted = set((order.runs.first_sample[1:] - 1).tolist())
     else:
         for group in range(order.groups):
-            wanted |= {int(numbers[-1]) for numbers in pieces_of(order, group).values()}
+            parts = parts_of(order, group, pairs=rule["pairs"])
+            wanted |= {int(numbers[-1]) for _, numbers in parts}
 
     assert seen == wanted
 
@@ -144,27 +151,26 @@ def test_the_last_sample_of_each_part_of_a_run_is_marked(lengths, rule):
 @given(lengths=lengths_of_scenes, rule=rules)
 @settings(deadline=None, max_examples=100)
 def test_no_more_runs_are_open_in_a_group_than_announced(lengths, rule):
-    order = order_of([7] * len(lengths), **(rule | {"kind": "shuffled", "start": "beginning"}))
+    order = order_of([7] * len(lengths), **(rule | {"kind": "shuffled"}))
     most = order.rule.most_open(order.runs.lengths)
     for group in range(order.groups):
-        runs = run_of(order, order.group(group)).tolist()
-        first = {run: runs.index(run) for run in set(runs)}
-        last = {run: len(runs) - runs[::-1].index(run) for run in first}
-        for place in range(len(runs)):
-            assert sum(first[run] <= place < last[run] for run in first) <= most
+        place = {number: place for place, number in enumerate(order.group(group).tolist())}
+        parts = [part for _, part in parts_of(order, group, pairs=rule["pairs"])]
+        ranges = [(place[int(part[0])], place[int(part[-1])]) for part in parts]
+        for now in range(len(place)):
+            assert sum(first <= now <= last for first, last in ranges) <= most
 
 
 @pytest.mark.parametrize("runs", [3, 10, 13, 64, 2123])
 @pytest.mark.parametrize("open_scenes", [1, 2, 4, 5, 15])
 def test_a_small_number_of_open_runs_is_reached_and_never_exceeded(runs, open_scenes):
-    order = order_of(
-        [7] * runs, batch_size=1, shuffle_groups=1, open_scenes=open_scenes, start="beginning"
-    )
-    found = run_of(order, order.group(0))
-    first = np.array([np.flatnonzero(found == run)[0] for run in range(runs)])
-    last = np.array([np.flatnonzero(found == run)[-1] for run in range(runs)])
-    opened = np.searchsorted(np.sort(first), np.arange(len(found)), side="right")
-    closed = np.searchsorted(np.sort(last), np.arange(len(found)))
+    order = order_of([7] * runs, batch_size=1, shuffle_groups=1, open_scenes=open_scenes)
+    numbers = order.group(0)
+    place = np.argsort(numbers)
+    parts = [part for _, part in parts_of(order, 0, pairs=1)]
+    first, last = (np.sort([place[part[end]] for part in parts]) for end in (0, -1))
+    opened = np.searchsorted(first, np.arange(len(numbers)), side="right")
+    closed = np.searchsorted(last, np.arange(len(numbers)))
 
     assert (opened - closed).max() == min(runs, open_scenes)
 
@@ -339,8 +345,6 @@ def test_whole_scenes_are_not_in_step(scenes):
     assert spread.mean() > 0.9 * INDEPENDENT
     assert spread.min() > 0.5 * INDEPENDENT
     assert spread[0] > 0.8 * INDEPENDENT
-    in_step = order_of([81] * scenes, start="beginning")
-    assert shown(in_step, [0])[2].max() <= 1
 
 
 @pytest.mark.parametrize("scenes", [64, 320])
@@ -383,10 +387,9 @@ def test_streams_start_where_decoding_can_begin(pairs, open_frames):
 @settings(deadline=None, max_examples=40)
 def test_in_a_block_each_pair_is_read_at_ascending_moments(lengths, rule):
     """Else a camera would go back to decode a moment that it had passed."""
-    rule = rule | {"kind": "shuffled", "start": "beginning", "pairs": 3}
-    order = order_of(lengths, **rule)
+    order = order_of(lengths, **(rule | {"kind": "shuffled", "pairs": 3}))
     for group in range(order.groups):
-        for run, numbers in pieces_of(order, group).items():
+        for run, numbers in parts_of(order, group, pairs=3):
             moments, pairs = np.divmod(numbers - order.runs.first_sample[run], 3)
             for pair in range(3):
                 assert (np.diff(moments[pairs == pair]) > 0).all()
@@ -434,7 +437,6 @@ def test_memory_grows_with_the_runs_and_not_with_the_samples():
         ({"open_scenes": 0}, "open_scenes must be a whole number from 1, got 0"),
         ({"seed": -1}, "seed must be a whole number from 0, got -1"),
         ({"open_frames": 0}, "open_frames must be a whole number from 1, got 0"),
-        ({"start": "middle"}, "start must be 'anywhere' or 'beginning', got 'middle'"),
         ({"kind": "random"}, "order must be 'shuffled' or 'sequential', got 'random'"),
     ],
     ids=str,
@@ -454,7 +456,6 @@ def test_a_rule_that_orders_nothing_is_refused(rule, message):
                 "shuffle_groups": st.integers(1, 6),
                 "open_scenes": st.integers(1, 24),
                 "open_frames": st.integers(1, 2),
-                "start": st.sampled_from(["anywhere", "beginning"]),
             }
         ),
         min_size=2,
