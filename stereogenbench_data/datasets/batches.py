@@ -170,6 +170,10 @@ class EpochBatches(Sampler[list[int]]):
             SelectionError: If an option is out of its range, or every batch would be dropped.
         """
         require_options(EpochBatches, options)
+        if isinstance(dataset, Sampler):
+            # So Lightning makes batches again. To predict, it takes the sampler of our loader.
+            self.__setstate__(_batches_behind(dataset).__getstate__())
+            return
         self.dataset = dataset
         rule = OrderRule(
             batch_size=batch_size,
@@ -200,6 +204,11 @@ class EpochBatches(Sampler[list[int]]):
     def batch_size(self) -> int:
         """How many samples a full batch of one rank has."""
         return self.rule.batch_size
+
+    @property
+    def drop_last(self) -> bool:
+        """Whether a short last batch is dropped; Lightning asks."""
+        return self.tail == "drop"
 
     @property
     def samples_of_epoch(self) -> int:
@@ -431,6 +440,22 @@ class EpochBatches(Sampler[list[int]]):
         """Become a copy, with passes of its own."""
         self.__dict__.update(state)
         self.passes = copy.copy(self.passes)
+
+
+def _batches_behind(sampler: Sampler[Any]) -> EpochBatches:
+    """Return the batches that a loader's sampler stands for.
+
+    Raises:
+        SelectionError: If it is another sampler, such as the one of Lightning's overfit_batches.
+    """
+    batches = getattr(sampler, "batches", None)
+    if not isinstance(batches, EpochBatches):
+        raise SelectionError(
+            f"EpochBatches orders a dataset such as StereoPairs by itself, and cannot take its "
+            f"order from a {type(sampler).__name__}. Lightning's overfit_batches puts one in: use "
+            "limit_train_batches=... (or overfit_batches) with pairs.loader(..., shuffle=False)."
+        )
+    return batches
 
 
 def batch_samples(order: EpochOrder, number: int, *, tail: Tail) -> tuple[list[int], list[int]]:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 import torch
-from torch.utils.data import DistributedSampler
+from torch.utils.data import DistributedSampler, SequentialSampler
 
 from stereogenbench_data.datasets.batches import EpochBatches
 
@@ -24,20 +24,30 @@ class ShareSampler(DistributedSampler[Any]):
         # torch asks a sampler's dataset for its length alone.
         samples: Any = range(batches.samples_of_epoch)
         super().__init__(samples, num_replicas=batches.world_size, rank=batches.rank)
-        self._batches = batches
+        self.batches = batches
 
     def __iter__(self) -> Iterator[int]:
         """Yield the numbers of the samples of this rank's batches."""
-        for batch in self._batches:
+        for batch in self.batches:
             yield from batch
 
     def __len__(self) -> int:
         """The number of samples in this rank's full batches."""
-        return len(self._batches) * self._batches.batch_size
+        return len(self.batches) * self.batches.batch_size
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch of the batches: Lightning does before each epoch."""
-        self._batches.set_epoch(epoch)
+        self.batches.set_epoch(epoch)
+
+
+class OrderedShareSampler(ShareSampler, SequentialSampler):
+    """The samples of one rank in order: Lightning's ``overfit_batches`` leaves them as they are."""
+
+
+def share_sampler(batches: EpochBatches) -> ShareSampler:
+    """Return the sampler that stands for these batches."""
+    is_in_order = batches.rule.kind == "sequential"
+    return OrderedShareSampler(batches) if is_in_order else ShareSampler(batches)
 
 
 class AcceleratedLoader:

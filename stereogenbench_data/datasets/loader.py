@@ -24,7 +24,7 @@ from stereogenbench_data.datasets.batches import (
     Numbered,
     State,
 )
-from stereogenbench_data.datasets.frameworks import AcceleratedLoader, ShareSampler
+from stereogenbench_data.datasets.frameworks import AcceleratedLoader, share_sampler
 from stereogenbench_data.datasets.passes import Pass
 from stereogenbench_data.datasets.shared_epoch import FetchedCounts
 from stereogenbench_data.datasets.workers import WorkerContext
@@ -182,7 +182,7 @@ class PairsLoader(AcceleratedLoader, DataLoader[Any]):
 
     def _set_sampler(self) -> None:
         # Past torch's guard against another sampler: it says that the batches are a rank's share.
-        object.__setattr__(self, "sampler", ShareSampler(self.batches))
+        object.__setattr__(self, "sampler", share_sampler(self.batches))
 
     @property
     def epoch(self) -> int:

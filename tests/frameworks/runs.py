@@ -58,14 +58,14 @@ class _StopAt(Callback):
             raise _Stopped
 
 
-def lightning(loader, folder, *, stop_at=None, resume=False, devices=1):
+def lightning(loader, folder, *, stop_at=None, resume=False, devices=1, **options):
     """Train with Lightning; stop after a step's checkpoint, or go on from it."""
     module, checkpoint = _Module(), Path(folder) / "lightning.ckpt"
     trainer = LightningTrainer(
         max_epochs=EPOCHS, accelerator="cpu", devices=devices, logger=False,
         strategy="ddp" if devices > 1 else "auto", enable_checkpointing=False,
         enable_model_summary=False, enable_progress_bar=False,
-        callbacks=[_StopAt(stop_at, checkpoint)] if stop_at else [],
+        callbacks=[_StopAt(stop_at, checkpoint)] if stop_at else [], **options,
     )  # fmt: skip
     try:
         path = {"ckpt_path": checkpoint, "weights_only": False} if resume else {}

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from accelerate import skip_first_batches
 
+from stereogenbench_data import SelectionError, StereoPairs
 from tests.datasets.conftest import flat, keys_of
 from tests.frameworks import runs
 
@@ -118,6 +119,31 @@ def test_hugging_faces_trainer_goes_on_as_if_it_had_not_stopped(
     assert len({tuple(sorted(keys)) for keys in of_epochs(whole, epochs=3)}) == 3
     assert len(before) == stop
     assert before + after == whole
+
+
+@pytest.mark.parametrize("limit", ["overfit_batches", "limit_train_batches"])
+def test_lightning_overfits_the_first_batches_in_order(indexed_release, tmp_path, limit):
+    pairs = StereoPairs(indexed_release, fields=("left", "__key__"), frames="all")
+    steps = runs.lightning(pairs.loader(4, shuffle=False), tmp_path, **{limit: 2})
+
+    assert steps == keys_of(pairs.loader(4, shuffle=False))[:2] * runs.EPOCHS
+
+
+def test_lightning_sees_other_samples_in_each_of_some_short_epochs(indexed_release, tmp_path):
+    pairs = StereoPairs(indexed_release, fields=("left", "__key__"), frames="all")
+    steps = runs.lightning(pairs.loader(4), tmp_path, limit_train_batches=2)
+    expected = [pairs.set_epoch(epoch) or keys_of(pairs.loader(4))[:2] for epoch in range(3)]
+
+    assert steps == flat(expected)
+
+
+def test_a_shuffled_loader_that_lightning_would_overfit_says_what_to_use(indexed_release, tmp_path):
+    pairs = runs.random_frames(indexed_release)
+
+    with pytest.raises(
+        SelectionError, match=r"limit_train_batches=.*pairs.loader\(..., shuffle=Fal"
+    ):
+        runs.lightning(pairs.loader(4), tmp_path, overfit_batches=2)
 
 
 @pytest.mark.parametrize("workers", [0, 1])
