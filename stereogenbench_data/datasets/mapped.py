@@ -184,7 +184,7 @@ class _MappedScenes(Dataset[Sample]):
             fills_up = batch.is_padding or [False] * len(batch)
             own = [number for number, is_again in zip(batch, fills_up, strict=True) if not is_again]
             epoch = batch.epoch, self.shared_epoch.times_set
-            self._drawn.mark(own, epoch=epoch, where=repr(self))
+            self._drawn.mark(own, epoch=epoch, dataset=self)
 
     def expect(self, batch: EpochBatch) -> None:
         """Let the bytes of a batch's samples, and of those after it, be fetched ahead."""
@@ -261,6 +261,13 @@ class _MappedScenes(Dataset[Sample]):
         self, batch_size: int = 1, *, num_workers: int = 0, **options: Unpack[LoaderOptions]
     ) -> PairsLoader:
         """Return a torch `DataLoader` whose order is the same for any number of ranks and workers.
+
+        Shuffled, as by default, samples that do not fill a batch of every rank are dropped at the
+        end of an epoch (``tail="drop"``). With ``shuffle=False`` samples come in order and none is
+        dropped: the last batch may be short, and ranks may differ by one batch
+        (``tail="uneven"``). ``tail`` or ``drop_last`` chooses otherwise.
+
+        Each pass is of the next epoch, also after a loop that was left; see `PairsLoader`.
 
         Args:
             batch_size: Samples in a batch of one rank.

@@ -127,13 +127,13 @@ class DrawnSamples:
         self._numbers = SharedNumbers([-1, 0])
         self._drawn = SharedNumbers([0] * min(samples, _WATCHED))
 
-    def mark(self, numbers: Sequence[int], *, epoch: tuple[int, int], where: str) -> None:
+    def mark(self, numbers: Sequence[int], *, epoch: tuple[int, int], dataset: object) -> None:
         """Mark the samples of a batch, and warn if one of them was marked before.
 
         Args:
             numbers: The samples.
             epoch: Their epoch, and how often it was set.
-            where: What draws them, for the warning.
+            dataset: What draws them, for the warning.
         """
         marked = hash(epoch)
         if self._numbers[0] != marked:
@@ -146,10 +146,10 @@ class DrawnSamples:
         if len(places) and speaks and self._drawn.tensor[places].any():
             self._numbers[1] = 1
             warnings.warn(
-                f"{where} is read by torch's own DataLoader, and samples of epoch {epoch[0]} come "
-                "a second time: with the same random frames and transforms. Call set_epoch(epoch) "
-                "of the dataset before each pass, or use its loader(...), whose every pass is of "
-                "the next epoch.",
+                f"{dataset!r} is read by torch's own DataLoader, and samples of epoch {epoch[0]} "
+                "come a second time, with the same random frames and transforms. Call "
+                "set_epoch(epoch) of the dataset before each pass, or use its loader(...), whose "
+                "every pass is of the next epoch.",
                 RepeatedEpochWarning,
                 stacklevel=3,
             )
