@@ -25,7 +25,6 @@ from stereogenbench_data.schema.release import (
     TRAINING_JSON,
 )
 from stereogenbench_data.schema.text import counted, markdown_text
-from stereogenbench_data.shards.companion_files import derivation_facts
 from stereogenbench_data.sources.files import write_atomic
 
 CARD_NAME: Final = "README.md"
@@ -277,7 +276,7 @@ def _provenance(facts: dataset_facts.Facts) -> list[str]:
 def _derivation(index: SceneIndex) -> list[str]:
     if not index.is_derived:
         return []
-    facts = derivation_facts(index)
+    facts = dataset_facts.derivation_facts(index)
     psnr_db = facts["psnr_db"]
     return [
         "## Derived for training",

@@ -380,6 +380,33 @@ def _stated(about: Path) -> Facts:
     return facts
 
 
+def derivation_facts(index: SceneIndex) -> dict[str, Any]:
+    """Return from what, how and with what error training shards were derived, as JSON.
+
+    Several values of a fact, as of scenes that were derived with several settings, are a list.
+    """
+    scenes = [index.scene(row) for row in range(len(index))]
+    known = [(scene.rig, scene.training) for scene in scenes if scene.training is not None]
+    facts: dict[str, Any] = {}
+    for name, values in (
+        ("size", {f"{rig.image_width_px}x{rig.image_height_px}" for rig, _ in known}),
+        ("quality", {training.quality for _, training in known}),
+        ("codec", {training.codec for _, training in known}),
+        ("settings", {training.settings for _, training in known}),
+        ("source_digest", {training.source_digest for _, training in known}),
+    ):
+        found = sorted(values)
+        found = [json.loads(each) for each in found] if name == "settings" else found
+        facts[name] = found[0] if len(found) == 1 else found
+    mean_db = [each for _, training in known for each in training.psnr_db if each == each]
+    worst_db = [each for _, training in known for each in training.worst_psnr_db if each == each]
+    facts["psnr_db"] = {
+        "mean": round(sum(mean_db) / max(len(mean_db), 1), 3),
+        "worst_frame": min(worst_db, default=0.0),
+    }
+    return facts
+
+
 def origin_of(index: SceneIndex) -> Origin:
     """Return where scenes come from, by their marks of completion, maps and sizes.
 

@@ -21,9 +21,7 @@ from stereogenbench_data.sources.location import local_path
 from stereogenbench_data.sources.members import require_own_files
 
 DESCRIPTOR_NAME: Final = "croissant.json"
-_COMPANIONS: Final = (
-    INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "croissant/*.parquet", "croissant/*.txt",
-)  # fmt: skip
+_COMPANIONS: Final = (INDEX_NAME, CARD_NAME, "croissant/*.parquet", "croissant/*.txt")
 
 
 @dataclass(frozen=True, slots=True)

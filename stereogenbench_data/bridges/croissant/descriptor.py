@@ -29,7 +29,6 @@ from stereogenbench_data.bridges.croissant.nodes import (
 from stereogenbench_data.bridges.croissant.shards import packed_nodes, write_tables
 from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.shards.companion_files import derivation_facts
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import is_remote, shown
 
@@ -175,7 +174,7 @@ def _packed(index: SceneIndex, facts: Node) -> Node:
 
 def _derived(index: SceneIndex, facts: Node) -> Node:
     """Return what the descriptor of training shards says instead: from what, how, what error."""
-    derived = derivation_facts(index)
+    derived = dataset_facts.derivation_facts(index)
     psnr_db, settings = derived["psnr_db"], json.dumps(derived["settings"], sort_keys=True)
     encoding = dataset_facts.activity(
         "Derivation for training",
