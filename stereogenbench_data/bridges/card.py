@@ -43,13 +43,13 @@ _SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 _ADJACENT: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
 
 
-def card(index: SceneIndex, *, repository: str, about: Path | None = None) -> str:
+def card(index: SceneIndex, *, repository: str, about: dataset_facts.About | None = None) -> str:
     """Return the card of shards, whose config "scenes" is what `viewer` writes beside them.
 
     Args:
         index: The index of the shards.
         repository: "ORG/NAME" on the Hub.
-        about: What the maker of the scenes states of them, as for `dataset_facts.facts_of`.
+        about: What the user states of the scenes, as for `dataset_facts.facts_of`.
 
     Raises:
         DescriptorError: If the data are not shards, or who made them is not known.
@@ -67,7 +67,7 @@ def write_card(
     folder: Path,
     *,
     repository: str,
-    about: Path | None = None,
+    about: dataset_facts.About | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write the card beside the shards, and the scenes that the Hub's viewer shows.

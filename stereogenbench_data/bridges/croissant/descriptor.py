@@ -50,8 +50,7 @@ class Publication:
             release has the URL of the release's own repository.
         tables_url: URL of the folder of tables. None for the folder in ``data_url`` with the name
             of the descriptor, or for paths relative to the descriptor.
-        about: A JSON file in which the maker of the scenes states what `dataset_facts` does not
-            know.
+        about: What the user states of the scenes, as for `dataset_facts.facts_of`.
     """
 
     name: str | None = None
@@ -59,7 +58,7 @@ class Publication:
     published: date | None = None
     data_url: str | None = None
     tables_url: str | None = None
-    about: Path | None = None
+    about: dataset_facts.About | None = None
 
 
 def write_descriptor(
