@@ -54,7 +54,7 @@ sample: $(READY)
 	$(SYNTH) --family IPD_Gaussian --seed 6 --split eval --subset unseen_map --map SynthYard
 	$(SYNTH) --family Uniform --seed 7 --split eval --subset unseen_map --map SynthYard
 	$(BIN)/stereogenbench pack $(SAMPLE)/release $(SAMPLE)/shards --shard-size 4MB
-	rm -rf shards/*.tar shards/dali
+	rm -f shards/*.tar
 	cp -r $(SAMPLE)/shards/* shards/
 	$(BIN)/stereogenbench verify --deep shards
 

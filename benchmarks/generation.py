@@ -25,7 +25,12 @@ import torch
 from benchmarks.results import Report
 from stereogenbench_data.media.depth_packing import grey_frame
 from stereogenbench_data.schema.release import CAMERA_COUNT, FRAME_COUNT
-from stereogenbench_data.synthesis.camera_writer import depth_units, depth_video, picture_video
+from stereogenbench_data.synthesis.camera_writer import (
+    DEPTH_FORMAT,
+    depth_units,
+    depth_video,
+    picture_video,
+)
 from stereogenbench_data.synthesis.checks import FrameStatistics
 from stereogenbench_data.synthesis.filters import DEFAULT_LIMITS
 from stereogenbench_data.synthesis.planning import plan_scene
@@ -97,11 +102,10 @@ def stages_s(request: SynthRequest, *, index: int, frames: int, folder: Path) ->
             writer.write(frame.reformat(format="yuv420p", threads=1))
     rgb_s = time.process_time() - start
     start = time.process_time()
-    eye = plan.view(camera=0, frame=0)
     with depth_video(depth, request.contract) as writer:
         for view in views:
-            units = depth_units(view.depth_m, view=eye, contract=request.contract)
-            writer.write(grey_frame(units, pixel_format=request.contract.depth_format))
+            units = depth_units(view.depth_m, unit_m=request.contract.depth_unit_m)
+            writer.write(grey_frame(units, pixel_format=DEPTH_FORMAT))
     depth_s = time.process_time() - start
     start = time.process_time()
     seen = FrameStatistics(plan, camera=0, limits=DEFAULT_LIMITS)

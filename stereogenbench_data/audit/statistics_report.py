@@ -59,21 +59,16 @@ class Line:
         return self.paper == self.ours
 
 
-def release_sized_splits(found: Statistics) -> tuple[str, ...]:
-    """Return the splits whose number of scenes is within a tenth of the paper's."""
-    return tuple(
+def compared(found: Statistics) -> tuple[Line, ...]:
+    """Return every figure of the paper's tables beside that of the statistics.
+
+    Only splits whose number of scenes is within a tenth of the paper's are compared.
+    """
+    splits = [
         split
         for split, count in SPLITS.items()
         if abs(_scenes_of(found, split) - count) <= _RELEASE_SIZED * count
-    )
-
-
-def _scenes_of(found: Statistics, split: str) -> int:
-    return sum(each.scenes for each in found.branches if each.split == split)
-
-
-def compared(found: Statistics, *, splits: tuple[str, ...] = tuple(SPLITS)) -> tuple[Line, ...]:
-    """Return every figure of the paper's tables for some splits, and that of the statistics."""
+    ]
     lines = [
         *_count_lines(found),
         *_baseline_lines(found),
@@ -83,6 +78,10 @@ def compared(found: Statistics, *, splits: tuple[str, ...] = tuple(SPLITS)) -> t
         *_map_lines(found),
     ]
     return tuple(line for split, line in lines if split in splits)
+
+
+def _scenes_of(found: Statistics, split: str) -> int:
+    return sum(each.scenes for each in found.branches if each.split == split)
 
 
 def _count_lines(found: Statistics) -> Iterator[tuple[str, Line]]:

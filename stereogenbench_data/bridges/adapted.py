@@ -31,7 +31,6 @@ class PairsOptions(Selection, total=False):
     check: Check
     buffers: Buffers
     fetch_ahead_bytes: int
-    connections: int
 
 
 class AdaptedPairs(Dataset[Item], Generic[Item]):

@@ -25,7 +25,6 @@ from stereogenbench_data.schema.release import (
     TRAINING_JSON,
 )
 from stereogenbench_data.schema.text import counted, markdown_text
-from stereogenbench_data.shards.companion_files import derivation_facts
 from stereogenbench_data.sources.files import write_atomic
 
 CARD_NAME: Final = "README.md"
@@ -44,13 +43,13 @@ _SIZES: Final = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 _ADJACENT: Final = [CAMERA_PAIRS.index(pair) for pair in ADJACENT_PAIRS]
 
 
-def card(index: SceneIndex, *, repository: str, about: Path | None = None) -> str:
+def card(index: SceneIndex, *, repository: str, about: dataset_facts.About | None = None) -> str:
     """Return the card of shards, whose config "scenes" is what `viewer` writes beside them.
 
     Args:
         index: The index of the shards.
         repository: "ORG/NAME" on the Hub.
-        about: What the maker of the scenes states of them, as for `dataset_facts.facts_of`.
+        about: What the user states of the scenes, as for `dataset_facts.facts_of`.
 
     Raises:
         DescriptorError: If the data are not shards, or who made them is not known.
@@ -68,7 +67,7 @@ def write_card(
     folder: Path,
     *,
     repository: str,
-    about: Path | None = None,
+    about: dataset_facts.About | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write the card beside the shards, and the scenes that the Hub's viewer shows.
@@ -277,7 +276,7 @@ def _provenance(facts: dataset_facts.Facts) -> list[str]:
 def _derivation(index: SceneIndex) -> list[str]:
     if not index.is_derived:
         return []
-    facts = derivation_facts(index)
+    facts = dataset_facts.derivation_facts(index)
     psnr_db = facts["psnr_db"]
     return [
         "## Derived for training",

@@ -2,10 +2,12 @@
 
 The properties are those of Croissant, under their names. They differ by where the data come from:
 
-- `RELEASE`: the scenes of the StereoGenBench paper. Source: its sections on limitations,
-  responsible use and release, and its appendices on hosting and on the generation environment.
-- `DRAWN`: scenes that `stereogenbench synth` made from its own shapes.
-- other scenes, also those that it rendered from assets of the user: their maker states the
+- `DRAWN`: scenes whose marks of completion say that `stereogenbench synth` drew them, from its own
+  shapes.
+- `RELEASE`: the scenes of the StereoGenBench paper, if the user says so: others may be rendered
+  on maps of the same names. Source: the paper's sections on limitations, responsible use and
+  release, and its appendices on hosting and on the generation environment.
+- other scenes, also those that `synth` rendered from assets of the user: their maker states the
   properties, in a copy of `template`.
 """
 
@@ -16,17 +18,12 @@ from typing import Any, Final, Literal
 
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.release import (
-    COMPLETE_JSON,
-    FRAME_COUNT,
-    IMAGE_SIZE_PX,
-    TRAIN_MAPS,
-    UNSEEN_MAPS,
-)
+from stereogenbench_data.schema.release import COMPLETE_JSON
 from stereogenbench_data.sources.members import MemberSource
 
 Facts = dict[str, Any]
-Origin = Literal["release", "drawn", "elsewhere"]
+About = Path | Literal["release"]
+"""What the user states of data: a JSON file, or that they are the scenes of the paper."""
 
 TITLE: Final = "StereoGenBench"
 HOME: Final = "https://huggingface.co/datasets/stereo-dataset/stereo-dataset"
@@ -328,31 +325,31 @@ def listed(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
 
 
-def facts_of(index: SceneIndex | None, *, about: Path | None = None) -> Facts:
+def facts_of(index: SceneIndex | None, *, about: About | None = None) -> Facts:
     """Return the properties of a dataset.
 
     Args:
         index: The data; None for the release.
-        about: A JSON file with properties that its maker states: all of `template` for scenes from
-            elsewhere, otherwise those that differ.
+        about: "release" for the scenes of the paper. Or a JSON file with properties that their
+            maker states: of scenes that `stereogenbench synth` drew those that differ, of others
+            all of `template`.
 
     Raises:
         DescriptorError: If the file cannot be read, has a property with another name or a blank,
-            or lacks one that is needed.
+            or lacks one that is needed, or drawn scenes are said to be the paper's.
         StorageError: If the scenes' marks of completion cannot be read.
     """
-    origin: Origin = "release" if index is None else origin_of(index)
-    known = {"release": RELEASE, "drawn": DRAWN, "elsewhere": {}}[origin]
-    known = RELEASE_ITSELF if index is None else known
-    facts = known | ({} if about is None else _stated(about))
+    facts = RELEASE_ITSELF if index is None else _known(index, about)
+    if isinstance(about, Path):
+        facts = facts | _stated(about)
     missing = [name for name in _QUESTIONS if name not in facts]
-    if missing:
-        where = about or ("the data" if index is None else index.where)
+    if index is not None and missing:
         raise DescriptorError(
-            f"{where}: who made the data, how, and under which licence is not known: they are "
-            f"neither scenes of the release nor drawn by `stereogenbench synth`. Not stated: "
-            f"{', '.join(missing)}. Write the questions into a file with `stereogenbench croissant "
-            "--template -o about.json`, answer them, and add `--about about.json`."
+            f"{about or index.where}: who made the data, how, and under which licence is not "
+            f"known, because `stereogenbench synth` did not draw them. Not stated: "
+            f"{', '.join(missing)}. If they are the scenes of the StereoGenBench paper, add "
+            "`--about release`. If not, write the questions into a file with `stereogenbench "
+            "croissant --template -o about.json`, answer them, and add `--about about.json`."
         )
     return facts
 
@@ -380,27 +377,46 @@ def _stated(about: Path) -> Facts:
     return facts
 
 
-def origin_of(index: SceneIndex) -> Origin:
-    """Return where scenes come from, by their marks of completion, maps and sizes.
+def derivation_facts(index: SceneIndex) -> dict[str, Any]:
+    """Return from what, how and with what error training shards were derived, as JSON.
 
-    One scene of each family and map is asked.
-
-    Raises:
-        StorageError: If a mark cannot be read.
+    Several values of a fact, as of scenes that were derived with several settings, are a list.
     """
+    scenes = [index.scene(row) for row in range(len(index))]
+    known = [(scene.rig, scene.training) for scene in scenes if scene.training is not None]
+    facts: dict[str, Any] = {}
+    for name, values in (
+        ("size", {f"{rig.image_width_px}x{rig.image_height_px}" for rig, _ in known}),
+        ("quality", {training.quality for _, training in known}),
+        ("codec", {training.codec for _, training in known}),
+        ("settings", {training.settings for _, training in known}),
+        ("source_digest", {training.source_digest for _, training in known}),
+    ):
+        found = sorted(values)
+        found = [json.loads(each) for each in found] if name == "settings" else found
+        facts[name] = found[0] if len(found) == 1 else found
+    mean_db = [each for _, training in known for each in training.psnr_db if each == each]
+    worst_db = [each for _, training in known for each in training.worst_psnr_db if each == each]
+    facts["psnr_db"] = {
+        "mean": round(sum(mean_db) / max(len(mean_db), 1), 3),
+        "worst_frame": min(worst_db, default=0.0),
+    }
+    return facts
+
+
+def _known(index: SceneIndex, about: About | None) -> Facts:
+    """Return what is known of data without their maker; one scene of each map is asked."""
     columns = (index.column(name) for name in ("split", "family", "map_name"))
     kinds = dict(zip(zip(*columns, strict=True), range(len(index)), strict=True))
-    drawn = [_is_drawn(index, row) for row in kinds.values()]
-    if drawn and all(drawn):
-        return "drawn"
-    sizes = {*index.column("image_width_px").tolist(), *index.column("image_height_px").tolist()}
-    is_whole = index.is_derived or sizes == {IMAGE_SIZE_PX}
-    is_release = (
-        not any(drawn)
-        and set(index.column("map_name")) <= TRAIN_MAPS | UNSEEN_MAPS
-        and set(index.column("frames").tolist()) == {FRAME_COUNT}
-    )
-    return "release" if is_release and is_whole else "elsewhere"
+    drawn = [row for row in kinds.values() if _is_drawn(index, row)]
+    if about != "release":
+        return DRAWN if len(drawn) == len(kinds) else {}
+    if drawn:
+        raise DescriptorError(
+            f"{index.where}: {index.scene(drawn[0]).id.key} was drawn by `stereogenbench synth`, "
+            "so these are not the scenes of the release. Leave out `--about release`."
+        )
+    return RELEASE
 
 
 def _is_drawn(index: SceneIndex, row: int) -> bool:

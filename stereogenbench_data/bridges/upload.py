@@ -10,6 +10,7 @@ from typing import Final
 
 from stereogenbench_data.bridges.card import CARD_NAME, write_card
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
+from stereogenbench_data.bridges.dataset_facts import About
 from stereogenbench_data.bridges.viewer import viewer_tars
 from stereogenbench_data.engine import Progress
 from stereogenbench_data.errors import DescriptorError, StorageError, missing_extra
@@ -21,9 +22,7 @@ from stereogenbench_data.sources.location import local_path
 from stereogenbench_data.sources.members import require_own_files
 
 DESCRIPTOR_NAME: Final = "croissant.json"
-_COMPANIONS: Final = (
-    INDEX_NAME, "shards.json", "dali/*.idx", CARD_NAME, "croissant/*.parquet", "croissant/*.txt",
-)  # fmt: skip
+_COMPANIONS: Final = (INDEX_NAME, CARD_NAME, "croissant/*.parquet", "croissant/*.txt")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +44,7 @@ def prepare_upload(
     shards: str | Path,
     repository: str,
     *,
-    about: Path | None = None,
+    about: About | None = None,
     progress: Progress | None = None,
 ) -> tuple[SceneIndex, str]:
     """Write the card, the rows of the Hub's viewer and the descriptor into a folder of shards.
@@ -53,7 +52,7 @@ def prepare_upload(
     Args:
         shards: The folder that ``pack`` wrote.
         repository: "ORG/NAME" of a dataset on the Hub.
-        about: What the maker of the scenes states of them, as for `dataset_facts.facts_of`.
+        about: What the user states of the scenes, as for `dataset_facts.facts_of`.
         progress: Called with (scenes done, scenes in all) while pictures of scenes are written.
 
     Returns:
@@ -80,7 +79,7 @@ def prepare_upload(
 
 
 def upload(
-    shards: str | Path, repository: str, *, branch: str = "main", about: Path | None = None
+    shards: str | Path, repository: str, *, branch: str = "main", about: About | None = None
 ) -> Upload:
     """Upload a folder of packed shards.
 
@@ -91,7 +90,7 @@ def upload(
         shards: The folder that ``pack`` wrote.
         repository: "ORG/NAME" of a dataset on the Hub; created if it does not exist.
         branch: The branch to commit to.
-        about: What the maker of the scenes states of them, as for `dataset_facts.facts_of`.
+        about: What the user states of the scenes, as for `dataset_facts.facts_of`.
 
     Raises:
         ExtraError: If huggingface_hub is not installed.

@@ -5,7 +5,7 @@ import re
 from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -14,6 +14,9 @@ from stereogenbench_data.cli.help import RARE
 from stereogenbench_data.cli.options import JsonOption, RootOption, ShardsOptions, grouped
 from stereogenbench_data.cli.progress import progress_bar
 from stereogenbench_data.schema.text import counted
+
+if TYPE_CHECKING:
+    from stereogenbench_data.bridges.dataset_facts import About
 
 _REPOSITORY: Final = re.compile(r"[\w.-]+/[\w.-]+")
 
@@ -27,13 +30,19 @@ def _require_repository(text: str) -> str:
 
 
 AboutOption = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
         "--about",
-        metavar="FILE",
-        help="Authors, licence, provenance: see `croissant --template`.",
+        metavar="FILE|release",
+        help="Authors, licence, provenance: answers to `croissant --template`, or release for the "
+        "paper's scenes.",
     ),
 ]
+
+
+def _stated(about: str | None) -> "About | None":
+    return "release" if about == "release" else None if about is None else Path(about)
+
 
 RepositoryArgument = Annotated[
     str,
@@ -126,7 +135,7 @@ def croissant(  # noqa: PLR0913 - one parameter an option
         published=None if published is None else published.date(),
         data_url=None if base_url is None else base_url.rstrip("/"),
         tables_url=None if tables_url is None else tables_url.rstrip("/"),
-        about=about,
+        about=_stated(about),
     )
     descriptor = write_descriptor(index, out, publication=publication)
     files, records = len(descriptor["distribution"]), len(descriptor["recordSet"])
@@ -184,10 +193,12 @@ def card(
 
     index = SceneIndex.open(source.shards, root=source.data_root)
     if out is None:
-        typer.echo(card_text(index, repository=repository, about=about), nl=False)
+        typer.echo(card_text(index, repository=repository, about=_stated(about)), nl=False)
         return
     with progress_bar("picturing", unit="scenes") as progress:
-        path = write_card(index, out, repository=repository, about=about, progress=progress)
+        path = write_card(
+            index, out, repository=repository, about=_stated(about), progress=progress
+        )
     typer.echo(str(path))
 
 
@@ -209,8 +220,8 @@ def upload(
 
     # The Hub's client has progress bars of its own.
     with progress_bar("picturing", unit="scenes") as progress:
-        prepare_upload(shards, repository, about=about, progress=progress)
-    report = uploaded(shards, repository, branch=branch, about=about)
+        prepare_upload(shards, repository, about=_stated(about), progress=progress)
+    report = uploaded(shards, repository, branch=branch, about=_stated(about))
     if as_json:
         typer.echo(json.dumps(asdict(report), indent=2))
         return

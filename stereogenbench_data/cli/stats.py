@@ -3,11 +3,10 @@
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from stereogenbench_data.cli.errors import FINDINGS
 from stereogenbench_data.cli.options import (
     DataOptions,
     JsonOption,
@@ -23,10 +22,6 @@ def stats(
     source: DataOptions,
     *,
     chosen: SceneOptions,
-    compare: Annotated[
-        Literal["auto", "always", "never"],
-        typer.Option(help="Show the paper's figures; auto: beside whole splits."),
-    ] = "auto",
     plots: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Folder for histograms (extra 'plots')."),
@@ -36,22 +31,18 @@ def stats(
 ) -> None:
     """Count scenes, maps, baselines and focal lengths.
 
-    The tables are the paper's. It reads only the index. With --compare always, the exit status is 1
-    if a figure differs from the paper's.
+    The tables are the paper's; its figures stand beside whole splits. It reads only the index.
     """
-    from stereogenbench_data.audit.paper_numbers import SPLITS
     from stereogenbench_data.audit.statistics import statistics
     from stereogenbench_data.audit.statistics_report import (
         compared,
-        release_sized_splits,
         statistics_markdown,
         write_plots,
     )
 
     index, filters = source.open(), chosen.filters()
     found = statistics(index, **filters)
-    splits = {"always": tuple(SPLITS), "never": ()}.get(compare)
-    lines = compared(found, splits=release_sized_splits(found) if splits is None else splits)
+    lines = compared(found)
     document = found.to_json() | {
         "paper": [asdict(line) | {"agrees": line.agrees} for line in lines]
     }
@@ -65,5 +56,3 @@ def stats(
             written = write_plots(index, plots, **filters)
         for path in written:
             typer.echo(str(path), err=True)
-    if compare == "always" and not all(line.agrees for line in lines):
-        raise typer.Exit(FINDINGS)

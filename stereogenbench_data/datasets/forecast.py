@@ -261,7 +261,7 @@ def planned_bytes(
         most = len(plan) if whole else _MOST_PLANNED
         # What is open from the start to the end counts too much in a part of an epoch.
         before = 0 if whole else most // 4
-        ahead = PlannedFetches(connections=connections)
+        ahead = PlannedFetches()
         decoder = SampleLoader(index, pairs.request, check="metadata", frames="shared", ahead=ahead)
         decoder.keep_open(videos, frames=batches.rule.open_frames)
         decoder.expect(_steps(pairs, batches, numbers))

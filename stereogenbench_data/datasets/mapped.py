@@ -46,7 +46,7 @@ from stereogenbench_data.selection.order import EpochOrder, OrderRule, Runs, Tai
 from stereogenbench_data.selection.plan import Address, Plan, Selection, plan_pairs, plan_views
 from stereogenbench_data.selection.windows import FramesSpec, Random
 from stereogenbench_data.sources.cache import ShardCache
-from stereogenbench_data.sources.fetch_ahead import CONNECTIONS, FETCH_AHEAD_BYTES, FetchAhead
+from stereogenbench_data.sources.fetch_ahead import FETCH_AHEAD_BYTES, FetchAhead
 from stereogenbench_data.sources.location import is_remote
 
 Data = str | Path | SceneIndex
@@ -76,14 +76,13 @@ class _MappedScenes(Dataset[Sample]):
         check: Check,
         buffers: Buffers,
         fetch_ahead_bytes: int,
-        connections: int,
     ) -> None:
         check_samples(index, plan, request)
         self.index = index
         self.plan = plan
         self.request = request
         opened = _opens_checked(check, plan)
-        ahead = FetchAhead(limit_bytes=fetch_ahead_bytes, connections=connections)
+        ahead = FetchAhead(limit_bytes=fetch_ahead_bytes)
         if cache is not None:
             # Several processes fill it: what one fetches ahead must not evict what another needs.
             ahead.limit_bytes = min(fetch_ahead_bytes, cache.limit_bytes // _OF_CACHE)
@@ -398,7 +397,6 @@ class StereoPairs(_MappedScenes):
         check: Check = "read",
         buffers: Buffers = "reused",
         fetch_ahead_bytes: int = FETCH_AHEAD_BYTES,
-        connections: int = CONNECTIONS,
         **selection: Unpack[Selection],
     ) -> None:
         """Select the samples; no video is opened before the first sample is read.
@@ -426,7 +424,6 @@ class StereoPairs(_MappedScenes):
             fetch_ahead_bytes: How many bytes each process fetches from a URL before they are
                 needed, 256 MB by default; 0 fetches only what the current sample needs. With a
                 cache, what is fetched ahead fills it.
-            connections: How many requests each process makes to a URL at a time.
             **selection: Filters on scenes (`SceneFilters`), pairs, direction, baseline_cm,
                 balance and limit (`PairOptions`), and frames (`parse_frames`).
 
@@ -458,7 +455,6 @@ class StereoPairs(_MappedScenes):
             check=check,
             buffers=buffers,
             fetch_ahead_bytes=fetch_ahead_bytes,
-            connections=connections,
         )
 
 
@@ -486,7 +482,6 @@ class SceneViews(_MappedScenes):
         check: Check = "read",
         buffers: Buffers = "reused",
         fetch_ahead_bytes: int = FETCH_AHEAD_BYTES,
-        connections: int = CONNECTIONS,
         **filters: Unpack[SceneFilters],
     ) -> None:
         """Select the samples; no video is opened before the first sample is read.
@@ -504,7 +499,6 @@ class SceneViews(_MappedScenes):
             check: As for `StereoPairs`.
             buffers: As for `StereoPairs`.
             fetch_ahead_bytes: As for `StereoPairs`.
-            connections: As for `StereoPairs`.
             **filters: Filters on scenes (`SceneFilters`).
 
         Raises:
@@ -533,7 +527,6 @@ class SceneViews(_MappedScenes):
             check=check,
             buffers=buffers,
             fetch_ahead_bytes=fetch_ahead_bytes,
-            connections=connections,
         )
 
 

@@ -39,7 +39,6 @@ class StreamOptions(Selection, EpochOptions, total=False):
     check: Check
     buffers: Buffers
     fetch_ahead_bytes: int
-    connections: int
 
 
 class StereoPairStream(IterableDataset[Sample]):

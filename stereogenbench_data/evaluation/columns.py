@@ -109,10 +109,10 @@ HEAVY_TAILED: Final = frozenset(f"sd_{fit}" for fit in _SD_FITS)
 PAIR_METRICS: Final[dict[str, str]] = {"lpips": "lpips"}
 """Learned metrics of pairs of pictures, and the models that they are computed with."""
 
-IMAGE_DISTANCES: Final[dict[str, str]] = {"fid": "inception", "fd-colour": "colour-statistics"}
+IMAGE_DISTANCES: Final[dict[str, str]] = {"fid": "inception"}
 """Distances between sets of frames, and the features that each is of."""
 
-VIDEO_DISTANCES: Final[dict[str, str]] = {"fvd": "i3d", "fd-motion": "motion-statistics"}
+VIDEO_DISTANCES: Final[dict[str, str]] = {"fvd": "i3d"}
 """Distances between sets of clips, one clip a pair, and the features that each is of."""
 
 METRICS: Final = (*FRAME_METRICS, *IMAGE_DISTANCES, *VIDEO_DISTANCES)

@@ -256,8 +256,7 @@ def plain(table: Table) -> dict[str, Any]:
 def heading(table: Table, column: str) -> str:
     """Return the head of a column: its name, what it was measured with, which way is better."""
     if column not in COLUMNS:
-        name = column.upper() if column in ("fid", "fvd") else f"FD{column.removeprefix('fd')}"
-        return f"{name}↓"
+        return f"{column.upper()}↓"
     median = " [median]" if column in HEAVY_TAILED else ""
     return f"{table.protocol.label(column)}{_ARROWS[COLUMNS[column].better]}{median}"
 

@@ -93,7 +93,7 @@ class SceneIndex:
                 ``stereogenbench index`` keeps the result).
             root: Where the data of an index file are, whatever the file says: any folder or URL
                 that you trust.
-            retry: How often reading from a server is retried, and how slow it may be.
+            retry: How slow a server may be.
 
         Raises:
             StorageError: If there are no such data, they hold no scene, the index is damaged or of

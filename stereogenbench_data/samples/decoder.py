@@ -124,8 +124,7 @@ class SampleDecoder:
         """Return a decoder of the same samples with open videos of its own."""
         twin = copy.copy(self)
         if self._ahead is not None:
-            limit_bytes, connections = self._ahead.limit_bytes, self._ahead.connections
-            twin._ahead = FetchAhead(limit_bytes=limit_bytes, connections=connections)
+            twin._ahead = FetchAhead(limit_bytes=self._ahead.limit_bytes)
             twin._source = self._source.fetching_by(twin._ahead)
         twin._streams = Streams(twin._source)
         twin._coming = twin._new_coming()

@@ -30,7 +30,6 @@ from stereogenbench_data.schema.release import (
     TRAINING_JSON,
 )
 from stereogenbench_data.schema.training import parse_training
-from stereogenbench_data.shards.companion_files import write_companion_files
 from stereogenbench_data.shards.plan import DEFAULT_SHARD_BYTES, DepthCodec, ShardPlan, plan_shards
 from stereogenbench_data.shards.tar import CHUNK_BYTES, read_members
 from stereogenbench_data.shards.training import Derivation, TrainingSettings
@@ -285,8 +284,7 @@ def _finish(job: PackJob, *, packed: set[str]) -> PackReport:
             for manifest in shards
         },
     )
-    # The index is written last: where it exists, everything else does, too.
-    write_companion_files(index, out=job.out)
+    # The index is written last: where it exists, every shard does, too.
     index.write(job.out / INDEX_NAME)
     warn_if_stale(job.out)
     return replace(report, index=job.out / INDEX_NAME)

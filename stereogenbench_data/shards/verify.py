@@ -39,7 +39,6 @@ from stereogenbench_data.schema.release import (
     depth_name,
 )
 from stereogenbench_data.schema.text import counted
-from stereogenbench_data.shards.companion_files import companion_files
 from stereogenbench_data.shards.open import open_shards
 from stereogenbench_data.shards.plan import SCENE_TEXTS
 from stereogenbench_data.shards.tar import FETCH_AGAIN, TarMember, read_checksums, read_members
@@ -54,7 +53,6 @@ from stereogenbench_data.shards.writer import TEMPORARY_SUFFIX
 
 _WRONG_INDEX: Final = "Put the index beside the shards that it was packed with."
 _FETCH_BOTH: Final = "Fetch the shard and its index again, or pack them again."
-_WRITE_AGAIN: Final = "Fetch it again, or run `stereogenbench pack` again to write it."
 _SHOWN: Final = 3
 _SAME_DB: Final = 0.01
 """How far a PSNR may be off that of another machine, in dB."""
@@ -235,15 +233,6 @@ def _folder_problems(index: SceneIndex, expected: dict[str, _ExpectedShard]) -> 
         elif name.endswith(f".tar{TEMPORARY_SUFFIX}"):
             cure = "Run `stereogenbench pack` again, or remove it."
             yield Problem(name, "", "", "is an unfinished shard", cure)
-    for name, content in companion_files(index).items():
-        try:
-            if Path(index.root, name).read_bytes() != content:
-                yield Problem(name, "", "", "contradicts the index", _WRITE_AGAIN)
-        except FileNotFoundError:
-            yield Problem(name, "", "", "is missing, and pack wrote it", _WRITE_AGAIN)
-        except OSError as error:
-            found = f"cannot be read ({error.strerror})"
-            yield Problem(name, "", "", found, cure_of(error, _WRITE_AGAIN))
 
 
 # One shard: its structure, every byte, and its metadata.

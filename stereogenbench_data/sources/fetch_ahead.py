@@ -25,7 +25,7 @@ FETCH_AHEAD_BYTES: Final = 256_000_000
 """Bytes that a process fetches ahead at the most, unless the user says otherwise."""
 
 CONNECTIONS: Final = 8
-"""Requests that a process makes at a time, unless the user says otherwise."""
+"""Requests that a process makes at a time."""
 
 LARGEST_REQUEST: Final = 2 * 1024 * 1024
 """Bytes to which ranges beside each other are merged."""
@@ -80,7 +80,6 @@ class _Part:
 class _State:
     """What the threads of a process share."""
 
-    connections: int
     pid: int = field(default_factory=os.getpid)
     cancellation: Cancellation = field(default_factory=Cancellation)
     changed: threading.Condition = field(default_factory=threading.Condition)
@@ -100,26 +99,20 @@ class FetchAhead:
 
     Attributes:
         limit_bytes: How many bytes may be planned and not yet released; 0 plans nothing ahead.
-        connections: How many requests are made at a time.
         most_bytes: The most that `planned_bytes` ever was.
     """
 
-    def __init__(
-        self, *, limit_bytes: int = FETCH_AHEAD_BYTES, connections: int = CONNECTIONS
-    ) -> None:
+    def __init__(self, *, limit_bytes: int = FETCH_AHEAD_BYTES) -> None:
         """Fetch nothing yet.
 
         Raises:
-            SelectionError: If a number is out of its range.
+            SelectionError: If the number is out of its range.
         """
-        for name, value, least in (
-            ("fetch_ahead_bytes", limit_bytes, 0),
-            ("connections", connections, 1),
-        ):
-            if type(value) is not int or value < least:
-                raise SelectionError(f"{name} must be a whole number from {least}, got {value!r}.")
+        if type(limit_bytes) is not int or limit_bytes < 0:
+            raise SelectionError(
+                f"fetch_ahead_bytes must be a whole number from 0, got {limit_bytes!r}."
+            )
         self.limit_bytes = limit_bytes
-        self.connections = connections
         self.most_bytes = 0
         self._own: _State | None = None
         self._finalizer: Callable[[], object] | None = None
@@ -127,7 +120,7 @@ class FetchAhead:
     @property
     def _state(self) -> _State:
         if self._own is None or self._own.pid != os.getpid():
-            self._own = _State(self.connections)
+            self._own = _State()
             self._finalizer = weakref.finalize(self, _end, self._own)
         return self._own
 
@@ -151,7 +144,7 @@ class FetchAhead:
         with state.changed:
             state.up_to = sample
             waiting = sum(first <= sample for first, _, _ in state.queue)
-            for _ in range(min(waiting, state.connections - len(state.threads))):
+            for _ in range(min(waiting, CONNECTIONS - len(state.threads))):
                 thread = threading.Thread(
                     target=_work, args=(state,), name="fetch-ahead", daemon=True
                 )

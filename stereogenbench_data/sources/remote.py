@@ -151,9 +151,6 @@ class RemoteObject:
             raise StorageError(
                 f"{self.where}: cannot be read, {doing} ({state.describe(error)}). Check the "
                 f"network and the server, then try again; or fetch the data and pass the folder; "
-                f"or allow a slower server: SceneIndex.open(..., retry=RetryPolicy(...)), which "
-                f"has least_rate_bytes_s={policy.least_rate_bytes_s:.10g} over "
-                f"window_s={policy.window_s:g}, timeout_s={policy.timeout_s:g}, "
-                f"longest_outage_s={policy.longest_outage_s:g}, "
-                f"longest_read_s={policy.longest_read_s:g} now."
+                f"or allow a server that is slower than timeout_s={policy.timeout_s:g}: "
+                f"SceneIndex.open(..., retry=RetryPolicy(timeout_s={2 * policy.timeout_s:g}))."
             ) from error

@@ -8,18 +8,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
-from typing import Final
+from dataclasses import dataclass
+from typing import ClassVar, Final
 
 from stereogenbench_data.errors import StorageError
 
 _BYTES_PER_TIME_LIMIT: Final = 8 * 2**20
 """The time limit of a read starts anew after this many bytes."""
-
-
-def _random() -> float:
-    """Draw from 0 to 1, without changing the program's own random numbers."""
-    return random.SystemRandom().random()
 
 
 class ReadCancelled(StorageError):
@@ -99,54 +94,72 @@ class Cancellation:
 
 @dataclass(frozen=True, slots=True)
 class RetryPolicy:
-    """How often reading from a server is retried, how long it waits, and how slow a server may be.
+    """How long reading waits for a server, and how often it tries again.
 
     Attributes:
-        attempts: Consecutive attempts below the least rate before reading gives up.
-        first_wait_s: Seconds before the second attempt. The wait doubles with each attempt and is
-            shortened at random by up to a half, so that many workers do not retry at once.
-        longest_wait_s: The longest wait in seconds, unless the server asks for more.
-        longest_retry_after_s: The longest wait in seconds that a server may request (Retry-After);
-            beyond it reading gives up.
-        timeout_s: Seconds until a response begins, connecting and redirects included.
-        least_rate_bytes_s: Bytes per second that a response must deliver once it has begun. Fewer
-            over ``window_s`` end the attempt.
-        window_s: Seconds over which the rate is measured.
-        longest_outage_s: Seconds without the least rate, over all attempts and waits, after which
-            reading gives up. Waits that the server asks for do not count.
-        longest_read_s: Seconds that one read may take with all attempts and waits; of a long read,
-            each 8 MiB. Time without a request to the server does not count.
-        sleep: Waits so many seconds.
-        chance: Draws a random number from 0 to 1.
-        clock: Returns the time in seconds.
+        timeout_s: Seconds until a response begins, connecting and redirects included. The other
+            limits of time grow with it: reading gives up after 2.25 times as long without data.
     """
 
-    attempts: int = 10
-    first_wait_s: float | int = 0.02
-    longest_wait_s: float | int = 10.0
-    longest_retry_after_s: float | int = 300.0
     timeout_s: float | int = 20.0
-    least_rate_bytes_s: float | int = 4096.0
-    window_s: float | int = 10.0
-    longest_outage_s: float | int = 45.0
-    longest_read_s: float | int = 600.0
-    sleep: Callable[[float], None] = field(default=time.sleep, repr=False)
-    chance: Callable[[], float] = field(default=_random, repr=False)
-    clock: Callable[[], float] = field(default=time.monotonic, repr=False)
+
+    attempts: ClassVar[int] = 10
+    """Consecutive attempts below the least rate before reading gives up."""
+    first_wait_s: ClassVar[float] = 0.02
+    """Seconds before the second attempt. The wait doubles with each attempt and is shortened at
+    random by up to a half, so that many workers do not retry at once."""
+    longest_wait_s: ClassVar[float] = 10.0
+    """The longest wait, unless the server asks for more."""
+    longest_retry_after_s: ClassVar[float] = 300.0
+    """The longest wait that a server may request (Retry-After); beyond it reading gives up."""
+    least_rate_bytes_s: ClassVar[float] = 4096.0
+    """Bytes per second that a response must deliver once it has begun. Fewer over ``window_s`` end
+    the attempt."""
 
     def __post_init__(self) -> None:
-        """Refuse limits without an effect.
+        """Refuse a limit without an effect.
 
         Raises:
-            StorageError: If there is no attempt, or a limit is negative or not a number.
+            StorageError: If the time is not a number above 0.
         """
-        above_zero = ("attempts", "timeout_s", "window_s", "longest_outage_s", "longest_read_s")
-        waits = ("first_wait_s", "longest_wait_s", "longest_retry_after_s")
-        for name in (*above_zero, "least_rate_bytes_s", *waits):
-            value = getattr(self, name)
-            if not value >= 0 or (name in above_zero and value == 0):
-                least = "above 0" if name in above_zero else "0 or more"
-                raise StorageError(f"RetryPolicy: {name} must be {least}, got {value!r}.")
+        if not self.timeout_s > 0:
+            raise StorageError(f"RetryPolicy: timeout_s must be above 0, got {self.timeout_s!r}.")
+
+    @property
+    def window_s(self) -> float:
+        """Seconds over which the rate of a response is measured."""
+        return self.timeout_s / 2
+
+    @property
+    def longest_outage_s(self) -> float:
+        """Seconds without the least rate, over all attempts and waits, until reading gives up.
+
+        Waits that the server asks for do not count.
+        """
+        return self.timeout_s * 2.25
+
+    @property
+    def longest_read_s(self) -> float:
+        """Seconds that one read may take with all attempts and waits; of a long one, each 8 MiB.
+
+        Time without a request to the server does not count.
+        """
+        return self.timeout_s * 30.0
+
+    def clock(self) -> float:
+        """Return the time in seconds."""
+        return time.monotonic()
+
+    def chance(self) -> float:
+        """Draw from 0 to 1, without changing the program's own random numbers."""
+        return random.SystemRandom().random()
+
+    def sleep(self, wait_s: float, *, cancellation: Cancellation | None) -> None:
+        """Wait so many seconds, or until reads are cancelled."""
+        if cancellation is None:
+            time.sleep(wait_s)
+        else:
+            cancellation.wait(wait_s)
 
     def backoff_s(self, failures: int) -> float:
         """Return the wait before the next attempt, after so many consecutive failures."""
@@ -375,10 +388,7 @@ class RetryState:
         if not is_asked and wait_s >= policy.longest_outage_s - self._outage_s:
             return False
         with self.timed():
-            if self._cancellation is None or policy.sleep is not time.sleep:
-                policy.sleep(wait_s)
-            else:
-                self._cancellation.wait(wait_s)
+            policy.sleep(wait_s, cancellation=self._cancellation)
         if is_asked:
             self._attempt_s = 0.0
         self._waited_for_s = max(self._waited_for_s, error.pause_until_s)

@@ -4,7 +4,6 @@ One thread encodes, and the bytes depend only on frames and options, so the same
 same bytes on any number of processors.
 """
 
-from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -21,11 +20,12 @@ from stereogenbench_data.schema.release import FRAME_RATE_HZ, depth_name, rgb_na
 from stereogenbench_data.synthesis.checks import CameraStatistics, FrameStatistics
 from stereogenbench_data.synthesis.filters import Limits
 from stereogenbench_data.synthesis.plan import ScenePlan
-from stereogenbench_data.synthesis.ray_casting import View
 from stereogenbench_data.synthesis.renderer import RenderedView, Renderer
 from stereogenbench_data.synthesis.request import LARGEST_UNITS, ExportContract
 
 _H264: Final = {"crf": "18", "x264-params": "cpu-independent=1"}
+DEPTH_FORMAT: Final = "gray16le"
+"""FFV1's pixel format of depth."""
 _FFV1: Final = {"level": "3", "slices": "4", "slicecrc": "1"}
 
 
@@ -68,32 +68,19 @@ class _CameraWriter:
     """The two videos of a camera, as a context manager."""
 
     def __init__(self, plan: ScenePlan, *, camera: int, folder: Path) -> None:
-        contract = plan.request.contract
-        self._contract, self._view = contract, plan.view(camera=camera, frame=0)
-        self._waiting: deque[UInt16[np.ndarray, "h w"]] = deque()
-        self._seen = 0
+        self._contract = plan.request.contract
         with ExitStack() as stack:
             self._rgb = stack.enter_context(picture_video(folder / rgb_name(camera)))
-            self._depth = stack.enter_context(depth_video(folder / depth_name(camera), contract))
+            depth = depth_video(folder / depth_name(camera), self._contract)
+            self._depth = stack.enter_context(depth)
             self._files = stack.pop_all()
 
     def write(self, view: RenderedView) -> None:
-        """Append a picture, and a depth: picture t has depth t - lag, or the first or last one."""
+        """Append a picture and its depth."""
         shown = av.VideoFrame.from_ndarray(view.picture, format="rgb24")
         self._rgb.write(shown.reformat(format="yuv420p", threads=1))
-        units = depth_units(view.depth_m, view=self._view, contract=self._contract)
-        lag = self._contract.frame_lag
-        if self._seen == 0:
-            self._waiting.extend([units] * max(lag, 0))
-        self._waiting.append(units)
-        first = self._waiting.popleft()
-        if self._seen >= -lag:
-            self._write_depth(first)
-        self._last = units
-        self._seen += 1
-
-    def _write_depth(self, units: UInt16[np.ndarray, "h w"]) -> None:
-        self._depth.write(grey_frame(units, pixel_format=self._contract.depth_format))
+        units = depth_units(view.depth_m, unit_m=self._contract.depth_unit_m)
+        self._depth.write(grey_frame(units, pixel_format=DEPTH_FORMAT))
 
     def __enter__(self) -> "_CameraWriter":
         return self
@@ -107,8 +94,6 @@ class _CameraWriter:
         with self._files:
             if error is not None:
                 raise error
-            for _ in range(min(-self._contract.frame_lag, self._seen)):
-                self._write_depth(self._last)
 
 
 def picture_video(path: Path) -> VideoWriter:
@@ -130,14 +115,6 @@ def depth_video(path: Path, contract: ExportContract) -> VideoWriter:
     )
 
 
-def depth_units(
-    depth_m: Float64[np.ndarray, "h w"], *, view: View, contract: ExportContract
-) -> UInt16[np.ndarray, "h w"]:
-    """Return depth in stored units: rounded, and limited to the largest number of the format."""
-    if contract.depth_kind == "ray":
-        width_px, height_px = view.size_px
-        right = view.right_of_axis(np.arange(width_px) + 0.5)
-        below = view.below_axis(np.arange(height_px)[:, None] + 0.5)
-        depth_m = depth_m * np.sqrt(1 + right**2 + below**2)
-    largest = LARGEST_UNITS[contract.depth_format]
-    return np.minimum(np.rint(depth_m / contract.depth_unit_m), largest).astype(np.uint16)
+def depth_units(depth_m: Float64[np.ndarray, "h w"], *, unit_m: float) -> UInt16[np.ndarray, "h w"]:
+    """Return depth in stored units: rounded, and limited to the largest number."""
+    return np.minimum(np.rint(depth_m / unit_m), LARGEST_UNITS).astype(np.uint16)

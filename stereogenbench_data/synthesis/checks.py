@@ -16,7 +16,6 @@ from stereogenbench_data.schema.release import CAMERA_COUNT, depth_name, rgb_nam
 from stereogenbench_data.synthesis.filters import Limits, Refusal
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.renderer import RenderedView
-from stereogenbench_data.synthesis.request import ExportContract
 
 _THIN: Final = 4
 """Brightness is measured on every fourth row and column."""
@@ -127,17 +126,15 @@ def check_files(folder: Path, *, frames: int) -> Refusal | None:
     return None
 
 
-def check_scene(root: Path, *, key: str, contract: ExportContract) -> Refusal | None:
+def check_scene(root: Path, *, key: str, unit_m: float) -> Refusal | None:
     """Return what the audit or the doctor finds in a complete scene, if they find something.
 
     Args:
         root: The root of a tree with the scene.
         key: The scene's whole path below it.
-        contract: How its depth is written.
+        unit_m: Metres in one stored unit of its depth.
     """
-    depth = DepthEncoding(
-        unit_m=contract.depth_unit_m, kind=contract.depth_kind, frame_lag=contract.frame_lag
-    )
+    depth = DepthEncoding(unit_m=unit_m)
     try:
         index = open_for_audit(root, workers=1, scenes=(key,))
         report = audit(index, AuditRequest(depth=depth), workers=1, scenes=(key,))

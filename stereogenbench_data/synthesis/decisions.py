@@ -173,7 +173,7 @@ class Decisions:
             "picture_px": list(request.picture_px),
             "focal_mm": request.focal_mm,
             "world_offset_cm": request.world_offset_cm,
-            "sensor_mm": list(request.contract.sensor_mm),
+            "sensors_mm": [list(sensor_mm) for sensor_mm in renderer.sensors_mm],
             "renderer": renderer.name,
             "fingerprint": renderer.fingerprint,
             "limits": asdict(limits),

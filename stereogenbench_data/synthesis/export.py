@@ -24,7 +24,7 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.synthesis.cameras import quaternion_from_rotator
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.proposal import Proposal
-from stereogenbench_data.synthesis.request import ExportContract
+from stereogenbench_data.synthesis.request import RotationForm
 
 _REPRESENTATIONS: Final = {
     "rotator": "unreal_rotator_degrees",
@@ -88,34 +88,25 @@ def _camera_name(plan: ScenePlan, *, camera: int) -> str:
     return f"{plan.proposal.label}_Cam_{camera:02d}"
 
 
-def _primary_pair(plan: ScenePlan) -> dict[str, str] | list[int]:
-    contract = plan.request.contract
-    left, right = contract.primary_pair
-    if contract.pair_form == "indices":
-        return [left, right]
+def _primary_pair(plan: ScenePlan) -> dict[str, str]:
     return {
-        "left_camera": _camera_name(plan, camera=left),
-        "right_camera": _camera_name(plan, camera=right),
+        "left_camera": _camera_name(plan, camera=0),
+        "right_camera": _camera_name(plan, camera=1),
     }
 
 
 def _baseline(plan: ScenePlan) -> dict[str, Any]:
     width_px, height_px = plan.request.picture_px
-    contract = plan.request.contract
-    intrinsics: dict[str, Any] = {
-        "focal_length_mm": plan.proposal.focal_mm,
-        "sensor_width_mm": plan.proposal.sensor_mm[0],
-        "sensor_height_mm": plan.proposal.sensor_mm[1],
-    }
-    if contract.principal_point_px is not None:
-        x_px, y_px = contract.principal_point_px
-        intrinsics["principal_point_px"] = {"x": x_px, "y": y_px}
     return _labels(plan.proposal) | {
         "unit": "cm",
         "camera_count": CAMERA_COUNT,
         "image_width": width_px,
         "image_height": height_px,
-        "camera_intrinsics": intrinsics,
+        "camera_intrinsics": {
+            "focal_length_mm": plan.proposal.focal_mm,
+            "sensor_width_mm": plan.proposal.sensor_mm[0],
+            "sensor_height_mm": plan.proposal.sensor_mm[1],
+        },
         "primary_stereo_pair": _primary_pair(plan),
         "adjacent_pairs": [_pair(plan, left=left, right=right) for left, right in ADJACENT_PAIRS],
         "pairwise_pairs": [_pair(plan, left=left, right=right) for left, right in CAMERA_PAIRS],
@@ -148,7 +139,7 @@ def _trajectory(plan: ScenePlan) -> dict[str, Any]:
 
 
 def _poses(plan: ScenePlan, *, frame: int) -> list[dict[str, Any]]:
-    rotation = _rotation(plan.rotators_deg[frame], contract=plan.request.contract)
+    rotation = _rotation(plan.rotators_deg[frame], form=plan.request.contract.rotation)
     return [
         {
             "camera_name": _camera_name(plan, camera=camera),
@@ -161,12 +152,12 @@ def _poses(plan: ScenePlan, *, frame: int) -> list[dict[str, Any]]:
 
 
 def _rotation(
-    rotator_deg: Float64[np.ndarray, "3"], *, contract: ExportContract
+    rotator_deg: Float64[np.ndarray, "3"], *, form: RotationForm
 ) -> dict[str, float] | list[float] | list[list[float]]:
-    if contract.rotation == "rotator":
+    if form == "rotator":
         return dict(zip(("pitch", "yaw", "roll"), rotator_deg.tolist(), strict=True))
-    if contract.rotation == "matrix":
+    if form == "matrix":
         rows: list[list[float]] = rotation_from_rotator_deg(rotator_deg).tolist()
         return rows
     x, y, z, w = quaternion_from_rotator(rotator_deg).tolist()
-    return [x, y, z, w] if contract.rotation == "quaternion_xyzw" else [w, x, y, z]
+    return [x, y, z, w] if form == "quaternion_xyzw" else [w, x, y, z]

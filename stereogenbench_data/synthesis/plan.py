@@ -53,7 +53,7 @@ class ScenePlan:
             eye=self.centres_m[frame] + lateral_m * axes[:, 1],
             axes=axes,
             focal_px=self.proposal.focal_px,
-            centre_px=self.request.contract.principal_point_px or (width_px / 2, height_px / 2),
+            centre_px=(width_px / 2, height_px / 2),
             size_px=(width_px, height_px),
         )
 

@@ -587,7 +587,7 @@ def _finish(
             (folder / name).write_text(text)
         if check == "audit":
             refusal = check_scene(
-                work.out / _TEMPORARY, key=plan.key, contract=plan.request.contract
+                work.out / _TEMPORARY, key=plan.key, unit_m=plan.request.contract.depth_unit_m
             )
             if refusal is not None:
                 return refusal

@@ -93,7 +93,7 @@ def draw_proposal(
     number: int,
     characters: tuple[str, ...],
     animations: tuple[str, ...],
-    sensors_mm: tuple[tuple[float, float], ...] = (),
+    sensors_mm: tuple[tuple[float, float], ...],
 ) -> Proposal:
     """Draw a proposal.
 
@@ -103,10 +103,9 @@ def draw_proposal(
         number: The proposal's number.
         characters: Subjects to draw from.
         animations: Motions to draw from.
-        sensors_mm: Sensors to draw from; empty for that of the request.
+        sensors_mm: Sensors to draw from.
     """
     rng = _rng(request, index=index, number=number, part="draw")
-    sensors_mm = sensors_mm or (request.contract.sensor_mm,)
     places_cm = lateral_places_cm(random_gaps_cm(request.family, rng=rng))
     focal_mm = float(rng.uniform(*FOCAL_RANGE_MM))
     return Proposal(

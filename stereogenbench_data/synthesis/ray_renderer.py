@@ -8,6 +8,7 @@ from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.render import SceneState, render_frame, static_light
 from stereogenbench_data.synthesis.renderer import RenderedView
+from stereogenbench_data.synthesis.request import SENSOR_MM
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +19,7 @@ class RayCasting:
     maps: tuple[str, ...] = MAPS
     characters: tuple[str, ...] = CHARACTERS
     animations: tuple[str, ...] = ANIMATIONS
-    sensors_mm: tuple[tuple[float, float], ...] = ()
+    sensors_mm: tuple[tuple[float, float], ...] = (SENSOR_MM,)
     fingerprint: str = "1"
     cameras_per_task: int = 1
 

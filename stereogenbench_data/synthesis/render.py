@@ -67,12 +67,6 @@ def static_light(scene: SceneModel) -> Float64[np.ndarray, "side side"]:
     return light
 
 
-def render_depth(state: SceneState, *, view: View) -> Float64[np.ndarray, "h w"]:
-    """Return depth along the optical axis at pixel centres, in metres; the sky is infinite."""
-    inverse, _ = first_hits(view, shapes=state.shapes, slope=state.scene.slope)
-    return _depth_m(inverse)
-
-
 def _depth_m(inverse: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
     with np.errstate(divide="ignore"):
         depth_m: Float64[np.ndarray, "*n"] = 1 / inverse
@@ -82,7 +76,10 @@ def _depth_m(inverse: Float64[np.ndarray, "*n"]) -> Float64[np.ndarray, "*n"]:
 def render_frame(
     state: SceneState, *, view: View
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Float64[np.ndarray, "h w"]]:
-    """Return a picture with anti-aliased edges, and its depth as from `render_depth`."""
+    """Return a picture with anti-aliased edges, and depth along the optical axis at pixel centres.
+
+    Depth is in metres; the sky is infinite.
+    """
     width, height = view.size_px
     inverse, faces = first_hits(view, shapes=state.shapes, slope=state.scene.slope)
     depth_m = _depth_m(inverse)
@@ -365,15 +362,6 @@ def cast_shadow(
     ]
     blocked = np.isfinite(entry_depth(shape, origin=origin, direction=list(from_world @ scene.sun)))
     light[low[1] : high[1], low[0] : high[0]][blocked] = _SHADE
-
-
-def sunlight_at(
-    light: Float64[np.ndarray, "side side"], *, x_m: Array, y_m: Array, scene: SceneModel
-) -> Float32[np.ndarray, " n"]:
-    """Return the interpolated light at places on the ground; beyond the map, that of its border."""
-    light_map = torch.from_numpy(light.astype(np.float32))[None, None]
-    places = (np.asarray(each, np.float32) for each in (x_m, y_m))
-    return _sunlight_at(light_map, **dict(zip(("x_m", "y_m"), places, strict=True)), scene=scene)
 
 
 def _texel_of(place_m: Array, *, scene: SceneModel) -> Array:

@@ -39,7 +39,7 @@ class Renderer(Protocol):
         maps: Names of its maps, as folders of the release.
         characters: Names of the subjects.
         animations: Names of the subjects' motions.
-        sensors_mm: Width and height of the sensors to draw from; empty for that of the request.
+        sensors_mm: Width and height of the sensors to draw from.
         fingerprint: Changes when the same proposal gives another scene: a version, a digest of
             assets.
         cameras_per_task: How many cameras one process draws together; 1, 2, 3 or 6.

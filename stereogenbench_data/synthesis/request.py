@@ -5,9 +5,7 @@ from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
 from stereogenbench_data.errors import SynthesisError
-from stereogenbench_data.schema.records import DepthKind
 from stereogenbench_data.schema.release import (
-    CAMERA_COUNT,
     FAMILIES,
     FRAME_COUNT,
     IMAGE_SIZE_PX,
@@ -18,22 +16,17 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.synthesis.cameras import OFFSET_RANGE_CM
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
-PairForm = Literal["names", "indices"]
-DepthFormat = Literal["gray16le", "gray12le", "gray10le"]
 
 SENSOR_MM: Final = (23.76, 23.76)
+"""Width and height of the sensor, where a renderer has no others."""
+LARGEST_UNITS: Final = 65535
+"""The largest number of stored depth, which means "no depth"."""
 _UNSEEN_MAP_FOLDER: Final = "MapUnseenInTrain"
 _LARGEST_PX: Final = 8192
 _FOCAL_RANGE_MM: Final = (4.0, 1000.0)
 """Shorter lenses see 140 degrees and more; longer ones frame a subject beyond the depth's range."""
 _LEAST_RANGE_M: Final = 1.0
 _LARGEST_UNIT_M: Final = 1.0
-LARGEST_UNITS: Final[dict[DepthFormat, int]] = {
-    "gray16le": 65535,
-    "gray12le": 4095,
-    "gray10le": 1023,
-}
-"""The largest number of a depth format, which means "no depth"."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,53 +35,28 @@ class ExportContract:
 
     Attributes:
         rotation: How ``trajectory.json`` records rotations.
-        pair_form: "names" writes the primary pair as camera names, "indices" as two integers.
-        primary_pair: Left and right camera of that pair.
-        depth_unit_m: Metres in one stored unit of depth, at most 1; such that the format reaches to
-            1 m at least.
+        depth_unit_m: Metres in one stored unit of depth, at most 1; such that 16 bits reach to
+            1 m at least. Farther depth, and the sky, are stored as 65535, "no depth".
         depth_tag: Container tag for the unit; None writes no tag.
-        depth_kind: Depth along the optical axis, or along the ray.
-        depth_format: FFV1's pixel format. Depth above its largest number, and the sky, are stored
-            as that number, which means "no depth". Reading fewer than 16 bits needs an encoding
-            that accepts them, such as ``DepthEncoding(accept={"10-bit"})``.
-        frame_lag: Depth frame t + frame_lag belongs to RGB frame t.
-        sensor_mm: Width and height of the sensor.
-        principal_point_px: Principal point (x, y), None for the picture's centre.
 
     Raises:
         SynthesisError: If a value is unknown or out of range.
     """
 
     rotation: RotationForm = "rotator"
-    pair_form: PairForm = "names"
-    primary_pair: tuple[int, int] = (0, 1)
     depth_unit_m: float = 0.001
     depth_tag: str | None = "DEPTH_SCALE"
-    depth_kind: DepthKind = "planar"
-    depth_format: DepthFormat = "gray16le"
-    frame_lag: int = 0
-    sensor_mm: tuple[float, float] = SENSOR_MM
-    principal_point_px: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Refuse values that cannot be written."""
         _require_choice("rotation", self.rotation, choices=get_args(RotationForm))
-        _require_choice("pair_form", self.pair_form, choices=get_args(PairForm))
-        _require_choice("depth_kind", self.depth_kind, choices=get_args(DepthKind))
-        _require_choice("depth_format", self.depth_format, choices=get_args(DepthFormat))
         _require_positive("depth_unit_m", self.depth_unit_m)
-        range_m = LARGEST_UNITS[self.depth_format] * self.depth_unit_m
+        range_m = LARGEST_UNITS * self.depth_unit_m
         if not (self.depth_unit_m <= _LARGEST_UNIT_M and range_m >= _LEAST_RANGE_M):
             raise SynthesisError(
                 f"depth_unit_m {self.depth_unit_m:g}: depth would have steps of "
-                f"{self.depth_unit_m:g} m up to {range_m:g} m in {self.depth_format}. Choose a "
-                f"unit of at most {_LARGEST_UNIT_M:g} m that reaches to {_LEAST_RANGE_M:g} m."
-            )
-        _require_positive("sensor_mm", *self.sensor_mm)
-        if not 0 <= self.primary_pair[0] < self.primary_pair[1] < CAMERA_COUNT:
-            raise SynthesisError(
-                f"primary_pair must be two different cameras of 0..{CAMERA_COUNT - 1}, the left "
-                f"one first, got {self.primary_pair}."
+                f"{self.depth_unit_m:g} m up to {range_m:g} m. Choose a unit of at most "
+                f"{_LARGEST_UNIT_M:g} m that reaches to {_LEAST_RANGE_M:g} m."
             )
 
 
@@ -211,7 +179,6 @@ def _require_choice(name: str, value: object, *, choices: tuple[object, ...]) ->
         )
 
 
-def _require_positive(name: str, *values: float) -> None:
-    for value in values:
-        if not (math.isfinite(value) and value > 0):
-            raise SynthesisError(f"{name} must be a positive number, got {value!r}.")
+def _require_positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise SynthesisError(f"{name} must be a positive number, got {value!r}.")

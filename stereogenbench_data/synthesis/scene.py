@@ -8,7 +8,7 @@ axis, t is the depth along that axis.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -96,54 +96,6 @@ def entry_depth(shape: Shape, *, origin: Sequence[Array], direction: Sequence[Ar
         root = np.sqrt(half_linear * half_linear - squared * constant)
         t = (-half_linear - root) / squared
         return np.where(t > 0, t, np.inf)
-
-
-class Surface(NamedTuple):
-    """The surface of a shape where rays hit it, with one number per ray in each attribute.
-
-    Attributes:
-        u_m: Place on the surface, in metres along the texture's width.
-        v_m: The same along its height.
-        facing: Cosine between the ray and the surface's normal, 0 for a grazing ray.
-        sunward: Cosine between the normal and the direction to the sun, negative in shade.
-        upward: Cosine between the normal and the vertical.
-    """
-
-    u_m: Array
-    v_m: Array
-    facing: Array
-    sunward: Array
-    upward: Array
-
-
-def surface(shape: Shape, *, point: Array, direction: Array, sun: Array) -> Surface:
-    """Describe the surface where rays hit it.
-
-    The texture of a face lies in its plane. An ellipsoid is textured like a box: along the two axes
-    that are most perpendicular to its normal.
-
-    Args:
-        shape: The shape that the rays hit.
-        point: (3, n) the hits, in the unit solid's coordinates.
-        direction: (3, n) the rays' directions in the same coordinates.
-        sun: (3,) unit direction to the sun, in the world.
-    """
-    half_m = shape.half_m[:, None]
-    gradient = point if shape.kind == "box" else point / half_m
-    face = np.abs(gradient).argmax(axis=0)
-    if shape.kind == "box":
-        normal = np.where(face == np.arange(3)[:, None], np.sign(point), 0.0)
-    else:
-        normal = gradient / np.sqrt((gradient * gradient).sum(axis=0))
-    ray = direction * half_m
-    place_m = point * half_m + 7.3 * shape.centre.sum()
-    return Surface(
-        u_m=np.where(face == 0, place_m[1], place_m[0]) + 0.37 * face,
-        v_m=np.where(face == 2, place_m[1], place_m[2]),
-        facing=np.abs((normal * ray).sum(axis=0)) / np.sqrt((ray * ray).sum(axis=0)),
-        sunward=(shape.axes @ sun) @ normal,
-        upward=shape.axes[:, 2] @ normal,
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

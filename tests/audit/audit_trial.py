@@ -18,6 +18,7 @@ import typer
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.audit import audit
+from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import (
     as_inverse,
@@ -204,9 +205,10 @@ def run(root: Path, *, seed: int, count: int, also: Path | None) -> list[dict]:
     """Draw, make wrong and audit; return one record a case."""
     rng = np.random.default_rng([seed, 3])
     rendered = sorted(path.parent for path in also.rglob("baseline.json")) if also else []
+    requests = [(request, RAY_CASTING) for request in drawn_requests(seed, count)]
     return run_cases(
         root,
-        [*drawn_scenes(root, drawn_requests(seed, count)), *rendered],
+        [*drawn_scenes(root, requests), *rendered],
         cases_of=lambda scene: cases(rng),
         examine=examine,
     )

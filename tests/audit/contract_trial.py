@@ -16,6 +16,7 @@ import numpy as np
 
 from stereogenbench_data.audit.contract.doctor import diagnose
 from stereogenbench_data.audit.contract.verdict import Verdict, encoding_line
+from stereogenbench_data.synthesis.ray_renderer import RayCasting
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.audit.corruption import (
     as_inverse,
@@ -67,28 +68,25 @@ class Case:
     details: str = ""
 
 
-def drawn_requests(seed: int, count: int) -> list[SynthRequest]:
+def drawn_requests(seed: int, count: int) -> list[tuple[SynthRequest, RayCasting]]:
     """Return scenes of all families, with lenses, sensors, sizes and units drawn at random."""
     rng = np.random.default_rng(seed)
     requests = []
     for number in range(count):
         shape = float(rng.choice([1.0, 3 / 4, 2 / 3]))
         width = int(rng.choice(SIZES_PX))
-        contract = ExportContract(
-            sensor_mm=SENSORS_MM[int(rng.integers(len(SENSORS_MM)))],
-            depth_unit_m=float(rng.choice([0.0005, 0.001, 0.002, 0.01])),
+        sensor_mm = SENSORS_MM[int(rng.integers(len(SENSORS_MM)))]
+        unit_m = float(rng.choice([0.0005, 0.001, 0.002, 0.01]))
+        request = SynthRequest(
+            family=FAMILIES[number % 3],
+            size_px=width,
+            height_px=2 * round(width * shape / 2),
+            frames=int(rng.integers(4, 21)),
+            seed=seed * 1000 + number,
+            focal_mm=round(float(rng.uniform(0.75, 3.4)) * sensor_mm[0], 1),
+            contract=ExportContract(depth_unit_m=unit_m),
         )
-        requests.append(
-            SynthRequest(
-                family=FAMILIES[number % 3],
-                size_px=width,
-                height_px=2 * round(width * shape / 2),
-                frames=int(rng.integers(4, 21)),
-                seed=seed * 1000 + number,
-                focal_mm=round(float(rng.uniform(0.75, 3.4)) * contract.sensor_mm[0], 1),
-                contract=contract,
-            )
-        )
+        requests.append((request, RayCasting(sensors_mm=(sensor_mm,))))
     return requests
 
 

@@ -27,6 +27,7 @@ from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING, RayCasting
 from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
 from tests.audit.corruption import (
     as_inverse,
@@ -44,6 +45,7 @@ from tests.audit.corruption import (
 )
 
 UNIT_M = 0.001
+FULL_FRAME = RayCasting(sensors_mm=((36, 24),))
 
 
 @pytest.fixture(scope="module")
@@ -631,13 +633,13 @@ def test_six_equal_views_decide_nothing(verdict_on):
 def small_parallax(tmp_path_factory):
     """A function to a scene of two-pixel disparities, whose errors look like other mistakes."""
 
-    def small_parallax(**changes):
+    def small_parallax(*, renderer=RAY_CASTING, **changes):
         root = tmp_path_factory.mktemp("small_parallax")
         request = SynthRequest(
             family="IPD_Gaussian", frames=11, seed=905311003, focal_mm=79.7,
-            contract=ExportContract(depth_unit_m=0.0005, **changes.pop("contract", {})), **changes,
+            contract=ExportContract(depth_unit_m=0.0005), **changes,
         )  # fmt: skip
-        (key,) = synthesise(root, request)
+        (key,) = synthesise(root, request, renderer=renderer)
         return root, root / key
 
     return small_parallax
@@ -654,8 +656,7 @@ def test_a_shift_where_little_is_seen_does_not_make_the_unit_wrong_too(small_par
 
 
 def test_a_unit_where_little_is_seen_is_not_taken_for_a_lag(small_parallax):
-    contract = {"sensor_mm": (36, 24)}
-    root, folder = small_parallax(size_px=128, height_px=84, contract=contract)
+    root, folder = small_parallax(size_px=128, height_px=84, renderer=FULL_FRAME)
     rewrite_depth(folder, lambda units: units, unit_factor=0.976)
 
     (verdict,) = diagnose(root, workers=1).verdicts
@@ -667,9 +668,9 @@ def test_a_unit_where_little_is_seen_is_not_taken_for_a_lag(small_parallax):
 def test_ray_depth_is_not_taken_for_what_explains_few_of_the_matches(tmp_path):
     request = SynthRequest(
         family="Uniform", size_px=170, height_px=128, frames=1, seed=905311007, focal_mm=92.2,
-        contract=ExportContract(depth_unit_m=0.0005, sensor_mm=(36, 24)),
+        contract=ExportContract(depth_unit_m=0.0005),
     )  # fmt: skip
-    (key,) = synthesise(tmp_path, request)
+    (key,) = synthesise(tmp_path, request, renderer=FULL_FRAME)
     rewrite_depth(tmp_path / key, lambda units: np.flip(units, 1))
 
     (verdict,) = diagnose(tmp_path, workers=1).verdicts

@@ -17,7 +17,6 @@ from stereogenbench_data.audit import paper_numbers
 from stereogenbench_data.audit.statistics import FOCAL_EDGES_MM, statistics
 from stereogenbench_data.audit.statistics_report import (
     compared,
-    release_sized_splits,
     statistics_markdown,
     write_plots,
 )
@@ -109,19 +108,14 @@ def test_filters_choose_what_is_counted(three):
         statistics(three, split="eval")
 
 
-def test_what_is_not_of_the_releases_size_is_not_compared_unless_requested(three):
-    found = statistics(three)
-
-    assert release_sized_splits(found) == ()
-    counts = [line for line in compared(found) if line.item == "scenes, train Uniform"]
-    assert [(line.paper, line.ours, line.agrees) for line in counts] == [("774", "3", False)]
+def test_what_is_not_of_the_releases_size_is_not_compared(three):
+    assert compared(statistics(three)) == ()
 
 
 def test_an_index_with_the_papers_counts_agrees_with_the_paper_in_every_figure(release):
     found = statistics(release)
     lines = compared(found)
 
-    assert release_sized_splits(found) == ("train", "eval")
     assert [line for line in lines if not line.agrees] == []
     assert len(lines) == 154
     assert {line.table for line in lines} >= {
@@ -154,10 +148,10 @@ def test_one_scene_less_is_seen_in_every_figure_that_it_moves(release):
 def test_a_split_by_itself_is_compared_by_itself(release):
     found = statistics(release, split="eval")
 
-    lines = compared(found, splits=release_sized_splits(found))
+    lines = compared(found)
 
-    assert release_sized_splits(found) == ("eval",)
     assert len(lines) > 60
+    assert not any("train" in line.item for line in lines)
     assert all(line.agrees for line in lines)
 
 
@@ -261,14 +255,12 @@ def test_the_command_compares_a_release_by_itself(written_release, run):
     assert "## Against the paper: 154 of 154 figures agree" in result.stdout
 
 
-def test_the_command_compares_other_data_only_if_requested_to(small_shards, run):
-    plain, asked = run(small_shards), run(small_shards, "--compare", "always")
+def test_the_command_shows_other_data_without_the_papers_figures(small_shards, run):
+    result = run(small_shards)
 
-    assert (plain.exit_code, asked.exit_code) == (0, 1)
-    assert "| train | - | Uniform | 2 |" in plain.stdout
-    assert "Against the paper" not in plain.stdout
-    assert "**differs**" in asked.stdout
-    assert "Against the paper" not in run(small_shards, "--compare", "never").stdout
+    assert result.exit_code == 0
+    assert "| train | - | Uniform | 2 |" in result.stdout
+    assert "Against the paper" not in result.stdout
 
 
 def test_the_command_writes_json_plots_and_files(small_shards, run, tmp_path):

@@ -10,18 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from stereogenbench_data.synthesis.produce import synthesise
+from stereogenbench_data.synthesis.ray_renderer import RayCasting
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import copied
 
 FAMILIES = ("IPD_Gaussian", "Uniform", "Pairwise_Uniform")
 
 
-def drawn_scenes(root: Path, requests: Iterable[SynthRequest]) -> list[Path]:
+def drawn_scenes(root: Path, requests: Iterable[tuple[SynthRequest, RayCasting]]) -> list[Path]:
     """Draw one scene for each request; return the folders."""
     scenes = []
-    for number, request in enumerate(requests):
+    for number, (request, renderer) in enumerate(requests):
         place = root / f"drawn_{number}"
-        (key,) = synthesise(place, request, workers=1)
+        (key,) = synthesise(place, request, renderer=renderer, workers=1)
         scenes.append(place / key)
     return scenes
 

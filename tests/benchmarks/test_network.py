@@ -12,7 +12,7 @@ from benchmarks.plots import plot_all
 from benchmarks.results import Results
 from benchmarks.server import Network, serving
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import RetryPolicy
+from tests.sources.policies import retry_policy
 
 DATA = bytes(range(256)) * 4000
 
@@ -75,7 +75,7 @@ def test_the_delayed_server_limits_the_bandwidth(started, line):
 
 def test_a_server_that_fails_costs_no_byte(started):
     with started(refused=0.1, lost=0.1) as server:
-        remote = RemoteObject(f"{server.url}/x.tar", retry=RetryPolicy(first_wait_s=0.001))
+        remote = RemoteObject(f"{server.url}/x.tar", retry=retry_policy(first_wait_s=0.001))
         for start in range(0, 200_000, 2000):
             assert remote.read(start, start + 2000) == DATA[start : start + 2000]
         counts = server.counts()

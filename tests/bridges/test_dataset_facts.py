@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,7 @@ from stereogenbench_data import SceneIndex
 from stereogenbench_data.bridges.card import card
 from stereogenbench_data.bridges.croissant.check import check_descriptor
 from stereogenbench_data.bridges.croissant.descriptor import Publication, write_descriptor
-from stereogenbench_data.bridges.dataset_facts import DRAWN, RELEASE, facts_of, origin_of, template
+from stereogenbench_data.bridges.dataset_facts import DRAWN, RELEASE, facts_of, template
 from stereogenbench_data.errors import DescriptorError
 from stereogenbench_data.schema.release import COMPLETE_JSON
 from stereogenbench_data.shards.pack import pack
@@ -47,24 +46,31 @@ def about(tmp_path):
 
 
 def test_scenes_that_synth_drew_are_drawn(small_shards):
-    assert origin_of(SceneIndex.open(small_shards)) == "drawn"
     assert facts_of(SceneIndex.open(small_shards)) == DRAWN
 
 
-def test_scenes_are_of_the_release_by_map_size_and_length(tmp_path):
-    scenes = paper_scenes()[::100]
+def test_scenes_on_the_papers_maps_are_the_papers_only_if_the_user_says_so(tmp_path):
+    """Others may render on maps of these names, at this size and length."""
+    index = SceneIndex.from_scenes(paper_scenes()[::100], tmp_path)
 
-    def origin(*, index=0, **changes):
-        changed = [*scenes[:index], replace(scenes[index], **changes), *scenes[index + 1 :]]
-        return origin_of(SceneIndex.from_scenes(changed, tmp_path))
+    with pytest.raises(DescriptorError, match=r"is not known.*creator.*--about release"):
+        facts_of(index)
+    assert facts_of(index, about="release") == RELEASE
 
-    small = replace(scenes[0].rig, image_width_px=320, image_height_px=320)
-    own_map = replace(scenes[0].id, map_name="MyTown")
 
-    assert origin() == "release"
-    assert origin(rig=small) == "elsewhere"
-    assert origin(id=own_map) == "elsewhere"
-    assert origin(frames=80) == "elsewhere"
+def test_drawn_scenes_cannot_be_said_to_be_the_papers(small_shards):
+    with pytest.raises(DescriptorError, match=r"scene_\d+ was drawn by .*--about release"):
+        facts_of(SceneIndex.open(small_shards), about="release")
+
+
+def test_the_command_takes_the_users_word_for_the_release(elsewhere, tmp_path):
+    path = tmp_path / "data.json"
+
+    told = invoke("croissant", elsewhere.root, "-o", path, "--about", "release")
+
+    assert told.exit_code == 0, told.output
+    assert "Yangzhi Cui" in path.read_text()
+    assert "cc-by-4.0" in invoke("card", elsewhere.root, "a/b", "--about", "release").stdout
 
 
 def test_without_data_the_release_is_meant():

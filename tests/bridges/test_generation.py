@@ -173,7 +173,7 @@ def test_a_misspelled_option_is_answered_with_all_options_of_the_class(indexed_r
 
     message = str(caught.value)
     assert "did you mean 'layout'? It has layout, " in message
-    assert {"captions", "frames", "baseline_cm", "connections"} <= set(
+    assert {"captions", "frames", "baseline_cm", "fetch_ahead_bytes"} <= set(
         message.split("It has ")[1].rstrip(".").split(", ")
     )
     assert " fields," not in message

@@ -2,6 +2,7 @@
 
 import gc
 import json
+import re
 from datetime import date
 
 import datasets
@@ -111,12 +112,15 @@ def test_mlcroissant_accepts_the_descriptor(packed, tmp_path):
     assert validated(tmp_path / "data.json") == [(0, [])]
 
 
-def test_the_card_says_so_and_lists_the_file_that_says_it(packed, small_shards):
+def test_the_card_says_so_and_lists_the_file_that_says_it(packed, small_release, small_shards):
     derived = card(SceneIndex.open(packed), repository="a/b")
     released = card(SceneIndex.open(small_shards), repository="a/b")
 
     assert "## Derived for training" in derived
     assert "size 48x32, quality small" in derived
+    assert f"source: the release with index {SceneIndex.open(small_release).digest}" in derived
+    mean, worst = re.search(r"([\d.]+) dB on average, ([\d.]+) in the worst", derived).groups()
+    assert float(worst) < float(mean)
     assert "name: training.json" in derived
     assert "size=(480, 832)" not in derived
     assert "training.json" not in released

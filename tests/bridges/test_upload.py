@@ -47,7 +47,7 @@ def test_shards_index_card_and_descriptor_arrive_whole(folder, upload_hub, tmp_p
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     there = upload_hub.folder
-    for name in (*index.shards, "index.parquet", "shards.json", "README.md", "croissant.json"):
+    for name in (*index.shards, "index.parquet", "README.md", "croissant.json"):
         assert (there / name).read_bytes() == (folder / name).read_bytes()
     assert SceneIndex.open(there).digest == index.digest
     for split in ("train", "eval_seen_map"):

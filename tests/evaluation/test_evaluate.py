@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol
 from stereogenbench_data.errors import PredictionError
+from stereogenbench_data.evaluation.models import i3d, inception
+from stereogenbench_data.evaluation.models.interfaces import NamedModel
 from stereogenbench_data.evaluation.predictions import frame_name, item_name
 from stereogenbench_data.schema.release import rgb_name
 from stereogenbench_data.shards.pack import pack
@@ -66,14 +69,13 @@ def test_scores_are_those_of_scikit_image_averaged_over_frames(scored_index, oth
 
 
 def test_one_and_two_processes_give_the_same_last_digits(scored_index, other_views, tmp_path):
-    protocol = EvaluationProtocol(metrics=("psnr", "ssim", "e_match", "fd-colour"), size=SIZE)
+    protocol = EvaluationProtocol(metrics=("psnr", "ssim", "e_match"), size=SIZE)
     results = [
         scored(scored_index, other_views, protocol, workers=workers, out=tmp_path / str(workers))
         for workers in (1, 2)
     ]
 
     assert numbers(results[0]) == numbers(results[1])
-    assert results[0].distances == results[1].distances
 
 
 def test_a_callable_gets_its_tiers_inputs_in_batches_and_scores_as_if_written(
@@ -355,19 +357,35 @@ def test_a_gap_that_was_filled_since_is_scored(scored_index, copied, protocol, t
     assert not any(pair.problem for pair in filled.pairs)
 
 
-def test_distances_between_sets_are_of_branches(scored_index, right_views, other_views, tmp_path):
-    protocol = EvaluationProtocol(metrics=("fd-colour", "fd-motion"), size=SIZE, batch_frames=3)
+class MeanColours(NamedModel):
+    """In place of a network: the mean colours of a picture, or of the frames of a clip."""
+
+    name = "mean colours"
+    min_frames = FRAMES
+    settings: ClassVar = {}
+
+    def __call__(self, pictures):
+        return pictures.mean(axis=(-2, -1)).reshape(len(pictures), -1)
+
+
+def test_distances_between_sets_are_of_branches(
+    scored_index, right_views, other_views, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(inception, "InceptionFeatures", MeanColours)
+    monkeypatch.setattr(i3d, "I3dFeatures", MeanColours)
+    protocol = EvaluationProtocol(metrics=("fid", "fvd"), size=SIZE, batch_frames=3)
     same = scored(scored_index, right_views, protocol).distances
     other = scored(scored_index, other_views, protocol, out=tmp_path / "out").distances
 
     assert set(same) == {("seen_map", "Uniform"), ("unseen_map", "IPD_Gaussian")}
     for branch, found in same.items():
-        assert found["fd-colour"].value == pytest.approx(0, abs=1e-6)
-        assert other[branch]["fd-colour"].value > 1
+        assert found["fid"].value == pytest.approx(0, abs=1e-6)
+        assert other[branch]["fid"].value > 0.01
     uniform = other["seen_map", "Uniform"]
-    assert uniform["fd-colour"].samples == (2 * FRAMES, 2 * FRAMES)
-    assert uniform["fd-motion"].samples == (2, 2)
-    assert uniform["fd-colour"].underdetermined
+    assert (uniform["fid"].samples, uniform["fid"].dim) == ((2 * FRAMES, 2 * FRAMES), 3)
+    assert (uniform["fvd"].samples, uniform["fvd"].dim) == ((2, 2), 3 * FRAMES)
+    assert not uniform["fid"].underdetermined
+    assert uniform["fvd"].underdetermined
 
 
 @pytest.mark.parametrize("frames", [("clips", 2), ("random", 2)])

@@ -22,8 +22,6 @@ from stereogenbench_data.evaluation.models.weights import read_weights, weights_
     [
         ("keypoint matcher", "sift"),
         ("stereo matcher", "sgbm"),
-        ("image features", "colour-statistics"),
-        ("video features", "motion-statistics"),
     ],
 )
 def test_what_needs_no_weights_is_loaded_by_name_and_names_its_choices(kind, name):

@@ -61,7 +61,6 @@ def test_least_squares_are_those_of_numpy(truth):
     assert fit.slope == pytest.approx(slope, abs=1e-6)
     assert fit.offset_px == pytest.approx(offset, abs=1e-5)
     assert fit.residual_std_px == pytest.approx(residual.std(), abs=1e-5)
-    assert fit.residual_mad_px == pytest.approx(np.median(np.abs(residual)), abs=1e-5)
     assert fit.r_squared == pytest.approx(
         np.corrcoef(noisy.ravel(), truth.ravel())[0, 1] ** 2, abs=1e-5
     )
@@ -250,7 +249,7 @@ def test_sgbm_on_a_photographed_pair_has_the_true_scale(cloth, sgbm):
     fit = fit_scale(sgbm(left, right), disparity, scored=disparity > 0)
 
     assert fit.drift < 0.005
-    assert fit.residual_mad_px < 0.25
+    assert fit.residual_std_px < 0.5
     assert fit.answered_ratio > 0.7
 
 

@@ -10,7 +10,6 @@ from stereogenbench_data.evaluation.metrics.matching import match_error, target_
 from stereogenbench_data.evaluation.metrics.pixels import outside_window, patch_psnr, psnr_db, ssim
 from stereogenbench_data.evaluation.metrics.scale import fit_scale
 from stereogenbench_data.evaluation.models.opencv import Sgbm, Sift
-from stereogenbench_data.evaluation.models.picture_statistics import ColourStatistics
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +109,6 @@ def measured(left, right, *, threads):
             match_error(noisy, against=against, matcher=Sift()).e_match,
             fit.slope,
             fit.residual_std_px,
-            *ColourStatistics()(noisy[None])[0],
         ]
     finally:
         cv2.setNumThreads(before[0])

@@ -217,15 +217,15 @@ def test_a_gap_is_a_column_of_the_table(scores):
 
 def test_a_distance_says_its_sample_and_its_dimension(scores):
     distance = FrechetDistance(value=12.5, samples=(6, 6), dim=66, underdetermined=True)
-    protocol = EvaluationProtocol(metrics=("psnr", "fd-colour"))
+    protocol = EvaluationProtocol(metrics=("psnr", "fid"))
     one = scores(protocol=protocol)
     told = Scores(
         "ours", "G0", protocol, {}, one.index, one.pairs,
-        {("seen_map", "Uniform"): {"fd-colour": distance}},
+        {("seen_map", "Uniform"): {"fid": distance}},
     )  # fmt: skip
     text = markdown(branch_table([told]))
 
-    assert "FD-colour↓" in text
+    assert "FID↓" in text
     assert "12.50 (N 6 ≤ D 66) !" in text
     assert "biased upwards" in text
 

@@ -13,7 +13,7 @@ from stereogenbench_data.selection.options import nearest_first, options_of, req
 
 PAIRS_OPTIONS = {
     "fields", "size", "transform", "depth", "seed", "cache", "check", "buffers",
-    "connections", "fetch_ahead_bytes",
+    "fetch_ahead_bytes",
     "pairs", "direction", "baseline_cm", "balance", "limit", "frames",
     "split", "subset", "family", "map", "character", "animation", "scenes", "focal_mm",
     "valid_depth_ratio", "caption",

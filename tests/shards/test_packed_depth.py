@@ -21,7 +21,6 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth_frames import DepthFrames
 from stereogenbench_data.media.video import VideoReader
 from stereogenbench_data.schema.release import PACKED_DEPTH_NAMES, depth_name, rgb_name
-from stereogenbench_data.shards.companion_files import write_companion_files
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.unpack import unpack
 from stereogenbench_data.shards.verify import verify
@@ -200,9 +199,7 @@ def damaged(shards):
         facts = index.shards | {
             PAIR: replace(index.shards[PAIR], sha256=sha256(content).hexdigest())
         }
-        altered = SceneIndex.from_scenes(scenes, shards, shards=facts)
-        altered.write(shards / "index.parquet")
-        write_companion_files(altered, out=shards)
+        SceneIndex.from_scenes(scenes, shards, shards=facts).write(shards / "index.parquet")
         return [str(each) for each in verify(shards, mode="decode", workers=1).problems]
 
     return damage

@@ -207,18 +207,6 @@ def test_a_scene_says_so_itself_and_keeps_the_released_metadata(release, packed)
     }
 
 
-def test_files_beside_the_shards_say_that_data_are_derived(packed, release, tmp_path):
-    pack(release, tmp_path, workers=1)
-    derived, released = (
-        json.loads((folder / "shards.json").read_bytes()) for folder in (packed, tmp_path)
-    )
-
-    assert derived["derived"]["size"] == "32x24"
-    assert derived["derived"]["source_digest"] == SceneIndex.open(release).digest
-    assert derived["derived"]["psnr_db"]["worst_frame"] < derived["derived"]["psnr_db"]["mean"]
-    assert "derived" not in released
-
-
 def test_the_same_input_gives_the_same_bytes_whatever_the_workers_and_parts(
     packed, release, tmp_path
 ):

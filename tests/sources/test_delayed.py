@@ -11,9 +11,10 @@ from benchmarks.server import serving as delayed_serving
 from stereogenbench_data.errors import ShardError, StorageError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.sources.remote import RemoteObject
-from stereogenbench_data.sources.retry import Cancellation, ReadCancelled, RetryPolicy
+from stereogenbench_data.sources.retry import Cancellation, ReadCancelled
 from tests.servers.hub import COMMIT, REPOSITORY
 from tests.servers.raw import raw_serving
+from tests.sources.policies import retry_policy
 
 DELAY_S = 0.3
 
@@ -91,7 +92,7 @@ def test_threads_wait_for_a_delay_together(store, before, shard):
 def test_lost_connections_cost_no_byte(store, before, shard):
     url, point = store
     with before(url, lost=0.1) as server:
-        retry = RetryPolicy(first_wait_s=0.001)
+        retry = retry_policy(first_wait_s=0.001)
         remote = RemoteObject(f"{point(server.url)}/{shard.name}", retry=retry)
         whole = shard.read_bytes()
 
@@ -113,7 +114,7 @@ def test_a_dead_store_is_a_named_error_within_the_longest_outage(store, how):
         yield 60.0
 
     _, point = store
-    policy = RetryPolicy(attempts=999, timeout_s=0.5, longest_outage_s=1.5)
+    policy = retry_policy(attempts=999, timeout_s=0.5, longest_outage_s=1.5)
     with raw_serving(never) as silent:
         root = point("http://127.0.0.1:1" if how == "refusing" else silent)
         began_s = time.monotonic()

@@ -44,7 +44,7 @@ ranges = st.tuples(st.integers(0, 9000), st.integers(1, 1200)).map(lambda r: (r[
 @given(st.lists(st.lists(ranges, max_size=4), min_size=1, max_size=8))
 @example([[(2732, 2999), (5047, 5996)]])  # as far apart as one request may join
 def test_every_byte_that_is_needed_is_fetched_once_and_no_other(samples):
-    ahead, log = FetchAhead(connections=1), Log()
+    ahead, log = FetchAhead(), Log()
     for number, needed in enumerate(samples):
         ahead.plan(number, log.wanted(*needed))
     ahead.begin()
@@ -90,26 +90,27 @@ def test_ranges_of_later_samples_wait_and_grow():
     ahead.close()
 
 
-def test_requests_are_made_at_a_time_up_to_their_number():
-    running, most, lock = [0], [0], threading.Lock()
+def test_eight_requests_are_made_at_a_time():
+    running, most, lock, eight = [0], [0], threading.Lock(), threading.Barrier(8, timeout=60)
 
     def fetch(start, stop, cancellation):
         with lock:
             running[0] += 1
             most[0] = max(most[0], running[0])
-        time.sleep(0.05)
+        eight.wait()
         with lock:
             running[0] -= 1
         return bytes(stop - start)
 
-    ahead = FetchAhead(connections=3)
-    ahead.plan(1, [Wanted(name, 0, 1, fetch) for name in "abcdef"])
+    names = [f"place {number}" for number in range(16)]
+    ahead = FetchAhead()
+    ahead.plan(1, [Wanted(name, 0, 1, fetch) for name in names])
     ahead.begin()
-    for name in "abcdef":
+    for name in names:
         ahead.read(name, 0)
     ahead.close()
 
-    assert most[0] == 3
+    assert most[0] == 8
 
 
 def test_an_error_is_raised_where_the_bytes_are_read_and_not_before():

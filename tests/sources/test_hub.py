@@ -15,6 +15,7 @@ from stereogenbench_data.sources.retry import RetryPolicy
 from tests.servers.failing_server import Answer
 from tests.servers.hub import COMMIT, REPOSITORY, hub_serving
 from tests.servers.tools import require_module
+from tests.sources.policies import retry_policy
 
 DATA = bytes(range(256)) * 100
 BRANCH = f"hf://datasets/{REPOSITORY}/x.tar"
@@ -43,7 +44,7 @@ def hub(folder, monkeypatch):
 
 
 def quick(**how):
-    return RetryPolicy(first_wait_s=0.001, **how)
+    return retry_policy(first_wait_s=0.001, **how)
 
 
 def resolved(server):
@@ -71,7 +72,7 @@ def test_a_signed_url_is_kept_for_later_reads(hub):
 
 def test_a_signed_url_is_not_used_after_it_has_expired(hub):
     hub.facts["signed_for_s"] = 1
-    remote = RemoteObject(PINNED, retry=RetryPolicy(attempts=1))
+    remote = RemoteObject(PINNED, retry=retry_policy(attempts=1))
     for _ in range(3):
         assert remote.read(5, 9) == DATA[5:9]
         time.sleep(0.6)
@@ -81,7 +82,7 @@ def test_a_signed_url_is_not_used_after_it_has_expired(hub):
 
 
 def test_a_signed_url_that_is_refused_is_resolved_again_within_the_attempt(hub):
-    remote = RemoteObject(PINNED, retry=RetryPolicy(attempts=1))
+    remote = RemoteObject(PINNED, retry=retry_policy(attempts=1))
     remote.read(0, 9)
     hub.facts["signatures"].clear()
 
@@ -91,7 +92,7 @@ def test_a_signed_url_that_is_refused_is_resolved_again_within_the_attempt(hub):
 
 def test_a_signed_url_that_is_refused_at_once_is_an_error_that_does_not_show_it(hub):
     hub.facts["signed_for_s"] = 0
-    remote = RemoteObject(PINNED, retry=RetryPolicy(attempts=1))
+    remote = RemoteObject(PINNED, retry=retry_policy(attempts=1))
 
     with pytest.raises(
         StorageError, match=r"x.tar: the server answers 403 .*check access"
@@ -148,7 +149,8 @@ def test_nothing_that_is_logged_shown_or_sent_to_a_process_holds_a_signature(
 ):
     conf = fsspec.config.conf["hf"] | {"token": "hf_mine"}
     monkeypatch.setitem(fsspec.config.conf, "hf", conf)
-    remote = RemoteObject(PINNED, retry=quick(attempts=2))
+    monkeypatch.setattr(RetryPolicy, "attempts", 2)
+    remote = RemoteObject(PINNED)
     with caplog.at_level(logging.DEBUG):
         remote.read(0, 9)
     state = pickle.dumps(remote)
@@ -194,7 +196,7 @@ def test_a_repository_that_asks_for_consent_says_so(hub):
 def test_a_limit_of_the_hub_is_waited_for(hub, headers, wait_s):
     waits_s = []
     hub.facts["refusals"] = [(429, headers)]
-    retry = RetryPolicy(sleep=waits_s.append, chance=lambda: 0.0)
+    retry = retry_policy(sleep=waits_s.append, chance=lambda: 0.0)
 
     assert RemoteObject(PINNED, retry=retry).read(0, 9) == DATA[:9]
     assert waits_s == [wait_s]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.synthesis.produce import synthesise
-from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
+from stereogenbench_data.synthesis.ray_renderer import RAY_CASTING
+from stereogenbench_data.synthesis.request import SynthRequest
 
 UNIT_M = 0.001
 SENSOR_MM = 23.76
@@ -61,10 +62,10 @@ def luma(frame):
 def draw(tmp_path_factory):
     """Draw one scene: by default 96 px wide, 3 frames."""
 
-    def draw_scene(*, contract=None, **request):
+    def draw_scene(*, renderer=RAY_CASTING, **request):
         asked = {"size_px": 96, "frames": 3, "seed": 2} | request
         out = tmp_path_factory.mktemp("synth")
-        (key,) = synthesise(out, SynthRequest(contract=contract or ExportContract(), **asked))
+        (key,) = synthesise(out, SynthRequest(**asked), renderer=renderer)
         return Drawn(out / key)
 
     return draw_scene

@@ -31,7 +31,7 @@ from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.renderer import Renderer
-from stereogenbench_data.synthesis.request import ExportContract, SynthRequest
+from stereogenbench_data.synthesis.request import SENSOR_MM, SynthRequest
 from stereogenbench_data.synthesis.world import Spawn, World
 from tests.synthesis.conftest import Drawn
 from tests.synthesis.test_pictures import psnr_db
@@ -65,14 +65,13 @@ def renderer(assets):
     return BlenderRenderer.from_file(assets / "assets.toml", python=PYTHON)
 
 
-def proposal(*, on="Yard", take="Walk", frames=3, size_px=64, height_px=None, **contract):
+def proposal(*, on="Yard", take="Walk", frames=3, size_px=64, height_px=None, sensor_mm=SENSOR_MM):
     """A proposal of a rig of 10 cm gaps, made by hand."""
     request = SynthRequest(
         map_name=on,
         frames=frames,
         size_px=size_px,
         height_px=height_px,
-        contract=ExportContract(**contract),
     )
     return Proposal(
         request=request,
@@ -81,7 +80,7 @@ def proposal(*, on="Yard", take="Walk", frames=3, size_px=64, height_px=None, **
         map_name=on,
         character="Figure",
         animation=take,
-        sensor_mm=request.contract.sensor_mm,
+        sensor_mm=sensor_mm,
         focal_mm=28.0,
         places_cm=np.arange(6) * 10.0,
         offset_cm=np.zeros(3),
@@ -266,7 +265,7 @@ def test_a_take_that_cannot_go_on_is_played_back(assets, take, repeat):
 
 @needs_blender
 def test_depth_is_that_of_another_librarys_rays(renderer, assets, tmp_path):
-    """Oblong pixels, a principal point off the centre, and a fan that turns."""
+    """Oblong pixels, and a fan that turns."""
     trimesh = pytest.importorskip("trimesh", reason="needs trimesh, and embreex to be fast")
     frame = 7
     made = proposal(
@@ -274,7 +273,6 @@ def test_depth_is_that_of_another_librarys_rays(renderer, assets, tmp_path):
         size_px=96,
         height_px=64,
         sensor_mm=(23.76, 12.0),
-        principal_point_px=(40.0, 36.5),
     )
     still = plan(made, eye=(-5.0, -2.0, 1.8), target=(0.0, 0.0, 2.4), place=(300.0, 0.0, 0.0))
 
@@ -290,8 +288,8 @@ def test_depth_is_that_of_another_librarys_rays(renderer, assets, tmp_path):
     )
     for camera, rendered in zip((0, 5), last, strict=True):
         view = still.view(camera=camera, frame=frame)
-        right = (np.arange(96) + 0.5 - 40.0) / view.focal_px[0]
-        down = (np.arange(64) + 0.5 - 36.5) / view.focal_px[1]
+        right = (np.arange(96) + 0.5 - 48) / view.focal_px[0]
+        down = (np.arange(64) + 0.5 - 32) / view.focal_px[1]
         forward_axis, right_axis, up_axis = view.axes.T
         rays = (
             forward_axis + right[None, :, None] * right_axis - down[:, None, None] * up_axis
@@ -307,10 +305,8 @@ def test_depth_is_that_of_another_librarys_rays(renderer, assets, tmp_path):
 
 @needs_blender
 def test_pictures_have_sky_exactly_where_depth_has_none(renderer):
-    """So intrinsics of pictures and depth agree, also off the centre and with oblong pixels."""
-    made = proposal(
-        frames=1, size_px=96, height_px=64, sensor_mm=(23.76, 12.0), principal_point_px=(40.0, 26.5)
-    )
+    """So intrinsics of pictures and depth agree, also with oblong pixels."""
+    made = proposal(frames=1, size_px=96, height_px=64, sensor_mm=(23.76, 12.0))
 
     shown = views(
         fast(renderer, samples_per_pixel=8), plan(made, target=(0.0, 0.0, 2.4)), cameras=(0, 5)

@@ -6,12 +6,7 @@ import pytest
 from stereogenbench_data.synthesis.maps import open_map
 from stereogenbench_data.synthesis.planning import plan_scene
 from stereogenbench_data.synthesis.ray_casting import GROUND, SKY, View, first_hits, shape_of
-from stereogenbench_data.synthesis.render import (
-    SceneState,
-    render_depth,
-    render_frame,
-    static_light,
-)
+from stereogenbench_data.synthesis.render import SceneState, render_frame, static_light
 from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.scene import Material, Shape
 
@@ -37,8 +32,8 @@ def state_of(plan, *, frame):
     return SceneState(world.scene, walker=walker, static_light=static_light(world.scene))
 
 
-def depth_of(shapes, view):
-    inverse, faces = first_hits(view, shapes=shapes, slope=LEVEL)
+def depth_of(shapes, view, *, slope=LEVEL):
+    inverse, faces = first_hits(view, shapes=shapes, slope=slope)
     with np.errstate(divide="ignore"):
         return 1 / inverse, faces
 
@@ -96,8 +91,7 @@ def test_every_hit_lies_on_the_surface_of_its_solid(index):
     plan = plan_scene(SynthRequest(family="Uniform", size_px=48), index=index).plan
     state = state_of(plan, frame=40)
     view = plan.view(camera=2, frame=40)
-    depth_m = render_depth(state, view=view)
-    _, faces = first_hits(view, shapes=state.shapes, slope=state.scene.slope)
+    depth_m, faces = depth_of(state.shapes, view, slope=state.scene.slope)
 
     v, u = np.nonzero(np.isfinite(depth_m))
     camera = np.stack(
@@ -130,7 +124,7 @@ def test_strips_of_a_large_picture_join_without_a_seam():
     picture, depth_m = render_frame(state, view=view)
 
     assert picture.shape == (112, 1280, 3)
-    np.testing.assert_array_equal(depth_m, render_depth(state, view=view))
+    np.testing.assert_array_equal(depth_m, depth_of(state.shapes, view, slope=state.scene.slope)[0])
     for row in (0, 101, 102, 111):
         alone = View(
             eye=view.eye,
@@ -139,6 +133,5 @@ def test_strips_of_a_large_picture_join_without_a_seam():
             centre_px=(view.centre_px[0], view.centre_px[1] - row),
             size_px=(1280, 1),
         )
-        np.testing.assert_allclose(
-            depth_m[row : row + 1], render_depth(state, view=alone), rtol=1e-9
-        )
+        cast, _ = depth_of(state.shapes, alone, slope=state.scene.slope)
+        np.testing.assert_allclose(depth_m[row : row + 1], cast, rtol=1e-9)

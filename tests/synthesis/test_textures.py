@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from stereogenbench_data.synthesis.render import cast_shadow, full_light, sunlight_at
+from stereogenbench_data.synthesis.render import cast_shadow, full_light
 from stereogenbench_data.synthesis.scene import Material, SceneModel, Shape
 from stereogenbench_data.synthesis.textures import TEXTURES, sample_atlas, texture_row
 
@@ -48,10 +48,13 @@ def test_a_box_shades_the_ground_on_the_side_away_from_the_sun():
 
     cast_shadow(light, shape=box, scene=scene)
 
-    away = 1.6 * -scene.sun[:2] / np.linalg.norm(scene.sun[:2])
+    away_m = 1.6 * -scene.sun[:2] / np.linalg.norm(scene.sun[:2])
     behind, before = (
-        sunlight_at(light, x_m=np.array([x]), y_m=np.array([y]), scene=scene)[0]
-        for x, y in (away, -away)
+        light[row, column]
+        for column, row in (
+            ((place_m / scene.shadow_range_m + 1) / 2 * len(light)).astype(int)
+            for place_m in (away_m, -away_m)
+        )
     )
     assert behind < 0.5
     assert before == 1.0

@@ -29,7 +29,6 @@ from stereogenbench_data.bridges.croissant.nodes import (
 from stereogenbench_data.bridges.croissant.shards import packed_nodes, write_tables
 from stereogenbench_data.errors import DescriptorError, describe_os_error
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.shards.companion_files import derivation_facts
 from stereogenbench_data.sources.files import write_atomic
 from stereogenbench_data.sources.location import is_remote, shown
 
@@ -51,8 +50,7 @@ class Publication:
             release has the URL of the release's own repository.
         tables_url: URL of the folder of tables. None for the folder in ``data_url`` with the name
             of the descriptor, or for paths relative to the descriptor.
-        about: A JSON file in which the maker of the scenes states what `dataset_facts` does not
-            know.
+        about: What the user states of the scenes, as for `dataset_facts.facts_of`.
     """
 
     name: str | None = None
@@ -60,7 +58,7 @@ class Publication:
     published: date | None = None
     data_url: str | None = None
     tables_url: str | None = None
-    about: Path | None = None
+    about: dataset_facts.About | None = None
 
 
 def write_descriptor(
@@ -175,7 +173,7 @@ def _packed(index: SceneIndex, facts: Node) -> Node:
 
 def _derived(index: SceneIndex, facts: Node) -> Node:
     """Return what the descriptor of training shards says instead: from what, how, what error."""
-    derived = derivation_facts(index)
+    derived = dataset_facts.derivation_facts(index)
     psnr_db, settings = derived["psnr_db"], json.dumps(derived["settings"], sort_keys=True)
     encoding = dataset_facts.activity(
         "Derivation for training",

@@ -59,7 +59,6 @@ class ScaleFit:
         valid_ratio: The share of the picture's pixels that the line was fitted to.
         answered_ratio: The share of the scored pixels for which the matcher had an answer.
         residual_std_px: Root mean squared residual of the fitted pixels.
-        residual_mad_px: Median absolute residual of all answered pixels.
         r_squared: The share of the fitted pixels' true variance that the line explains.
         reason: Why there is no line; empty where there is one.
     """
@@ -72,7 +71,6 @@ class ScaleFit:
     valid_ratio: float = 0.0
     answered_ratio: float = math.nan
     residual_std_px: float = math.nan
-    residual_mad_px: float = math.nan
     r_squared: float = math.nan
     reason: str = ""
 
@@ -133,10 +131,10 @@ def fit_scale(
     if reason:
         return ScaleFit(answered_ratio=answered_ratio, reason=reason)
     slope, offset = line or _least_squares(estimated[kept], true[kept])
-    residual = true - slope * estimated - offset
+    residual = (true - slope * estimated - offset)[kept]
     pixels = int(np.count_nonzero(kept))
     variance = float(np.var(true[kept]))
-    mean_squared = float(np.mean(residual[kept] ** 2))
+    mean_squared = float(np.mean(residual**2))
     return ScaleFit(
         drift=abs(slope - 1),
         slope=slope,
@@ -146,7 +144,6 @@ def fit_scale(
         valid_ratio=pixels / scored.size,
         answered_ratio=answered_ratio,
         residual_std_px=math.sqrt(mean_squared),
-        residual_mad_px=float(np.median(np.abs(residual))),
         r_squared=1 - mean_squared / variance if variance else math.nan,
     )
 

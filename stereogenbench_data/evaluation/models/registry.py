@@ -43,14 +43,8 @@ MODELS: Final[dict[ModelKind, dict[str, str]]] = {
         "foundation-stereo": "foundation_stereo:FoundationStereoMatcher",
     },
     "pair metric": {"lpips": "lpips:Lpips"},
-    "image features": {
-        "colour-statistics": "picture_statistics:ColourStatistics",
-        "inception": "inception:InceptionFeatures",
-    },
-    "video features": {
-        "motion-statistics": "picture_statistics:MotionStatistics",
-        "i3d": "i3d:I3dFeatures",
-    },
+    "image features": {"inception": "inception:InceptionFeatures"},
+    "video features": {"i3d": "i3d:I3dFeatures"},
 }
 """The class of every model, by kind and name, as "module:class" of this folder."""
 

@@ -104,7 +104,7 @@ class Assets:
 
     Attributes:
         path: The file itself.
-        sensors_mm: Widths and heights of sensors, sorted by name; empty for that of the request.
+        sensors_mm: Widths and heights of sensors, sorted by name; empty for the built-in one.
         digest: Of the file and of every file that it names.
     """
 

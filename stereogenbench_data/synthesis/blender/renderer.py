@@ -21,6 +21,7 @@ from stereogenbench_data.synthesis.blender.process import blender
 from stereogenbench_data.synthesis.plan import ScenePlan
 from stereogenbench_data.synthesis.proposal import Proposal
 from stereogenbench_data.synthesis.renderer import RenderedView, unknown_map
+from stereogenbench_data.synthesis.request import SENSOR_MM
 from stereogenbench_data.synthesis.world import Bounds, Spawn
 
 _VERSION: Final = 1
@@ -77,8 +78,8 @@ class BlenderRenderer:
 
     @property
     def sensors_mm(self) -> tuple[tuple[float, float], ...]:
-        """Sensors to draw from; empty for that of the request."""
-        return self.assets.sensors_mm
+        """Sensors to draw from."""
+        return self.assets.sensors_mm or (SENSOR_MM,)
 
     @property
     def fingerprint(self) -> str:
@@ -109,7 +110,6 @@ class BlenderRenderer:
                     "yaw_deg": plan.spawn.yaw_deg,
                     "size_px": views[0].size_px,
                     "focal_px": views[0].focal_px,
-                    "centre_px": views[0].centre_px,
                     "folder": str(process.folder),
                     "seed": zlib.crc32(f"{plan.request.seed}/{plan.key}".encode()) >> 1,
                     "samples_per_pixel": settings.samples_per_pixel,

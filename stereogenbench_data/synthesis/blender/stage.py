@@ -1101,8 +1101,7 @@ class Stage:
     def _set_cameras(self, spec: dict[str, Any], *, eyes: Array, axes: Array) -> None:
         """Make one camera a view, whose pictures Cycles writes in one render."""
         scene, render = self.scene, self.scene.render
-        (width_px, height_px), (fx, fy) = spec["size_px"], spec["focal_px"]
-        centre_x, centre_y = spec["centre_px"]
+        width_px, (fx, fy) = spec["size_px"][0], spec["focal_px"]
         render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)
         render.use_multiview = True
         render.views_format = "MULTIVIEW"
@@ -1122,8 +1121,7 @@ class Stage:
             camera.type, camera.sensor_fit = "PERSP", "HORIZONTAL"
             camera.sensor_width = 36.0
             camera.lens = fx * 36.0 / width_px
-            camera.shift_x = (width_px / 2 - centre_x) / width_px
-            camera.shift_y = (centre_y - height_px / 2) * (fx / fy) / width_px
+            camera.shift_x = camera.shift_y = 0.0
             camera.clip_start, camera.clip_end = 1e-3 / self.mirror.unit_m, 1e6
             camera.dof.use_dof = False
             view = render.views.get(name) or render.views.new(name)
@@ -1135,9 +1133,8 @@ class Stage:
 def _pixel_ways(spec: dict[str, Any], *, axes: Array) -> Array:
     """Return the directions (n, 3) through pixel centres; their part along the axis is 1."""
     (width_px, height_px), (fx, fy) = spec["size_px"], spec["focal_px"]
-    centre_x, centre_y = spec["centre_px"]
-    across = (np.arange(width_px) + 0.5 - centre_x) / fx
-    down = (np.arange(height_px) + 0.5 - centre_y) / fy
+    across = (np.arange(width_px) + 0.5 - width_px / 2) / fx
+    down = (np.arange(height_px) + 0.5 - height_px / 2) / fy
     forward, right, up = axes.T
     ways: Array = forward + across[None, :, None] * right - down[:, None, None] * up
     return ways.reshape(-1, 3)
