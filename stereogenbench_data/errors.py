@@ -41,9 +41,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-_CHAIN: Final = re.compile(r"::(?=(?:[\w+.-]+::)*[A-Za-z][\w+.-]*://|/|data:|[\w+.-]*$)", re.ASCII)
+_CHAIN: Final = re.compile(
+    r"::(?=(?:[\w+.-]++::){0,9}[A-Za-z][\w+.-]*+://|/|data:|[\w+.-]*+$)", re.ASCII
+)
 """Where a chain of file systems continues; colons of IPv6 addresses and passwords do not match."""
-_IN_TEXT: Final = re.compile(r"[A-Za-z][\w+.-]*(?:::[\w+.-]+)*://[^\s'\"<>]+", re.ASCII)
+_IN_TEXT: Final = re.compile(
+    r"(?<![\w+.-])(?<![\w+.-]::)(?:[\w+.-]++(?:::(?=[\w+.-]))?)++://[^\s'\"<>]+", re.ASCII
+)
+"""A URL or a chain of them. Each run of letters is tried once, from its start, so that the time
+of a search grows with the text and not with its square."""
 _AS_PATH: Final = re.compile(
     r"\b(https?|s3a?|hf|ftps?|sftp|ssh|smb|gs|gcs|az|abfss?|webhdfs):/(?!/)([^\s'\"]+)"
 )

@@ -28,6 +28,7 @@ from stereogenbench_data.index.scene_folder import (
 )
 from stereogenbench_data.index.tree import FoundScenes, find_remote_scenes, find_scene_folders
 from stereogenbench_data.media.depth import require_depth_stream
+from stereogenbench_data.schema.document import brief
 from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import DepthEncoding, Scene, SceneId
 from stereogenbench_data.schema.release import TRAIN_MAPS, Subset, depth_name
@@ -195,8 +196,8 @@ def _report(
             scenes.append(scene)
         if scene.labels.map_name not in (None, scene.id.map_name):
             labels.append(
-                f"{scene.id.key}: its files call the map {scene.labels.map_name!r}; the folder's "
-                f"name is used"
+                f"{scene.id.key}: its files call the map {brief(scene.labels.map_name)}; the "
+                f"folder's name is used"
             )
     subsets = [
         f"eval/{folder} names no subset; a scene there counts as seen_map if its map occurs in "

@@ -31,7 +31,7 @@ from stereogenbench_data.index.parquet import (
 )
 from stereogenbench_data.index.stale import StaleIndexWarning, stale_message
 from stereogenbench_data.index.tree import find_remote_scenes
-from stereogenbench_data.schema.text import counted
+from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.sources.location import (
     is_remote,
     joined,
@@ -51,6 +51,7 @@ MOST_REMOTE_SCENES: Final = 64
 """The most scenes behind a URL that are described when a tree without an index is opened."""
 
 _LONGEST_ROOT: Final = 300
+_LONGEST_REASON: Final = 5000
 _SHOWN: Final = 10
 
 
@@ -257,7 +258,7 @@ def _recorded_folder(recorded: str, beside: Path) -> Path | None:
 def _must_be_named(path: Path, recorded: str, reason: str) -> StorageError:
     place = shown(recorded)
     if not place.isprintable() or len(place) > _LONGEST_ROOT:
-        place = repr(place[:_LONGEST_ROOT])
+        place = repr(shortened(place, _LONGEST_ROOT))
     return StorageError(
         f"{path}: its data are not beside it, and it records their root as {place}. A file may not "
         f"choose such a place ({reason}). If you trust it, name the root yourself: "
@@ -268,8 +269,9 @@ def _must_be_named(path: Path, recorded: str, reason: str) -> StorageError:
 
 def _listed(left_out: Mapping[str, str]) -> str:
     lines = [
-        reason if key in reason else f"{key}: {reason}" for key, reason in sorted(left_out.items())
+        shortened(reason if key in reason else f"{key}: {reason}", _LONGEST_REASON)
+        for key, reason in sorted(left_out.items())[:_SHOWN]
     ]
-    if len(lines) > _SHOWN:
-        lines[_SHOWN:] = [f"and {len(lines) - _SHOWN} more"]
+    if len(left_out) > _SHOWN:
+        lines.append(f"and {len(left_out) - _SHOWN} more")
     return "\n  ".join([f"{counted(len(left_out), 'scene')} cannot be used:", *lines])

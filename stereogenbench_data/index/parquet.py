@@ -23,8 +23,10 @@ import pyarrow.parquet as pq
 from stereogenbench_data.errors import StorageError, cure_of, describe_os_error, explain_os_errors
 from stereogenbench_data.index.arrow import as_numpy, one_array
 from stereogenbench_data.index.rows import ADDED, SCHEMA, SEEK_COLUMN, TRAINING_COLUMNS, row_of
+from stereogenbench_data.schema.document import MOST_LETTERS
 from stereogenbench_data.schema.records import Scene, ShardFacts
 from stereogenbench_data.schema.release import CAMERA_COUNT
+from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.schema.training import MOST_PSNR_DB
 from stereogenbench_data.sources.files import open_atomic
 from stereogenbench_data.sources.location import is_remote, local_path, shown
@@ -34,6 +36,12 @@ INDEX_NAME: Final = "index.parquet"
 
 _FORMAT: Final = 1
 _LARGEST: Final = 2**63
+_FREE_BYTES: Final = 64 * 2**20
+_BYTES_A_BYTE: Final = 32
+"""An index may take so much memory, and so much for each byte of its file. One of the release takes
+some six bytes for each."""
+_BYTES_A_ROW: Final = 1024
+"""What a row takes beside its texts and lists of any length."""
 _METADATA_KEY: Final = b"stereogenbench_data.index"
 
 
@@ -74,12 +82,13 @@ def read_index_file(file: Path | pa.BufferReader, *, where: str) -> tuple[pa.Tab
         StorageError: If it is not an index of this version, or was altered.
     """
     try:
-        with pq.ParquetFile(file, pre_buffer=True) as parquet:
-            metadata = (parquet.schema_arrow.metadata or {}).get(_METADATA_KEY)
-            head = _parse_head(metadata, where=where)
-            names = [name for name in parquet.schema_arrow.names if name != SEEK_COLUMN]
-            table = parquet.read(columns=names).replace_schema_metadata()
-            table = _with_added(table).combine_chunks()
+        with pq.ParquetFile(file) as parquet:
+            schema, footer = parquet.schema_arrow, parquet.metadata
+        head = _parse_head((schema.metadata or {}).get(_METADATA_KEY), where=where)
+        names = [name for name in schema.names if name != SEEK_COLUMN]
+        _require_columns(schema, names, where=where)
+        table = _with_added(_read_bounded(file, footer, schema, names, where=where))
+        table = table.combine_chunks()
         table.validate(full=True)
     except StorageError:
         raise
@@ -102,12 +111,93 @@ def read_seek_tables(file: Path | pa.BufferReader) -> pa.BinaryArray | None:
     """
     try:
         with pq.ParquetFile(file) as parquet:
-            if SEEK_COLUMN not in parquet.schema_arrow.names:
-                return None
-            found = one_array(parquet.read(columns=[SEEK_COLUMN]).column(SEEK_COLUMN))
+            schema, footer = parquet.schema_arrow, parquet.metadata
+        if schema.names.count(SEEK_COLUMN) != 1 or schema.field(SEEK_COLUMN).type != pa.binary():
+            return None
+        found = _read_bounded(file, footer, schema, [SEEK_COLUMN], where=SEEK_COLUMN)
+        return one_array(found.column(SEEK_COLUMN))
     except (pa.ArrowException, OSError):
         return None
-    return found if pa.types.is_binary(found.type) else None
+
+
+def _require_columns(schema: pa.Schema, names: list[str], *, where: str) -> None:
+    """Refuse columns that are not those of an index, before one of them is read."""
+    odd = [
+        name
+        for name in names
+        if names.count(name) > 1
+        or name not in SCHEMA.names
+        or not schema.field(name).equals(SCHEMA.field(name))
+    ]
+    odd += [name for name in SCHEMA.names if name not in (*names, *ADDED)]
+    if odd:
+        raise StorageError(
+            f"{where}: its columns are not those of an index (see "
+            f"{shortened(', '.join(odd), 300)}). {made_again(where)}"
+        )
+
+
+def _read_bounded(
+    file: Path | pa.BufferReader,
+    footer: pq.FileMetaData,
+    schema: pa.Schema,
+    names: list[str],
+    *,
+    where: str,
+) -> pa.Table:
+    """Return columns of a Parquet file if the memory they take fits its size.
+
+    Equal values are stored once, so a small file may stand for any number of rows and for texts of
+    any length. The footer says how much the columns take with each different text once. They are
+    read so, and how much they take with every text is added up before they are spread out.
+
+    Raises:
+        StorageError: If they take more than a fixed allowance and a multiple of the file's size.
+    """
+    size = file.size() if isinstance(file, pa.BufferReader) else file.stat().st_size
+    most = _FREE_BYTES + _BYTES_A_BYTE * size
+    texts: dict[str, None] = {}
+    need = 0
+    for group in map(footer.row_group, range(footer.num_row_groups)):
+        need += _BYTES_A_ROW * group.num_rows
+        for column in map(group.column, range(group.num_columns)):
+            if column.path_in_schema.partition(".")[0] in names:
+                need += column.total_uncompressed_size + 8 * column.num_values
+                if column.physical_type == "BYTE_ARRAY":
+                    texts[column.path_in_schema] = None
+        if need > most:
+            break
+    plain = pa.schema([schema.field(name) for name in names])
+    groups = [plain.empty_table()]
+    if need <= most:
+        with pq.ParquetFile(
+            file, metadata=footer, read_dictionary=[*texts], pre_buffer=True
+        ) as parquet:
+            for number in range(footer.num_row_groups):
+                group = parquet.read_row_group(number, columns=names).replace_schema_metadata()
+                need += sum(_text_bytes(chunk) for each in group.columns for chunk in each.chunks)
+                if need > most:
+                    break
+                groups.append(group.cast(plain))
+    if need <= most:
+        return pa.concat_tables(groups)
+    raise StorageError(
+        f"{where}: its {footer.num_rows:,} rows take {need:,} bytes of memory or more, and an "
+        f"index of {size:,} bytes may take {most:,}. It was altered. {made_again(where)}"
+    )
+
+
+def _text_bytes(values: Any) -> int:
+    """Return how many bytes the texts of a column take, each as often as it occurs."""
+    kind = values.type
+    if pa.types.is_struct(kind):
+        return sum(map(_text_bytes, values.flatten()))
+    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        return _text_bytes(values.flatten())
+    if not pa.types.is_dictionary(kind):
+        return 0
+    lengths = as_numpy(pc.binary_length(values.dictionary)).astype(np.int64)
+    return int(lengths[as_numpy(values.indices.drop_null())].sum())
 
 
 def _with_added(table: pa.Table) -> pa.Table:
@@ -198,8 +288,8 @@ def _parse_head(metadata: bytes | None, *, where: str) -> IndexHead:
         )
     if head.get("format") != _FORMAT:
         raise StorageError(
-            f"{where}: is an index of format {head.get('format')!r}, and this version of the "
-            f"package reads format {_FORMAT}. {made_again(where)}"
+            f"{where}: is an index of format {shortened(repr(head.get('format')))}, and this "
+            f"version of the package reads format {_FORMAT}. {made_again(where)}"
         )
     reasons = [head.get("incomplete"), head.get("broken")]
     if (
@@ -250,13 +340,15 @@ def require_sound(table: pa.Table, *, where: str) -> None:
             f"{where}: its columns are not those of an index (see {', '.join(odd) or 'order'}). "
             f"{made_again(where)}"
         )
+    members = pc.list_flatten(table.column("members"))
+    _require_lengths(table, members, where=where)
     keys = table.column("key").to_pylist()
     for key, following in itertools.pairwise(keys):
         if key >= following:
             raise StorageError(
-                f"{where}: scene {following!r} is listed twice or out of order. {made_again(where)}"
+                f"{where}: scene {shortened(following)!r} is listed twice or out of order. "
+                f"{made_again(where)}"
             )
-    members = pc.list_flatten(table.column("members"))
     for paths, unfit in (
         (table.column("key"), UNSAFE_PATH),
         (pc.struct_field(members, "path"), UNSAFE_PATH),
@@ -265,11 +357,27 @@ def require_sound(table: pa.Table, *, where: str) -> None:
         unsafe = paths.filter(pc.match_substring_regex(paths, unfit))
         if len(unsafe):
             raise StorageError(
-                f"{where}: {unsafe[0].as_py()!r} is not a path inside the data's root. The index "
-                f"was altered. {made_again(where)}"
+                f"{where}: {shortened(unsafe[0].as_py())!r} is not a path inside the data's root. "
+                f"The index was altered. {made_again(where)}"
             )
     _require_texts(table, where=where)
     _require_numbers(table, members, where=where)
+
+
+def _require_lengths(table: pa.Table, members: Any, *, where: str) -> None:
+    columns = {name: table.column(name) for name in SCHEMA.names}
+    texts = {name: column for name, column in columns.items() if pa.types.is_string(column.type)}
+    for name in ("depth_unit_source", "depth_codec", "depth_pixel_format"):
+        texts[name] = pc.list_flatten(columns[name])
+    texts |= {f"a member's {name}": pc.struct_field(members, name) for name in ("name", "path")}
+    for name, column in texts.items():
+        most = _LONGEST_NAME if name in ("family", "map_name") else MOST_LETTERS
+        length = pc.max(pc.utf8_length(column)).as_py() or 0
+        if length > most:
+            raise StorageError(
+                f"{where}: {name} of a scene has {length:,} letters, and it may have {most:,}. "
+                f"The index was altered. {made_again(where)}"
+            )
 
 
 def _require_texts(table: pa.Table, *, where: str) -> None:
@@ -290,7 +398,7 @@ def _require_texts(table: pa.Table, *, where: str) -> None:
         except (ValueError, RecursionError):
             is_object = False
         if not is_object:
-            raise _odd(where, "training_settings", text[:_SHOWN], "not a JSON object")
+            raise _odd(where, "training_settings", text, "not a JSON object")
     for name in ("family", "map_name"):
         texts = table.column(name)
         odd = texts.filter(pc.match_substring_regex(texts, r"^$|[/\\\x00-\x1f]"))
@@ -344,11 +452,11 @@ def _require_key_frames(table: pa.Table, *, where: str) -> None:
 
 def _odd(where: str, name: str, found: Any, why: str) -> StorageError:
     return StorageError(
-        f"{where}: {name} is {found!r}, {why}. The index was altered. {made_again(where)}"
+        f"{where}: {name} is {shortened(repr(found))}, {why}. The index was altered. "
+        f"{made_again(where)}"
     )
 
 
-_SHOWN: Final = 60
 _FORMS: Final = {
     "training_source": r"^[0-9a-f]{64}$",
     "training_quality": r"^[A-Za-z0-9_.+-]{1,40}$",
@@ -365,6 +473,7 @@ _KNOWN: Final = {
 _OF_BYTES: Final = (0, 2**61)
 _ABOVE: Final = (sys.float_info.min, sys.float_info.max)
 _FINITE: Final = (-sys.float_info.max, sys.float_info.max)
+_LONGEST_NAME: Final = 255
 _BOUNDS: Final = {
     "focal_mm": _ABOVE,
     "sensor_width_mm": _ABOVE,
@@ -376,7 +485,7 @@ _BOUNDS: Final = {
     "baselines_cm": _ABOVE,
     "primary_left": (0, CAMERA_COUNT - 1),
     "primary_right": (0, CAMERA_COUNT - 1),
-    "frames": (1, 2**31),
+    "frames": (1, 2**17),
     "frame_rate_hz": (0, sys.float_info.max),
     "lateral_m": _FINITE,
     "rig_residual_px": (0, math.inf),

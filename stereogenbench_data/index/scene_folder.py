@@ -37,7 +37,7 @@ from stereogenbench_data.media.depth import (
 from stereogenbench_data.media.depth_frames import CODEC_NAME
 from stereogenbench_data.media.seek_table import SeekTable, packed_tables, read_seek_table
 from stereogenbench_data.media.video import NO_COLOUR, probe, require_pixel_aspect
-from stereogenbench_data.schema.document import parse_text, require_text_size
+from stereogenbench_data.schema.document import MOST_LETTERS, brief, parse_text, require_text_size
 from stereogenbench_data.schema.parse import (
     parse_complete,
     parse_description,
@@ -97,7 +97,6 @@ Difference = tuple[str, str]
 
 _SAME_M: Final = 1e-6
 _SAME_PX: Final = 1e-3
-_SHOWN_LETTERS: Final = 60
 
 
 class IncompleteScene(StorageError):
@@ -242,8 +241,8 @@ def describe_scene(root: str | Path, key: str, *, valid_depth: ValidDepth = "ski
     ):
         if found != said:
             raise StorageError(
-                f"{key}: {TRAINING_JSON} tells {what} {_brief(said)}, and the scene has "
-                f"{_brief(found)}. A file is of another scene: fetch the scene again."
+                f"{key}: {TRAINING_JSON} tells {what} {brief(said)}, and the scene has "
+                f"{brief(found)}. A file is of another scene: fetch the scene again."
             )
     return derived
 
@@ -307,7 +306,13 @@ def _caption(texts: Mapping[str, bytes], *, key: str) -> str:
         if written:
             return written
     if DESCRIPTION_TXT in texts:
-        return parse_text(texts[DESCRIPTION_TXT], where=f"{key}/{DESCRIPTION_TXT}").strip()
+        written = parse_text(texts[DESCRIPTION_TXT], where=f"{key}/{DESCRIPTION_TXT}").strip()
+        if len(written) > MOST_LETTERS:
+            raise SchemaError(
+                f"{key}/{DESCRIPTION_TXT}: may have {MOST_LETTERS:,} letters, this one has "
+                f"{len(written):,}. Replace it with the file of the release."
+            )
+        return written
     return ""
 
 
@@ -506,12 +511,7 @@ def metadata_differences(scene: Scene, texts: Mapping[str, bytes]) -> list[Diffe
 
 
 def _difference(name: str, what: str, found: object, indexed: object) -> Difference:
-    return name, f"tells {what} {_brief(found)}, and by the index it is {_brief(indexed)}"
-
-
-def _brief(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= _SHOWN_LETTERS else f"{text[:_SHOWN_LETTERS]}..."
+    return name, f"tells {what} {brief(found)}, and by the index it is {brief(indexed)}"
 
 
 def _differing_place(scene: Scene) -> Iterator[Difference]:
@@ -524,7 +524,8 @@ def _differing_place(scene: Scene) -> Iterator[Difference]:
         found, indexed = getattr(place, name), getattr(scene.id, name)
         is_known = found is not None or scene.id.split == "train"
         if is_known and found != indexed:
-            yield "", f"its path tells {name} {found!r}, and by the index it is {indexed!r}"
+            told = f"its path tells {name} {brief(found)}"
+            yield "", f"{told}, and by the index it is {brief(indexed)}"
 
 
 def _differing_rig(scene: Scene, texts: Mapping[str, bytes]) -> Iterator[Difference]:

@@ -4,6 +4,7 @@ A depth picture is read in the pixel format in which it is stored. No conversion
 FFmpeg: its conversion to 8 bits drops the low byte, and one between 10, 12 and 16 bits rescales.
 """
 
+import itertools
 import math
 import re
 from dataclasses import dataclass, replace
@@ -20,11 +21,14 @@ from stereogenbench_data.media.depth_frames import CODEC_NAME, PACKED_SUFFIX, De
 from stereogenbench_data.media.video import VideoReader, plane_numbers
 from stereogenbench_data.schema.records import DepthEncoding, DepthRisk
 from stereogenbench_data.schema.release import DEFAULT_DEPTH_UNIT_M
+from stereogenbench_data.schema.text import shortened
 
 _LOSSLESS_CODECS: Final = frozenset(
     {CODEC_NAME, "ffv1", "ffvhuff", "huffyuv", "png", "rawvideo", "utvideo"}
 )
 """Codecs that return what they were given, whatever their settings."""
+
+_TAGS_SHOWN: Final = 4
 
 ANY_DEPTH: Final = DepthEncoding(accept=frozenset(get_args(DepthRisk)))
 """A contract that takes whatever holds one number a pixel."""
@@ -61,7 +65,8 @@ def resolve_encoding(
         return contract.with_file_unit(DEFAULT_DEPTH_UNIT_M, source="default")
     units_m = {unit_m for value in scales.values() if (unit_m := _unit_m(value)) is not None}
     if len(units_m) != 1:
-        found = ", ".join(f"{key}={value!r}" for key, value in sorted(scales.items()))
+        tags = (f"{shortened(key)}={shortened(value)!r}" for key, value in sorted(scales.items()))
+        found = ", ".join(itertools.islice(tags, _TAGS_SHOWN))
         raise MediaError(
             f"{name}: its tags must give one positive number of metres for a stored unit of depth, "
             f"found {found}: correct the tags, or pass DepthEncoding(unit_m=...)."

@@ -17,7 +17,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from io import FileIO
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -32,6 +32,7 @@ from stereogenbench_data.media.container import (
     VideoFile,
     merged_tags,
 )
+from stereogenbench_data.schema.text import shortened
 
 CODEC_NAME: Final = "blosc2"
 PACKED_SUFFIX: Final = ".b2frame"
@@ -211,9 +212,9 @@ def parse_header(header: bytes, *, file_bytes: int, name: str) -> FrameHeader:
         sizes, crc32s = (tuple(map(int, description[key])) for key in ("sizes", "crc32s"))
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise _unfit(
-            name, f"its description of itself is malformed or incomplete ({error!r})"
+            name, f"its description of itself is malformed or incomplete ({shortened(repr(error))})"
         ) from error
-    offsets = tuple(size + sum(sizes[:number]) for number in range(len(sizes)))
+    offsets = tuple(accumulate(sizes, initial=size))[:-1]
     expected = (len(sizes) * clip.frame_bytes, sum(sizes), UNIT_BYTES, clip.frame_bytes)
     found = (units, chunks, typesize, chunk_bytes)
     counts = {len(sizes), len(crc32s), len(clip.pts)}

@@ -5,6 +5,7 @@ the file is checked too. `Problems.require_none` then raises one error with all 
 calls it before it returns anything.
 """
 
+import functools
 import json
 import math
 import re
@@ -14,12 +15,15 @@ from typing import Any, Final, TypeGuard
 from stereogenbench_data.errors import SchemaError
 from stereogenbench_data.schema.release import CAMERA_COUNT
 from stereogenbench_data.schema.spellings import KNOWN_KEYS, LOOKALIKES, SPELLINGS
+from stereogenbench_data.schema.text import shortened
 
 MAX_TEXT_BYTES: Final = 32 * 2**20
 """The largest metadata file that is read. The release's largest is a third of a megabyte."""
 
+MOST_LETTERS: Final = 2**16
+"""The longest text of a metadata file or an index that is read; captions have some hundreds."""
+
 _SHOWN: Final = 20
-_BRIEF_LENGTH: Final = 60
 _LARGEST_INT: Final = 2**53
 _PLAIN_KEY: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _CAMERA_NAME: Final = re.compile(r"[Cc]am_?([0-9]{1,6})\Z")
@@ -76,8 +80,7 @@ def parse_object(text: bytes, *, where: str) -> dict[str, Any]:
     def keep_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         kept = dict(pairs)
         if len(kept) != len(pairs):
-            keys = [key for key, _ in pairs]
-            repeated.append((kept, next(key for key in keys if keys.count(key) > 1)))
+            repeated.append((kept, _first_repeated(pairs)))
         return kept
 
     try:
@@ -113,18 +116,32 @@ def parse_object(text: bytes, *, where: str) -> dict[str, Any]:
     return document
 
 
+def _first_repeated(pairs: list[tuple[str, Any]]) -> str:
+    places = {key: place for place, (key, _) in enumerate(pairs)}
+    return next(key for place, (key, _) in enumerate(pairs) if places[key] != place)
+
+
 def _path_of(document: object, wanted: object) -> str:
     """Return the JSON path of an element that is known to be in the document, by identity."""
-    waiting = [("$", document)]
+    parents: dict[int, tuple[int, str | int]] = {}
+    waiting = [document]
     while waiting:
-        path, value = waiting.pop()
-        if value is wanted:
-            return path
-        if isinstance(value, dict):
-            waiting += [(child_path(path, key), child) for key, child in value.items()]
-        elif isinstance(value, list):
-            waiting += [(child_path(path, place), child) for place, child in enumerate(value)]
-    return "$..."
+        holder = waiting.pop()
+        if holder is wanted:
+            break
+        if isinstance(holder, dict | list):
+            children = holder.items() if isinstance(holder, dict) else enumerate(holder)
+            for key, child in children:
+                if isinstance(child, dict | list):
+                    parents[id(child)] = id(holder), key
+                    waiting.append(child)
+    else:
+        return "$..."
+    keys, place = [], id(wanted)
+    while place in parents:
+        place, key = parents[place]
+        keys.append(key)
+    return functools.reduce(child_path, reversed(keys), "$")
 
 
 def child_path(path: str, key: str | int) -> str:
@@ -135,6 +152,7 @@ def child_path(path: str, key: str | int) -> str:
     """
     if isinstance(key, int):
         return f"{path}[{key}]"
+    key = shortened(key)
     return f"{path}.{key}" if _PLAIN_KEY.match(key) else f"{path}[{json.dumps(key)}]"
 
 
@@ -144,8 +162,7 @@ def brief(value: object) -> str:
         return f"an object with {len(value)} keys ({_keys(value)})" if value else "an empty object"
     if isinstance(value, list):
         return f"a list of {len(value)}"
-    shown = "null" if value is None else repr(value)
-    return shown if len(shown) <= _BRIEF_LENGTH else f"{shown[: _BRIEF_LENGTH - 3]}..."
+    return "null" if value is None else shortened(repr(value))
 
 
 def _keys(document: dict[str, object]) -> str:
@@ -153,7 +170,7 @@ def _keys(document: dict[str, object]) -> str:
     keys = sorted(document)
     more = f", and {len(keys) - _SHOWN} more" if len(keys) > _SHOWN else ""
     plain = (key if key.isascii() and key.isprintable() else ascii(key) for key in keys[:_SHOWN])
-    return ", ".join(key[:_BRIEF_LENGTH] for key in plain) + more or "none"
+    return ", ".join(map(shortened, plain)) + more or "none"
 
 
 class Problems:
@@ -229,14 +246,17 @@ class JsonValue:
             return found
         inner = [self.child(key) for key in self.value if isinstance(self.value[key], dict)]
         for holder in (self, *inner):
-            for key, value in holder.value.items():
-                snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", key).lower()
-                looks_alike = key not in KNOWN_KEYS and LOOKALIKES[quantity].search(snake)
-                if value is not None and looks_alike:
-                    holder.child(key).complain(
-                        f"is not a known key and may stand for {SPELLINGS[quantity][0]}. Rename "
-                        f"or remove it; the keys here are: {_keys(holder.value)}"
-                    )
+            alike = [
+                holder.child(key)
+                for key, value in holder.value.items()
+                if value is not None and key not in KNOWN_KEYS and _may_be(quantity, key)
+            ]
+            keys = _keys(holder.value) if alike else ""
+            for each in alike:
+                each.complain(
+                    f"is not a known key and may stand for {SPELLINGS[quantity][0]}. Rename "
+                    f"or remove it; the keys here are: {keys}"
+                )
         return None
 
     def find_text(self, quantity: str) -> str | None:
@@ -306,6 +326,9 @@ class JsonValue:
         if not isinstance(self.value, str):
             self.complain(f"must be a text, found {brief(self.value)}")
             return ""
+        if len(self.value) > MOST_LETTERS:
+            self.complain(f"may have {MOST_LETTERS:,} letters, found {len(self.value):,}")
+            return ""
         if any("\ud800" <= letter <= "\udfff" for letter in self.value):
             self.complain(f"contains half a character (a lone surrogate): {brief(self.value)}")
             return ""
@@ -330,6 +353,11 @@ class JsonValue:
         if isinstance(self.value, dict) and all(name in self.value for name in names):
             return [self.value[name] for name in names]
         return None
+
+
+def _may_be(quantity: str, key: str) -> bool:
+    snake = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", key).lower()
+    return LOOKALIKES[quantity].search(snake) is not None
 
 
 def is_number(value: object) -> TypeGuard[int | float]:

@@ -19,9 +19,12 @@ from stereogenbench_data.schema.release import (
     subset_of_folder,
 )
 from stereogenbench_data.schema.spellings import UNITS_M
+from stereogenbench_data.schema.text import shortened
 
 _FOLDER: Final = re.compile(r"[!-\-0-\[\]-~](?:[ -\-0-\[\]-~]*[!-\-0-\[\]-~])?\Z")
 """Printable ASCII without dot, slash and backslash, and without a space at either end."""
+
+_KEY_SHOWN: Final = 300
 
 _AGREEMENT: Final = 1e-6
 """How far two records of one baseline may differ, relative: ten float32 roundings."""
@@ -47,26 +50,26 @@ def parse_scene_key(key: str) -> SceneId:
     >>> parse_scene_key("eval/MapSeenInTrain/Uniform/Car_Dealer/scene_000000").subset
     'seen_map'
     """
-    folders = key.split("/")
+    folders, shown = key.split("/"), shortened(key, _KEY_SHOWN)
     if "." in key:
         raise SchemaError(
-            f"scene {key!r}: a folder name contains a dot, which would end the scene's key "
+            f"scene {shown!r}: a folder name contains a dot, which would end the scene's key "
             f"in a tar shard. Rename the folder."
         )
     bad = next((folder for folder in folders if not _FOLDER.match(folder)), None)
     if bad is not None:
         raise SchemaError(
-            f"scene {key!r}: {bad!r} is not a valid folder name: use printable ASCII without a "
-            f"backslash, and without a space at either end. Rename the folder."
+            f"scene {shown!r}: {shortened(bad)!r} is not a valid folder name: use printable ASCII "
+            f"without a backslash, and without a space at either end. Rename the folder."
         )
     if folders[0] == "train" and len(folders) == 4:
         return SceneId(key, "train", None, folders[1], folders[2])
     if folders[0] == "eval" and len(folders) == 5:
         return SceneId(key, "eval", subset_of_folder(folders[1]), folders[2], folders[3])
     raise SchemaError(
-        f"scene {key!r}: a scene's path must be train/<family>/<map>/<scene> or "
+        f"scene {shown!r}: a scene's path must be train/<family>/<map>/<scene> or "
         f"eval/<subset>/<family>/<map>/<scene>, found {len(folders)} folders "
-        f"that start with {folders[0]!r}. Name the scene by its path below the root."
+        f"that start with {shortened(folders[0])!r}. Name the scene by its path below the root."
     )
 
 

@@ -10,6 +10,15 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
+def shortened(text: str, most: int = 60) -> str:
+    """Return a text of the data as a message holds it: its first letters, if it is long.
+
+    >>> shortened("scene_000041"), shortened("x" * 99, 8)
+    ('scene_000041', 'xxxxx...')
+    """
+    return text if len(text) <= most else f"{text[: most - 3]}..."
+
+
 def markdown_text(text: str) -> str:
     r"""Return text from the data as Markdown that shows it literally, also in a table cell.
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Int64
 
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.text import counted
+from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.selection.options import nearest_first
 
 Range = tuple[float, float]
@@ -60,6 +60,7 @@ _TEXT_COLUMNS = {
 }
 _RANGE_COLUMNS = ("focal_mm", "valid_depth_ratio")
 _MOST_VALUES = 12
+_LONGEST_SHOWN = 255
 _PLAIN = re.compile(r"[\w./@+:-]+")
 """A value that needs no quotes in a message."""
 _MOST_KEYS = 6
@@ -149,7 +150,8 @@ def _quoted(value: Any) -> str:
     """Return a value as text, in quotes if spaces or odd characters are in it."""
     if isinstance(value, int | float):
         return f"{value:g}"
-    return value if isinstance(value, str) and _PLAIN.fullmatch(value) else repr(value)
+    is_plain = isinstance(value, str) and _PLAIN.fullmatch(value)
+    return shortened(value if is_plain else repr(value), _LONGEST_SHOWN)
 
 
 def _whole_keys(index: SceneIndex, names: list[str]) -> list[str]:
@@ -233,12 +235,12 @@ def find_scene(index: SceneIndex, text: str) -> int:
             return matches[0]
         if matches:
             raise SelectionError(
-                f"{text!r} is a part of {len(matches)} keys: "
+                f"{shortened(text)!r} is a part of {len(matches)} keys: "
                 f"{_first_keys([keys[row] for row in matches])}. Give more of the key."
             )
     near = _near_keys(wanted, keys)
     raise SelectionError(
-        f"{text!r} is not a key of {counted(len(keys), 'scene')}, nor a part of one. "
+        f"{shortened(text)!r} is not a key of {counted(len(keys), 'scene')}, nor a part of one. "
         + (f"Did you mean {_first_keys(near)}?" if near else f"There is {_first_keys(keys)}.")
         + stale_note(index)
     )

@@ -12,6 +12,7 @@ from typing import Final
 from urllib.parse import SplitResult, quote, unquote, urlsplit, urlunsplit
 
 from stereogenbench_data.errors import StorageError, url_without_secrets
+from stereogenbench_data.schema.text import shortened
 
 WEB_SCHEMES: Final = ("http", "https")
 FILE_SCHEMES: Final = ("https", "http", "hf", "s3")
@@ -81,8 +82,8 @@ def joined(root: str, path: str) -> str:
     """
     if "::" in path:
         raise StorageError(
-            f"{shown(root)}: holds {path!r}, and a name with '::' in it would open another file "
-            f"system. Rename it."
+            f"{shown(root)}: holds {shortened(path)!r}, and a name with '::' in it would open "
+            f"another file system. Rename it."
         )
     if is_web(root):
         parts = split_url(root)

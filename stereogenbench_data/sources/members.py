@@ -15,6 +15,7 @@ from stereogenbench_data.errors import ShardError, StorageError, explain_os_erro
 from stereogenbench_data.media.seek_table import Position, SeekTable, parse_tables
 from stereogenbench_data.schema.document import require_text_size
 from stereogenbench_data.schema.records import Member, Scene, ShardFacts
+from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.sources.cache import ShardCache
 from stereogenbench_data.sources.fetch_ahead import FetchAhead, Wanted
 from stereogenbench_data.sources.location import is_remote, joined, local_path, shown
@@ -389,8 +390,8 @@ def require_own_files(root: str | Path, paths: Iterable[str]) -> None:
 def _require_safe(member: Member) -> None:
     if re.search(UNSAFE_PATH, member.path):
         raise StorageError(
-            f"{member.path!r}: a member's path is relative to the data's root and stays inside "
-            f"it. The index was not made by this package: run `stereogenbench index` again."
+            f"{shortened(member.path)!r}: a member's path is relative to the data's root and stays "
+            f"inside it. The index was not made by this package: run `stereogenbench index` again."
         )
 
 

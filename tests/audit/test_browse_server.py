@@ -160,6 +160,26 @@ def test_a_name_that_was_made_to_point_here_is_refused(server, host):
     assert b"another host" in content
 
 
+def test_a_request_of_40000_letters_is_refused_in_few_words(server):
+    status, content, _ = ask(server, f"/left.jpg?key={'a' * 40_000}")
+
+    assert status == 414
+    assert len(content) < 200
+
+
+def test_a_long_name_in_a_request_comes_back_shortened(server):
+    status, content, _ = ask(server, f"/api/scene?key={'a' * 10_000}")
+
+    assert status == 400
+    assert b"aaa...' is not a key of" in content
+    assert len(content) < 500
+
+
+@pytest.mark.parametrize("target", ["http://[", "http://[::1/"])
+def test_a_malformed_target_is_answered_with_400(server, target):
+    assert ask(server, target)[0] == 400
+
+
 def test_localhost_is_its_name_too(server):
     host = f"localhost:{server.server_address[1]}"
 

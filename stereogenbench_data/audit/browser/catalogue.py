@@ -15,6 +15,7 @@ from stereogenbench_data.geometry.camera import rig_intrinsics
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.records import DepthEncoding, Scene
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
+from stereogenbench_data.schema.text import shortened
 from stereogenbench_data.selection.filters import filter_scenes, find_scene
 from stereogenbench_data.selection.pairs import PairList, baselines_cm, choose_pairs, in_bin
 
@@ -76,7 +77,8 @@ def parse_choice(query: Mapping[str, list[str]]) -> Choice:
     if unknown or pairs not in get_args(PairKind):
         known = BASELINE_BINS if unknown else get_args(PairKind)
         raise SelectionError(
-            f"there is no choice {(unknown or [pairs])[0]!r}: choose among {', '.join(known)}."
+            f"there is no choice {shortened((unknown or [pairs])[0])!r}: choose among "
+            f"{', '.join(known)}."
         )
     return Choice(
         texts=texts,
@@ -95,9 +97,9 @@ def _range(query: Mapping[str, list[str]], name: str) -> tuple[float, float] | N
         try:
             ends.append(float(text) if text else default)
         except ValueError:
-            raise SelectionError(f"{name} must be of numbers, got {text!r}.") from None
+            raise SelectionError(f"{name} must be of numbers, got {shortened(text)!r}.") from None
         if not math.isfinite(ends[-1]):
-            raise SelectionError(f"{name} must be of finite numbers, got {text!r}.")
+            raise SelectionError(f"{name} must be of finite numbers, got {shortened(text)!r}.")
         if ends[-1].is_integer():
             ends[-1] = int(ends[-1])
     return None if ends == [0.0, 1e6] else (ends[0], ends[1])
@@ -144,7 +146,9 @@ class Catalogue:
             SelectionError: If there is no such scene.
         """
         if key not in self._row_of:
-            raise SelectionError(f"{key!r} is not the key of any of {len(self.index)} scenes.")
+            raise SelectionError(
+                f"{shortened(key)!r} is not the key of any of {len(self.index)} scenes."
+            )
         return self._row_of[key]
 
     def about(self) -> dict[str, Any]:

@@ -27,6 +27,8 @@ _HEADERS: Final = {
     "X-Frame-Options": "DENY",
 }
 _MOST_CONNECTIONS: Final = 64
+_LONGEST_REQUEST: Final = 16_384
+"""Letters of a path with its query; the page's longest have a few thousand."""
 _SILENT_S: Final = 20
 """How long a connection may send nothing, or leave a response unread."""
 _LEAST_WAIT_S: Final = 0.25
@@ -154,8 +156,11 @@ class _Handler(BaseHTTPRequestHandler):
         if refusal:
             self.close_connection = True
             return HTTPStatus.FORBIDDEN, _error(refusal)
-        parts = urlsplit(self.path)
+        if len(self.path) > _LONGEST_REQUEST:
+            self.close_connection = True
+            return HTTPStatus.REQUEST_URI_TOO_LONG, _error("the request is too long")
         try:
+            parts = urlsplit(self.path)
             query = parse_qs(parts.query, max_num_fields=200, errors="strict")
             response = self.server.service.answer(parts.path, query)
         except SelectionError as error:

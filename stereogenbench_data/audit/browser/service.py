@@ -16,6 +16,7 @@ from stereogenbench_data.audit.pictures.scene_pictures import HIDDEN
 from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.samples.picture import COLOUR_STOPS, NOT_MEASURED
+from stereogenbench_data.schema.text import shortened
 
 Query = Mapping[str, list[str]]
 
@@ -138,5 +139,5 @@ def _text(query: Query, name: str) -> str:
 def _whole(query: Query, name: str) -> int:
     text = _text(query, name)
     if not (text.isascii() and text.isdecimal() and len(text) < 10):
-        raise SelectionError(f"{name} must be a whole number, got {text[:40]!r}.")
+        raise SelectionError(f"{name} must be a whole number, got {shortened(text)!r}.")
     return int(text)

@@ -1,0 +1,136 @@
+"""Texts of any length: the work grows with their length, and messages hold their start.
+
+A text here would take hours if the work grew with its square.
+"""
+
+import pytest
+
+from stereogenbench_data.errors import SchemaError, StereoGenBenchError, url_without_secrets
+from stereogenbench_data.schema.parse import parse_description, parse_scene_key
+from tests.hostile import run_bounded
+
+MANY = 2_000_000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "'a' * {many}",
+        "'a.' * {many}",
+        "'a::' * {many}",
+        "'http://' + 'a::' * {many}",
+        "'a:' * {many}",
+        "'http://h/' + 'a:' * {many}",
+        "'https://' + '@' * {many}",
+        "'http:/' * {many}",
+    ],
+)
+def test_a_message_of_any_length_is_searched_for_urls_once(text):
+    told = run_bounded(
+        "from stereogenbench_data.errors import StereoGenBenchError\n"
+        f"text = {text.format(many=MANY)}\n"
+        "print(len(str(StereoGenBenchError(text))) <= len(text))"
+    )
+
+    assert told == "True\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("at zip://a::https://me:word@host/b?key=1 now", "at zip://a::https://host/b now"),
+        ("'s3://me:word@bucket/a'", "'s3://bucket/a'"),
+        ("a::b::https://me:word@host", "a::b::https://host"),
+        ("1https://me:word@host", "1https://host"),
+        ("file:///a?b", "file:///a?b"),
+        ("<hf://datasets/a/b@main>", "<hf://datasets/a/b@main>"),
+    ],
+)
+def test_urls_in_a_message_are_shown_without_secrets(text, shown):
+    assert str(StereoGenBenchError(text)) == shown
+
+
+def test_a_chain_of_many_file_systems_keeps_no_secret():
+    chain = "a::" * 50 + "https://me:word@host/b?key=1"
+
+    assert url_without_secrets(chain) == "a::" * 50 + "https://host/b"
+
+
+def test_keys_that_are_all_written_twice_are_counted_once():
+    told = run_bounded(
+        "from stereogenbench_data.schema.document import parse_object\n"
+        "text = '{' + ','.join(f'\"k{n // 2}\":1' for n in range(1_000_000)) + '}'\n"
+        "try:\n"
+        "    parse_object(text.encode(), where='a.json')\n"
+        "except ValueError as error:\n"
+        "    print(error)"
+    )
+
+    assert told.startswith("a.json: $.k0 is written twice")
+
+
+def test_the_path_of_a_repeated_key_is_sought_without_the_paths_of_all_others():
+    told = run_bounded(
+        "from stereogenbench_data.schema.document import parse_object\n"
+        "text = '{\"' + 'k' * 4_000_000 + '\": [' + '[],' * 500_000 + '{\"a\":1,\"a\":2}]}'\n"
+        "# bounded\n"
+        "try:\n"
+        "    parse_object(text.encode(), where='a.json')\n"
+        "except ValueError as error:\n"
+        "    print(error)",
+        memory_mb=1000,
+    )
+
+    assert 'kkk..."][500000].a is written twice' in told
+    assert len(told) < 300
+
+
+def test_the_places_of_a_million_packed_frames_are_added_up_once():
+    told = run_bounded(
+        "import json, zlib\n"
+        "from stereogenbench_data.media import depth_frames as packed\n"
+        "clip = dict(width_px=2, height_px=2, codec='ffv1', pixel_format='gray16le')\n"
+        "clip |= dict(rate=[15, 1], time_base=[1, 1000], pts=[0], tags={}, stream_tags={})\n"
+        "many = [0] * 1_000_000\n"
+        "text = json.dumps({'format': 1, 'clip': clip, 'sizes': many, 'crc32s': many}).encode()\n"
+        "layer = zlib.crc32(text).to_bytes(4, 'big') + text\n"
+        "layer = bytes(5) + b'\\xc6' + len(layer).to_bytes(4, 'big') + layer\n"
+        "start = packed._NAME_AT + len(packed._NAME) + packed._LAYER_AT.size\n"
+        "fixed = packed._FIXED.pack(b'', 0, 9, 0, 0, 0, 0, 0, 0, 0, b'').ljust(packed._NAME_AT)\n"
+        "header = fixed + packed._NAME + packed._LAYER_AT.pack(start) + layer\n"
+        "try:\n"
+        "    packed.parse_header(header, file_bytes=9, name='a.b2frame')\n"
+        "except ValueError as error:\n"
+        "    print(error)"
+    )
+
+    assert "a.b2frame: is not depth that this package packed" in told
+    assert "bytes of units, chunks, unit, frame" in told
+
+
+def test_many_unknown_keys_that_may_be_a_caption_are_listed_once():
+    told = run_bounded(
+        "from stereogenbench_data.schema.parse import parse_description\n"
+        "text = '{' + ','.join(f'\"caption{n}\":1' for n in range(200_000)) + '}'\n"
+        "try:\n"
+        "    parse_description(text.encode(), where='a.json')\n"
+        "except ValueError as error:\n"
+        "    print(error)"
+    )
+
+    assert "a.json: 400000 problems" in told
+    assert len(told) < 5000
+
+
+def test_a_scene_with_a_long_name_is_refused_in_few_words():
+    with pytest.raises(SchemaError, match=r"scene 'train/Uniform/xxx") as refused:
+        parse_scene_key(f"train/Uniform/{'x' * 100_000}.y/scene")
+
+    assert len(str(refused.value)) < 1000
+
+
+def test_a_long_text_of_a_metadata_file_is_refused_with_its_length():
+    text = b'{"short_caption": "' + b"x" * 70_000 + b'"}'
+
+    with pytest.raises(SchemaError, match=r"short_caption: may have 65,536 letters, found 70,000"):
+        parse_description(text, where="a.json")
