@@ -417,7 +417,8 @@ def _require_numbers(table: pa.Table, members: Any, *, where: str) -> None:
         flat = numbers[name].ravel()
         odd = flat[~((flat >= least) & (flat <= most))]
         if len(odd):
-            raise _odd(where, name, odd[0].item(), f"not {least:g} to {most:g}")
+            bounds = [each if isinstance(each, int) else f"{each:g}" for each in (least, most)]
+            raise _odd(where, name, odd[0].item(), f"not {bounds[0]} to {bounds[1]}")
     if pc.any(pc.equal(table.column("primary_left"), table.column("primary_right"))).as_py():
         raise StorageError(f"{where}: a primary pair has a camera twice. {made_again(where)}")
     _require_key_frames(table, where=where)

@@ -39,7 +39,9 @@ def is_web(location: str) -> bool:
 
 
 def local_path(location: str | Path) -> Path:
-    """Return a local location as an absolute path, ``~`` expanded; a ``file://`` URL is one too.
+    """Return a local location as an absolute path; a ``file://`` URL is one too.
+
+    ``~`` and ``~name`` are a home only where no folder or file has that name.
 
     Raises:
         StorageError: If it is an empty text, as of a variable of a shell that is not set.
@@ -48,7 +50,13 @@ def local_path(location: str | Path) -> Path:
         raise StorageError("the path is empty: name a file or folder, or . for this folder.")
     if _is_file_url(location):
         return Path(unquote(split_url(str(location)).path))
-    return Path(location).expanduser().absolute()
+    path = Path(location)
+    if not str(location).startswith("~") or Path(path.parts[0]).exists():
+        return path.absolute()
+    try:
+        return path.expanduser().absolute()
+    except RuntimeError:
+        raise StorageError(f"{path}: there is neither such a folder nor such a user.") from None
 
 
 def _is_file_url(location: str | Path) -> bool:

@@ -289,8 +289,27 @@ def test_the_command_writes_and_checks(small_shards, tmp_path):
     assert "rai:dataBiases: is missing" in found.output
 
 
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000])
+def test_deep_nesting_is_refused_by_name(tmp_path, text):
+    (tmp_path / "data.json").write_text(text)
+
+    with pytest.raises(DescriptorError, match=r"data\.json: .* nested hundreds of levels deep"):
+        check_descriptor(tmp_path / "data.json")
+
+
 @pytest.mark.parametrize(
-    "place", ["/etc/passwd", "/x.tar", "~/x.tar", "../secret", "a\\b.tar", "c:x.tar", "\0.tar"]
+    "place",
+    [
+        "/etc/passwd",
+        "/x.tar",
+        "~/x.tar",
+        "../secret",
+        "a\\b.tar",
+        "c:x.tar",
+        "\0.tar",
+        "file:///etc/passwd",
+        "FILE:///x.tar",
+    ],
 )
 def test_a_path_outside_the_data_is_not_read(written, place):
     document = json.loads(written.read_text())

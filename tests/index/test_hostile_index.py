@@ -1,5 +1,6 @@
 """Index files that somebody made to take time or memory."""
 
+import dataclasses
 import json
 
 import pyarrow as pa
@@ -8,6 +9,7 @@ import pytest
 
 from stereogenbench_data.errors import StorageError
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.records import Member
 from tests.hostile import run_bounded
 from tests.index.test_table import METADATA, scene_of
 
@@ -133,3 +135,11 @@ def test_reasons_of_any_length_are_listed_by_their_start(file):
         SceneIndex.open(file)
 
     assert len(str(told[0].message)) < 60_000
+
+
+def test_a_size_above_the_bound_is_shown_beside_the_bound_in_full(tmp_path):
+    scene = scene_of(0)
+    members = {"a.mp4": Member("a.mp4", 0, 2**61 + 1)}
+
+    with pytest.raises(StorageError, match="size is 2305843009213693953, not 0 to 230584300921369"):
+        SceneIndex.from_scenes([dataclasses.replace(scene, members=members)], tmp_path)

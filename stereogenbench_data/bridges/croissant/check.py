@@ -127,6 +127,11 @@ def check_descriptor(path: Path, *, mapping: Mapping[str, Path] | None = None) -
     """
     try:
         node = json.loads(path.read_bytes())
+    except RecursionError as error:
+        raise DescriptorError(
+            f"{path}: lists or objects are nested hundreds of levels deep. Name a descriptor, such "
+            f"as croissant.json."
+        ) from error
     except (OSError, ValueError) as error:
         raise DescriptorError(
             f"{path}: cannot be read as JSON ({error}). Name a descriptor, such as croissant.json."
@@ -138,7 +143,7 @@ def check_descriptor(path: Path, *, mapping: Mapping[str, Path] | None = None) -
     check = _Check(node, path.parent, mapping or {})
     try:
         check.run()
-    except (AttributeError, TypeError) as error:
+    except (AttributeError, RecursionError, TypeError) as error:
         check.report(
             path.name, f"does not have the structure of a descriptor ({error}): write it again"
         )
@@ -376,7 +381,7 @@ class _Check:
     def _check_local_file(self, name: str, file: Node) -> None:
         path, url = self._local(file), str(file["contentUrl"])
         if path is None:
-            if "://" not in url:
+            if "://" not in url or url[:5].lower() == "file:":
                 self.report(
                     name,
                     f"has the contentUrl {url!r}, and a path must be relative and end in "
