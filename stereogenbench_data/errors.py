@@ -96,6 +96,7 @@ def text_without_secrets(text: str) -> str:
 _CURES: Final = {
     errno.ENOSPC: "Make room, or choose another place.",
     errno.EDQUOT: "Make room, or choose another place.",
+    errno.ENAMETOOLONG: "Choose a shorter name.",
     errno.EFBIG: "Choose a place that takes files of this size.",
     errno.EROFS: "Choose a place that can be written.",
     errno.EMFILE: "Raise the limit of open files (`ulimit -n`), or use fewer workers.",

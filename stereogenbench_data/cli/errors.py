@@ -12,7 +12,7 @@ from typing import Final, TextIO
 import typer
 
 from stereogenbench_data.cli.signals import STOPPED
-from stereogenbench_data.errors import StereoGenBenchError, describe_os_error
+from stereogenbench_data.errors import DISK_FULL, StereoGenBenchError, describe_os_error
 from stereogenbench_data.schema.text import plain_line
 
 FINDINGS: Final = 1
@@ -105,10 +105,11 @@ def _message(error: BaseException) -> str:
     if isinstance(error, StereoGenBenchError):
         return f"{type(error).__name__}: {error}"
     if isinstance(error, OSError) and error.errno is not None:
-        where = f": {error.filename}" if error.filename else ""
-        return describe_os_error(
-            f"{type(error).__name__}{where}", error, _CURES.get(error.errno, "")
-        )
+        kind = "StorageError" if type(error) is OSError else type(error).__name__
+        is_output = not error.filename and error.errno in DISK_FULL
+        where = error.filename or ("the output cannot be written" if is_output else "")
+        what = f"{kind}: {where}" if where else kind
+        return describe_os_error(what, error, _CURES.get(error.errno, ""))
     if isinstance(error, MemoryError):
         return "MemoryError: memory is short. Use fewer workers or smaller pictures."
     by_typer = isinstance(error, typer.Exit | typer.Abort | EOFError)

@@ -45,7 +45,10 @@ def reported(error, capsys):
         (
             OSError(errno.ENOSPC, "No space left on device"),
             2,
-            ["OSError (No space left on device). Make room, or choose another place."],
+            [
+                "StorageError: the output cannot be written (No space left on device). "
+                "Make room, or choose another place."
+            ],
         ),
         (
             MemoryError(),
@@ -105,7 +108,9 @@ def test_a_full_disk_is_reported(small_shards, tmp_path):
     assert shown.exit_code == 2
     assert "sheet.png (No space left on device). Make room" in shown.stderr
     assert printed.returncode == 2
-    assert printed.stderr.startswith("OSError (No space left on device). Make room")
+    assert printed.stderr.startswith(
+        "StorageError: the output cannot be written (No space left on device). Make room"
+    )
     assert len(printed.stderr.splitlines()) == 1
 
 
@@ -191,3 +196,10 @@ def test_a_value_of_another_type_is_quoted_as_it_was_typed(words, quoted):
 
     assert ended.exit_code == 2
     assert f"Invalid value for '{words[2]}': {quoted}" in one_line(ended.stderr)
+
+
+def test_a_name_of_300_letters_is_refused_with_a_cure(tmp_path):
+    printed = invoke("index", str(tmp_path / ("x" * 300)))
+
+    assert printed.exit_code == 2
+    assert "File name too long). Choose a shorter name." in printed.output
