@@ -56,7 +56,7 @@ _MOST_PLANNED: Final = 16_384
 _PREFETCHED: Final = 2
 """Batches that torch has each worker load ahead."""
 
-_FEW_OPEN: Final[dict[str, Any]] = {"open_scenes": 2, "start": "beginning"}
+_FEW_OPEN: Final[dict[str, Any]] = {"open_scenes": 2}
 """The order in which a part of a long epoch is measured: scenes are opened all the time."""
 
 _SHORT: Final = 6
