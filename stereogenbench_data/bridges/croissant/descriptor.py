@@ -122,9 +122,9 @@ def write_descriptor(
         data_url = publication.data_url or dataset_facts.HOME
         files, records = release_nodes(repository_url=data_url)
     if index is not None and index.is_derived:
-        facts |= _derived(index, facts)
+        facts = facts | _derived(index, facts)
     elif index is not None and index.shards:
-        facts |= _packed(index, facts)
+        facts = facts | _packed(index, facts)
     head = _head(facts, publication, url=_page(data_url, beside=path))
     descriptor = head | {"distribution": files, "recordSet": records}
     write_node(descriptor, path)
