@@ -179,7 +179,7 @@ def _derived(
     chunk_pixels = _CHUNK_PIXELS_ELSEWHERE
     if moments.units.device.type == "cpu" and not torch.compiler.is_compiling():
         chunk_pixels = _CHUNK_PIXELS
-    step = max(1, chunk_pixels // (count * frames * height_px * width_px))
+    step = max(1, chunk_pixels // max(1, count * frames * height_px * width_px))
     made: dict[str, torch.Tensor] = {}
     for start in range(0, len(places), step):
         chunk = places[start : start + step]
@@ -213,6 +213,10 @@ class _Contract(NamedTuple):
     form: str
 
 
+_NO_SCENE: Final = _Contract("rectified", "planar", "depth")
+"""What an empty batch is taken for: its maps are empty, of the same shapes by any contract."""
+
+
 def _contracts(batch: Mapping[str, Any]) -> list[tuple[_Contract, list[int]]]:
     """Return the contracts of a batch's moments, and which have each. Texts: no device is asked."""
     names = ("rig", "depth_kind", "depth_form")
@@ -220,7 +224,7 @@ def _contracts(batch: Mapping[str, Any]) -> list[tuple[_Contract, list[int]]]:
     apart = [each for row, each in enumerate(texts) if each not in texts[:row]]
     return [
         (_Contract(*each), [row for row, other in enumerate(texts) if other == each])
-        for each in apart
+        for each in apart or [_NO_SCENE]
     ]
 
 
@@ -405,12 +409,19 @@ class _Direction:
         return _taken(self._moments.unit_m, self._sources)
 
     @_once
+    def known(self) -> torch.Tensor:
+        """Where disparity is known: depth was measured, and the point is ahead of the target."""
+        if self._contract.rig == "rectified":
+            return self.measured
+        return self.measured & torch.isfinite(self.projection.u_px)
+
+    @_once
     def disparity(self) -> torch.Tensor:
-        """Disparity in pixels, 0 where depth was not measured."""
+        """Disparity in pixels, 0 where it is not known."""
         if self._contract.rig != "rectified":
             width_px = self.measured.shape[-1]
             u_px = torch.arange(width_px, dtype=torch.float64, device=self.measured.device) + 0.5
-            moved = torch.where(self.measured, u_px - self.projection.u_px, 0.0)
+            moved = torch.where(self.known, u_px - self.projection.u_px, 0.0)
             return moved.to(torch.float32)
         if self._contract.kind == "ray":
             depth_m = torch.where(self.depth_m > 0, self.depth_m, torch.inf).to(torch.float64)
@@ -456,13 +467,13 @@ class _Direction:
         shift_px_m = _per_map(self.shift_px_m.abs())
         if self._contract.form == "inverse":
             half_step_px = shift_px_m / _per_map(self.unit_m) / 2
-            return self.measured * half_step_px.to(torch.float32)
+            return self.known * half_step_px.to(torch.float32)
         bound_px: torch.Tensor = error_bound_px(
             self.depth_m,
             shift_px_m=shift_px_m.to(torch.float32),
             half_step_m=(_per_map(self.unit_m) / 2).to(torch.float32),
         )
-        return bound_px
+        return bound_px if self._contract.rig == "rectified" else bound_px * self.known
 
     @property
     def visible_from_source(self) -> torch.Tensor:
@@ -521,14 +532,14 @@ _MAKERS: Final[dict[str, Callable[[_Direction, _Direction], torch.Tensor]]] = {
     "left": lambda ahead, back: ahead.picture,
     "right": lambda ahead, back: back.picture,
     "disparity": lambda ahead, back: ahead.disparity.unsqueeze(-3),
-    "valid": lambda ahead, back: ahead.measured.unsqueeze(-3),
+    "valid": lambda ahead, back: ahead.known.unsqueeze(-3),
     "visible": lambda ahead, back: ahead.visible(back).unsqueeze(-3),
     "visible_from_left": lambda ahead, back: ahead.visible_from_source.unsqueeze(-3),
     "disparity_error": lambda ahead, back: ahead.disparity_error.unsqueeze(-3),
     "depth": lambda ahead, back: ahead.depth_m.unsqueeze(-3),
     "depth_right": lambda ahead, back: back.depth_m.unsqueeze(-3),
     "disparity_right": lambda ahead, back: 0 - back.disparity.unsqueeze(-3),
-    "valid_right": lambda ahead, back: back.measured.unsqueeze(-3),
+    "valid_right": lambda ahead, back: back.known.unsqueeze(-3),
     "visible_right": lambda ahead, back: back.visible(ahead).unsqueeze(-3),
     "warped_right": lambda ahead, back: ahead.warped,
     "hole": lambda ahead, back: ahead.front[1].unsqueeze(-3),

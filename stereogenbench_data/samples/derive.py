@@ -152,8 +152,19 @@ class PairGeometry:
         return depth_m
 
     @cached_property
+    def known(self) -> MapBool:
+        """Where disparity is known: depth was measured, and the target's plane is behind the point.
+
+        Only on a rig that is not rectified can a point lie on or behind that plane, or at infinity.
+        """
+        if self._facts.is_rectified:
+            return self.stored.measured
+        projects: MapBool = np.isfinite(self.projection.u_px)
+        return projects & self.stored.measured
+
+    @cached_property
     def disparity(self) -> MapF32:
-        """Disparity in pixels, 0 where depth was not measured."""
+        """Disparity in pixels, 0 where it is not known."""
         disparity = np.empty(self.stored.units.shape, dtype=np.float32)
         self.write_disparity(disparity)
         return disparity
@@ -164,7 +175,7 @@ class PairGeometry:
             np.multiply(self.disparity, np.float32(sign), out=out)
         elif not self._facts.is_rectified:
             u_px = np.arange(self.depth_m.shape[-1]) + 0.5
-            moved = np.where(self.stored.measured, u_px - self.projection.u_px, 0)
+            moved = np.where(self.known, u_px - self.projection.u_px, 0)
             np.multiply(moved, sign, out=out, casting="same_kind")
         elif self.encoding.kind == "ray":
             rig = {"focal_px": self._views.intrinsics.fx_px, "baseline_m": self.baseline_m}
@@ -232,11 +243,11 @@ class PairGeometry:
 
     @cached_property
     def disparity_error(self) -> MapF32:
-        """How far quantised depth can put disparity off, in pixels; 0 where not measured."""
+        """How far quantised depth can put disparity off, in pixels; 0 where it is not known."""
         focal_px = self._views.intrinsics.fx_px
         if self.encoding.form == "inverse":
             half_step_px = focal_px * abs(self.baseline_m) / self.encoding.known_unit_m / 2
-            flat: MapF32 = self.stored.measured * np.float32(half_step_px)
+            flat: MapF32 = self.known * np.float32(half_step_px)
             return flat
         bound: MapF32 = disparity_error_px(
             self.depth_m,
@@ -244,7 +255,7 @@ class PairGeometry:
             baseline_m=self.baseline_m,
             quantum_m=self.encoding.known_unit_m,
         )
-        return bound
+        return bound if self._facts.is_rectified else bound * self.known
 
     @cached_property
     def visible_from_source(self) -> MapBool:
@@ -320,6 +331,20 @@ class PairSample:
     def backward(self) -> PairGeometry:
         """From the target to the source."""
         return PairGeometry(self.views, self.facts, source=self.target, target=self.views.source)
+
+    @cached_property
+    def valid(self) -> MapBool:
+        """Where the source's disparity to each target of the sample is known."""
+        if self.facts.is_rectified:
+            return self.forward.known
+        ways = [
+            self.forward
+            if target == self.target
+            else PairGeometry(self.views, self.facts, source=self.views.source, target=target)
+            for target in self.views.targets
+        ]
+        known: MapBool = np.logical_and.reduce([way.known for way in ways])
+        return known
 
     @property
     def to_each_view(self) -> list[PairGeometry]:

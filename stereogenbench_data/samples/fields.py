@@ -79,9 +79,10 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
         streams=SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
-        "valid", "bool", "(1,H,W)", "depth was measured there",
-        make=lambda s: s.forward.stored.measured[:, None],
-        streams=SOURCE_DEPTH,
+        "valid", "bool", "(1,H,W)",
+        "depth was measured there, and no second view has the point behind it",
+        make=lambda s: s.valid[:, None],
+        streams=SOURCE_DEPTH, needs_poses="unless rectified",
     ),
     Field(
         "visible", "bool", "(1,H,W)",
@@ -102,7 +103,7 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
         streams=SOURCE_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
-        "depth", "float32", "(1,H,W)", "m along the optical axis; 0 where not valid",
+        "depth", "float32", "(1,H,W)", "m along the optical axis; 0 where not measured",
         make=lambda s: s.forward.depth_m[:, None],
         streams=SOURCE_DEPTH,
     ),
@@ -113,14 +114,15 @@ PAIR_FIELDS: Final[dict[str, Field]] = _table(
     ),
     Field(
         "disparity_right", "float32", "(1,H,W)",
-        "of the second view's pixels, x_left = x_right + d",
+        "of the second view's pixels, x_left = x_right + d; 0 where not valid_right",
         write=lambda s, out: s.backward.write_disparity(out, sign=-1),
         streams=TARGET_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
-        "valid_right", "bool", "(1,H,W)", "depth of the second view was measured there",
-        make=lambda s: s.backward.stored.measured[:, None],
-        streams=TARGET_DEPTH, per_target=True,
+        "valid_right", "bool", "(1,H,W)",
+        "depth of the second view was measured there, and the first has the point ahead of it",
+        make=lambda s: s.backward.known[:, None],
+        streams=TARGET_DEPTH, needs_poses="unless rectified", per_target=True,
     ),
     Field(
         "visible_right", "bool", "(1,H,W)", "pixels of the second view that the first one sees",

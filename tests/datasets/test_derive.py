@@ -55,11 +55,13 @@ MASKS = ("valid", "visible", "visible_from_left", "valid_right", "visible_right"
 def scene(encoding, *, rig="rectified", seed=0):
     """Return the views of a scene of 6 cameras and 2 frames, of random depth, and its facts."""
     rng = np.random.default_rng(seed)
-    known = facts(encoding, residual_px=1.0 if rig == "posed" else 0.0)
+    known = facts(encoding, residual_px=0.0 if rig == "rectified" else 1.0)
     locations = np.zeros((len(FRAMES), 6, 3))
     locations[:, :, 1] = 100 * np.asarray(known.scene.lateral_m)
     locations += rng.normal(0, 3, locations.shape)
     turns = rng.normal(0, 0.5, locations.shape)
+    if rig == "turned apart":
+        turns[:, :, 1] += np.linspace(0, 85, 6)
     poses = CameraPoses.from_trajectory(Trajectory(locations, 0.01, turns, "rotator_deg"))
     units_m = [float(encoding.known_unit_m * ratio) for ratio in rng.choice([1.0, 2.5], 6)]
     known = replace(
@@ -146,6 +148,53 @@ def test_every_field_is_that_of_stereo_pairs(contract, rig):
     assert_equal(made, expected)
     for name in MASKS:
         assert 0.001 < made[name].float().mean() < 0.999, name
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered:RuntimeWarning")
+def test_points_behind_the_second_camera_are_not_valid_and_nothing_is_nan():
+    scenes = [scene(CONTRACTS["planar depth"], rig="turned apart", seed=seed) for seed in (1, 2)]
+
+    made = derive(batch_of(scenes), fields=DERIVED_FIELDS)
+
+    assert_equal(made, expected_of(scenes))
+    measured = made["depth"] > 0
+    assert (measured & ~made["valid"]).float().mean() > 0.01
+    for name in ("disparity", "disparity_right", "disparity_error"):
+        assert made[name].isfinite().all(), name
+    assert (made["disparity"][~made["valid"]] == 0).all()
+    assert (made["disparity_right"][~made["valid_right"]] == 0).all()
+
+
+def test_a_sweep_is_valid_where_every_second_camera_has_the_point_ahead():
+    views, known = scene(CONTRACTS["planar depth"], rig="turned apart")
+    one = [
+        written(replace(views, targets=(target,)), known, kind="pairs", fields=("valid",))["valid"]
+        for target in views.targets
+    ]
+
+    request = Request(kind="pairs", fields=("valid", "disparity"), layout="stacked")
+    address = Address(0, views.source, views.targets, FRAMES)
+    writer = SampleWriter(request, address, clip="clip", allocate=new_array)
+    writer.write(views, known, slice(0, len(FRAMES)))
+
+    assert np.array_equal(writer.sample["valid"], np.logical_and.reduce([v.numpy() for v in one]))
+    assert not np.array_equal(one[0], one[-1])
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_an_empty_batch_gives_empty_maps_of_the_right_shapes(frames):
+    batch = batch_of([scene(CONTRACTS["planar depth"])])
+    if frames == 1:
+        per_frame = ("stored_depth", "cams_from_cam", "image")
+        batch |= {name: batch[name][:, :, 0] for name in per_frame}
+    whole = derive(batch, fields=DERIVED_FIELDS)
+
+    empty = derive({name: values[:0] for name, values in batch.items()}, fields=DERIVED_FIELDS)
+
+    assert {name: v.shape for name, v in empty.items()} == {
+        name: (0, *v.shape[1:]) for name, v in whole.items()
+    }
+    assert {name: v.dtype for name, v in empty.items()} == {n: v.dtype for n, v in whole.items()}
 
 
 @pytest.mark.parametrize("cx_px", [20.0, 20.3])

@@ -8,7 +8,7 @@ import pytest
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.geometry.camera import Intrinsics
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.samples.derive import PairGeometry, SceneFacts
+from stereogenbench_data.samples.derive import PairGeometry, PairSample, SceneFacts
 from stereogenbench_data.samples.views import StoredDepth, Views
 from stereogenbench_data.schema.records import (
     DepthEncoding,
@@ -125,6 +125,29 @@ def test_a_turned_camera_moves_pixels_as_its_homography_says():
 
     # far away only the turn of one degree to the right counts, at the centre f tan(1 degree)
     assert pair.disparity[0, 10, 20] == pytest.approx(100 * np.tan(np.pi / 180), rel=0.01)
+
+
+@pytest.mark.parametrize("form", ["depth", "inverse"])
+def test_a_point_behind_the_other_camera_is_not_valid_and_has_no_disparity(form):
+    units = some_units()
+    encoding = DepthEncoding(0.1) if form == "depth" else DepthEncoding(500.0, form="inverse")
+    pair = geometry(units, encoding, residual_px=5.0, yaw_deg=(0.0, 80.0, 0, 0, 0, 0))
+    to_the_right = PairSample(pair._views, pair._facts, target=1)
+
+    # the right camera stands 0.2 m to the right and looks 80 degrees to the right of the left one
+    ahead_m = np.divide(500, units, where=units > 0, out=np.zeros(units.shape))
+    ahead_m = 0.1 * units if form == "depth" else ahead_m
+    right_m = ahead_m * (np.arange(40) + 0.5 - 20) / 100
+    turn = np.deg2rad(80)
+    in_front = ahead_m * np.cos(turn) + (right_m - 0.2) * np.sin(turn) > 0
+    expected = in_front & (units > 0)
+    assert 0.2 < expected.mean() < 0.98
+    assert np.array_equal(to_the_right.valid[0], expected)
+    assert np.isfinite(pair.disparity).all()
+    assert (pair.disparity[0][~expected] == 0).all()
+    assert (pair.disparity[0][expected] != 0).all()
+    assert np.isfinite(pair.disparity_error).all()
+    assert (pair.disparity_error[0][~expected] == 0).all()
 
 
 @pytest.mark.parametrize(
