@@ -168,7 +168,7 @@ def _read_bounded(
         if need > most:
             break
     plain = pa.schema([schema.field(name) for name in names])
-    groups = [plain.empty_table()]
+    groups = [pa.Table.from_batches([], schema=plain)]  # `empty_table` would import pandas
     if need <= most:
         with pq.ParquetFile(
             file, metadata=footer, read_dictionary=[*texts], pre_buffer=True
