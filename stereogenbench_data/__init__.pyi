@@ -8,6 +8,7 @@ from stereogenbench_data.datasets.derive import DERIVED_FIELDS as DERIVED_FIELDS
 from stereogenbench_data.datasets.derive import derive as derive
 from stereogenbench_data.datasets.forecast import forecast as forecast
 from stereogenbench_data.datasets.loader import PairsLoader as PairsLoader
+from stereogenbench_data.datasets.mapped import MixedSplitsWarning as MixedSplitsWarning
 from stereogenbench_data.datasets.mapped import SceneViews as SceneViews
 from stereogenbench_data.datasets.mapped import SeekTableWarning as SeekTableWarning
 from stereogenbench_data.datasets.mapped import StereoPairs as StereoPairs

@@ -1,6 +1,7 @@
 """Map-style datasets: a sample by its number, for torch's own `DataLoader`."""
 
 import copy
+import multiprocessing
 import operator
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -61,6 +62,10 @@ _OF_CACHE: Final = 16
 
 class SeekTableWarning(UserWarning):
     """The index of data behind a URL is of an earlier version, so reading is slow."""
+
+
+class MixedSplitsWarning(UserWarning):
+    """No split was chosen, so samples come from train and from eval scenes."""
 
 
 class _MappedScenes(Dataset[Sample]):
@@ -439,6 +444,7 @@ class StereoPairs(_MappedScenes):
         require_options(StereoPairs, selection, elsewhere={"loader": of_loader})
         index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
         plan = plan_pairs(index, seed=seed, **selection)
+        _warn_of_mixed_splits(index, plan, selection)
         request = parse_request(
             "pairs",
             "stacked" if selection.get("pairs") == "sweep" else "single",
@@ -519,6 +525,7 @@ class SceneViews(_MappedScenes):
         )
         index = data if isinstance(data, SceneIndex) else SceneIndex.open(data)
         plan = plan_views(index, cameras=cameras, frames=frames, seed=seed, filters=filters)
+        _warn_of_mixed_splits(index, plan, filters)
         super().__init__(
             index,
             plan,
@@ -528,6 +535,24 @@ class SceneViews(_MappedScenes):
             buffers=buffers,
             fetch_ahead_bytes=fetch_ahead_bytes,
         )
+
+
+def _warn_of_mixed_splits(index: SceneIndex, plan: Plan, filters: SceneFilters) -> None:
+    """Tell that no split was chosen where there are both: in the user's process, not in workers."""
+    if filters.get("split") is not None or filters.get("scenes") is not None:
+        return
+    splits, counts = np.unique(
+        index.column("split")[plan.scene_rows].astype(str), return_counts=True
+    )
+    if len(splits) < 2 or multiprocessing.parent_process() is not None:
+        return
+    each = " and ".join(f"{n} {split}" for split, n in zip(splits, counts, strict=True))
+    warnings.warn(
+        f"{index.where}: no split was chosen, so {each} scenes come together. Give split='train' "
+        "to train and split='eval' to score; split=('train', 'eval') takes both without a word.",
+        MixedSplitsWarning,
+        stacklevel=3,
+    )
 
 
 def _is_random(plan: Plan, request: Request) -> bool:

@@ -159,8 +159,8 @@ class PairGeometry:
         """
         if self._facts.is_rectified:
             return self.stored.measured
-        projects: MapBool = np.isfinite(self.projection.u_px)
-        return projects & self.stored.measured
+        known: MapBool = np.isfinite(self.projection.u_px) & self.stored.measured
+        return known
 
     @cached_property
     def disparity(self) -> MapF32:
