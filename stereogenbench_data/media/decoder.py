@@ -11,7 +11,7 @@ Source: RFC 9043, sections 4.8 (slice footer) and 4.9.3 (CRC-32, most significan
 
 import zlib
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING, Final
 
@@ -66,8 +66,17 @@ class Decoder:
         *,
         clock: Clock,
         placed: Placed = "at the first packet",
+        crc32s: Sequence[int] = (),
     ) -> None:
-        """Take over a container that was just opened."""
+        """Take over a container that was just opened.
+
+        Args:
+            container: It is closed with the decoder.
+            clock: When each frame is shown.
+            placed: Where the container stands.
+            crc32s: What `packet_checksums` found, of a codec whose packets come in the order in
+                which they are shown.
+        """
         self._container = container
         self._is_placed = placed == "at the first packet"
         self._clock = clock
@@ -79,6 +88,7 @@ class Decoder:
         self._can_skip = self.codec in _SKIPS_EXACTLY
         # FFV1 before version 3 keeps no record beside its packets, and no checksums in them.
         self._has_checksums = self.codec == "ffv1" and bool(self._context.extradata)
+        self._crc32s = crc32s
         self._is_intra_only = self.codec in INTRA_ONLY
         self._knows_key_frames = self._stream.frames > 0
         self._packets: Iterator[VideoPacket] = container.demux(self._stream)
@@ -238,6 +248,8 @@ class Decoder:
         if packet.is_corrupt:
             raise UnexpectedPicture(f"the packet of frame {index} is cut short")
         if self._has_checksums and fails_slice_checksums(bytes(packet)):
+            raise UnexpectedPicture(f"the packet of frame {index} fails its checksum")
+        if self._crc32s and zlib.crc32(packet) != self._crc32s[index]:
             raise UnexpectedPicture(f"the packet of frame {index} fails its checksum")
         self._fed.add(index)
         self._newest = max(self._newest, index)

@@ -24,6 +24,11 @@ from PIL import Image
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.container import VideoFile, open_container, stream_facts
+from stereogenbench_data.media.packet_checksums import (
+    TAG,
+    reserved_checksums,
+    write_checksums,
+)
 from stereogenbench_data.media.siting import CENTRE, Converter
 from stereogenbench_data.media.video import VideoReader, read_rgb
 from stereogenbench_data.schema.training import MOST_PSNR_DB
@@ -148,29 +153,29 @@ def write_pictures(
             stream: Any = container.add_stream(encoder, rate=rate_hz, options=dict(settings))
             stream.width, stream.height, stream.pix_fmt = width, height, codec.pixel_format
             stream.codec_context.thread_count = 1
-            if codec.codec == "mjpeg":
-                for index, picture in enumerate(pictures):
+            container.metadata[TAG] = reserved_checksums(len(pictures))
+            converter = Converter()
+            for index, picture in enumerate(pictures):
+                if codec.codec == "mjpeg":
                     packet = av.Packet(_jpeg(picture, codec))
                     packet.stream, packet.is_keyframe = stream, True
                     packet.pts = packet.dts = index
                     packet.duration, packet.time_base = 1, 1 / rate_hz
                     container.mux(packet)
-                    after_frame()
-                return
-            converter = Converter()
-            for index, picture in enumerate(pictures):
-                frame = converter.convert(
-                    _planar(picture),
-                    size=(height, width),
-                    pixel_format=codec.pixel_format,
-                    flags=f"{_TO_YUV}:out_color_matrix=smpte170m:out_range=tv"
-                    f":out_chroma_loc={CENTRE}",
-                    siting=CENTRE,
-                )
-                frame.pts, frame.time_base = index, 1 / rate_hz
-                container.mux(stream.encode(frame))
+                else:
+                    frame = converter.convert(
+                        _planar(picture),
+                        size=(height, width),
+                        pixel_format=codec.pixel_format,
+                        flags=f"{_TO_YUV}:out_color_matrix=smpte170m:out_range=tv"
+                        f":out_chroma_loc={CENTRE}",
+                        siting=CENTRE,
+                    )
+                    frame.pts, frame.time_base = index, 1 / rate_hz
+                    container.mux(stream.encode(frame))
                 after_frame()
-            container.mux(stream.encode(None))
+            if codec.codec == "h264":
+                container.mux(stream.encode(None))
     except (av.FFmpegError, ValueError) as error:
         if isinstance(error, OSError) and error.errno is not None and not _is_codecs(error):
             raise
@@ -178,6 +183,7 @@ def write_pictures(
             f"{target}: {width}x{height} pictures cannot be encoded as {codec.codec} ({error}). "
             f"Check that this PyAV has libx264, or choose another quality."
         ) from error
+    write_checksums(target, packets=len(pictures))
 
 
 def _is_codecs(error: OSError) -> bool:

@@ -38,6 +38,7 @@ from stereogenbench_data.media.container import (
 )
 from stereogenbench_data.media.decoder import Decoder, UnexpectedPicture
 from stereogenbench_data.media.depth_frames import PACKED_SUFFIX, DepthFrames
+from stereogenbench_data.media.packet_checksums import packet_checksums
 from stereogenbench_data.media.siting import (
     CENTRE,
     Converter,
@@ -162,6 +163,7 @@ class VideoReader(FrameReader):
         container, placed = open_by_header(file, name=name)
         try:
             require_whole_payload(container, name=name)
+            self._crc32s = packet_checksums(container, frames=frames, name=name)
             context = container.streams.video[0].codec_context
             self.size_px = (context.width, context.height)
             """Width and height by the header; 0 if it does not give them."""
@@ -183,7 +185,7 @@ class VideoReader(FrameReader):
         if steady is None:
             container.close()
         else:
-            self._decoder = Decoder(container, clock=steady, placed=placed)
+            self._decoder = Decoder(container, clock=steady, placed=placed, crc32s=self._crc32s)
 
     @property
     def facts(self) -> StreamFacts:
@@ -242,7 +244,9 @@ class VideoReader(FrameReader):
     def _reach(self, index: int) -> VideoFrame:
         if self._decoder is None:
             container, placed = open_by_header(self._file, name=self.name)
-            self._decoder = Decoder(container, clock=self._clock, placed=placed)
+            self._decoder = Decoder(
+                container, clock=self._clock, placed=placed, crc32s=self._crc32s
+            )
         try:
             return self._decoder.reach(index)
         except (UnexpectedPicture, av.FFmpegError):
@@ -255,7 +259,7 @@ class VideoReader(FrameReader):
             with open_container(self._file, name=self.name) as container:
                 self._clock = self._survey(container)
         container = open_container(self._file, name=self.name)
-        self._decoder = Decoder(container, clock=self._clock)
+        self._decoder = Decoder(container, clock=self._clock, crc32s=self._crc32s)
         try:
             return self._decoder.decode_to(index)
         except (UnexpectedPicture, av.FFmpegError) as error:
