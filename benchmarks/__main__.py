@@ -16,7 +16,6 @@ from benchmarks.derive import measure_derive
 from benchmarks.equality import differences
 from benchmarks.evaluation import measure_evaluation
 from benchmarks.ffmpeg_links import link_libraries
-from benchmarks.forecast import forecast_section, measure_forecast
 from benchmarks.generation import measure_generation
 from benchmarks.material import Material, facts, prepared
 from benchmarks.network import DELAYS_MS, network_tables, run_network
@@ -42,7 +41,6 @@ OTHERS: Final = (
     "derive",
     "training",
     "generation",
-    "forecast",
 )
 """Measurements beside the races; `--only` takes these names too."""
 
@@ -156,7 +154,6 @@ def measure_others(
         ),
         "evaluation": lambda: measure_evaluation(rounds=min(rounds, 3), report=report),
         "generation": lambda: measure_generation(size_px=options.size, report=report),
-        "forecast": lambda: measure_forecast(material, rounds=min(rounds, 3), report=report),
     }
     failed = []
     for name in names:
@@ -165,7 +162,7 @@ def measure_others(
         began = time.perf_counter()
         try:
             # These fork by themselves: a GPU is of no use in a fork.
-            forks = name in ("derive", "training", "forecast")
+            forks = name in ("derive", "training")
             results.put(name, work[name]() if forks else in_a_fork(work[name]))
         except MeasurementError as error:
             failed.append(f"{name}: {error}")
@@ -179,8 +176,6 @@ def write_pages(results: Results, out: Path) -> None:
     text = tables(results.sections)
     if "network" in results.sections:
         text += "\n" + network_tables(results.sections["network"])
-    if "forecast" in results.sections:
-        text += "\n" + forecast_section(results.sections["forecast"])
     (out / "tables.md").write_text(text)
     plot_all(results.sections, out)
 
