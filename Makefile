@@ -41,7 +41,7 @@ docs: $(READY)
 bench: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
 		--constraint $(CONSTRAINTS) --editable ".[bench]"
-	$(BIN)/stereogenbench bench
+	$(BIN)/python -m benchmarks
 
 # The scenes in shards/: videos are not drawn to the same bytes everywhere, packing is the same.
 sample: $(READY)

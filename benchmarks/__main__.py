@@ -12,57 +12,38 @@ from typing import Final
 
 from benchmarks.accuracy import CASES, measure_accuracy
 from benchmarks.clock import MeasurementError, in_a_fork
-from benchmarks.derive import measure_derive
 from benchmarks.equality import differences
-from benchmarks.evaluation import measure_evaluation
 from benchmarks.ffmpeg_links import link_libraries
-from benchmarks.generation import measure_generation
 from benchmarks.material import Material, facts, prepared
 from benchmarks.network import DELAYS_MS, network_tables, run_network
 from benchmarks.network import Plan as NetworkPlan
 from benchmarks.plots import plot_all
-from benchmarks.profile import measure_profile
 from benchmarks.race import Plan, run_races
 from benchmarks.results import Results, machine
-from benchmarks.start import measure_memory, measure_start
 from benchmarks.tables import tables
 from benchmarks.training import measure_training
-from benchmarks.tried import measure_tried
-from benchmarks.workloads import RATES, WORKLOADS, Workload
+from benchmarks.workloads import WORKLOADS, Workload
 
 ROOT: Final = Path(__file__).parents[1]
-OTHERS: Final = (
-    "accuracy",
-    "profile",
-    "start",
-    "memory",
-    "tried",
-    "evaluation",
-    "derive",
-    "training",
-    "generation",
-)
-"""Measurements beside the races; `--only` takes these names too."""
+OTHERS: Final = ("accuracy", "training")
+"""Measurements beside the races; `--only` takes these names and "network" too."""
 
-QUICK: Final = ("first", "all-frames", "random", "accuracy", "profile")
+QUICK: Final = ("first", "all-frames", "random", "accuracy")
 
 
 def parse(words: Sequence[str]) -> argparse.Namespace:
     """Return the options of a command line."""
-    known = [workload.name for workload in WORKLOADS] + ["rates", "network", *OTHERS]
-    parser = argparse.ArgumentParser(prog="stereogenbench bench", description=__doc__)
+    known = [workload.name for workload in WORKLOADS] + ["network", *OTHERS]
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument(
         "--only", action="append", choices=known, help="measure only this; may be repeated"
     )
     parser.add_argument("--quick", action="store_true", help="one round of " + ", ".join(QUICK))
     parser.add_argument("--rounds", type=int, default=5, help="rounds of every race [5]")
     parser.add_argument("--workers", help="worker processes of every race, such as 2,0,1,4")
-    parser.add_argument("--whole", action="store_true", help="race over all frames, not a window")
     parser.add_argument("--delays", help="of the races over a network, in ms, such as 0,60")
     parser.add_argument("--scenes", type=int, default=0, help="of the races over a network")
-    parser.add_argument("--batches", type=int, default=2000, help="of the memory run [2000]")
     parser.add_argument("--resume", action="store_true", help="keep the rounds that exist")
-    parser.add_argument("--draw", action="store_true", help="only draw and pack the data")
     parser.add_argument(
         "--check", action="store_true", help="only compare every contestant's samples with ours"
     )
@@ -78,11 +59,7 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
 def chosen(options: argparse.Namespace) -> tuple[list[Workload], list[str]]:
     """Return the workloads of the races, and the names of the other measurements."""
     names = options.only or (QUICK if options.quick else [w.name for w in WORKLOADS] + [*OTHERS])
-    if "rates" in names:
-        names = [*names, *(workload.name for workload in RATES)]
     workloads = [workload for workload in WORKLOADS if workload.name in names]
-    if options.whole:
-        workloads = [replace(workload, window=workload.frames) for workload in workloads]
     if options.workers:
         workers = tuple(int(word) for word in options.workers.split(","))
         workloads = [replace(workload, workers=workers) for workload in workloads]
@@ -100,8 +77,6 @@ def measure(options: argparse.Namespace, *, report: Callable[[str], None]) -> li
     failed: list[str] = []
     if not options.tables:
         prepared(material, report=report)
-        if options.draw:
-            return failed
         if options.check:
             print(json.dumps(differences(material), indent=1))  # noqa: T201
             return failed
@@ -143,17 +118,12 @@ def measure_others(
     """Run the measurements beside the races; return a message for each failure."""
     rounds = 1 if options.quick else options.rounds
     work = {
-        "accuracy": lambda: measure_accuracy(material, rounds=rounds, cases=CASES, report=report),
-        "profile": lambda: measure_profile(material, rounds=min(rounds, 3), report=report),
-        "start": lambda: measure_start(material, rounds=rounds, report=report),
-        "memory": lambda: measure_memory(material, batches=options.batches, report=report),
-        "tried": lambda: measure_tried(material, rounds=min(rounds, 3), report=report),
-        "derive": lambda: measure_derive(material, rounds=min(rounds, 3), report=report),
+        "accuracy": lambda: in_a_fork(
+            lambda: measure_accuracy(material, rounds=rounds, cases=CASES, report=report)
+        ),
         "training": lambda: measure_training(
             material, rounds=min(rounds, 3), workers=os.cpu_count() or 1, report=report
         ),
-        "evaluation": lambda: measure_evaluation(rounds=min(rounds, 3), report=report),
-        "generation": lambda: measure_generation(size_px=options.size, report=report),
     }
     failed = []
     for name in names:
@@ -161,9 +131,7 @@ def measure_others(
             continue
         began = time.perf_counter()
         try:
-            # These fork by themselves: a GPU is of no use in a fork.
-            forks = name in ("derive", "training")
-            results.put(name, work[name]() if forks else in_a_fork(work[name]))
+            results.put(name, work[name]())
         except MeasurementError as error:
             failed.append(f"{name}: {error}")
             report(f"{name} failed: {error}")

@@ -1,19 +1,9 @@
-"""Speed against error: nanoseconds a pixel of every way, and its error.
+"""Speed against error: nanoseconds a pixel of every way, and its error on hard cases."""
 
-The disparity and visibility kernels also run beside a plain conversion of the map to float32. The
-cost of the conversion depends mostly on the memory that it writes into. So there are three
-readings; in each, kernel and conversion write into memory of the same kind.
-"""
-
-import math
-import mmap
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import av
 import numpy as np
@@ -23,7 +13,6 @@ from benchmarks.results import Report, spread_of
 from benchmarks.ways import (
     WAYS,
     Pair,
-    in_blocks,
     interpolated,
     sight_of,
     visible_by_both,
@@ -44,49 +33,6 @@ INVENTED_PX: Final = 1.0
 
 SHORTEST_S: Final = 0.02
 """A call is repeated until it has used this much processor time."""
-
-KEPT: Final = 4
-"""Maps that the decoding loop holds, like those of a batch."""
-FRAMES: Final = 16
-
-_TIGHT: Final[dict[str, Literal["the same", "fresh"]]] = {
-    "the same array every time": "the same",
-    "memory fresh from the system, shared between processes": "fresh",
-}
-"""Readings of one frame again and again."""
-
-Depths = tuple[np.ndarray, np.ndarray]
-
-
-@dataclass(frozen=True, slots=True)
-class Kernel:
-    """A function that writes a map.
-
-    Attributes:
-        dtype: The dtype of the map.
-        inputs: Makes the inputs from a pair and its stored depths, before the clock starts.
-        write: Writes a map from the inputs; this is timed.
-        most: The target: at most as many times the time of a conversion.
-    """
-
-    dtype: type
-    inputs: Callable[[Pair, Depths], Any]
-    write: Callable[[Any, Pair, np.ndarray], Any]
-    most: float | None = None
-
-
-KERNELS: Final = {
-    CONVERSION: Kernel(
-        np.float32, lambda _, depths: depths[0], lambda units, _, out: np.copyto(out, units)
-    ),
-    "disparity": Kernel(np.float32, lambda _, depths: depths[0], in_blocks, 1 / 0.7),
-    "visibility": Kernel(
-        np.bool_,
-        lambda pair, depths: sight_of(pair, *depths, dtype=np.float32),
-        lambda sight, _, out: np.copyto(out, visible_by_both(sight)),
-        12.0,
-    ),
-}
 
 
 def hard_pairs(count: int = CASES) -> Iterator[tuple[Pair, np.ndarray]]:
@@ -125,7 +71,7 @@ def measure_accuracy(
     """Return the section of the results: error and speed of every way."""
     report("speed against error")
     pair, paths = rendered_pair(material)
-    left, right = next(decoded(paths))
+    left, right = map(_first_depth, paths)
     ways = [
         {"name": way.name, "offered": way.offered, "kind": "disparity"} | _errors(way.run, cases)
         for way in WAYS
@@ -147,7 +93,6 @@ def measure_accuracy(
         "ways": ways,
         "resized": resized,
         "visibility": sights,
-        "kernels": _kernels(pair, paths, rounds=rounds),
         "justified": justified(ways),
         "rounds": rounds,
     }
@@ -328,78 +273,7 @@ def beside(times: Mapping[str, list[float]], *, base: str) -> dict[str, dict[str
     return found
 
 
-def _kernels(pair: Pair, paths: list[Path], *, rounds: int) -> list[dict[str, Any]]:
-    """Return the spreads of every kernel in every reading, with its target."""
-    depths = next(decoded(paths))
-    readings = {
-        memory: time_calls(
-            {name: _call(kernel, pair, depths, where=where) for name, kernel in KERNELS.items()},
-            pixels=depths[0].size,
-            rounds=rounds,
-        )
-        for memory, where in _TIGHT.items()
-    }
-    readings[f"a new array after each decoded frame, {KEPT} kept"] = _after_decoding(
-        pair, paths, rounds=rounds
-    )
-    found = []
-    for memory, times in readings.items():
-        spreads = beside(times, base=CONVERSION)
-        found += [
-            {
-                "kernel": name,
-                "memory": memory,
-                "ns_a_pixel": spreads[name],
-                "conversion_ns": spreads[CONVERSION]["median"],
-                "most": KERNELS[name].most,
-            }
-            for name in KERNELS
-            if name != CONVERSION
-        ]
-    return found
-
-
-def decoded(paths: list[Path]) -> Iterator[Depths]:
-    """Yield the stored depths of two cameras, frame by frame."""
-    with av.open(str(paths[0])) as left, av.open(str(paths[1])) as right:
-        for frames in zip(left.decode(video=0), right.decode(video=0), strict=True):
-            one, other = (np.ascontiguousarray(frame.to_ndarray()) for frame in frames)
-            yield one, other
-
-
-def _call(
-    kernel: Kernel, pair: Pair, depths: Depths, *, where: Literal["the same", "fresh"]
-) -> Callable[[], Any]:
-    """Return a call that writes into the same array every time, or into fresh memory."""
-    inputs, shape = kernel.inputs(pair, depths), depths[0].shape
-    if where == "fresh":
-        return lambda: kernel.write(inputs, pair, _fresh(shape, kernel.dtype))
-    out = np.empty(shape, kernel.dtype)
-    return lambda: kernel.write(inputs, pair, out)
-
-
-def _fresh(shape: tuple[int, ...], dtype: type) -> np.ndarray:
-    """Return an array in memory that the system has not allocated yet, like that of a new batch."""
-    size = math.prod(shape) * np.dtype(dtype).itemsize
-    return np.frombuffer(mmap.mmap(-1, size), dtype).reshape(shape)
-
-
-def _after_decoding(pair: Pair, paths: list[Path], *, rounds: int) -> dict[str, list[float]]:
-    """Return nanoseconds a pixel if every map is written into newly allocated memory.
-
-    Each kernel has its own loop; the median over its frames counts.
-    """
-    times: dict[str, list[float]] = {name: [] for name in KERNELS}
-    for _ in range(rounds):
-        for name, kernel in KERNELS.items():
-            kept: deque[np.ndarray] = deque(maxlen=KEPT)
-            spent = []
-            for depths in islice(decoded(paths), FRAMES):
-                inputs = kernel.inputs(pair, depths)
-                begin = time.process_time_ns()
-                out = np.empty(depths[0].shape, kernel.dtype)
-                kernel.write(inputs, pair, out)
-                spent.append((time.process_time_ns() - begin) / out.size)
-                kept.append(out)
-            times[name].append(float(np.median(spent)))
-    return times
+def _first_depth(path: Path) -> np.ndarray:
+    """Return the stored depth of a video's first frame."""
+    with av.open(str(path)) as container:
+        return np.ascontiguousarray(next(container.decode(video=0)).to_ndarray())

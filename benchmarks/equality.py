@@ -10,8 +10,6 @@ from benchmarks.clock import in_a_fork
 from benchmarks.contestants import limit
 from benchmarks.field import CONTESTANTS, LIMIT, NO_DEPTH, entrants, why_not
 from benchmarks.material import Material
-from benchmarks.race import addressed
-from benchmarks.server import serving
 from benchmarks.workloads import WORKLOADS, Job, tiny
 from stereogenbench_data import StereoPairs
 
@@ -28,20 +26,19 @@ def differences(material: Material, *, only: Collection[str] = ()) -> dict[str, 
     was measured). ``error`` is the message of a failure.
     """
     found: dict[str, dict[str, Any]] = {}
-    with serving(material.root, home=material.root / "server") as server:
-        for workload in (tiny(each) for each in WORKLOADS if not only or each.name in only):
-            found[workload.name] = {}
-            for name, _ in entrants(workload):
-                if name == NO_DEPTH:
-                    continue
-                reason = why_not(name)
-                if reason is None:
-                    reading = CONTESTANTS[name].reading if name in CONTESTANTS else "forwards"
-                    job = Job(workload, material, reading=reading, url=server.url)
-                    result = in_a_fork(lambda name=name, job=job: difference(name, job))
-                else:
-                    result = {"error": reason}
-                found[workload.name][name] = result
+    for workload in (tiny(each) for each in WORKLOADS if not only or each.name in only):
+        found[workload.name] = {}
+        for name, _ in entrants(workload):
+            if name == NO_DEPTH:
+                continue
+            reason = why_not(name)
+            if reason is None:
+                reading = CONTESTANTS[name].reading if name in CONTESTANTS else "forwards"
+                job = Job(workload, material, reading=reading)
+                result = in_a_fork(lambda name=name, job=job: difference(name, job))
+            else:
+                result = {"error": reason}
+            found[workload.name][name] = result
     return found
 
 
@@ -70,7 +67,7 @@ def samples_of(name: str, job: Job) -> list[tuple[Key, dict[str, np.ndarray]]]:
             for wanted in [sample.pop("wanted")]
         ]
     found = []
-    for batch in CONTESTANTS[name].batches(addressed(job, name), num_workers=0):
+    for batch in CONTESTANTS[name].batches(job, num_workers=0):
         for place in range(len(batch["scene"])):
             sample = {field: values[place] for field, values in batch.items()}
             arrays = {

@@ -57,10 +57,6 @@ _TITLES: Final = {
     "ours-stream": "ours, StereoPairStream",
     "ours-shards": "ours, from shards",
     "ours-blosc2": "ours, from blosc2 shards",
-    "ours-web": "ours, shards by HTTP",
-    "ours-web-blosc2": "ours, blosc2 shards by HTTP",
-    "webdataset-web": "webdataset by HTTP",
-    "datasets-web": "HF datasets by HTTP",
 }
 
 _CONTESTANTS: Final = (
@@ -92,27 +88,11 @@ _CONTESTANTS: Final = (
     ),
     Contestant(
         "ours-shards", _TITLES["ours-shards"], "forwards",
-        lambda job, **o: ours.mapped(job, job.data.shards, **o),
+        lambda job, **o: ours.mapped(job, job.material.shards, **o),
     ),
     Contestant(
         "ours-blosc2", _TITLES["ours-blosc2"], "forwards",
-        lambda job, **o: ours.mapped(job, job.data.blosc2, **o), "blosc2",
-    ),
-    Contestant(
-        "ours-web", _TITLES["ours-web"], "forwards",
-        lambda job, **o: ours.mapped(job, f"{job.url}/shards", **o),
-    ),
-    Contestant(
-        "ours-web-blosc2", _TITLES["ours-web-blosc2"], "forwards",
-        lambda job, **o: ours.mapped(job, f"{job.url}/blosc2", **o), "blosc2",
-    ),
-    Contestant(
-        "webdataset-web", _TITLES["webdataset-web"], "forwards",
-        _forwards(scenewise.webdataset_samples), "webdataset",
-    ),
-    Contestant(
-        "datasets-web", _TITLES["datasets-web"], "forwards",
-        _forwards(scenewise.hugging_face_samples), "datasets",
+        lambda job, **o: ours.mapped(job, job.material.blosc2, **o), "blosc2",
     ),
 )  # fmt: skip
 CONTESTANTS: Final = {contestant.name: contestant for contestant in _CONTESTANTS}

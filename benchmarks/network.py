@@ -303,7 +303,7 @@ def measured(name: str, job: Job, network: Network, *, workers: int) -> Turn:
     if name == LOCAL:
         found: Turn = in_a_fork(lambda: _run(name, job, "", workers=workers), longest_s=LONGEST_S)
         return found
-    with serving(job.root, home=job.root.parent / "server", network=network) as server:
+    with serving(job.root, network=network) as server:
         found = in_a_fork(lambda: _run(name, job, server.url, workers=workers), longest_s=LONGEST_S)
         return _counted(found, server)
 

@@ -6,12 +6,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.field import CONTESTANTS, LIMIT, NO_DEPTH, OURS, title
-from benchmarks.material import DRAWN_CRF, OTHER_CRFS
+from benchmarks.field import LIMIT
 from benchmarks.network import network_plot
-from benchmarks.results import Spread, entry, rates, ratios, sent_mb, shares
-from benchmarks.tables import rgb_mbit_s
-from benchmarks.workloads import RATED, RATES, WORKLOADS, Workload
+from benchmarks.results import Spread, entry, ratios
+from benchmarks.workloads import WORKLOADS, Workload
 
 _INK: Final = "#222222"
 _OURS: Final = "#0b6e99"
@@ -36,19 +34,12 @@ def plot_all(sections: dict[str, Any], folder: Path) -> list[Path]:
         }
     )  # fmt: skip
     races = sections.get("races", {})
-    local = [w for w in WORKLOADS if w.name in races and w.source == "local" and not w.field]
-    web = [w for w in WORKLOADS if w.name in races and w.source == "web"]
+    local = [w for w in WORKLOADS if w.name in races and not w.field]
     made = []
     for name, wanted, make in (
         ("speed", local, lambda: _speed(races, local)),
-        ("contestants", local, lambda: _contestants(races, local)),
-        ("workers", "all-frames" in races, lambda: _workers(races["all-frames"])),
-        ("rates", any(w.name in races for w in RATES), lambda: _by_rate(sections)),
-        ("web", web, lambda: _web(races, web)),
         ("network", "network" in sections, lambda: network_plot(sections["network"])),
         ("accuracy", "accuracy" in sections, lambda: _accuracy(sections["accuracy"])),
-        ("profile", "profile" in sections, lambda: _profile(sections["profile"])),
-        ("memory", "memory" in sections, lambda: _memory(sections["memory"])),
     ):
         if wanted:
             path = folder / f"{name}.png"
@@ -64,32 +55,11 @@ def _save(figure: Any, path: Path) -> None:
     plt.close(figure)
 
 
-def _colour(name: str) -> str:
-    return _OURS if name.startswith(OURS) else _OTHERS
-
-
 def _medians(spreads: Iterable[Spread]) -> tuple[np.ndarray, np.ndarray]:
     """Return medians, and how far the quartiles are below and above them, shaped (2, n)."""
     kept = [(each.low, each.median, each.high) for each in spreads]
     low, middle, high = np.array(kept).reshape(-1, 3).T
     return middle, np.stack([middle - low, high - middle])
-
-
-def _bars(axes: Any, names: list[str], spreads: list[Spread], *, form: str) -> None:
-    """Draw horizontal bars of medians with quartiles, each with its number."""
-    places = np.arange(len(names))[::-1]
-    middle, errors = _medians(spreads)
-    axes.barh(places, middle, color=[_colour(name) for name in names], height=0.7)
-    axes.errorbar(middle, places, xerr=errors, fmt="none", ecolor=_INK, elinewidth=1)
-    for place, spread in zip(places, spreads, strict=True):
-        axes.annotate(
-            f"{spread.median:{form}}", (spread.high, place), xytext=(4, 0),
-            textcoords="offset points", va="center", fontsize=8, color=_INK, zorder=5,
-            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
-        )  # fmt: skip
-    axes.set_yticks(places, [title(name) for name in names], fontsize=8)
-    axes.margins(x=0.15)
-    axes.set_xlim(left=0)
 
 
 _SHOWN: Final = (
@@ -132,142 +102,6 @@ def _speed(races: dict[str, Any], workloads: list[Workload]) -> Any:
         loc="upper center", handletextpad=0.3, columnspacing=1.5,
     )  # fmt: skip
     figure.tight_layout(rect=(0, 0, 1, 0.93))
-    return figure
-
-
-def _contestants(races: dict[str, Any], workloads: list[Workload]) -> Any:
-    import matplotlib.pyplot as plt
-
-    rows = -(-len(workloads) // 2)
-    figure, grid = plt.subplots(rows, 2, figsize=(12.5, 3.3 * rows), squeeze=False)
-    for axes in grid.flat[len(workloads) :]:
-        axes.set_visible(False)
-    for axes, workload in zip(grid.flat, workloads, strict=False):
-        rounds, workers = races[workload.name]["rounds"], workload.workers[0]
-        found = {
-            name: ratios(rounds, entry(name, workers), to=entry(LIMIT, workers))
-            for name in (*CONTESTANTS,)
-        }
-        shown = {name: spread for name, spread in found.items() if spread is not None}
-        names = sorted(shown, key=lambda name: -shown[name].median)
-        _bars(axes, names, [shown[name] for name in names], form=".2f")
-        axes.axvline(1, color=_INK, linewidth=1)
-        axes.set_xlim(right=max(1.05, axes.get_xlim()[1]))
-        if workload.target is not None:
-            axes.axvline(workload.target.limit, color=_TARGET, linewidth=1, linestyle="--")
-        axes.set_title(workload.title)
-        axes.set_xlabel("samples a second, as a share of the bare loop's", fontsize=8)
-    figure.suptitle(
-        "Speed against a bare decoding loop, as many processes each "
-        "(line: the loop; dashed: target for ours; bars: median, quartiles)",
-        x=0.01, ha="left", fontsize=10,
-    )  # fmt: skip
-    figure.tight_layout(rect=(0, 0, 1, 0.98))
-    return figure
-
-
-def _workers(race: dict[str, Any]) -> Any:
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(6.5, 4))
-    workers = sorted({int(name.split("/")[1]) for found in race["rounds"] for name in found})
-    for name, colour, marker in ((LIMIT, _INK, "s"), (OURS, _OURS, "o")):
-        spreads = {count: rates(race["rounds"], entry(name, count)) for count in workers}
-        shown = {count: spread for count, spread in spreads.items() if spread is not None}
-        if not shown:
-            continue
-        middle, errors = _medians(shown.values())
-        places = [workers.index(count) for count in shown]
-        axes.errorbar(
-            places, middle, yerr=errors, color=colour, marker=marker, capsize=3,
-            label=title(name),
-        )  # fmt: skip
-    axes.set_xticks(range(len(workers)), [str(count) for count in workers])
-    axes.set_xlabel("worker processes (0: in the training process)")
-    axes.set_ylabel("samples a second")
-    axes.set_ylim(bottom=0)
-    axes.set_title(race["settings"]["title"])
-    axes.legend(frameon=False, fontsize=8)
-    return figure
-
-
-def _to_limit(race: dict[str, Any], name: str) -> Spread | None:
-    """Return the ratios of a contestant to the limit under the race's first number of workers."""
-    workers = race["settings"]["workers"][0]
-    return ratios(race["rounds"], entry(name, workers), to=entry(LIMIT, workers))
-
-
-def _by_rate(sections: dict[str, Any]) -> Any:
-    """Draw the gain of the depth codec against the bit rate of the pictures, and its bound."""
-    import matplotlib.pyplot as plt
-
-    lines = (
-        ("ours-blosc2", "ours, blosc2 shards", _OURS, "o"),
-        ("ours-shards", "ours, released shards", "#7fb8d1", "s"),
-        (NO_DEPTH, title(NO_DEPTH), _INK, "^"),
-    )
-    figure, grid = plt.subplots(1, len(RATED), figsize=(13, 4), sharey=True)
-    for axes, name in zip(grid, RATED, strict=True):
-        found = {
-            rgb_mbit_s(sections, crf): sections["races"][race]
-            for crf in (DRAWN_CRF, *OTHER_CRFS)
-            if (race := name if crf == DRAWN_CRF else f"{name}-crf{crf}") in sections["races"]
-        }
-        for entrant, label, colour, marker in lines:
-            spreads = {mbit_s: _to_limit(race, entrant) for mbit_s, race in found.items()}
-            shown = {mbit_s: each for mbit_s, each in spreads.items() if each is not None}
-            middle, errors = _medians(shown.values())
-            axes.errorbar(
-                list(shown), middle, yerr=errors, color=colour, marker=marker, capsize=3,
-                label=label,
-            )  # fmt: skip
-        for mbit_s, race in found.items():
-            workers = race["settings"]["workers"][0]
-            limit, free = entry(LIMIT, workers), entry(NO_DEPTH, workers)
-            share = shares(race["rounds"], limit, without=free)
-            if share is not None:
-                axes.annotate(
-                    f"{share.median * 100:.0f} %", (mbit_s, 0), xytext=(0, 4), ha="center",
-                    textcoords="offset points", fontsize=8, color=_TARGET,
-                )  # fmt: skip
-        workload = next(workload for workload in WORKLOADS if workload.name == name)
-        axes.axhline(1, color=_INK, linewidth=1)
-        axes.set_title(workload.title, fontsize=9)
-        axes.set_xlabel("Mbit/s a camera")
-        axes.margins(x=0.1)
-        axes.set_xlim(left=0)
-    grid[0].set_ylim(bottom=0)
-    grid[0].set_ylabel("speed, in the bare loop's")
-    grid[0].legend(frameon=False, fontsize=8)
-    figure.suptitle(
-        "What the codec of depth gives depends on what the pictures cost "
-        "(red: depth decoding's share of the bare loop's time)", x=0.01, ha="left", fontsize=10,
-    )  # fmt: skip
-    figure.tight_layout(rect=(0, 0, 1, 0.96))
-    return figure
-
-
-def _web(races: dict[str, Any], workloads: list[Workload]) -> Any:
-    import matplotlib.pyplot as plt
-
-    figure, grid = plt.subplots(
-        len(workloads), 2, figsize=(12.5, 2.3 * len(workloads)), squeeze=False
-    )
-    for (speed, traffic), workload in zip(grid, workloads, strict=True):
-        rounds, workers = races[workload.name]["rounds"], workload.workers[0]
-        names = [
-            name
-            for name in ("ours-web", "ours-web-blosc2", "webdataset-web", "datasets-web")
-            if rates(rounds, entry(name, workers)) is not None
-        ]
-        _bars(speed, names, [rates(rounds, entry(name, workers)) for name in names], form=".1f")
-        sent = [sent_mb(rounds, entry(name, workers)) for name in names]
-        _bars(traffic, names, sent, form=".2f")
-        traffic.set_yticks([])
-        speed.set_title(workload.title)
-        speed.set_xlabel("samples a second", fontsize=8)
-        traffic.set_xlabel("MB fetched a sample", fontsize=8)
-    figure.tight_layout()
     return figure
 
 
@@ -318,52 +152,4 @@ def _accuracy(found: dict[str, Any]) -> Any:
     axes.set_ylabel("error in px, of disparities up to 1280 px\n(mark: worst; dash: 99.9 %)")
     axes.set_title("Ways from stored depth to disparity: speed against error")
     axes.legend(frameon=False, fontsize=8.5, loc="upper left", bbox_to_anchor=(1.01, 1))
-    return figure
-
-
-def _profile(profile: dict[str, Any]) -> Any:
-    import matplotlib.pyplot as plt
-
-    names = list(profile)
-    labels = list(profile[names[0]]["ms_a_sample"])
-    colours = plt.get_cmap("tab20")(np.linspace(0, 1, len(labels)))
-    figure, axes = plt.subplots(figsize=(11, 0.75 * len(names) + 2))
-    places = np.arange(len(names))[::-1]
-    left = np.zeros(len(names))
-    totals = np.array([sum(profile[name]["ms_a_sample"].values()) for name in names])
-    for label, colour in zip(labels, colours, strict=True):
-        shares = np.array([profile[name]["ms_a_sample"][label] for name in names]) / totals * 100
-        axes.barh(places, shares, left=left, color=colour, label=label, height=0.65)
-        for place, share, start in zip(places, shares, left, strict=True):
-            if share >= 4:
-                axes.text(start + share / 2, place, f"{share:.0f}", ha="center", va="center",
-                          fontsize=8)  # fmt: skip
-        left += shares
-    axes.set_yticks(
-        places,
-        [f"{name}\n{total:.1f} ms a sample" for name, total in zip(names, totals, strict=True)],
-        fontsize=8,
-    )
-    axes.set_xlim(0, 100)
-    axes.set_xlabel("% of one worker's time")
-    axes.set_title("Where an epoch's time goes")
-    axes.legend(
-        frameon=False, fontsize=8, ncol=6, loc="upper left", bbox_to_anchor=(0, -0.9 / len(names))
-    )
-    return figure
-
-
-def _memory(memory: dict[str, Any]) -> Any:
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(8, 3.6))
-    axes.plot(memory["resident_mb"], color=_OURS, label="resident")
-    axes.plot(memory["private_mb"], color=_OTHERS, label="without shared memory")
-    axes.axhline(1500, color=_TARGET, linestyle="--", linewidth=1, label="target")
-    axes.set_xlim(0, len(memory["resident_mb"]))
-    axes.set_ylim(0, 1650)
-    axes.set_xlabel(f"batches of {memory['batch']}")
-    axes.set_ylabel("MB of the larger worker")
-    axes.set_title("A worker's memory: all pairs, all frames, default settings")
-    axes.legend(frameon=False, fontsize=8, loc="lower right")
     return figure

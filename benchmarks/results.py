@@ -101,16 +101,6 @@ def ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
     )  # fmt: skip
 
 
-def shares(rounds: list[Round], entrant: str, *, without: str) -> Spread | None:
-    """Return the share of an entrant's time that another one, which leaves out a part, saves."""
-    return Spread.of(
-        1 - (found[entrant]["samples"] / found[entrant]["seconds"])
-        / (found[without]["samples"] / found[without]["seconds"])
-        for found in rounds
-        if entrant in found and without in found
-    )  # fmt: skip
-
-
 def cpu_ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
     """Return the ratio of processor times per sample, which other processes disturb less."""
     return Spread.of(
@@ -118,15 +108,6 @@ def cpu_ratios(rounds: list[Round], entrant: str, *, to: str) -> Spread | None:
         / (found[entrant]["cpu_s"] / found[entrant]["samples"])
         for found in rounds
         if entrant in found and to in found
-    )
-
-
-def sent_mb(rounds: list[Round], entrant: str) -> Spread | None:
-    """Return the megabytes that an entrant fetched per sample, None if they were not counted."""
-    return Spread.of(
-        found[entrant]["bytes"] / found[entrant]["samples"] / 1e6
-        for found in rounds
-        if "bytes" in found.get(entrant, {})
     )
 
 

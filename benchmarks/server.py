@@ -1,11 +1,11 @@
-"""Web servers on this machine that answer ranges and count: nginx, or one like a network far away.
+"""A web server on this machine that answers ranges and counts, as if it were far away.
 
-``python -m benchmarks.server FOLDER --delay-ms 60 --mb-s 20`` serves a folder until it is stopped;
-with ``--to URL`` it stands before another server of this machine, which it delays.
+``python -m benchmarks.server FOLDER --delay-ms 60`` serves a folder until it is stopped; with
+``--to URL`` it stands before another server of this machine, which it delays.
 
-The delayed server waits before the first byte of each response, limits the bandwidth of each
-connection and of all together, cuts connections and answers 503. It does not imitate handshakes
-(unless asked to), TCP's slow start or lost packets. It runs in one process, and the kernel copies
+It waits before the first byte of each response, limits the bandwidth of each
+connection and of all together, cuts connections and answers 503. It does not imitate handshakes,
+TCP's slow start or lost packets. It runs in one process, and the kernel copies
 the bytes of files, so it takes little of a processor that contestants need.
 """
 
@@ -16,9 +16,7 @@ import json
 import os
 import random
 import re
-import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -28,26 +26,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 from urllib.parse import unquote, urlsplit
-
-_NGINX: Final = """
-daemon off;
-master_process off;
-pid nginx.pid;
-error_log error.log;
-events {{ worker_connections 256; }}
-http {{
-    log_format counted '$body_bytes_sent';
-    access_log sent.log counted;
-    client_body_temp_path body;
-    proxy_temp_path proxy;
-    fastcgi_temp_path fastcgi;
-    uwsgi_temp_path uwsgi;
-    scgi_temp_path scgi;
-    keepalive_requests 100000;
-    sendfile on;
-    server {{ listen 127.0.0.1:{port}; root {folder}; }}
-}}
-"""
 
 _COUNTS: Final = "/-/counts"
 """The path at which the delayed server tells what it counted."""
@@ -64,7 +42,6 @@ class Network:
 
     Attributes:
         delay_s: Seconds before the first byte of each response.
-        handshakes: Further delays before the first response of each connection.
         connection_mb_s: Megabytes a second of each connection; 0 is unlimited.
         total_mb_s: Megabytes a second of all connections together; 0 is unlimited.
         lost: The share of responses that are cut, some before their first byte.
@@ -72,7 +49,6 @@ class Network:
     """
 
     delay_s: float = 0.0
-    handshakes: int = 0
     connection_mb_s: float = 0.0
     total_mb_s: float = 0.0
     lost: float = 0.0
@@ -95,90 +71,31 @@ class Counts:
 
 @dataclass(frozen=True, slots=True)
 class WebServer:
-    """A running server.
-
-    Attributes:
-        url: The URL of its folder.
-        kind: "nginx" or "python".
-        log: A file with one line of bytes sent for every answer, of nginx.
-    """
+    """A running server, by the URL of its folder."""
 
     url: str
-    kind: str
-    log: Path
 
     def counts(self) -> Counts:
         """Return what it has counted so far."""
-        if self.kind == "nginx":
-            time.sleep(0.1)  # it writes its log just after it has answered
-            sent = self.log.read_text().split() if self.log.exists() else []
-            return Counts(len(sent), sum(map(int, sent)))
         with urllib.request.urlopen(self.url + _COUNTS, timeout=10) as response:
             return Counts(**json.load(response))
 
-    def sent_bytes(self) -> int:
-        """Return the number of bytes of bodies sent so far."""
-        return self.counts().sent_bytes
-
 
 @contextlib.contextmanager
-def serving(
-    folder: Path, *, home: Path, network: Network | None = None, to: str = ""
-) -> Iterator[WebServer]:
-    """Serve a folder on a free port of this machine.
-
-    Args:
-        folder: What to serve.
-        home: Takes logs and settings.
-        network: What lies between; None serves by nginx where that is installed.
-        to: The URL of a server of this machine to stand before, in place of a folder.
-    """
-    home.mkdir(parents=True, exist_ok=True)
-    program = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin:/usr/local/sbin")
-    if network is None and program:
-        with _nginx(program, folder, home) as server:
-            yield server
-        return
-    command = [sys.executable, "-m", "benchmarks.server", str(folder)]
-    words = [*(network or Network()).words(), *([f"--to={to}"] if to else [])]
+def serving(folder: Path, *, network: Network, to: str = "") -> Iterator[WebServer]:
+    """Serve a folder on a free port of this machine through a network, or stand before a server."""
+    command = [sys.executable, "-m", "benchmarks.server", str(folder), f"--to={to}"]
+    command += network.words()
     place = Path(__file__).parents[1]
-    with subprocess.Popen([*command, *words], stdout=subprocess.PIPE, cwd=place) as running:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=place) as running:
         try:
             assert running.stdout is not None
             url = running.stdout.readline().decode().strip()
             if not url:
                 raise RuntimeError("the web server on this machine did not start")
-            yield WebServer(url, "python", home / "sent.log")
+            yield WebServer(url)
         finally:
             running.terminate()
-
-
-@contextlib.contextmanager
-def _nginx(program: str, folder: Path, home: Path) -> Iterator[WebServer]:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    log = home / "sent.log"
-    log.unlink(missing_ok=True)
-    (home / "nginx.conf").write_text(_NGINX.format(port=port, folder=folder.resolve()))
-    command = [program, "-p", str(home.resolve()), "-c", "nginx.conf", "-e", "error.log"]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as running:
-        try:
-            _wait_for(port, running)
-            yield WebServer(f"http://127.0.0.1:{port}", "nginx", log)
-        finally:
-            running.terminate()
-
-
-def _wait_for(port: int, server: "subprocess.Popen[bytes]") -> None:
-    for _ in range(200):
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                return
-        if server.poll() is not None:
-            break
-        time.sleep(0.05)
-    raise RuntimeError("the web server on this machine did not start")
 
 
 class _Line:
@@ -224,7 +141,7 @@ class _Server:
 
     async def answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the requests of a connection."""
-        line, delays = _Line(self._network.connection_mb_s), 1 + self._network.handshakes
+        line = _Line(self._network.connection_mb_s)
         self._counts["connections"] += 1
         with contextlib.suppress(ConnectionError, asyncio.IncompleteReadError):
             keeps = True
@@ -235,8 +152,8 @@ class _Server:
                     writer.write(_head(200, "OK", len(text), "") + text)
                     break
                 self._counts["requests"] += 1
-                await asyncio.sleep(delays * self._network.delay_s)
-                delays, keeps = 1, asked.keeps
+                await asyncio.sleep(self._network.delay_s)
+                keeps = asked.keeps
                 if not await self._send(asked, writer, line):
                     break
         writer.close()
@@ -393,18 +310,17 @@ def main() -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("folder", type=Path, help="what to serve")
-    parser.add_argument("--port", type=int, default=0, help="0 is a free one [0]")
     parser.add_argument("--to", default="", help="the URL of a server to stand before")
+    parser.add_argument("--port", type=int, default=0, help="0 is a free one [0]")
     parser.add_argument("--delay-s", type=float, default=0.0, help=argparse.SUPPRESS)
     parser.add_argument("--delay-ms", type=float, default=0.0, help="before each first byte")
-    parser.add_argument("--handshakes", type=int, default=0, help="delays of a new connection")
     parser.add_argument("--connection-mb-s", type=float, default=0.0, help="0 is unlimited [0]")
     parser.add_argument("--total-mb-s", type=float, default=0.0, help="0 is unlimited [0]")
     parser.add_argument("--lost", type=float, default=0.0, help="share of responses cut [0]")
     parser.add_argument("--refused", type=float, default=0.0, help="share answered 503 [0]")
     options = parser.parse_args()
     network = Network(
-        options.delay_s + options.delay_ms / 1e3, options.handshakes, options.connection_mb_s,
+        options.delay_s + options.delay_ms / 1e3, options.connection_mb_s,
         options.total_mb_s, options.lost, options.refused,
     )  # fmt: skip
     asyncio.run(_serve(options, network))

@@ -4,12 +4,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from benchmarks.derive import MARK
 from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, NO_DEPTH, OURS, title
-from benchmarks.material import DRAWN_CRF, OTHER_CRFS
-from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios, sent_mb, shares
+from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios
 from benchmarks.training import MARK_OWN
-from benchmarks.workloads import RATED, RATES, WORKLOADS, Workload
+from benchmarks.workloads import WORKLOADS, Workload
 from stereogenbench_data.schema.text import counted
 
 
@@ -20,14 +18,8 @@ def tables(sections: dict[str, Any]) -> str:
     if races:
         parts += [headlines(races)]
         parts += [race_table(workload, races[workload.name]) for workload in WORKLOADS
-                  if workload.name in races and workload not in RATES]  # fmt: skip
-        if any(workload.name in races for workload in RATES):
-            parts.append(by_rate(sections))
-    for name, make in (
-        ("start", _start), ("memory", _memory), ("accuracy", _accuracy), ("profile", _profile),
-        ("tried", _tried), ("evaluation", _evaluation), ("derive", _derive),
-        ("training", _training), ("generation", _generation),
-    ):  # fmt: skip
+                  if workload.name in races]  # fmt: skip
+    for name, make in (("accuracy", _accuracy), ("training", _training)):
         if name in sections:
             parts.append(make(sections[name]))
     return "\n".join(parts)
@@ -59,68 +51,6 @@ def _how(sections: dict[str, Any]) -> str:
         "",
     ]
     return "\n".join(lines)
-
-
-def _ms(value: dict[str, float]) -> str:
-    return spread_text(value, ".0f", scale=1e3)
-
-
-def _start(start: dict[str, Any]) -> str:
-    rows = [[name, _ms(value), ""] for name, value in start["imports_s"].items()]
-    for name, value in start["commands_s"].items():
-        mark = at_most(value["median"], 0.4, scale=1e3) if name == "stereogenbench --help" else ""
-        rows.append([f"`{name}`", _ms(value), mark])
-    both = start["index_both_s"]
-    rows += [
-        [f"open an index of {start['index_scenes']:,} scenes", _ms(start["index_open_s"]), ""],
-        [f"select {start['index_pairs']:,} pairs of a family", _ms(start["index_select_s"]), ""],
-        ["both", _ms(both), at_most(both["median"], 0.2, scale=1e3)],
-        ["first batch of a fresh process, no file cached: ours",
-         _ms(start["first_batch_s"]["ours"]), ""],
-        ["the same: naive", _ms(start["first_batch_s"]["naive"]), ""],
-        ["loading a state of half an epoch", _ms(start["resuming"]["seek_s"]), ""],
-    ]  # fmt: skip
-    torch = "imports torch" if start["imports_torch"] else "does not import torch"
-    rounds = counted(start["rounds"], "round")
-    text = f"## Start\n\n`import stereogenbench_data` {torch}. {rounds}.\n\n"
-    return text + table(("", "ms", "target"), rows) + "\n" + _resuming(start)
-
-
-def _resuming(start: dict[str, Any]) -> str:
-    """Return the table of starting and resuming, beside a bare loop over the same frames."""
-    titles = {
-        "start_s": "first batch at the start of an epoch",
-        "resume_s": "first batch, resumed at half an epoch",
-        "rest_from_start_s": "a batch on average, over the first 17",
-        "rest_from_half_s": "a batch on average, over 17 from the middle",
-    }
-    rows = []
-    for name, what in titles.items():
-        times, to_bare = start["resuming"], start["resuming_to_bare"].get(name)
-        beside = ["", ""]
-        if to_bare is not None:
-            beside = [_ms(times[f"bare_{name}"]), spread_text(to_bare)]
-        rows.append([what, _ms(times[name]), *beside])
-    head = ("", "ours, ms", "a bare loop to the same frames, ms", "ours to the loop, times")
-    return table(head, rows)
-
-
-def _memory(memory: dict[str, Any]) -> str:
-    peak = memory["peak_mb"]
-    rows = [
-        ["peak of the larger worker, MB", f"{peak:.0f}",
-         at_most(peak, 1500)],
-        ["the same without shared memory, MB", f"{memory['peak_private_mb']:.0f}", ""],
-        ["growth from the third to the last quarter, MB a 1,000 batches",
-         f"{memory['growth_mb_per_1000']:.0f}", "0"],
-    ]  # fmt: skip
-    text = (
-        "## Memory\n\nAll pairs, all frames, default fields and settings "
-        f"({memory['lanes']} shuffle groups, {memory['open_scenes']} open scenes each), "
-        f"{memory['scenes']} scenes, {memory['workers']} workers, batches of {memory['batch']}, "
-        f"{memory['batches']} batches.\n\n"
-    )
-    return text + table(("", "", "target"), rows)
 
 
 def _accuracy(found: dict[str, Any]) -> str:
@@ -173,140 +103,7 @@ def _accuracy(found: dict[str, Any]) -> str:
         for way in found["visibility"]
     ]
     head = ("visibility", "in the package", "ns a pixel", "conversions", "decided otherwise, %")
-    return text + table(head, rows) + "\n" + _kernels(found)
-
-
-def _kernels(found: dict[str, Any]) -> str:
-    rows = []
-    for kernel in found["kernels"]:
-        ns, most = kernel["ns_a_pixel"], kernel["most"]
-        rows.append(
-            [
-                kernel["kernel"], kernel["memory"], f"{kernel['conversion_ns']:.2f}",
-                f"{ns['median']:.2f}",
-                f"{ns['conversions']:.2f} ({ns['conversions_low']:.2f} to "
-                f"{ns['conversions_high']:.2f})",
-                at_most(ns["conversions"], most, ".2f"),
-            ]
-        )  # fmt: skip
-    head = (
-        "kernel", "written into", "plain conversion, ns a pixel", "kernel, ns a pixel",
-        "conversions", "at most",
-    )  # fmt: skip
-    return table(head, rows)
-
-
-def _tried(found: dict[str, Any]) -> str:
-    text = (
-        "## Ways to decode and to convert\n\nOne process, "
-        f"{counted(found['rounds'], 'round')}; the package's own way is the first of each table. "
-        '"Equal" means bit for bit.\n'
-    )
-    for group, ways in found["groups"].items():
-        rows = []
-        for way in ways:
-            times, alike = way["times"], "not compared"
-            if "psnr_db" in way:
-                alike = "equal" if way["psnr_db"] is None else f"{way['psnr_db']:.0f} dB"
-            spread = spread_text(times)
-            ms = (f"{way['cpu_ms']:.2f}", f"{way['wall_ms']:.2f}")
-            rows.append([way["name"], *ms, "" if way is ways[0] else spread, alike])
-        head = (
-            group,
-            "ms of processor a picture",
-            "ms",
-            "processor time, in the first's",
-            "result",
-        )
-        text += "\n" + table(head, rows)
-    return text
-
-
-def _evaluation(found: dict[str, Any]) -> str:
-    beside, most = found["beside_matchers_over_decoding"], found["limit"]
-    rows = [
-        ["decoding and resizing what is scored, s", f"{found['decoding_and_resizing_s']:.2f}", ""],
-        ["scoring, s", f"{found['scoring_s']:.2f}", ""],
-        ["of it the matchers, s", f"{found['matchers_s']:.2f}", ""],
-        ["scoring beside the matchers, in decodings",
-         spread_text(beside),
-         at_most(beside["median"], most)],
-    ]  # fmt: skip
-    text = (
-        f"## Scoring\n\nOne scene of {found['frames']} frames of {found['stored_px']} px, scored "
-        f"at {found['scored_at']} by the offline metrics; processor time, "
-        f"{counted(found['rounds'], 'round')}.\n\n"
-    )
-    return text + table(("", "", "at most"), rows)
-
-
-def _generation(found: dict[str, Any]) -> str:
-    stages = list(found["rows"][0]["stages_s"])
-    rows = [
-        [
-            f"{row['map']}, {row['family']}, {row['size_px']} px",
-            *(f"{row['stages_s'][stage]:.1f}" for stage in stages),
-            f"{row['scene_core_s']:.0f}", f"{row['times_encoding']:.2f}",
-            at_most(row["times_encoding"], found["limit"]),
-            f"{row['scenes_an_hour_a_core']:.1f}", f"{row['release_core_hours']:,}",
-        ]
-        for row in found["rows"]
-    ]  # fmt: skip
-    low, high = found["paper_scenes_an_hour"]
-    text = (
-        "## Generating scenes\n\nSeconds of one core's time for a scene of 6 x 81 frames, "
-        f"by the built-in renderer; {counted(found['frames'], 'frame')} of one camera stand for "
-        f"all, medians of {counted(found['scenes'], 'scene')}. The paper names {low} to {high} "
-        "scenes an hour on a workstation with one GPU.\n\n"
-    )
-    head = (
-        "map, family", *stages, "in all", "times encoding", "at most", "scenes an hour, one core",
-        "core-hours of the release",
-    )  # fmt: skip
     return text + table(head, rows)
-
-
-def _profile(profile: dict[str, Any]) -> str:
-    names = list(profile)
-    labels = list(profile[names[0]]["ms_a_sample"])
-    rows = []
-    for label in labels:
-        cells = []
-        for name in names:
-            ms = profile[name]["ms_a_sample"]
-            cells.append(f"{ms[label]:.2f} ({ms[label] / sum(ms.values()) * 100:.0f} %)")
-        rows.append([label, *cells])
-    rows.append(["all", *(f"{sum(profile[n]['ms_a_sample'].values()):.2f}" for n in names)])
-    head = ("ms a sample, one worker", *names)
-    return "## Where the time goes\n\n" + table(head, rows)
-
-
-def _derive(found: dict[str, Any]) -> str:
-    parts = ["## Pairs made on the device\n"]
-    rows = []
-    for size, measured in found.items():
-        ways = measured["ways"]
-        decoding_s = ways["decoding alone"]["cpu_s"]
-        for name, way in ways.items():
-            ratio = way["cpu_s"] / decoding_s
-            mark = at_most(ratio, MARK) if name == "views and stored depth" else ""
-            rows.append(
-                [f"{name}, {size}", f"{way['cpu_s'] * 1e3:.1f}", f"{ratio:.2f}", mark,
-                 f"{way['bytes'] / 1e6:.1f}"]
-            )  # fmt: skip
-    head = ("a moment of six cameras", "processor ms", "to decoding", "target", "MB")
-    parts.append(table(head, rows))
-    rows = [
-        [f"{size}, {way}", f"{gpu[way]:.0f}", f"{gpu[way] / gpu['limit']:.2f}", gpu["device"]]
-        for size, measured in found.items()
-        if (gpu := measured["gpu"]) is not None
-        for way in ("limit", "eager", "compiled")
-        if way in gpu
-    ]
-    if not rows:
-        return "\n".join([*parts, "No GPU was at hand: rates on one were not measured.\n"])
-    head = ("15 pairs with all maps", "moments/s", "to the memory's limit", "device")
-    return "\n".join([*parts, table(head, rows)])
 
 
 def _training(found: dict[str, Any]) -> str:
@@ -357,54 +154,13 @@ def headlines(races: dict[str, Any]) -> str:
     return "## Headlines\n\n" + table(head, rows)
 
 
-def by_rate(sections: dict[str, Any]) -> str:
-    """Return the table of the gain of blosc2 depth by the bit rate of the pictures."""
-    rows = []
-    for name in RATED:
-        for crf in (DRAWN_CRF, *OTHER_CRFS):
-            race = sections["races"].get(name if crf == DRAWN_CRF else f"{name}-crf{crf}")
-            if race is None:
-                continue
-            rounds, workers = race["rounds"], race["settings"]["workers"][0]
-            limit, free, shards, blosc2 = (
-                entry(name, workers) for name in (LIMIT, NO_DEPTH, "ours-shards", "ours-blosc2")
-            )
-            rows.append(
-                [
-                    next(workload.title for workload in WORKLOADS if workload.name == name),
-                    str(crf), f"{rgb_mbit_s(sections, crf):.1f}",
-                    spread_text(shares(rounds, limit, without=free)),
-                    spread_text(ratios(rounds, free, to=limit)),
-                    spread_text(ratios(rounds, shards, to=limit)),
-                    spread_text(ratios(rounds, blosc2, to=limit)),
-                    spread_text(ratios(rounds, blosc2, to=shards)),
-                ]
-            )  # fmt: skip
-    head = (
-        "2 workers", "rate factor", "Mbit/s a camera", "depth's share of the limit's time",
-        "the limit with depth for nothing, to the limit", "ours, released shards, to the limit",
-        "ours, blosc2 shards, to the limit", "ours, blosc2 to released shards",
-    )  # fmt: skip
-    text = "## What blosc2 depth gives by the pictures' rate\n\n" + table(head, rows)
-    return text + "\n![What depth's codec gives by the pictures' rate](rates.png)\n"
-
-
-def rgb_mbit_s(sections: dict[str, Any], crf: int) -> float:
-    """Return the pictures' Mbit/s a camera at a constant rate factor."""
-    data = sections["data"]
-    found: float = (data if crf == DRAWN_CRF else data["other_rates"][str(crf)])["rgb_mbit_s"]
-    return found
-
-
 def race_table(workload: Workload, race: dict[str, Any]) -> str:
     """Return the table of one race: a row for each contestant and number of workers."""
     rounds = race["rounds"]
     names = {name for found in rounds for name in found}
-    is_web = workload.source == "web"
-    where = "ours from local files" if is_web else "the limit"
     rows = []
     for workers in sorted(workload.workers):
-        base, naive = entry(OURS if is_web else LIMIT, workers), entry(NAIVE, workers)
+        base, naive = entry(LIMIT, workers), entry(NAIVE, workers)
         first = (LIMIT, NO_DEPTH, OURS)
         for name in (*first, *(n for n in _order(names) if n not in first)):
             entrant = entry(name, workers)
@@ -415,18 +171,11 @@ def race_table(workload: Workload, race: dict[str, Any]) -> str:
                     title(name), str(workers), rate_text(rates(rounds, entrant)),
                     spread_text(ratios(rounds, entrant, to=base)) if entrant != base else "",
                     spread_text(cpu_ratios(rounds, entrant, to=base)) if entrant != base else "",
-                    *(
-                        [rate_text(sent_mb(rounds, entrant))]
-                        if is_web
-                        else [spread_text(ratios(rounds, entrant, to=naive), ".1f")]
-                        if name != NAIVE
-                        else [""]
-                    ),
+                    spread_text(ratios(rounds, entrant, to=naive), ".1f") if name != NAIVE else "",
                 ]
             )  # fmt: skip
     head = [
-        "", "workers", "samples/s", *(f"to {where}{how}" for how in ("", ", by processor time")),
-        "MB a sample" if is_web else "to naive",
+        "", "workers", "samples/s", "to the limit", "to the limit, by processor time", "to naive",
     ]  # fmt: skip
     slices = f"{race['settings']['samples']} samples of {counted(workload.scenes, 'scene')}"
     failed = [f"- {title(name.split('/')[0])}: {why}" for name, why in race["failed"].items()]

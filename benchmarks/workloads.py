@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from benchmarks.material import DRAWN_CRF, EIGHT, OTHER_CRFS, Material
+from benchmarks.material import EIGHT, Material
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.index.table import SceneIndex
 
@@ -60,8 +60,6 @@ class Workload:
         blosc2: The target ratio with blosc2 shards, if any.
         more: Further contestants in this workload.
         field: Contestants in this workload instead of the usual ones.
-        source: "local" files, or shards through the "web".
-        crf: The constant rate factor of the pictures.
     """
 
     name: str
@@ -79,8 +77,6 @@ class Workload:
     blosc2: float | None = None
     more: tuple[str, ...] = ()
     field: tuple[str, ...] = ()
-    source: Literal["local", "web"] = "local"
-    crf: int = DRAWN_CRF
 
     @property
     def is_clip(self) -> bool:
@@ -94,10 +90,9 @@ class Workload:
         return ("left", "right", *maps, "baseline_m", "frame_index", "pair", "scene")
 
 
-_WEB: Final = ("ours", "ours-web", "ours-web-blosc2", "webdataset-web", "datasets-web")
 _CODECS: Final = ("limit-no-depth", "ours-shards", "ours-blosc2")
 
-_AT_DRAWN_RATE: Final = (
+WORKLOADS: Final = (
     Workload(
         "first", "primary pair, first frame, 1280", 24, "first", "first", few=8,
         target=Target(0.85, 1.2),
@@ -127,44 +122,7 @@ _AT_DRAWN_RATE: Final = (
         "random", "random single frames, 8 a scene, 1280", 4, ("random", 8), ("random", 8),
         target=Target(0.7, 3), blosc2=3.0, more=_CODECS,
     ),
-    Workload(
-        "web-first", "by HTTP: primary pair, first frame, 1280", 8, "first", "first",
-        field=_WEB, source="web",
-    ),
-    Workload(
-        "web-all-frames", "by HTTP: primary pair, all frames shuffled, 1280", 2, "all", "all",
-        batch=1, field=_WEB, source="web",
-    ),
-    Workload(
-        "web-random", "by HTTP: random single frames, 8 a scene, 1280", 4, ("random", 8),
-        ("random", 8), field=_WEB, source="web",
-    ),
 )  # fmt: skip
-
-RATED: Final[dict[str, Any]] = {
-    "all-frames": "all", "random": ("random", 8), "all-pairs-832": range(16),
-}  # fmt: skip
-"""The workloads that are raced over at other bit rates too, by four scenes each, and their windows.
-
-Samples of easily coded pictures come so fast that the start would take most of a shorter run.
-"""
-
-
-def _at_rate(workload: Workload, crf: int) -> Workload:
-    return replace(
-        workload, name=f"{workload.name}-crf{crf}", title=f"{workload.title}, rate factor {crf}",
-        scenes=4, workers=workload.workers[:1], target=None, blosc2=None, crf=crf, more=(),
-        field=("limit", *_CODECS), window=RATED[workload.name],
-    )  # fmt: skip
-
-
-RATES: Final = tuple(
-    _at_rate(workload, crf)
-    for crf in OTHER_CRFS
-    for workload in _AT_DRAWN_RATE
-    if workload.name in RATED
-)
-WORKLOADS: Final = (*_AT_DRAWN_RATE, *RATES)
 
 
 def tiny(workload: Workload) -> Workload:
@@ -187,23 +145,16 @@ class Job:
         workload: The workload.
         material: The data.
         reading: Whether the slice is that of forward readers, or a random choice of all samples.
-        url: The URL of the shards, if they are read by HTTP.
     """
 
     workload: Workload
     material: Material
     reading: Reading = "forwards"
-    url: str | None = None
-
-    @property
-    def data(self) -> Material:
-        """The data at the bit rate of the workload."""
-        return self.material.at_rate(self.workload.crf)
 
     @cached_property
     def tree(self) -> Path:
         """The released folder that this workload reads."""
-        return self.data.many if self.workload.scenes > EIGHT else self.data.eight
+        return self.material.many if self.workload.scenes > EIGHT else self.material.eight
 
     @cached_property
     def keys(self) -> list[str]:

@@ -25,19 +25,18 @@ from benchmarks.workloads import Job, Wanted, Workload
 from stereogenbench_data.index.table import SceneIndex
 
 
-def urls(job: Job) -> list[str]:
-    """Return the paths or URLs of the shards of the workload's scenes, as far as they are packed.
+def shards_of(job: Job) -> list[str]:
+    """Return the paths of the shards of the workload's scenes, as far as they are packed.
 
     A workload of more scenes than are packed is read in part: each scene costs the same here.
     """
-    index = SceneIndex.open(job.data.shards)
+    index = SceneIndex.open(job.material.shards)
     shards = {
         str(index.column("key")[row]): index.scene(row).members["baseline.json"].path
         for row in range(len(index))
     }
     names = list(dict.fromkeys(shards[key] for key in job.keys if key in shards))
-    folder = job.url or str(job.data.shards)
-    return [f"{folder}/{name}" for name in names]
+    return [f"{job.material.shards}/{name}" for name in names]
 
 
 class DecodedJob(Protocol):
@@ -139,7 +138,7 @@ class DecodedScenes(IterableDataset[dict[str, Any]]):
 
 def webdataset_samples(job: Job) -> IterableDataset[dict[str, Any]]:
     """Return samples through plain webdataset."""
-    return webdataset_stream(job, urls(job))
+    return webdataset_stream(job, shards_of(job))
 
 
 def webdataset_stream(job: DecodedJob, shards: list[str]) -> IterableDataset[dict[str, Any]]:
@@ -161,7 +160,7 @@ def webdataset_stream(job: DecodedJob, shards: list[str]) -> IterableDataset[dic
 
 def hugging_face_samples(job: Job) -> IterableDataset[dict[str, Any]]:
     """Return samples through Hugging Face datasets, streaming."""
-    return hugging_face_stream(job, urls(job))
+    return hugging_face_stream(job, shards_of(job))
 
 
 def hugging_face_stream(job: DecodedJob, shards: list[str]) -> IterableDataset[dict[str, Any]]:

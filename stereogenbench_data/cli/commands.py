@@ -11,7 +11,6 @@ import typer
 
 from stereogenbench_data.cli import export_clips, export_views
 from stereogenbench_data.cli.audit import audit
-from stereogenbench_data.cli.bench import bench
 from stereogenbench_data.cli.browse import browse
 from stereogenbench_data.cli.doctor import doctor
 from stereogenbench_data.cli.download import download
@@ -50,7 +49,6 @@ _COMMANDS: Final[dict[str, dict[Callable[..., None], str]]] = {
         audit: "audit shards/ --scenes 20 -o audit.md",
         verify: "verify shards/ --deep",
         forecast: "forecast shards/ --samples-s 100 --delay-ms 60",
-        bench: "bench --only all-frames",
     },
     "Score with them": {
         export_inputs: "export-inputs shards/ inputs/ --tier G1 --split eval",

@@ -4,8 +4,7 @@ Training reads few frames of many scenes, in any order, so a video begins anew e
 (closed groups of pictures, none added where the scene changes). Frames are encoded by one thread
 with fixed settings, so the same pictures and libraries give the same bytes.
 
-Source of the settings: ``benchmarks/codecs.py``, which compares them by speed, size and what they
-do to stereo matching.
+Source of the settings: ``docs/performance/README.md``, "Codecs of training shards".
 """
 
 import io

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.material import OTHER_CRFS, Material, prepared
+from benchmarks.material import Material, prepared
 
 
 @pytest.fixture(scope="session")
@@ -10,4 +10,4 @@ def material(tmp_path_factory) -> Material:
     """Everything that a race reads."""
     root = tmp_path_factory.mktemp("bench")
     wanted = Material(root, size_px=64, frames=4, scale=0.02)
-    return prepared(wanted, report=lambda _: None, workers=1, crfs=OTHER_CRFS[:1])
+    return prepared(wanted, report=lambda _: None, workers=1)

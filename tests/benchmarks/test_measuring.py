@@ -1,34 +1,25 @@
 """What measures, run once on tiny data; what came out is written, tabled and drawn."""
 
 import json
-import subprocess
-import sys
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from benchmarks import (
     __main__,
     accuracy,
     clock,
-    derive,
-    evaluation,
-    generation,
-    profile,
     race,
-    start,
     tables,
     training,
-    tried,
 )
 from benchmarks.__main__ import chosen, parse
 from benchmarks.contestants import limit
 from benchmarks.material import facts
 from benchmarks.plots import plot_all
-from benchmarks.results import Results, Spread, ratios, shares
+from benchmarks.results import Results, Spread, ratios
 from benchmarks.ways import WAYS
 from benchmarks.workloads import WORKLOADS, Job, tiny
 from stereogenbench_data import StereoPairs
@@ -44,14 +35,7 @@ def results(material, tmp_path_factory):
     found.put("machine", {"cores": 2, "cpu": "a processor", "versions": {"av": "18.1"}})
     found.put("accuracy", accuracy.measure_accuracy(material, rounds=1, cases=6, report=str))
     plan = race.Plan(rounds=1)
-    found.put("tried", tried.measure_tried(material, rounds=1, report=str))
-    found.put("evaluation", evaluation.measure(frames=1, size_px=64, workers=1))
-    found.put(
-        "generation",
-        generation.measure(sizes_px=(64,), frames=1, scenes=1, maps=("SynthHall",)),
-    )
-    workloads = [TINY["all-frames"], TINY["all-frames-crf26"]]
-    race.run_races(workloads, material, found, plan=plan, report=str)
+    race.run_races([TINY["all-frames"]], material, found, plan=plan, report=str)
     return found
 
 
@@ -120,35 +104,6 @@ def test_depth_that_is_averaged_belongs_to_no_surface(results):
     assert shares["bilinear, depth"] > 0
 
 
-def test_the_functions_that_the_profile_times_are_there():
-    assert clock.in_a_fork(lambda: profile.Spans().install()) == []
-
-
-def test_the_parts_of_a_profile_add_up_to_the_whole(material):
-    job = Job(TINY["all-frames"], material)
-
-    found = clock.in_a_fork(lambda: profile.profiled(job, job.tree))
-
-    assert found["ms"]["decoding depth"] > 0
-    assert found["ms"]["decoding colour"] > 0
-    assert found["ms"]["queueing"] > 0
-
-
-def test_pairs_in_the_loader_are_compared_with_views_that_become_pairs(material, monkeypatch):
-    monkeypatch.setattr(derive, "SIZES", {"as stored": None, "smaller": (24, 40)})
-    found = derive.measure_derive(material, rounds=1, report=str)
-
-    text = tables.tables({"derive": found})
-    for size in ("as stored", "smaller"):
-        ways = found[size]["ways"]
-        pixels = 64 * 64 if size == "as stored" else 24 * 40
-        # Six pictures and six maps of two bytes, and numbers of cameras beside them.
-        assert ways["views and stored depth"]["bytes"] == pytest.approx(30 * pixels, abs=6000)
-        assert ways["15 pairs in the loader"]["bytes"] == 15 * (2 * 3 + 2 * 4 + 5 + 3) * pixels
-        assert all(way["cpu_s"] > 0 for way in ways.values())
-        assert f"views and stored depth, {size}" in text
-
-
 def test_training_shards_are_compared_with_bare_loops_over_the_same_samples(material, monkeypatch):
     drawn = {"random frames": ("random", 3), "random clip": ("random clips", 1, 2)}
     chosen = [
@@ -174,35 +129,13 @@ def test_training_shards_are_compared_with_bare_loops_over_the_same_samples(mate
         np.testing.assert_allclose(bare["disparity"][0][seen], own["disparity"][0][seen], rtol=1e-6)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU with CUDA")
-def test_the_rate_on_a_gpu_stands_beside_its_memorys(material):
-    gpu = derive.measure_derive(material, rounds=1, report=str)["832x480"]["gpu"]
-
-    assert 0 < gpu["eager"] < gpu["limit"]
-
-
-def test_starting_and_memory_are_measured(material):
-    index = start.open_and_select(material)
-    watched = clock.in_a_fork(lambda: start.watch_memory(material, batches=2, report=str))
-
-    assert index["pairs"] == 15 * round(774 * material.scale)
-    assert watched["batches"] == 2
-    assert watched["peak_mb"] > 50
-
-
 def test_the_tables_and_the_plots_are_made_of_the_results(results, tmp_path):
     text = tables.tables(results.sections)
     made = plot_all(results.sections, tmp_path)
 
     assert "primary pair, all frames shuffled" in text
     assert "float32 closed form" in text
-    assert "each camera decoded once for all its pairs" in text
-    assert "## Scoring" in text
-    assert "| SynthHall, Uniform, 64 px |" in text
-    assert "| primary pair, all frames shuffled, 1280 | 26 |" in text
-    assert {path.name for path in made} == {
-        "speed.png", "contestants.png", "workers.png", "accuracy.png", "rates.png",
-    }  # fmt: skip
+    assert {path.name for path in made} == {"speed.png", "accuracy.png"}
     assert all(path.stat().st_size > 10_000 for path in made)
 
 
@@ -210,15 +143,6 @@ def test_results_outlive_the_process(results):
     again = Results(results.path)
 
     assert again.sections == json.loads(json.dumps(results.sections))
-
-
-def test_threads_and_planes_make_the_same_pictures(results):
-    groups = results.sections["tried"]["groups"]
-    decoding = groups["decoding colour, one picture after another"]
-    stored = groups["colour conversion, stored size"]
-
-    assert [way["psnr_db"] for way in decoding[:3]] == [None, None, None]
-    assert [way["psnr_db"] for way in stored[:4]] == [None, None, None, None]
 
 
 def test_a_ratio_is_taken_within_each_round():
@@ -229,27 +153,6 @@ def test_a_ratio_is_taken_within_each_round():
     ]
 
     assert ratios(rounds, "a/2", to="b/2") == Spread(3.0, 2.5, 3.5, 2)
-
-
-def test_a_share_is_what_leaving_out_a_part_saves():
-    rounds = [{"a/2": {"samples": 10, "seconds": 4}, "b/2": {"samples": 10, "seconds": 1}}]
-
-    assert shares(rounds, "a/2", without="b/2") == Spread(0.75, 0.75, 0.75, 1)
-
-
-def test_pictures_at_another_rate_are_smaller_and_their_depth_the_same(material):
-    other = material.at_rate(26)
-    sizes = {
-        kind: [
-            sum(file.stat().st_size for file in made.release.rglob(f"cam_*_{kind}"))
-            for made in (material, other)
-        ]
-        for kind in ("rgb.mp4", "depth.mkv")
-    }
-
-    assert sizes["rgb.mp4"][1] < sizes["rgb.mp4"][0]
-    assert sizes["depth.mkv"][1] == sizes["depth.mkv"][0] > 0
-    assert material.at_rate(18) == material
 
 
 def test_the_slice_of_those_that_start_anew_is_spread_over_the_places_in_a_video(material):
@@ -265,48 +168,27 @@ def test_a_step_that_fails_is_reported_and_the_others_are_measured(material, tmp
     def fail(*_, **__):
         raise ValueError("no such thing")
 
-    monkeypatch.setattr(__main__, "measure_memory", fail)
-    monkeypatch.setattr(__main__, "measure_profile", lambda *_, **__: {"all": 1})
+    monkeypatch.setattr(__main__, "measure_accuracy", fail)
+    monkeypatch.setattr(__main__, "measure_training", lambda *_, **__: {"all": 1})
     results, reported = Results(tmp_path / "results.json"), []
 
     failed = __main__.measure_others(
-        ["memory", "profile"],
+        ["accuracy", "training"],
         material,
         results,
         options=parse(["--rounds", "1"]),
         report=reported.append,
     )
 
-    assert failed == ["memory: ValueError: no such thing"]
-    assert Results(results.path).sections["profile"] == {"all": 1}
-
-
-def test_rates_stand_for_all_their_races():
-    workloads, others = chosen(parse(["--only", "rates"]))
-
-    assert {workload.crf for workload in workloads} == {26, 34}
-    assert len(workloads) == 6
-    assert others == []
+    assert failed == ["accuracy: ValueError: no such thing"]
+    assert Results(results.path).sections["training"] == {"all": 1}
 
 
 def test_options_choose_workloads_and_workers():
-    workloads, others = chosen(parse(["--only", "clips", "--only", "memory", "--workers", "4,1"]))
+    workloads, others = chosen(parse(["--only", "clips", "--only", "training", "--workers", "4,1"]))
 
     assert [(workload.name, workload.workers) for workload in workloads] == [("clips", (4, 1))]
-    assert others == ["memory"]
-
-
-def test_the_command_names_the_checkout_that_it_needs(tmp_path):
-    code = (
-        "import sys, pathlib, stereogenbench_data.cli.bench as bench; "
-        "bench.__file__ = '/nowhere/at/all/bench.py'; bench.bench()"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-
-    assert done.returncode == 1
-    assert "StorageError: benchmarks/: is neither in /nowhere" in done.stderr
+    assert others == ["training"]
 
 
 def test_the_spread_of_nothing_is_none():

@@ -25,11 +25,11 @@ def folder(tmp_path):
 
 
 @pytest.fixture
-def started(folder, tmp_path):
+def started(folder):
     """Start a server with a network before it."""
 
     def start(**how):
-        return serving(folder, home=tmp_path / "home", network=Network(**how))
+        return serving(folder, network=Network(**how))
 
     return start
 
@@ -70,7 +70,7 @@ def test_the_delayed_server_limits_the_bandwidth(started, line):
         began_s = time.monotonic()
         assert RemoteObject(f"{server.url}/x.tar").read(0, len(DATA)) == DATA
 
-    assert 0.24 <= time.monotonic() - began_s < 1.5
+    assert time.monotonic() - began_s >= 0.24
 
 
 def test_a_server_that_fails_costs_no_byte(started):
@@ -82,18 +82,6 @@ def test_a_server_that_fails_costs_no_byte(started):
 
     assert counts.failures > 5
     assert counts.requests > 100
-
-
-def test_a_server_may_stand_before_another(started, tmp_path, folder):
-    with (
-        started() as behind,
-        serving(folder, home=tmp_path / "home", network=Network(0.05), to=behind.url) as server,
-    ):
-        remote, began_s = RemoteObject(f"{server.url}/x.tar"), time.monotonic()
-        assert remote.read(0, 100) + remote.read(500, 900) == DATA[:100] + DATA[500:900]
-
-        assert time.monotonic() - began_s >= 0.1
-        assert behind.counts().requests == 2
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from benchmarks.ffmpeg_links import link_libraries
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
-COMPARED = ("all-pairs-832", "clips", "web-first")
+COMPARED = ("all-pairs-832", "clips")
 """Every contestant and every kind of sample is in these."""
 
 SCALED = "all-pairs-832"
@@ -42,7 +42,7 @@ def differences(material):
 
 def test_every_contestant_is_compared(differences):
     ours = [name for name, found in differences.items() if found["ours"]["samples"] > 0]
-    optional = {"torchcodec", "decord", "datasets", "datasets-web"}
+    optional = {"torchcodec", "decord", "datasets"}
     failed = {
         (workload, name): found["error"]
         for workload, contestants in differences.items()

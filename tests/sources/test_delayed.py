@@ -24,7 +24,7 @@ def before(tmp_path):
     """Put a network before a server of this machine."""
 
     def begin(url, **how):
-        return delayed_serving(tmp_path, home=tmp_path / "home", network=Network(**how), to=url)
+        return delayed_serving(tmp_path, network=Network(**how), to=url)
 
     return begin
 
