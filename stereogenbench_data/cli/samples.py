@@ -66,7 +66,9 @@ def pairs_option(text: str) -> Any:
     """Return the pairs of ``--pairs`` as `StereoPairs` takes them."""
     if text in ("primary", "adjacent", "all"):
         return text
-    pairs = [each.split("-") for each in text.split(",")]
+    bare = text.strip("() ").replace(" ", "")
+    one = bare.replace(",", "-") if bare.replace(",", "", 1).isdecimal() else bare
+    pairs = [each.split("-") for each in one.split(",")]
     if not all(len(pair) == 2 and all(map(str.isdecimal, pair)) for pair in pairs):
         raise typer.BadParameter(
             f"{text!r} is not primary, adjacent, all or pairs such as 0-1,0-5.",

@@ -149,6 +149,7 @@ class _MappedScenes(Dataset[Sample]):
 
         Raises:
             IndexError: If there is no such sample.
+            SelectionError: If it is a slice.
             StorageError: If a file is missing or altered.
             MediaError: If a video does not decode to what the index says.
         """
@@ -245,6 +246,12 @@ class _MappedScenes(Dataset[Sample]):
 
     def _sample(self, number: int, batch: EpochBatch, allocate: Allocate = new_array) -> Sample:
         """Return a sample of a batch as arrays, written into what is allocated for them."""
+        if isinstance(number, slice):
+            start, stop, step = number.indices(len(self.plan))
+            raise SelectionError(
+                f"a sample is chosen by its number, got {number!r}. For several of them: "
+                f"torch.utils.data.Subset(pairs, {range(start, stop, step)!r})."
+            )
         number = operator.index(number)
         count = len(self.plan)
         if not -count <= number < count:
@@ -447,7 +454,7 @@ class StereoPairs(_MappedScenes):
         _warn_of_mixed_splits(index, plan, selection)
         request = parse_request(
             "pairs",
-            "stacked" if selection.get("pairs") == "sweep" else "single",
+            "stacked" if str(selection.get("pairs")) == "sweep" else "single",
             fields=fields,
             size=size,
             depth=depth,

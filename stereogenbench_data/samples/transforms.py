@@ -24,7 +24,7 @@ from stereogenbench_data.samples.views import StoredDepth, Views
 Generator = np.random.Generator
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class Compose:
     """Transforms one after the other.
 
@@ -35,8 +35,12 @@ class Compose:
 
     transforms: Sequence[Transform]
 
-    def __post_init__(self) -> None:
-        """Refuse non-transforms, and an order that would give wrong samples."""
+    def __init__(self, transforms: Sequence[Transform], *others: Any) -> None:
+        """Take a list; refuse non-transforms, and an order that would give wrong samples."""
+        object.__setattr__(self, "transforms", transforms)
+        if others or not isinstance(transforms, Sequence) or isinstance(transforms, str):
+            given = ", ".join(map(repr, (transforms, *others)))
+            raise FieldError(f"Compose takes one list: write Compose([{given}]).")
         odd = [step for step in self.transforms if not isinstance(step, Transform)]
         if odd or any(isinstance(step, type) for step in self.transforms):
             raise FieldError(f"Compose takes transforms, got {(odd or self.transforms)[0]!r}.")
@@ -69,29 +73,42 @@ class Compose:
         return views
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class _Sized:
-    """What makes views of a size in pixels."""
+    """What makes views of a size in pixels: (height, width), one side of a square, or both."""
 
     height: int
     width: int
     swaps_views: ClassVar[bool] = False
 
-    def __post_init__(self) -> None:
+    def __init__(self, height: int | Sequence[int], width: int | None = None) -> None:
         """Require at least one pixel."""
-        _require_size(self.height, self.width)
+        sides: Any = (height, height if width is None else width)
+        if width is None and isinstance(height, Sequence):
+            sides = height
+        if isinstance(sides, str) or len(sides) != 2:
+            raise FieldError(f"a size is (height, width) in pixels, got {height!r}.")
+        _require_size(*sides)
+        object.__setattr__(self, "height", int(sides[0]))
+        object.__setattr__(self, "width", int(sides[1]))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class Resize(_Sized):
     """Stretch to a size in pixels; fx, cx and fy, cy scale by the realised factors."""
+
+    def __init__(self, height: int | Sequence[int], width: int | None = None) -> None:
+        """Require both sides: with one alone, torchvision would keep the aspect ratio."""
+        if width is None and not isinstance(height, Sequence):
+            raise FieldError(f"Resize needs height and width: write Resize({height}, {height}).")
+        _Sized.__init__(self, height, width)
 
     def __call__(self, views: Views, generator: Generator) -> Views:
         """Return resized views."""
         return _resized(views, height=self.height, width=self.width)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class Letterbox(_Sized):
     """Scale to fit a size in pixels without stretching, centred; the rest is black, unmeasured.
 
@@ -141,7 +158,7 @@ class Crop:
         return _windowed(views, top=self.top, left=self.left, size=(self.height, self.width))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class RandomCrop(_Sized):
     """Cut a window of a size in pixels, anywhere inside the picture."""
 

@@ -1,9 +1,10 @@
 """Which cameras: the ordered pairs of each scene, by name, by index and by baseline."""
 
 import operator
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64
@@ -20,9 +21,16 @@ from stereogenbench_data.schema.release import (
 from stereogenbench_data.schema.text import counted
 from stereogenbench_data.selection.filters import Range, require_range, typed
 
-PairsSpec = Literal["primary", "adjacent", "all", "sweep"] | Sequence[tuple[int, int]]
+PairsSpec = (
+    Literal["primary", "adjacent", "all", "sweep"]
+    | str
+    | tuple[int, int]
+    | Sequence[tuple[int, int] | str]
+)
 Direction = Literal["left_to_right", "right_to_left"]
 BaselineSpec = Range | str | Sequence[str]
+
+_PAIR: Final = re.compile(r"\s*[0-9]+\s*-\s*[0-9]+\s*")
 
 PAIR_NUMBER: Int64[np.ndarray, "6 6"] = np.full((CAMERA_COUNT, CAMERA_COUNT), -1, dtype=np.int64)
 """[a, b]: the place of cameras a and b among `CAMERA_PAIRS`, in either order; -1 for a == b."""
@@ -66,10 +74,10 @@ def choose_pairs(
     Args:
         index: The index that the rows belong to.
         rows: Rows of scenes, ascending.
-        pairs: "primary" (one a scene), "adjacent" (5), "all" (15), explicit pairs
-            (left, right) with left < right, or "sweep", several pairs as one entry: the primary
-            pair's left view with every view to its right, or right to left the rightmost view with
-            every view to its left.
+        pairs: "primary" (one a scene), "adjacent" (5), "all" (15), one or several explicit pairs
+            (left, right) or "left-right" with left < right, or "sweep", several pairs as one
+            entry: the primary pair's left view with every view to its right, or right to left the
+            rightmost view with every view to its left.
         direction: "left_to_right": the left camera's pixels have the disparity.
             "right_to_left": the right camera's, with negative disparity and baseline.
         baseline_cm: A closed range in cm, or names of the paper's bins.
@@ -103,21 +111,36 @@ def baselines_cm(index: SceneIndex, pairs: PairList) -> Float64[np.ndarray, "n k
 def require_pairs(pairs: Any) -> tuple[tuple[int, int], ...]:
     """Return explicit camera pairs as a tuple of (left, right).
 
+    Args:
+        pairs: Pairs such as (0, 5) or "0-5", or one of them.
+
     Raises:
         SelectionError: If one is not two cameras of 0 to 5, the left before the right, or if one
             is given twice.
+
+    >>> require_pairs((0, 1)), require_pairs("0-1"), require_pairs([(0, 1), "0-5"])
+    (((0, 1),), ((0, 1),), ((0, 1), (0, 5)))
     """
-    if isinstance(pairs, str):
+    listed: Any = pairs.tolist() if isinstance(pairs, np.ndarray) else pairs
+    if isinstance(pairs, str) and all(map(_PAIR.fullmatch, pairs.split(","))):
+        listed = pairs.split(",")
+    if not isinstance(listed, Iterable) or isinstance(listed, str):
         raise SelectionError(
             "pairs must be 'primary', 'adjacent', 'all', 'sweep' or camera pairs such as "
-            f"[(0, 5)], got {pairs!r}."
+            f"(0, 5) or [(0, 5), (1, 3)], got {pairs!r}."
         )
+    listed = [*listed]
+    if len(listed) == 2 and all(isinstance(camera, int | np.integer) for camera in listed):
+        listed = [listed]
     found = []
-    for pair in pairs.tolist() if isinstance(pairs, np.ndarray) else pairs:
+    for pair in listed:
+        is_text = isinstance(pair, str) and _PAIR.fullmatch(pair)
         try:
-            left, right = (operator.index(camera) for camera in pair)
+            left, right = map(int, pair.split("-")) if is_text else map(operator.index, pair)
         except (TypeError, ValueError):
-            raise SelectionError(f"a pair is (left, right) camera numbers, got {pair!r}.") from None
+            raise SelectionError(
+                f"a pair is two camera numbers, such as (0, 5) or '0-5', got {pair!r}."
+            ) from None
         if (left, right) not in CAMERA_PAIRS:
             cure = f"write two different cameras from 0 to {CAMERA_COUNT - 1}, the left one first"
             if (right, left) in CAMERA_PAIRS:

@@ -5,6 +5,7 @@ see `why_not_from_a_file`.
 """
 
 import ipaddress
+import os
 import re
 import socket
 from pathlib import Path
@@ -44,8 +45,10 @@ def local_path(location: str | Path) -> Path:
     ``~`` and ``~name`` are a home only where no folder or file has that name.
 
     Raises:
-        StorageError: If it is an empty text, as of a variable of a shell that is not set.
+        StorageError: If it is not a path or an empty text, as of a variable that is not set.
     """
+    if not isinstance(location, str | os.PathLike):
+        raise StorageError(f"{location!r} is not a path: name a folder, a file or a URL.")
     if location == "":
         raise StorageError("the path is empty: name a file or folder, or . for this folder.")
     if _is_file_url(location):

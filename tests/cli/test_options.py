@@ -8,6 +8,7 @@ import typer
 from typer.testing import CliRunner
 
 from stereogenbench_data.cli.options import grouped
+from stereogenbench_data.cli.samples import pairs_option
 from stereogenbench_data.samples.size import SwappedSizeWarning
 from tests.cli.command import invoke, one_line
 
@@ -84,6 +85,11 @@ def test_a_refused_option_is_named_with_its_value_and_what_it_may_be(words, opti
     message = refused(*words, option, value)
 
     assert all(word in message for word in (option, value, cure)), message
+
+
+@pytest.mark.parametrize("typed", ["0-5", "0,5", "(0, 5)", "0 - 5"])
+def test_one_pair_is_taken_however_it_is_typed(typed):
+    assert pairs_option(typed) == [(0, 5)]
 
 
 @pytest.mark.parametrize("command", ["card", "upload"])

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -28,6 +29,8 @@ from stereogenbench_data import (
     SceneViews,
     SelectionError,
     StereoPairs,
+    StereoPairStream,
+    StorageError,
     collate,
 )
 
@@ -122,6 +125,35 @@ def test_the_primary_pair_of_the_first_frame_is_the_default(indexed_release):
     assert pairs[-1]["__key__"] == pairs[3]["__key__"]
     assert pairs[0]["__key__"].startswith("eval/MapSeenInTrain/Uniform/")
     assert pairs[0]["__key__"].endswith("/00-01/000")
+
+
+def test_a_slice_is_answered_with_a_subset_of_the_same_samples(indexed_release):
+    pairs = StereoPairs(indexed_release, fields=("left",))
+
+    with pytest.raises(SelectionError, match=r"got slice.*Subset\(pairs, range\(0, 3\)\)"):
+        pairs[:3]
+    subset = torch.utils.data.Subset(pairs, range(3))
+    assert torch.equal(subset[2]["left"], pairs[2]["left"])
+
+
+@pytest.mark.parametrize("pairs", [(0, 5), "0-5", np.array([[0, 5]])], ids=repr)
+def test_a_pair_may_be_given_by_itself(indexed_release, pairs):
+    chosen = StereoPairs(indexed_release, fields=("pair",), pairs=pairs)
+
+    assert [sample["pair"].tolist() for sample in chosen] == [[0, 5]] * 4
+
+
+@pytest.mark.parametrize("data", [None, 5, ["scenes"]], ids=repr)
+@pytest.mark.parametrize(
+    "open_data",
+    [StereoPairs, SceneViews, SceneIndex.open, lambda data: StereoPairStream(data, 2)],
+    ids=["pairs", "views", "index", "stream"],
+)
+def test_what_is_not_a_path_is_named_with_what_is_one(open_data, data):
+    with pytest.raises(
+        StorageError, match=rf"{re.escape(repr(data))} is not a path: name a folder"
+    ):
+        open_data(data)
 
 
 def test_torchs_own_collate_takes_every_field(indexed_release):
@@ -338,7 +370,7 @@ def test_a_dataset_goes_on_after_a_change_of_folder(indexed_release, monkeypatch
     assert pairs[0]["__url__"].startswith(str(indexed_release))
 
 
-@pytest.mark.parametrize("number", [2.7, "0", slice(0, 2), [0, 1], None])
+@pytest.mark.parametrize("number", [2.7, "0", [0, 1], None])
 def test_a_sample_is_requested_by_a_whole_number(indexed_release, number):
     with pytest.raises(TypeError, match="cannot be interpreted as an integer"):
         StereoPairs(indexed_release)[number]

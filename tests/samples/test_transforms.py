@@ -452,6 +452,15 @@ def test_the_eraser_paints_on_the_second_view_alone():
         (lambda: RandomScale(2, 1), "low, high of RandomScale must ascend"),
         (lambda: ColorJitter(hue=3), "hue of ColorJitter must be 0 to 1, got 3"),
         (lambda: Eraser(1.0, 2, 100, 50), "low, high of Eraser must ascend from 1"),
+        (lambda: Resize(64), r"write Resize\(64, 64\)"),
+        (lambda: RandomCrop((1, 2, 3)), r"is \(height, width\) in pixels, got \(1, 2, 3\)"),
+        (lambda: RandomCrop("64x64"), "is .height, width. in pixels, got '64x64'"),
+        (lambda: RandomCrop(6.4), "whole numbers of pixels from 1, got 6.4 x 6.4"),
+        (
+            lambda: Compose(HorizontalFlip(1.0), RandomCrop(8)),
+            r"write Compose\(\[HorizontalFlip\(.*\), RandomCrop\(height=8, width=8\)\]\)",
+        ),
+        (lambda: Compose(Eraser()), r"write Compose\(\[Eraser\("),
         (lambda: Compose([1]), "Compose takes transforms, got 1"),
         (lambda: Compose([HorizontalFlip]), "Compose takes transforms"),
         (lambda: RandomCrop(41, 5)(made_views(), None), "larger than a picture of 60 x 40"),
@@ -460,6 +469,14 @@ def test_the_eraser_paints_on_the_second_view_alone():
 def test_a_transform_that_cannot_be_is_refused(make, message):
     with pytest.raises(FieldError, match=message):
         make()
+
+
+@pytest.mark.parametrize("size", [(64, 48), [64, 48]])
+def test_a_size_is_given_as_in_torchvision(size):
+    assert RandomCrop(64) == RandomCrop((64, 64)) == RandomCrop(64, 64)
+    assert RandomCrop(size) == RandomCrop(64, 48) == RandomCrop(height=64, width=48)
+    assert Resize(size) == Resize(64, 48)
+    assert Letterbox(size) == Letterbox(64, 48)
 
 
 def test_a_flip_of_a_sweep_is_refused(detailed_release):

@@ -28,6 +28,21 @@ def test_every_scene_gives_as_many_pairs_as_requested(index, pairs, each):
     assert len(chosen(index, pairs=pairs)) == each * len(index)
 
 
+@pytest.mark.parametrize(
+    "pairs",
+    [(0, 1), [0, 1], "0-1", "0 - 1", ["0-1"], np.array([0, 1]), np.array([[0, 1]])],
+    ids=repr,
+)
+def test_one_pair_needs_no_list_around_it(index, pairs):
+    assert chosen(index, pairs=pairs) == chosen(index, pairs=[(0, 1)])
+
+
+def test_several_pairs_are_a_list_or_one_text(index):
+    expected = chosen(index, pairs=[(0, 5), (1, 3)])
+
+    assert chosen(index, pairs="0-5,1-3") == chosen(index, pairs=["0-5", (1, 3)]) == expected
+
+
 def test_all_pairs_are_the_fifteen_of_six_cameras_left_before_right(index):
     found = chosen(index, {"subset": "seen_map"}, pairs="all")
 
@@ -122,6 +137,10 @@ def test_a_baseline_that_no_pair_has_says_which_there_are(index):
         ([(0, 1), (0, 1)], "each only once"),
         ([], "at least one"),
         ("every", "must be 'primary'"),
+        ("1-0", r"write \(0, 1\), .* direction='right_to_left'"),
+        ((0, 6), r"there is no pair \(0, 6\)"),
+        (None, "camera pairs such as .* got None"),
+        (5, "camera pairs such as .* got 5"),
         ([5], "got 5"),
         ([(0, 1, 2)], r"got \(0, 1, 2\)"),
         ([(0.9, 1.9)], r"got \(0.9, 1.9\)"),
