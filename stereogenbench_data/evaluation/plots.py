@@ -18,7 +18,7 @@ from stereogenbench_data.evaluation.aggregate import (
     require_comparable,
 )
 from stereogenbench_data.evaluation.columns import COLUMNS, FRAME_METRICS, HEAVY_TAILED
-from stereogenbench_data.evaluation.reference import reference_rows
+from stereogenbench_data.evaluation.reference import reference_rows, release_difference
 from stereogenbench_data.schema.release import BASELINE_BINS, baseline_bin
 from stereogenbench_data.sources.files import open_atomic
 
@@ -83,9 +83,12 @@ def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
         axes.scatter(baselines_cm, means, s=14, alpha=0.45, color=colour, linewidths=0)
         heights += means
         _draw_bins(axes, pairs, column, colour, name=one.name)
+    differs = release_difference(
+        results[0].index, {pair.row for one in results for pair in one.pairs if not pair.problem}
+    )
     metric = {columns[0]: name for name, columns in FRAME_METRICS.items()}.get(column)
     if metric is not None and protocol.is_papers(column):
-        heights += _draw_reference(axes, results, metric)
+        heights += _draw_reference(axes, results, metric, differs=differs)
     _draw_edges(axes, results)
     axes.set_ylabel(f"{protocol.label(column)} ({facts.better} is better)")
     axes.set_xlabel("baseline in cm")
@@ -97,6 +100,12 @@ def _draw(axes: Any, results: Sequence[Scores], column: str) -> None:
     axes.set_ylim(0 if column in HEAVY_TAILED else low - margin, high + margin)
     tier = "calibration controls" if results[0].tier == CONTROL else f"tier {results[0].tier}"
     axes.set_title(f"{protocol.label(column)} by baseline, {tier}", fontsize=11)
+    if differs:
+        axes.annotate(
+            f"Scored: {differs}.\nNot the scenes of the paper, so not comparable with its curves.",
+            (0, 0), (0, -44), xycoords="axes fraction", textcoords="offset points", va="top",
+            fontsize=8.5, color="#c0392b",
+        )  # fmt: skip
     axes.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
     axes.spines[["top", "right"]].set_visible(False)
 
@@ -123,7 +132,9 @@ def _draw_bins(
     )  # fmt: skip
 
 
-def _draw_reference(axes: Any, results: Sequence[Scores], metric: str) -> list[float]:
+def _draw_reference(
+    axes: Any, results: Sequence[Scores], metric: str, *, differs: str
+) -> list[float]:
     """Draw the paper's bins of the tier if Uniform scenes were scored; return their numbers.
 
     A metric that the paper does not report has none.
@@ -138,7 +149,7 @@ def _draw_reference(axes: Any, results: Sequence[Scores], metric: str) -> list[f
         axes.plot(
             middles, [float(row[metric]) for row in found], color="#777777", linewidth=0.9,
             linestyle=("--", ":", "-.")[number % 3], marker="sDv^<>"[number % 6], markersize=3,
-            label=f"{method} (paper, Uniform)",
+            label=f"{method} (paper, Uniform{', other scenes' * bool(differs)})",
         )  # fmt: skip
     return [float(row[metric]) for row in rows]
 

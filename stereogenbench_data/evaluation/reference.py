@@ -5,12 +5,15 @@ of a reference is part of it. An empty cell is a dash of the paper.
 """
 
 import csv
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping
 from functools import cache
 from importlib.resources import files
 from typing import Final, Literal
 
 from stereogenbench_data.errors import EvaluationError
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.release import TRAIN_MAPS, UNSEEN_MAPS
 
 TableName = Literal["main", "unseen", "bins", "controls"]
 ReferenceRow = Mapping[str, str]
@@ -23,6 +26,14 @@ SOURCES: Final[dict[str, str]] = {
     "controls": "tab:metric-calibration, calibration controls on the full evaluation split",
 }
 """Where each table stands in the paper: its LaTeX label and what it is."""
+
+SCENES_SCORED: Final[Mapping[tuple[str, str], int]] = {
+    ("seen_map", "IPD_Gaussian"): 265,
+    ("seen_map", "Uniform"): 281,
+    ("unseen_map", "IPD_Gaussian"): 91,
+    ("unseen_map", "Uniform"): 102,
+}
+"""How many scenes the paper's numbers are of, by subset and family."""
 
 PAPER: Final = (
     "StereoGenBench: A Synthetic Multi-Camera Benchmark for Stereo Generation under Controlled "
@@ -101,3 +112,34 @@ def reference_rows(name: TableName, **where: str) -> list[ReferenceRow]:
             f"table {name!r} has no column {min(unknown)!r}: it has {', '.join(rows[0])}."
         )
     return [row for row in rows if all(row[column] == value for column, value in where.items())]
+
+
+def release_difference(index: SceneIndex, rows: Collection[int], *, scored: str = "some") -> str:
+    """Return how scored scenes differ from those that the paper scored, empty if they do not.
+
+    By their maps, subsets and numbers: what the index tells.
+
+    Args:
+        index: The scenes.
+        rows: Which of them were scored.
+        scored: "some" of the branches of subset and family, or "all" of them.
+    """
+    chosen = sorted(set(rows))
+    names = Counter(index.column("map_name")[chosen].tolist())
+    others = sorted(set(names) - TRAIN_MAPS - UNSEEN_MAPS)
+    if others:
+        count, named = sum(names[name] for name in others), ", ".join(others[:3])
+        return f"{count} of {len(chosen)} scenes on maps that it does not have ({named})"
+    branches = Counter(
+        zip(
+            index.column("subset")[chosen].tolist(),
+            index.column("family")[chosen].tolist(),
+            strict=True,
+        )
+    )
+    for branch in {**branches, **(SCENES_SCORED if scored == "all" else {})}:
+        found, expected = branches[branch], SCENES_SCORED.get(branch, 0)
+        if found != expected:
+            name = " ".join(filter(None, branch))
+            return f"{found} scenes of {name}, of which the paper scored {expected or 'none'}"
+    return ""

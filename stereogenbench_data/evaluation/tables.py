@@ -28,6 +28,7 @@ from stereogenbench_data.evaluation.reference import (
     ReferenceRow,
     TableName,
     reference_rows,
+    release_difference,
 )
 from stereogenbench_data.schema.release import BASELINE_BINS, FAMILIES, FRAME_COUNT, baseline_bin
 
@@ -179,9 +180,11 @@ def explaining_table(results: Sequence[Scores]) -> Table:
 def control_table(results: Sequence[Scores]) -> Table:
     """Return all pairs of the selection together, beside the paper's calibration controls."""
     rows: list[TableRow] = []
+    differs = _difference(results, "controls")
     for one in results:
         rows.append(_row(one, (), one.pairs))
-        rows.extend(_paper_row(row, ()) for row in reference_rows("controls", control=one.name))
+        found = reference_rows("controls", control=one.name)
+        rows.extend(_paper_row(row, (), differs=differs) for row in found)
     return _table(results, rows, "controls", "Calibration controls", ())
 
 
@@ -205,6 +208,7 @@ def _rows(
         paper: Returns the paper's rows of a group.
     """
     index = results[0].index
+    differs = _difference(results)
 
     def label_of(pair: PairMeans, key: str) -> str:
         if key == "baseline":
@@ -232,7 +236,7 @@ def _rows(
             if labels in groups:
                 found = one.distances.get(labels, {}) if distances == "show" else {}
                 rows.append(_row(one, labels, groups[labels], distances=found))
-        rows += [_paper_row(row, labels) for row in paper(labels)]
+        rows += [_paper_row(row, labels, differs=differs) for row in paper(labels)]
     return rows
 
 
@@ -268,7 +272,14 @@ def _row(
     )
 
 
-def _paper_row(row: ReferenceRow, labels: Labels) -> TableRow:
+def _difference(results: Sequence[Scores], name: str = "") -> str:
+    """Return how the scored scenes differ from the paper's, empty if they do not."""
+    rows = {pair.row for one in results for pair in one.pairs if not pair.problem}
+    scored = "all" if name == "controls" else "some"
+    return release_difference(results[0].index, rows, scored=scored)
+
+
+def _paper_row(row: ReferenceRow, labels: Labels, *, differs: str) -> TableRow:
     """Return a row of one of the paper's tables, its numbers as printed."""
     printed = {}
     for name in (*FRAME_METRICS, "fid", "fvd"):
@@ -277,7 +288,7 @@ def _paper_row(row: ReferenceRow, labels: Labels) -> TableRow:
             headline = FRAME_METRICS.get(name, (name,))[0]
             printed[headline] = f"{value} ± {interval}" if interval else value
     return TableRow(
-        method=f"{row.get('method') or row['control']} (paper)",
+        method=f"{row.get('method') or row['control']} (paper{', other scenes' * bool(differs)})",
         labels=labels,
         scenes=int(row["n_scenes"]) if "n_scenes" in row else None,
         frames=int(row["n_frames"]) if "n_frames" in row else None,
@@ -318,6 +329,13 @@ def _notes(
     if any(COLUMNS[column].fit for column in of_frames):
         notes.append(f"SD: {SD_OF_THE_PAPER}.")
     if any(row.is_papers for row in rows):
+        differs = _difference(results, name)
+        if differs:
+            notes.append(
+                f"NOT COMPARABLE WITH THE PAPER: these scores are not of the release's evaluation "
+                f"scenes, but of {differs}. Its rows are of other pictures: nothing here is better "
+                f"or worse than they."
+            )
         sources = "; ".join(SOURCES[each] for each in _TABLES_OF_THE_PAPER[name])
         notes.append(f"Rows of the paper as printed: {sources}.")
         others = [

@@ -28,7 +28,7 @@ def test_predictions_are_scored_and_reported(scenes, other_views, tmp_path):
 
     assert shown.exit_code == 0, shown.output
     assert "# next camera, tier G1: calibrated target camera" in shown.stdout
-    assert "StereoSpace (paper) | seen_map | Uniform" in shown.stdout
+    assert "StereoSpace (paper, other scenes) | seen_map | Uniform" in shown.stdout
     assert "By map_name" in shown.stdout
     assert {path.name for path in out.iterdir()} == {
         "results.json", "report.md", "tables.tex", "tables.csv", "pairs.csv", "plots", "partial",
@@ -113,7 +113,7 @@ def test_controls_that_hold_end_with_0(scenes, tmp_path):
 
     assert shown.exit_code == 0, shown.output
     assert "- holds: every frame of the rendered target is identical (3 of 3)" in shown.stdout
-    assert "rendered target (paper)" in shown.stdout
+    assert "rendered target (paper, other scenes)" in shown.stdout
 
 
 def test_controls_that_do_not_hold_end_with_1(scenes, tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol, score_controls
@@ -32,6 +33,15 @@ def test_each_headline_metric_with_numbers_has_a_plot(results, tmp_path):
 
         assert pixels.shape[1] > pixels.shape[0] > 300
         assert (pixels != 255).any(axis=2).mean() > 0.01
+
+
+def test_a_plot_of_other_scenes_than_the_papers_says_so(results):
+    axes = Figure().add_subplot()
+    plots._draw(axes, results, "psnr")
+
+    (said,) = [each.get_text() for each in axes.texts]
+    assert "3 of 3 scenes on maps that it does not have" in said
+    assert "not comparable" in said
 
 
 def test_a_metric_without_a_finite_number_has_no_plot(results, tmp_path):

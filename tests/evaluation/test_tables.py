@@ -3,13 +3,16 @@
 import csv
 import io
 import json
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from stereogenbench_data import EvaluationError, EvaluationProtocol, tables_of, write_report
 from stereogenbench_data.evaluation.aggregate import PairMeans, Scores, tally
 from stereogenbench_data.evaluation.metrics.frechet import FrechetDistance
-from stereogenbench_data.evaluation.report import document, latex, markdown
+from stereogenbench_data.evaluation.reference import release_difference
+from stereogenbench_data.evaluation.report import csv_text, document, latex, markdown
 from stereogenbench_data.evaluation.tables import bin_table, branch_table, stratum_table
 
 PAPERS = EvaluationProtocol()
@@ -53,13 +56,40 @@ def test_branches_stand_beside_the_papers_rows_of_the_same_tier(scores):
 
     assert rows(table) == [
         ("ours", "seen_map", "Uniform"),
-        ("StereoSpace (paper)", "seen_map", "Uniform"),
+        ("StereoSpace (paper, other scenes)", "seen_map", "Uniform"),
         ("ours", "unseen_map", "IPD_Gaussian"),
-        ("StereoSpace (paper)", "unseen_map", "IPD_Gaussian"),
+        ("StereoSpace (paper, other scenes)", "unseen_map", "IPD_Gaussian"),
     ]
     assert table.rows[0].cells["psnr"].mean == (31 + 22) / 2
     assert table.rows[1].printed["psnr"] == "19.71"
     assert (table.rows[0].scenes, table.rows[0].frames) == (2, 4)
+
+
+def test_scores_of_other_scenes_than_the_papers_say_so_in_table_and_csv(scores):
+    table = branch_table([scores(tier="G1")])
+
+    assert "NOT COMPARABLE WITH THE PAPER" in markdown(table)
+    assert "3 of 3 scenes on maps that it does not have (SynthStage, SynthYard)" in latex(table)
+    assert "StereoSpace (paper, other scenes)" in csv_text([table])
+
+
+def test_only_all_scenes_of_a_branch_are_those_of_the_paper():
+    def difference(count, *, subset="seen_map", map_name="Stylized_Egypt", **scored):
+        columns = {
+            "map_name": np.array([map_name] * count, dtype=object),
+            "subset": np.array([subset] * count, dtype=object),
+            "family": np.array(["Uniform"] * count, dtype=object),
+        }
+        return release_difference(SimpleNamespace(column=columns.get), range(count), **scored)
+
+    assert difference(281) == ""
+    assert difference(102, subset="unseen_map") == ""
+    assert difference(281, scored="all").startswith("0 scenes of seen_map IPD_Gaussian")
+    assert difference(280) == "280 scenes of seen_map Uniform, of which the paper scored 281"
+    assert difference(5, subset=None) == "5 scenes of Uniform, of which the paper scored none"
+    assert (
+        difference(281, map_name="Home") == "281 of 281 scenes on maps that it does not have (Home)"
+    )
 
 
 def test_bins_are_in_order_with_the_papers_beside(scores):
@@ -67,9 +97,9 @@ def test_bins_are_in_order_with_the_papers_beside(scores):
 
     assert rows(table) == [
         ("ours", "seen_map", "Uniform", "[1,10)"),
-        ("StereoSpace (paper)", "seen_map", "Uniform", "[1,10)"),
+        ("StereoSpace (paper, other scenes)", "seen_map", "Uniform", "[1,10)"),
         ("ours", "seen_map", "Uniform", "[10,30)"),
-        ("StereoSpace (paper)", "seen_map", "Uniform", "[10,30)"),
+        ("StereoSpace (paper, other scenes)", "seen_map", "Uniform", "[10,30)"),
         ("ours", "unseen_map", "IPD_Gaussian", "[100,150]"),
     ]
     assert table.rows[1].printed["psnr"] == "21.69 ± 1.04"
@@ -147,7 +177,9 @@ def test_the_papers_sd_stands_in_the_filtered_column_alone(scores, fit):
     paper = next(row for row in table.rows if row.is_papers)
     lines = markdown(table).splitlines()
     head = [each.strip() for each in lines[2].split("|")]
-    line = next(each for each in lines if "StereoSpace (paper)" in each and "seen_map" in each)
+    line = next(
+        each for each in lines if "StereoSpace (paper, other scenes)" in each and "seen_map" in each
+    )
     cells = dict(zip(head, (each.strip() for each in line.split("|")), strict=True))
 
     assert paper.printed["sd_filtered"] == "0.3951"
