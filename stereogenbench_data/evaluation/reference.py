@@ -129,7 +129,7 @@ def release_difference(index: SceneIndex, rows: Collection[int], *, scored: str 
     others = sorted(set(names) - TRAIN_MAPS - UNSEEN_MAPS)
     if others:
         count, named = sum(names[name] for name in others), ", ".join(others[:3])
-        return f"{count} of {len(chosen)} scenes on maps that it does not have ({named})"
+        return f"{count} of {len(chosen)} scenes on maps that the release does not have ({named})"
     branches = Counter(
         zip(
             index.column("subset")[chosen].tolist(),

@@ -40,7 +40,7 @@ def test_a_plot_of_other_scenes_than_the_papers_says_so(results):
     plots._draw(axes, results, "psnr")
 
     (said,) = [each.get_text() for each in axes.texts]
-    assert "3 of 3 scenes on maps that it does not have" in said
+    assert "3 of 3 scenes on maps that the release does not have" in said
     assert "not comparable" in said
 
 

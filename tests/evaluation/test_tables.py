@@ -69,7 +69,9 @@ def test_scores_of_other_scenes_than_the_papers_say_so_in_table_and_csv(scores):
     table = branch_table([scores(tier="G1")])
 
     assert "NOT COMPARABLE WITH THE PAPER" in markdown(table)
-    assert "3 of 3 scenes on maps that it does not have (SynthStage, SynthYard)" in latex(table)
+    assert "3 of 3 scenes on maps that the release does not have (SynthStage, SynthYard)" in latex(
+        table
+    )
     assert "StereoSpace (paper, other scenes)" in csv_text([table])
 
 
@@ -88,7 +90,8 @@ def test_only_all_scenes_of_a_branch_are_those_of_the_paper():
     assert difference(280) == "280 scenes of seen_map Uniform, of which the paper scored 281"
     assert difference(5, subset=None) == "5 scenes of Uniform, of which the paper scored none"
     assert (
-        difference(281, map_name="Home") == "281 of 281 scenes on maps that it does not have (Home)"
+        difference(281, map_name="Home")
+        == "281 of 281 scenes on maps that the release does not have (Home)"
     )
 
 
