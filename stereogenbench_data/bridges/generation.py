@@ -14,9 +14,10 @@ from PIL import Image
 
 from stereogenbench_data.bridges.adapted import AdaptedPairs, PairsOptions
 from stereogenbench_data.datasets.mapped import Data
-from stereogenbench_data.errors import FieldError
+from stereogenbench_data.errors import FieldError, SelectionError
 from stereogenbench_data.geometry.projection import project_rectified
 from stereogenbench_data.geometry.warp import front_pixels
+from stereogenbench_data.samples.derive import RECTIFIED_PX
 from stereogenbench_data.samples.fields import Sample
 
 Layout = Literal["tchw", "cthw"]
@@ -59,7 +60,8 @@ class GenStereo(AdaptedPairs[dict[str, torch.Tensor]]):
             **options: As for `StereoPairs`; ``frames`` are single frames.
 
         Raises:
-            SelectionError: If nothing matches, or samples are clips or sweeps.
+            SelectionError: If nothing matches, samples are clips or sweeps, or a rig is not
+                rectified: the item is warped along the rows.
             StereoGenBenchError: As `StereoPairs` does.
         """
         super().__init__(
@@ -69,6 +71,16 @@ class GenStereo(AdaptedPairs[dict[str, torch.Tensor]]):
             frames="frame",
             options=options,
         )
+        index, rows = self.pairs.index, self.pairs.plan.scene_rows
+        odd = rows[index.column("rig_residual_px")[rows] > RECTIFIED_PX]
+        if len(odd):
+            key, residual_px = (index.column(name)[odd[0]] for name in ("key", "rig_residual_px"))
+            raise SelectionError(
+                f"{index.where}: {len(odd)} selected scenes have rigs that are not rectified (the "
+                f"first: {key}, off by {residual_px:.2g} px), and GenStereo's inputs are warped "
+                f"along the rows. Leave them out by scenes=..., or take StereoClips or the field "
+                f"warped_right, which are warped by the poses."
+            )
 
 
 class StereoClips(AdaptedPairs[dict[str, Any]]):

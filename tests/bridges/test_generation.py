@@ -1,5 +1,7 @@
 """Generation: items as GenStereo's loop takes them, and clips for video diffusion."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,8 @@ from PIL import Image
 
 from stereogenbench_data import FieldError, HorizontalFlip, Letterbox, SelectionError, StereoPairs
 from stereogenbench_data.bridges.generation import GenStereo, StereoClips, describe_pair
+from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.samples.checks import OddSceneWarning
 from tests.servers.tools import require_module
 
 FIELDS = ("left", "right", "disparity", "valid", "warped_right", "hole")
@@ -49,6 +53,15 @@ def test_the_warped_view_and_the_mask_are_the_fields(detailed_release, transform
     assert torch.equal(item["correspondence"], plain["disparity"])
     assert torch.equal(item["source"], in_unit_range(plain["left"]))
     assert torch.equal(item["target"], in_unit_range(plain["right"]))
+
+
+def test_genstereo_refuses_rigs_that_are_not_rectified_by_name(detailed_release):
+    index = SceneIndex.open(detailed_release)
+    scenes = [replace(index.scene(row), rig_residual_px=3.5) for row in range(len(index))]
+    turned = SceneIndex.from_scenes(scenes, index.root)
+
+    with pytest.warns(OddSceneWarning), pytest.raises(SelectionError, match=r"off by 3\.5 px"):
+        GenStereo(turned)
 
 
 def test_the_warped_view_is_close_to_the_target_where_it_is_no_hole(item):
