@@ -10,14 +10,7 @@ import numpy as np
 
 from benchmarks.material import Material
 from benchmarks.results import Report, spread_of
-from benchmarks.ways import (
-    WAYS,
-    Pair,
-    interpolated,
-    sight_of,
-    visible_by_both,
-    visible_by_left,
-)
+from benchmarks.ways import WAYS, Pair, interpolated
 from stereogenbench_data.geometry.disparity import disparity_error_px
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.depth import resized_nearest
@@ -70,8 +63,8 @@ def measure_accuracy(
 ) -> dict[str, Any]:
     """Return the section of the results: error and speed of every way."""
     report("speed against error")
-    pair, paths = rendered_pair(material)
-    left, right = map(_first_depth, paths)
+    pair, path = rendered_pair(material)
+    left = _first_depth(path)
     ways = [
         {"name": way.name, "offered": way.offered, "kind": "disparity"} | _errors(way.run, cases)
         for way in WAYS
@@ -81,10 +74,9 @@ def measure_accuracy(
     }
     calls[CONVERSION] = lambda: left.astype(np.float32)
     resized, resizing = _resized(material.size_px)
-    sights, seeing = _visibility(pair, left, right)
-    calls |= resizing | seeing
+    calls |= resizing
     spent = beside(time_calls(calls, pixels=left.size, rounds=rounds), base=CONVERSION)
-    for way in (*ways, *resized, *sights):
+    for way in (*ways, *resized):
         way["ns_a_pixel"] = spent[way["name"]]
     return {
         "pixels": left.size,
@@ -92,7 +84,6 @@ def measure_accuracy(
         "conversion_ns": spent[CONVERSION],
         "ways": ways,
         "resized": resized,
-        "visibility": sights,
         "justified": justified(ways),
         "rounds": rounds,
     }
@@ -138,8 +129,8 @@ def justified(ways: list[dict[str, Any]]) -> str:
     return str(min(fit, key=lambda way: way["ns_a_pixel"]["median"])["name"])
 
 
-def rendered_pair(material: Material) -> tuple[Pair, list[Path]]:
-    """Return the primary pair of a drawn scene, and the files of both stored depths."""
+def rendered_pair(material: Material) -> tuple[Pair, Path]:
+    """Return the primary pair of a drawn scene, and the file of its left stored depth."""
     index = SceneIndex.open(material.eight)
     scene = index.scene(0)
     cameras = scene.rig.primary_pair
@@ -148,8 +139,7 @@ def rendered_pair(material: Material) -> tuple[Pair, list[Path]]:
         baseline_m=scene.rig.baseline_cm(*cameras) / 100,
         unit_m=scene.depth_unit_m[cameras[0]],
     )
-    members = [scene.members[f"cam_{camera:02d}_depth.mkv"] for camera in cameras]
-    return pair, [Path(index.root) / member.path for member in members]
+    return pair, Path(index.root) / scene.members[f"cam_{cameras[0]:02d}_depth.mkv"].path
 
 
 def two_planes(
@@ -211,34 +201,6 @@ def _resized(size: int) -> tuple[list[dict[str, Any]], dict[str, Callable[[], An
     return found, {name: run for name, (_, run) in policies.items()}
 
 
-def _visibility(
-    pair: Pair, left: np.ndarray, right: np.ndarray
-) -> tuple[list[dict[str, Any]], dict[str, Callable[[], Any]]]:
-    """Return how often each way differs from float64 by both depths, and its call."""
-    single, double = (
-        sight_of(pair, left, right, dtype=dtype) for dtype in (np.float32, np.float64)
-    )
-    truth = visible_by_both(double)
-    ways: dict[str, tuple[str, Callable[[], Any]]] = {
-        "visible, float64": ("not taken", lambda: visible_by_both(double)),
-        "visible, float32": ("default", lambda: visible_by_both(single)),
-        "visible, float32, from stored units on": (
-            "default", lambda: visible_by_both(sight_of(pair, left, right, dtype=np.float32)),
-        ),
-        "visible_from_left, float32": ("offered", lambda: visible_by_left(single)),
-    }  # fmt: skip
-    found = [
-        {
-            "name": name,
-            "kind": "visibility",
-            "offered": offered,
-            "other_share": float(np.mean(run() != truth)),
-        }
-        for name, (offered, run) in ways.items()
-    ]
-    return found, {name: run for name, (_, run) in ways.items()}
-
-
 def time_calls(
     calls: Mapping[str, Callable[[], Any]], *, pixels: int, rounds: int
 ) -> dict[str, list[float]]:
@@ -259,17 +221,14 @@ def time_calls(
 
 
 def beside(times: Mapping[str, list[float]], *, base: str) -> dict[str, dict[str, float]]:
-    """Return the spread of the times of every call, and of their ratio to the base in each round.
+    """Return the spread of the times of every call, and their median ratio to the base's.
 
     The base is a conversion of the map, so ratios are called conversions.
     """
     found = {}
     for name, values in times.items():
         ratio = spread_of(value / plain for value, plain in zip(values, times[base], strict=True))
-        found[name] = spread_of(values) | {
-            "conversions": ratio["median"], "conversions_low": ratio["low"],
-            "conversions_high": ratio["high"],
-        }  # fmt: skip
+        found[name] = spread_of(values) | {"conversions": ratio["median"]}
     return found
 
 

@@ -12,13 +12,15 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any, Final
 
 import torch
+from torch.utils.data import DataLoader
 
 from benchmarks.contestants import limit
-from benchmarks.field import CONTESTANTS, LIMIT, NO_DEPTH
+from benchmarks.field import CONTESTANTS, LIMIT
 from benchmarks.workloads import Job, Wanted
 
 LONGEST_S: Final = 300.0
@@ -31,11 +33,21 @@ _FORK = multiprocessing.get_context("fork")
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A measurement: samples, wall time, and processor time of all processes, in seconds."""
+    """A measurement.
+
+    Attributes:
+        samples: The number of samples.
+        seconds: Wall time from the start of the workers to the last batch.
+        cpu_s: Processor time of all processes.
+        first_samples: The samples of the first batch; 0 of the limit, which has no batches.
+        first_s: Wall time to the first batch.
+    """
 
     samples: int
     seconds: float
     cpu_s: float
+    first_samples: int = 0
+    first_s: float = 0.0
 
 
 class MeasurementError(Exception):
@@ -85,12 +97,10 @@ def _report(work: Callable[[], Any], to: Connection) -> None:
 def _run(name: str, job: Job, *, workers: int) -> Measured:
     torch.set_num_threads(1)
     list(job.of_scene)  # Computed before the clock starts.
+    if name != LIMIT:
+        return whole_pass(partial(CONTESTANTS[name].batches, job), workers=workers)
     before = _cpu_s()
-    if name in (LIMIT, NO_DEPTH):
-        depth: limit.Depth = "given" if name == NO_DEPTH else "decoded"
-        samples, seconds = _bare(job, processes=max(1, workers), depth=depth)
-    else:
-        samples, seconds = _batched(name, job, workers=workers)
+    samples, seconds = _bare(job, processes=max(1, workers))
     return Measured(samples, seconds, _cpu_s() - before)
 
 
@@ -100,7 +110,10 @@ def _cpu_s() -> float:
     return sum(usage.ru_utime + usage.ru_stime for usage in spent)
 
 
-def _batched(name: str, job: Job, *, workers: int) -> tuple[int, float]:
+def whole_pass(make: Callable[..., DataLoader[Any]], *, workers: int) -> Measured:
+    """Return what one pass takes over a loader, which is made with the options of its workers."""
+    torch.set_num_threads(1)
+    before = _cpu_s()
     started = torch.zeros(max(1, workers), dtype=torch.float64).share_memory_()
 
     def note_start(worker: int) -> None:
@@ -108,25 +121,31 @@ def _batched(name: str, job: Job, *, workers: int) -> tuple[int, float]:
         started[worker] = time.perf_counter()
 
     warnings.filterwarnings("ignore", message="This DataLoader will create")
-    loader = CONTESTANTS[name].batches(job, num_workers=workers, worker_init_fn=note_start)
-    samples = 0
+    loader = make(num_workers=workers, worker_init_fn=note_start)
+    arrived: list[tuple[int, float]] = []
     note_start(0)
     for batch in loader:
-        samples += len(batch["scene"])
-    return samples, time.perf_counter() - float(started.mean())
+        arrived.append((len(batch["scene"]), time.perf_counter()))
+    del batch, loader  # ends the workers, whose processor time counts
+    began = float(started.mean())
+    (first_samples, first), (_, last) = arrived[0], arrived[-1]
+    return Measured(
+        sum(samples for samples, _ in arrived), last - began, _cpu_s() - before,
+        first_samples, first - began,
+    )  # fmt: skip
 
 
-def _bare(job: Job, *, processes: int, depth: limit.Depth) -> tuple[int, float]:
+def _bare(job: Job, *, processes: int) -> tuple[int, float]:
     """Run the limit: N loops over different scenes; their rates are added up."""
     scenes = list(job.of_scene.items())
     if processes == 1:
-        return _timed_loop(job, scenes, depth=depth)
+        return _timed_loop(job, scenes)
     barrier = _FORK.Barrier(processes)
     here, there = _FORK.Pipe(duplex=False)
 
     def loop(own: Scenes) -> None:
         barrier.wait()
-        there.send(_timed_loop(job, own, depth=depth))
+        there.send(_timed_loop(job, own))
 
     running = [
         _FORK.Process(target=loop, args=(scenes[place::processes],)) for place in range(processes)
@@ -141,7 +160,7 @@ def _bare(job: Job, *, processes: int, depth: limit.Depth) -> tuple[int, float]:
     return samples, samples / sum(count / seconds for count, seconds in found)
 
 
-def _timed_loop(job: Job, scenes: Scenes, *, depth: limit.Depth) -> tuple[int, float]:
+def _timed_loop(job: Job, scenes: Scenes) -> tuple[int, float]:
     begin = time.perf_counter()
-    samples = sum(1 for _ in limit.samples(job, dict(scenes), depth=depth))
+    samples = sum(1 for _ in limit.samples(job, dict(scenes)))
     return samples, time.perf_counter() - begin

@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.clock import in_a_fork
 from benchmarks.contestants import limit
-from benchmarks.field import CONTESTANTS, LIMIT, NO_DEPTH, entrants, why_not
+from benchmarks.field import CONTESTANTS, LIMIT, entrants, why_not
 from benchmarks.material import Material
 from benchmarks.workloads import WORKLOADS, Job, tiny
 from stereogenbench_data import StereoPairs
@@ -29,8 +29,6 @@ def differences(material: Material, *, only: Collection[str] = ()) -> dict[str, 
     for workload in (tiny(each) for each in WORKLOADS if not only or each.name in only):
         found[workload.name] = {}
         for name, _ in entrants(workload):
-            if name == NO_DEPTH:
-                continue
             reason = why_not(name)
             if reason is None:
                 reading = CONTESTANTS[name].reading if name in CONTESTANTS else "forwards"

@@ -8,11 +8,9 @@ from typing import Any, Final
 from torch.utils.data import DataLoader
 
 from benchmarks.contestants import naive, ours, random_access, scenewise
-from benchmarks.material import can_pack_blosc2
 from benchmarks.workloads import Job, Reading, Workload
 
 LIMIT: Final = "limit"
-NO_DEPTH: Final = "limit-no-depth"
 NAIVE: Final = "naive"
 OURS: Final = "ours"
 
@@ -47,7 +45,6 @@ def _forwards(dataset: Callable[[Job], Any]) -> Callable[..., DataLoader[Any]]:
 
 _TITLES: Final = {
     LIMIT: "limit: bare PyAV loop",
-    NO_DEPTH: "the limit with depth for nothing",
     NAIVE: "naive: the paper's snippet",
     "webdataset": "webdataset + decode step",
     "datasets": "HF datasets streaming + decode step",
@@ -56,7 +53,6 @@ _TITLES: Final = {
     OURS: "ours, StereoPairs.loader",
     "ours-stream": "ours, StereoPairStream",
     "ours-shards": "ours, from shards",
-    "ours-blosc2": "ours, from blosc2 shards",
 }
 
 _CONTESTANTS: Final = (
@@ -90,10 +86,6 @@ _CONTESTANTS: Final = (
         "ours-shards", _TITLES["ours-shards"], "forwards",
         lambda job, **o: ours.mapped(job, job.material.shards, **o),
     ),
-    Contestant(
-        "ours-blosc2", _TITLES["ours-blosc2"], "forwards",
-        lambda job, **o: ours.mapped(job, job.material.blosc2, **o), "blosc2",
-    ),
 )  # fmt: skip
 CONTESTANTS: Final = {contestant.name: contestant for contestant in _CONTESTANTS}
 
@@ -105,8 +97,6 @@ def title(name: str) -> str:
 
 def why_not(name: str) -> str | None:
     """Return why a contestant cannot race here, None where it can."""
-    if "blosc2" in name and not can_pack_blosc2():
-        return "blosc2 is not installed"
     contestant = CONTESTANTS.get(name)
     if contestant is None or contestant.module is None:
         return None

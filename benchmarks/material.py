@@ -7,7 +7,6 @@ under other keys: as many scenes open at a time as in a real epoch, without draw
 import json
 import os
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +15,6 @@ from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import FRAME_RATE_HZ, IMAGE_SIZE_PX
 from stereogenbench_data.shards.pack import pack
-from stereogenbench_data.shards.plan import DepthCodec
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 
@@ -63,16 +61,6 @@ class Material:
         """The eight scenes in shards, one a shard, as released."""
         return self.root / "shards"
 
-    @property
-    def blosc2(self) -> Path:
-        """The eight scenes in shards with depth as blosc2 frames; absent if that cannot be made."""
-        return self.root / "blosc2"
-
-
-def can_pack_blosc2() -> bool:
-    """Return whether depth can be packed as blosc2 frames here."""
-    return find_spec("blosc2") is not None
-
 
 def prepared(
     material: Material,
@@ -102,7 +90,8 @@ def prepared(
     _link(material.release, material.many, scenes=max(EIGHT, round(MANY * material.scale)))
     _index(material.many, report=report)
     _link(material.release, material.eight, scenes=EIGHT)
-    _index_and_pack(material, report=report, workers=workers)
+    _index(material.eight, report=report)
+    _pack(material, report=report, workers=workers)
     record.write_text(text)
     return material
 
@@ -141,17 +130,9 @@ def _index(tree: Path, *, report: Report) -> None:
         SceneIndex.open(tree).write(tree / INDEX_NAME)
 
 
-def _index_and_pack(material: Material, *, report: Report, workers: int) -> None:
-    _index(material.eight, report=report)
-    _pack(material.eight, material.shards, report=report, workers=workers)
-    if can_pack_blosc2():
-        _pack(material.eight, material.blosc2, report=report, workers=workers, depth_codec="blosc2")
-
-
-def _pack(
-    tree: Path, out: Path, *, report: Report, workers: int, depth_codec: DepthCodec = "released"
-) -> None:
-    """Pack a tree, one scene a shard."""
+def _pack(material: Material, *, report: Report, workers: int) -> None:
+    """Pack the eight scenes, one a shard."""
+    tree, out = material.eight, material.shards
     if (out / INDEX_NAME).exists():
         return
     report(f"packing {out}")
@@ -160,7 +141,7 @@ def _pack(
         for scene in tree.rglob("baseline.json")
     ]
     target_bytes = (max(sizes) * 101 // 100_000_000 + 1) * 1_000_000
-    pack(tree, out, target_bytes=target_bytes, depth_codec=depth_codec, workers=workers)
+    pack(tree, out, target_bytes=target_bytes, workers=workers)
 
 
 def facts(material: Material) -> dict[str, Any]:
@@ -173,8 +154,5 @@ def facts(material: Material) -> dict[str, Any]:
         mean = sum(sizes) / len(sizes)
         found[f"{label}_mb_a_frame"] = mean / material.frames / 1e6
         found[f"{label}_mbit_s"] = mean * FRAME_RATE_HZ / material.frames * 8 / 1e6
-    for label, folder in (("shards", material.shards), ("blosc2", material.blosc2)):
-        if folder.exists():
-            packed = sum(file.stat().st_size for file in folder.glob("*.tar"))
-            found[f"{label}_mb_a_scene"] = packed / EIGHT / 1e6
-    return found
+    packed = sum(file.stat().st_size for file in material.shards.glob("*.tar"))
+    return found | {"shards_mb_a_scene": packed / EIGHT / 1e6}

@@ -15,24 +15,21 @@ import os
 import resource
 import shutil
 import tempfile
-import time
-import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import torch
 from torch.utils.data import DataLoader, IterableDataset
 
-from benchmarks.clock import MeasurementError, in_a_fork
+from benchmarks.clock import Measured, MeasurementError, in_a_fork, whole_pass
 from benchmarks.contestants import mosaic, scenewise
 from benchmarks.contestants.rig import camera_files
 from benchmarks.material import Material
 from benchmarks.results import Report, Results, Spread
-from benchmarks.server import Network, WebServer, serving
+from benchmarks.server import Network, serving
 from benchmarks.tables import rate_text, spread_text, table
 from benchmarks.workloads import SEED, Wanted, Workload
 from stereogenbench_data import StereoPairs
@@ -154,28 +151,18 @@ class Job:
         return ["baseline.json", *camera_files(wanted, both_ways=self.workload.both_ways)]
 
 
-@dataclass(slots=True)
-class Turn:
-    """One contestant's turn.
+@dataclass(frozen=True, slots=True)
+class Turn(Measured):
+    """One contestant's turn, with what its process and the server counted.
 
     Attributes:
-        samples: The number of samples.
-        seconds: From the start of the workers to the last batch.
-        first_s: From the start of the workers to the first batch.
-        first_samples: The samples of the first batch.
-        cpu_s: Processor time of all processes.
         peak_mb: The most memory that a worker held, shared memory included.
         requests: Requests that the server counted.
         sent_mb: Megabytes of bodies that it counted.
         failures: Responses that it cut or refused on purpose.
     """
 
-    samples: int
-    seconds: float
-    first_s: float
-    first_samples: int
-    cpu_s: float
-    peak_mb: float
+    peak_mb: float = 0.0
     requests: int = 0
     sent_mb: float = 0.0
     failures: int = 0
@@ -189,9 +176,10 @@ def link_shards(material: Material, job: Job) -> None:
     if (job.shards / INDEX_NAME).exists():
         return
     index = SceneIndex.open(material.shards)
+    index.load_seek_tables()
     firsts: dict[str, Scene] = {}
     for row in range(len(index)):
-        scene = _scene(index, row)
+        scene = replace(index.scene(row), seek_tables=index.seek_tables(row))
         firsts.setdefault(scene.members["baseline.json"].path, scene)
     drawn = list(firsts.values())
     job.shards.mkdir(parents=True, exist_ok=True)
@@ -211,14 +199,6 @@ def link_shards(material: Material, job: Job) -> None:
     keys = "\n".join(scene.id.key for scene in drawn[: job.scenes])
     (job.shards / "keys.txt").write_text(keys)
     SceneIndex.from_scenes(scenes, job.shards, shards=facts).write(job.shards / INDEX_NAME)
-
-
-def _scene(index: SceneIndex, row: int) -> Scene:
-    """Return a scene with where its packets lie, if the index has that."""
-    scene = index.scene(row)
-    if hasattr(index, "load_seek_tables") and index.load_seek_tables():
-        scene = replace(scene, seek_tables=index.seek_tables(row))
-    return scene
 
 
 def link_mds(material: Material, job: Job) -> None:
@@ -305,52 +285,19 @@ def measured(name: str, job: Job, network: Network, *, workers: int) -> Turn:
         return found
     with serving(job.root, network=network) as server:
         found = in_a_fork(lambda: _run(name, job, server.url, workers=workers), longest_s=LONGEST_S)
-        return _counted(found, server)
-
-
-def _counted(turn: Turn, server: WebServer) -> Turn:
-    counts = server.counts()
-    turn.requests, turn.sent_mb = counts.requests, round(counts.sent_bytes / 1e6, 3)
-    turn.failures = counts.failures
-    return turn
+        counts = server.counts()
+    sent_mb = round(counts.sent_bytes / 1e6, 3)
+    return replace(found, requests=counts.requests, sent_mb=sent_mb, failures=counts.failures)
 
 
 def _run(name: str, job: Job, url: str, *, workers: int) -> Turn:
-    torch.set_num_threads(1)
     list(job.of_scene)  # computed before the clock starts
     with tempfile.TemporaryDirectory() as local:
-        make = _loaders()[name]
-        started = torch.zeros(max(1, workers), dtype=torch.float64).share_memory_()
-
-        def note_start(worker: int) -> None:
-            torch.set_num_threads(1)
-            started[worker] = time.perf_counter()
-
-        warnings.filterwarnings("ignore", message="This DataLoader will create")
-        before_s = _cpu_s()
-        loader = make(job, url, Path(local), num_workers=workers, worker_init_fn=note_start)
-        samples = first_samples = 0
-        first_s = last_s = 0.0
-        note_start(0)
-        for batch in loader:
-            samples += len(batch["scene"])
-            last_s = time.perf_counter()
-            if not first_samples:
-                first_samples, first_s = samples, last_s
-        began_s = float(started.mean())
-        del batch, loader
+        took = whole_pass(partial(_loaders()[name], job, url, Path(local)), workers=workers)
     peak_kb = resource.getrusage(
         resource.RUSAGE_CHILDREN if workers else resource.RUSAGE_SELF
     ).ru_maxrss
-    return Turn(
-        samples, round(last_s - began_s, 4), round(first_s - began_s, 4), first_samples,
-        round(_cpu_s() - before_s, 3), round(peak_kb / 1e3, 1),
-    )  # fmt: skip
-
-
-def _cpu_s() -> float:
-    spent = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(usage.ru_utime + usage.ru_stime for usage in spent)
+    return Turn(**asdict(took), peak_mb=round(peak_kb / 1e3, 1))
 
 
 def _loaders() -> dict[str, Callable[..., Any]]:

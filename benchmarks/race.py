@@ -1,6 +1,6 @@
 """Races: rounds in which every entrant of a workload runs once, in turn, on the same samples."""
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from benchmarks.clock import MeasurementError, measured
@@ -88,9 +88,4 @@ def _measured(name: str, job: Job, *, workers: int) -> dict[str, float]:
         MeasurementError: If it failed.
     """
     reading = CONTESTANTS[name].reading if name in CONTESTANTS else "forwards"
-    took = measured(name, replace(job, reading=reading), workers=workers)
-    return {
-        "samples": took.samples,
-        "seconds": round(took.seconds, 4),
-        "cpu_s": round(took.cpu_s, 3),
-    }
+    return asdict(measured(name, replace(job, reading=reading), workers=workers))

@@ -3,10 +3,10 @@
 ``python -m benchmarks.server FOLDER --delay-ms 60`` serves a folder until it is stopped; with
 ``--to URL`` it stands before another server of this machine, which it delays.
 
-It waits before the first byte of each response, limits the bandwidth of each
-connection and of all together, cuts connections and answers 503. It does not imitate handshakes,
-TCP's slow start or lost packets. It runs in one process, and the kernel copies
-the bytes of files, so it takes little of a processor that contestants need.
+It waits before the first byte of each response, limits the bandwidth of each connection and of all
+together, cuts connections and answers 503. It does not imitate handshakes, TCP's slow start or lost
+packets. It runs in one process, and the kernel copies the bytes of files, so it takes little of a
+processor that contestants need.
 """
 
 import argparse

@@ -1,10 +1,9 @@
 """The Markdown tables of the results, computed from the JSON file."""
 
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from collections.abc import Iterable
 from typing import Any
 
-from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, NO_DEPTH, OURS, title
+from benchmarks.field import CONTESTANTS, LIMIT, NAIVE, OURS, title
 from benchmarks.results import Spread, cpu_ratios, entry, rates, ratios
 from benchmarks.training import MARK_OWN
 from benchmarks.workloads import WORKLOADS, Workload
@@ -39,13 +38,7 @@ def _how(sections: dict[str, Any]) -> str:
         f"{data.get('size_px')}x{data.get('size_px')}, {data.get('frames')} frames; H.264 "
         f"{data.get('rgb_mbit_s', 0):.1f} Mbit/s a camera with one key frame, FFV1 depth "
         f"{data.get('depth_mb_a_frame', 0):.2f} MB a frame; a scene takes "
-        f"{data.get('shards_mb_a_scene', 0):.0f} MB in shards"
-        + (
-            f" and {data['blosc2_mb_a_scene']:.0f} MB with depth as blosc2 frames "
-            f"({data['blosc2_mb_a_scene'] / data['shards_mb_a_scene']:.2f} times)."
-            if "blosc2_mb_a_scene" in data
-            else "."
-        ),
+        f"{data.get('shards_mb_a_scene', 0):.0f} MB in shards.",
         "",
         "Ratios are medians over rounds with quartiles; each is taken within one round.",
         "",
@@ -97,12 +90,6 @@ def _accuracy(found: dict[str, Any]) -> str:
         "resized to 832x480", "in the package", "ns a source pixel", "conversions", "99 % px",
         "99.9 % px", "worst px", "mean px", "of no surface, % of pixels",
     )  # fmt: skip
-    text += table(head, rows) + "\n"
-    rows = [
-        [way["name"], offered[way["offered"]], *speed(way), f"{way['other_share'] * 100:.4f}"]
-        for way in found["visibility"]
-    ]
-    head = ("visibility", "in the package", "ns a pixel", "conversions", "decided otherwise, %")
     return text + table(head, rows)
 
 
@@ -138,19 +125,13 @@ def headlines(races: dict[str, Any]) -> str:
         own = entry(OURS, workers)
         limit = ratios(rounds, own, to=entry(LIMIT, workers))
         naive = ratios(rounds, own, to=entry(NAIVE, workers))
-        blosc2 = ratios(rounds, entry("ours-blosc2", workers), to=entry(LIMIT, workers))
-        best = ratios(rounds, entry(NO_DEPTH, workers), to=entry(LIMIT, workers))
         rows.append(
             [
                 workload.title, spread_text(limit), at_least(limit, workload.target.limit),
                 spread_text(naive, ".1f"), at_least(naive, workload.target.naive),
-                spread_text(blosc2), at_least(blosc2, workload.blosc2), spread_text(best),
             ]
         )  # fmt: skip
-    head = (
-        "ours, 2 workers", "to the limit", "target", "to naive", "target",
-        "blosc2 shards to the released codecs' limit", "target", "that limit, depth for nothing",
-    )  # fmt: skip
+    head = ("ours, 2 workers", "to the limit", "target", "to naive", "target")
     return "## Headlines\n\n" + table(head, rows)
 
 
@@ -161,7 +142,7 @@ def race_table(workload: Workload, race: dict[str, Any]) -> str:
     rows = []
     for workers in sorted(workload.workers):
         base, naive = entry(LIMIT, workers), entry(NAIVE, workers)
-        first = (LIMIT, NO_DEPTH, OURS)
+        first = (LIMIT, OURS)
         for name in (*first, *(n for n in _order(names) if n not in first)):
             entrant = entry(name, workers)
             if entrant not in names:
@@ -198,15 +179,11 @@ def table(head: Iterable[str], rows: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def spread_text(
-    spread: Spread | Mapping[str, float] | None, form: str = ".2f", *, scale: float = 1
-) -> str:
-    """Return median (low to high quartile), times a scale."""
+def spread_text(spread: Spread | None, form: str = ".2f") -> str:
+    """Return median (low to high quartile)."""
     if spread is None:
         return ""
-    kept = asdict(spread) if isinstance(spread, Spread) else spread
-    median, low, high = (f"{kept[name] * scale:{form}}" for name in ("median", "low", "high"))
-    return f"{median} ({low} to {high})"
+    return f"{spread.median:{form}} ({spread.low:{form}} to {spread.high:{form}})"
 
 
 def rate_text(spread: Spread | None) -> str:
@@ -221,8 +198,3 @@ def at_least(spread: Spread | None, wanted: float | None) -> str:
 
 def _reached(ratio: float, wanted: float) -> str:
     return f"{wanted:g} {'reached' if ratio >= wanted else '**missed**'}"
-
-
-def at_most(value: float, wanted: float, form: str = "g", *, scale: float = 1) -> str:
-    """Return the largest allowed value, times a scale, and whether the value is within it."""
-    return f"{wanted * scale:{form}} {'reached' if value <= wanted else '**missed**'}"

@@ -127,9 +127,7 @@ class _Shards:
         self._source = MemberSource(index.root, shards=index.shards, revision=index.digest)
         self._scenes = {index.scene(row).id.key: index.scene(row) for row in range(len(index))}
 
-    def __call__(
-        self, job: Job, key: str, names: Sequence[str], *, depth: limit.Depth
-    ) -> limit.Opened:
+    def __call__(self, job: Job, key: str, names: Sequence[str]) -> limit.Opened:
         source, scene = self._source, self._scenes[key]
         streams = {
             name: _Depth(source.open(scene, name), name=name, frames="any")

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 import torch
@@ -15,8 +15,7 @@ from stereogenbench_data.geometry.disparity import (
     write_disparity,
 )
 from stereogenbench_data.geometry.pose import CameraPoses
-from stereogenbench_data.geometry.projection import project_rectified, project_through_poses
-from stereogenbench_data.geometry.visibility import visible_from_source, visible_in_target
+from stereogenbench_data.geometry.projection import project_through_poses
 from stereogenbench_data.schema.records import Trajectory
 
 
@@ -209,52 +208,3 @@ def interpolated(values: np.ndarray, *, size: tuple[int, int], mode: str) -> np.
         torch.from_numpy(values)[None, None], size, mode=mode, **options
     )
     return found[0, 0].numpy()
-
-
-@dataclass(frozen=True, slots=True)
-class Sight:
-    """The input of visibility: depth in metres of both views, and where it was measured."""
-
-    left_m: np.ndarray
-    right_m: np.ndarray
-    left_measured: np.ndarray
-    right_measured: np.ndarray
-    disparity_px: np.ndarray
-    quantum_m: float
-
-
-def sight_of(pair: Pair, left: np.ndarray, right: np.ndarray, *, dtype: Any) -> Sight:
-    """Return the input of visibility from the stored depth of both views."""
-    measured = [(units != 0) & (units != 65535) for units in (left, right)]
-    left_m, right_m = (
-        np.multiply(units, pair.unit_m, dtype=np.float64).astype(dtype) * there
-        for units, there in zip((left, right), measured, strict=True)
-    )
-    if dtype == np.float32:
-        disparity_px = measured[0] * disparity_from_units(
-            left, focal_px=pair.focal_px, baseline_m=pair.baseline_m, unit_m=pair.unit_m
-        )
-    else:
-        with np.errstate(divide="ignore"):
-            disparity_px = np.where(measured[0], pair.focal_px * pair.baseline_m / left_m, 0.0)
-    return Sight(left_m, right_m, *measured, disparity_px, pair.unit_m)
-
-
-def visible_by_both(sight: Sight) -> Any:
-    """Return the pixels that the right camera sees, by its own depth."""
-    return visible_in_target(
-        project_rectified(sight.left_m, sight.disparity_px),
-        measured=sight.left_measured,
-        target_depth_m=sight.right_m,
-        target_measured=sight.right_measured,
-        quantum_m=sight.quantum_m,
-    )
-
-
-def visible_by_left(sight: Sight) -> Any:
-    """Return the pixels that the right camera sees, by the left depth alone."""
-    return visible_from_source(
-        project_rectified(sight.left_m, sight.disparity_px),
-        measured=sight.left_measured,
-        quantum_m=sight.quantum_m,
-    )

@@ -57,7 +57,6 @@ class Workload:
         few: Samples in the slice of contestants that start again at every sample.
         workers: Worker processes, the first being the headline.
         target: The target ratios, if any.
-        blosc2: The target ratio with blosc2 shards, if any.
         more: Further contestants in this workload.
         field: Contestants in this workload instead of the usual ones.
     """
@@ -74,7 +73,6 @@ class Workload:
     few: int = 4
     workers: tuple[int, ...] = (2,)
     target: Target | None = None
-    blosc2: float | None = None
     more: tuple[str, ...] = ()
     field: tuple[str, ...] = ()
 
@@ -90,8 +88,6 @@ class Workload:
         return ("left", "right", *maps, "baseline_m", "frame_index", "pair", "scene")
 
 
-_CODECS: Final = ("limit-no-depth", "ours-shards", "ours-blosc2")
-
 WORKLOADS: Final = (
     Workload(
         "first", "primary pair, first frame, 1280", 24, "first", "first", few=8,
@@ -99,7 +95,7 @@ WORKLOADS: Final = (
     ),
     Workload(
         "all-frames", "primary pair, all frames shuffled, 1280", 8, "all", range(12),
-        workers=(2, 0, 1, 4), target=Target(0.85, 15), blosc2=2.5, more=_CODECS,
+        workers=(2, 0, 1, 4), target=Target(0.85, 15), more=("ours-shards",),
     ),
     Workload(
         "all-pairs", "all 15 pairs, all frames, both disparities, 1280", 4, "all", range(4),
@@ -107,8 +103,8 @@ WORKLOADS: Final = (
     ),
     Workload(
         "all-pairs-832", "all 15 pairs, all frames, both disparities, 832x480", 4, "all", range(4),
-        pairs="all", both_ways=True, size=(480, 832), target=Target(0.85, 60), blosc2=2.5,
-        more=_CODECS,
+        pairs="all", both_ways=True, size=(480, 832), target=Target(0.85, 60),
+        more=("ours-shards",),
     ),
     Workload(
         "clips", "16-frame clips, primary pair, 1280", 6, ("clips", 16, 1, 16),
@@ -120,7 +116,7 @@ WORKLOADS: Final = (
     ),
     Workload(
         "random", "random single frames, 8 a scene, 1280", 4, ("random", 8), ("random", 8),
-        target=Target(0.7, 3), blosc2=3.0, more=_CODECS,
+        target=Target(0.7, 3), more=("ours-shards",),
     ),
 )  # fmt: skip
 

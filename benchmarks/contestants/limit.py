@@ -2,15 +2,12 @@
 
 It does nothing else: no checks, no masks, no batches, no queues. It reuses its buffers, so it does
 not even allocate memory. With N processes, N of these loops run over different scenes.
-
-With depth for nothing, no depth file is opened and every map has the same numbers. The speed of
-this loop bounds the gain of any other codec for depth.
 """
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import av
 import av.filter
@@ -21,8 +18,6 @@ from benchmarks.contestants.rig import camera_files, nearest_places, pair_number
 from benchmarks.workloads import Job, Wanted
 
 _RED_GREEN_BLUE: Final = (2, 0, 1)
-
-Depth = Literal["decoded", "given"]
 
 
 class Stream:
@@ -94,30 +89,6 @@ class Stream:
         return frame
 
 
-class GivenDepth:
-    """Depth that costs nothing to decode: the same stored numbers for every frame."""
-
-    def __init__(self, stored: np.ndarray, size: tuple[int, int]) -> None:
-        """Take stored numbers, to be scaled to (height, width)."""
-        self._stored = stored
-        self._size = size
-        self._at = -1
-        self._kept: Any = None
-
-    def units(self, index: int) -> np.ndarray:
-        """Return the stored depth of a frame."""
-        if index != self._at:
-            self._at, self._kept = index, _resized(self._stored, self._size)
-        return self._kept
-
-    def unit_m(self) -> float:
-        """Return the metres in a stored unit."""
-        return 0.001
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
 def _resized(stored: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if stored.shape == size:
         return stored
@@ -135,17 +106,11 @@ Opened = tuple[dict[str, Any], Mapping[str, Any]]
 """A scene's baseline.json, and its open videos by their released names."""
 
 
-def released(job: Job, key: str, names: Sequence[str], *, depth: Depth) -> Opened:
+def released(job: Job, key: str, names: Sequence[str]) -> Opened:
     """Open videos of a scene in the released layout."""
     folder = job.tree / key
     size = job.workload.size or (job.material.size_px, job.material.size_px)
-    stored = np.full((job.material.size_px, job.material.size_px), 5000, dtype=np.uint16)
-    streams = {
-        name: GivenDepth(stored, size)
-        if depth == "given" and name.endswith(".mkv")
-        else Stream(folder / name, size)
-        for name in names
-    }
+    streams = {name: Stream(folder / name, size) for name in names}
     return json.loads((folder / "baseline.json").read_text()), streams
 
 
@@ -153,7 +118,6 @@ def samples(
     job: Job,
     scenes: Mapping[str, Sequence[Wanted]],
     *,
-    depth: Depth = "decoded",
     opened: Callable[..., Opened] = released,
 ) -> Iterator[dict[str, Any]]:
     """Yield samples by scene, each scene's by frame; the next one overwrites the arrays."""
@@ -171,7 +135,7 @@ def samples(
     shown = {name: array[cut] for name, array in arrays.items()}
     for key, wanted in scenes.items():
         names = camera_files(wanted, both_ways=workload.both_ways)
-        document, streams = opened(job, key, names, depth=depth)
+        document, streams = opened(job, key, names)
         unit_m = streams[f"cam_{wanted[0].left:02d}_depth.mkv"].unit_m()
         for sample in wanted:
             pair = pair_numbers(document, left=sample.left, right=sample.right, width_px=width)
