@@ -19,11 +19,12 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import urllib.request
+from asyncio import sleep
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from time import monotonic
 from typing import Final
 from urllib.parse import unquote, urlsplit
 
@@ -109,7 +110,7 @@ class _Line:
         """Return for how many seconds to wait before so many bytes have gone through."""
         if not self._bytes_s:
             return 0.0
-        now_s = time.monotonic()
+        now_s = monotonic()
         self._free_s = max(self._free_s, now_s) + count / self._bytes_s
         return self._free_s - now_s
 
@@ -152,7 +153,7 @@ class _Server:
                     writer.write(_head(200, "OK", len(text), "") + text)
                     break
                 self._counts["requests"] += 1
-                await asyncio.sleep(self._network.delay_s)
+                await sleep(self._network.delay_s)
                 keeps = asked.keeps
                 if not await self._send(asked, writer, line):
                     break
@@ -205,7 +206,7 @@ class _Server:
                 count = self._total.piece(line.piece(stop - start))
                 wait_s = max(line.reserve(count), self._total.reserve(count))
                 if wait_s > 0:
-                    await asyncio.sleep(wait_s)
+                    await sleep(wait_s)
                 await writer.drain()
                 await loop.sendfile(writer.transport, file, start, count)
                 self._counts["sent_bytes"] += count
@@ -249,12 +250,12 @@ class _Proxy:
     ) -> None:
         while data := await reader.read(65_536):
             if delayed:
-                await asyncio.sleep(self._network.delay_s)
+                await sleep(self._network.delay_s)
                 if self._chance.random() < self._network.lost:
                     return
             else:
                 wait_s = max(line.reserve(len(data)), self._total.reserve(len(data)))
-                await asyncio.sleep(wait_s)
+                await sleep(wait_s)
             writer.write(data)
             await writer.drain()
 

@@ -1,11 +1,12 @@
 """The server for measuring and the races over a network, run once on tiny data."""
 
-import time
+import asyncio
 import urllib.error
 import urllib.request
 
 import pytest
 
+import benchmarks.server
 from benchmarks.network import LOCAL, OURS, Job, Plan, measured, network_tables, run_network
 from benchmarks.network import WORKLOADS as NETWORK_WORKLOADS
 from benchmarks.plots import plot_all
@@ -36,12 +37,10 @@ def started(folder):
 
 def test_the_delayed_server_counts_what_it_sends(started):
     with started(delay_s=0.05) as server:
-        remote, began_s = RemoteObject(f"{server.url}/x.tar"), time.monotonic()
+        remote = RemoteObject(f"{server.url}/x.tar")
         assert remote.read(0, 100) + remote.read(500, 900) == DATA[:100] + DATA[500:900]
-        took_s = time.monotonic() - began_s
         counts = server.counts()
 
-    assert took_s >= 0.1
     assert (counts.requests, counts.sent_bytes, counts.connections) == (2, 500, 1)
 
 
@@ -64,13 +63,44 @@ def test_the_delayed_server_answers_as_web_servers_do(started):
         assert answer(f"{server.url}/none") == (404, b"")
 
 
-@pytest.mark.parametrize("line", ["connection_mb_s", "total_mb_s"])
-def test_the_delayed_server_limits_the_bandwidth(started, line):
-    with started(**{line: 4.0}) as server:
-        began_s = time.monotonic()
-        assert RemoteObject(f"{server.url}/x.tar").read(0, len(DATA)) == DATA
+@pytest.fixture
+def waits_s(monkeypatch):
+    """What a server waits, in seconds, by a clock that only its waits move."""
+    found = []
 
-    assert time.monotonic() - began_s >= 0.24
+    async def sleep(seconds):
+        found.append(seconds)
+
+    monkeypatch.setattr(benchmarks.server, "sleep", sleep)
+    monkeypatch.setattr(benchmarks.server, "monotonic", lambda: sum(found))
+    return found
+
+
+def bodies_of_two_responses(folder, network):
+    """Return how often the file comes whole from a server in this process, asked twice."""
+
+    async def ask():
+        server = benchmarks.server._Server(folder, network)
+        async with await asyncio.start_server(server.answer, "127.0.0.1", 0) as listening:
+            reader, writer = await asyncio.open_connection(*listening.sockets[0].getsockname())
+            for keeps in ("keep-alive", "close"):
+                writer.write(f"GET /x.tar HTTP/1.1\r\nConnection: {keeps}\r\n\r\n".encode())
+            found = await reader.read()
+            writer.close()
+        return found
+
+    return asyncio.run(ask()).count(DATA)
+
+
+def test_the_delayed_server_waits_before_each_response(folder, waits_s):
+    assert bodies_of_two_responses(folder, Network(0.05)) == 2
+    assert waits_s == [0.05, 0.05]
+
+
+@pytest.mark.parametrize("line", ["connection_mb_s", "total_mb_s"])
+def test_the_delayed_server_limits_the_bandwidth(folder, waits_s, line):
+    assert bodies_of_two_responses(folder, Network(**{line: 4.0})) == 2
+    assert sum(waits_s) == pytest.approx(2 * len(DATA) / 4e6)
 
 
 def test_a_server_that_fails_costs_no_byte(started):
