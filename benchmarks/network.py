@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -224,13 +225,11 @@ def link_mds(material: Material, job: Job) -> None:
 
 def why_not(name: str) -> str | None:
     """Return why a contestant cannot race here, None where it can."""
+    modules = {"webdataset": ("webdataset",), "HF datasets": ("aiohttp", "datasets")}
     try:
-        if name == "webdataset":
-            import webdataset  # noqa: F401
-        elif name == "HF datasets":
-            import aiohttp  # noqa: F401
-            import datasets  # noqa: F401
-        elif name == "Mosaic Streaming":
+        for module in modules.get(name, ()):
+            import_module(module)
+        if name == "Mosaic Streaming":
             mosaic.streaming_module()
     except (ImportError, RuntimeError, OSError) as error:
         return f"cannot be imported: {str(error).splitlines()[0]}"
