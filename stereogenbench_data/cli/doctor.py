@@ -120,7 +120,12 @@ def _lines(report: "DoctorReport") -> list[str]:
     if not report.verdicts:
         lines.append("NOT TESTED: no scene could be judged. Run `stereogenbench audit`.")
     if len(report.verdicts) > 1:
-        lines.append(f"SCENES DIFFER: {len(report.verdicts)} verdicts follow.")
+        lines.append(
+            f"SCENES DIFFER: {len(report.verdicts)} verdicts follow."
+            if report.is_wrong
+            else f"{len(report.verdicts)} verdicts follow, as the pictures fit best by different "
+            f"contracts; none contradicts the declared one."
+        )
     silent = [scene for scene in report.scenes if scene.problem]
     if silent and len(silent) < len(report.scenes):
         lines += [f"{scene.key}: cannot tell: {scene.problem}" for scene in silent]

@@ -15,8 +15,8 @@ import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.audit.browser.catalogue import Catalogue
-from stereogenbench_data.audit.browser.server import PageServer
-from stereogenbench_data.audit.browser.service import STATIC, Service
+from stereogenbench_data.audit.browser.server import PageServer, _Handler
+from stereogenbench_data.audit.browser.service import STATIC, Response, Service
 from stereogenbench_data.audit.pictures.scene_reader import SceneReader
 from tests.audit.browsing import serving
 
@@ -313,3 +313,39 @@ def test_a_connection_that_is_answered_is_not_ended_for_others(server):
         kept.close()
         for each in silent:
             each.close()
+
+
+class LargeAnswers:
+    """A service whose answers do not fit into the buffers of a connection."""
+
+    def answer(self, path, query):
+        return Response(bytes(16_000_000 if path == "/large" else 10), "text/plain")
+
+
+@pytest.mark.parametrize("leave", [False, True], ids=["stay", "leave"])
+def test_clients_that_ask_and_never_read_are_ended(monkeypatch, leave):
+    monkeypatch.setattr(_Handler, "timeout", 1)
+    with PageServer(LargeAnswers()) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        request = f"GET /large HTTP/1.1\r\nHost: 127.0.0.1:{server.server_address[1]}\r\n\r\n"
+        silent = []
+        for _ in range(64):
+            each = socket.socket()
+            each.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            each.connect(server.server_address)
+            each.sendall(request.encode() * 1000)
+            silent.append(each)
+        if leave:
+            for each in silent:
+                each.close()
+        answers = 0
+        while answers < 100:  # the whole run has a time limit
+            with suppress(OSError, http.client.HTTPException):
+                answers += ask(server, "/small")[0] == 200
+        for each in silent:
+            each.close()
+        server.shutdown()
+        thread.join()
+
+    assert answers == 100

@@ -169,6 +169,7 @@ def test_the_table_has_the_papers_figures_beside(exact):
 def test_the_report_is_json_and_markdown(exact):
     document = json.loads(json.dumps(exact.to_json(), allow_nan=False))
     markdown = audit_markdown(exact)
+    assert markdown.startswith("# Nothing wrong found")
 
     assert document["limits"]["baseline_cm"] == 1e-3
     assert len(document["scenes"]) == 4
@@ -301,6 +302,7 @@ def test_what_is_wrong_is_a_finding(
     assert report.scenes_audited == 1
     assert any(check in row.ours for row in report.rows if row.check == "findings")
     assert f"## Findings ({len(report.findings)})" in audit_markdown(report)
+    assert audit_markdown(report).startswith(f"# WRONG: {len(report.findings)} finding")
 
 
 def without_texture(folder):

@@ -117,6 +117,24 @@ def test_the_pose_chain_of_a_rectified_rig_is_the_closed_form(encoding):
     assert (closed.disparity[0, 3, 4], chained.disparity[0, 3, 4]) == (0, 0)
 
 
+def test_disparity_of_depth_along_the_ray_is_within_four_units_in_the_last_place():
+    """Depth of the ray's length is rounded to float32 on its way, that of the axis is not."""
+    rng, worst = np.random.default_rng(3), {"planar": 0.0, "ray": 0.0}
+    u, v = np.arange(40) + 0.5 - 20, np.arange(20)[:, None] + 0.5 - 10
+    lengths = {"planar": 1.0, "ray": np.sqrt(1 + (u / 100) ** 2 + (v / 100) ** 2)}
+    for _ in range(400):
+        unit_m = float(np.exp(rng.uniform(np.log(1e-4), np.log(0.1))))
+        units = rng.integers(1, 65535, (20, 40))
+        for kind, length in lengths.items():
+            found = geometry(units, DepthEncoding(unit_m, kind=kind)).disparity[0]
+            exact = 100 * GAP_CM / 100 * length / (units * np.float64(unit_m))
+            error = np.abs(found - exact) / np.spacing(exact.astype(np.float32))
+            worst[kind] = max(worst[kind], float(error.max()))
+
+    assert worst["planar"] < 0.55
+    assert worst["ray"] < 3.5
+
+
 def test_a_turned_camera_moves_pixels_as_its_homography_says():
     pair = geometry(
         np.full((20, 40), 60000), DepthEncoding(1e3), residual_px=5.0,

@@ -185,19 +185,22 @@ class _Handler(BaseHTTPRequestHandler):
         return ""
 
     def _send(self, status: HTTPStatus, answer: Response, *, body: str) -> None:
-        with suppress(ConnectionError, TimeoutError):
-            self.send_response(status)
-            for name, value in _HEADERS.items():
-                self.send_header(name, value)
-            if status == HTTPStatus.METHOD_NOT_ALLOWED:
-                self.send_header("Allow", "GET, HEAD")
-            keep = "private, max-age=600" if answer.keep else "no-store"
-            self.send_header("Cache-Control", keep)
-            self.send_header("Content-Type", answer.kind)
-            self.send_header("Content-Length", str(len(answer.content)))
+        self.send_response(status)
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        if status == HTTPStatus.METHOD_NOT_ALLOWED:
+            self.send_header("Allow", "GET, HEAD")
+        keep = "private, max-age=600" if answer.keep else "no-store"
+        self.send_header("Cache-Control", keep)
+        self.send_header("Content-Type", answer.kind)
+        self.send_header("Content-Length", str(len(answer.content)))
+        try:
             self.end_headers()
             if body == "send":
                 self.wfile.write(answer.content)
+        except (ConnectionError, TimeoutError):
+            # A reader that left, or did not read for so long, gets no further answer.
+            self.close_connection = True
 
 
 def _error(message: str) -> Response:

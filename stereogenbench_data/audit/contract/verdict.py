@@ -142,6 +142,11 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     # To be called wrong the declared answer must be behind; to be pasted, by the margin too.
     of_declared = gains.get(declared)
     is_behind = of_declared is not None and (of_declared.by_shape or of_declared.low_db > 0)
+    if question == "frame_lag":
+        # The further a lag is from the right one, the worse it fits: where lags on both sides of
+        # the declared one are not excluded, it is not excluded either.
+        sides = {answer > declared for answer in [best, *close, *doubtful] if answer != declared}
+        is_behind = is_behind and len(sides) == 1
     if declared in close or not is_behind:
         note = f"{describe(best)} fits best, but not surely better"
         return replace(blank, behind=of_declared, note=f"{note}; {words}" if words else note)

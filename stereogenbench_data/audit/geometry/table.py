@@ -275,10 +275,10 @@ def pooled_px(audits: Iterable[ToleranceAudit], share: float) -> float:
 
 
 def audit_markdown(report: AuditReport) -> str:
-    """Return a report as Markdown: the table, its definitions, and the findings."""
+    """Return a report as Markdown: the verdict, the table, its definitions, and the findings."""
     frames = "all frames" if report.frames == 0 else f"up to {counted(report.frames, 'frame')}"
     lines = [
-        f"# Audit of {markdown_text(str(report.root))}",
+        f"# {_verdict(report)}: audit of {markdown_text(str(report.root))}",
         "",
         f"{report.scenes_audited} of {counted(report.scenes_there, 'scene')}, {frames} of "
         f"each. Under paper: {AUDIT_TABLE}.",
@@ -299,6 +299,16 @@ def audit_markdown(report: AuditReport) -> str:
     lines += _listed("Not testable", [str(each) for each in report.untested])
     lines += _listed("Notes", list(report.notes))
     return "\n".join(lines) + "\n"
+
+
+def _verdict(report: AuditReport) -> str:
+    """Return in words whether anything is wrong."""
+    untested = counted(len(report.untested), "check") + " not testable"
+    if report.findings:
+        scenes = len({finding.scene for finding in report.findings})
+        found = counted(len(report.findings), "finding")
+        return f"WRONG: {found} in {counted(scenes, 'scene')}"
+    return f"Nothing wrong found{f', {untested}' if report.untested else ''}"
 
 
 def _listed(title: str, texts: list[str]) -> list[str]:
