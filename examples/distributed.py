@@ -21,6 +21,8 @@ STATE = Path("state.pt")
 
 
 def main() -> None:
+    if "LOCAL_RANK" not in os.environ:
+        raise SystemExit(f"torchrun sets the ranks: torchrun --nproc-per-node 2 {sys.argv[0]}")
     device = torch.device("cpu")
     if torch.cuda.is_available():
         device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))

@@ -87,11 +87,23 @@ def _link_without_secrets(link: str) -> str:
 
 
 def text_without_secrets(text: str) -> str:
-    """Return a text in which each URL is without login, query and fragment."""
-    whole = _IN_TEXT.sub(lambda found: url_without_secrets(found[0]), text)
+    """Return a text in which each URL is without login, query and fragment.
+
+    A colon behind a URL gets a space before it, so that nobody copies it with the URL.
+
+    >>> text_without_secrets("https://me:word@host/a.tar: does not exist")
+    'https://host/a.tar : does not exist'
+    """
+    whole = _IN_TEXT.sub(_shown_in_text, text)
     return _AS_PATH.sub(
         lambda found: url_without_secrets(f"{found[1]}://{found[2]}").replace("://", ":/", 1), whole
     )
+
+
+def _shown_in_text(found: re.Match[str]) -> str:
+    url = url_without_secrets(found[0])
+    is_before_text = found.string.startswith(" ", found.end())
+    return f"{url[:-1]} :" if url.endswith(":") and is_before_text else url
 
 
 _CURES: Final = {

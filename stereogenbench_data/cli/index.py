@@ -20,7 +20,7 @@ from stereogenbench_data.cli.options import (
     grouped,
 )
 from stereogenbench_data.cli.progress import progress_bar
-from stereogenbench_data.cli.writing import writing
+from stereogenbench_data.cli.writing import require_writable, writing
 from stereogenbench_data.schema.text import counted, plain_line
 
 if TYPE_CHECKING:
@@ -83,6 +83,15 @@ def index(  # noqa: PLR0913 - one parameter an option
         raise typer.BadParameter(
             f"{target} is not a regular file, and an index would replace it.", param_hint="--out"
         )
+    if out is None and target.parent.is_dir():
+        try:
+            require_writable(target, "file")
+        except OSError as error:
+            raise typer.BadParameter(
+                f"{target} cannot be written ({error.strerror}): name a file elsewhere with --out "
+                "FILE or -o FILE.",
+                param_hint="--out",
+            ) from error
     recorded_root(root, beside=target.parent)  # Refuses a root before hours of work.
     done_before = target.with_name(f"{target.name}.journal")
     with (

@@ -230,6 +230,10 @@ class SceneOptions:
         tuple[float, float] | None,
         typer.Option(help="Focal lengths, such as 18 35.", rich_help_panel=SCENES),
     ] = None
+    min_frames: Annotated[
+        int | None,
+        typer.Option(min=1, help="Fewest frames of a scene.", rich_help_panel=SCENES),
+    ] = None
     caption: Annotated[
         str | None,
         typer.Option(
@@ -248,6 +252,7 @@ class SceneOptions:
             "map": self.map_name,
             "scenes": self.scene,
             "focal_mm": self.focal_mm,
+            "min_frames": self.min_frames,
             "caption": self.caption,
         }
         return {name: value for name, value in options.items() if value not in (None, [], ())}

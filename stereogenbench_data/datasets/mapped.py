@@ -25,7 +25,7 @@ from stereogenbench_data.datasets.open_videos import videos_to_keep
 from stereogenbench_data.datasets.passes import Passes
 from stereogenbench_data.datasets.shared_epoch import DrawnSamples, FetchedCounts, SharedEpoch
 from stereogenbench_data.datasets.tensors import to_tensors
-from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.errors import SelectionError, text_without_secrets
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.checks import check_samples
 from stereogenbench_data.samples.coming import Step
@@ -93,7 +93,7 @@ class _MappedScenes(Dataset[Sample]):
             ahead.limit_bytes = min(fetch_ahead_bytes, cache.limit_bytes // _OF_CACHE)
         if is_remote(index.root) and not index.load_seek_tables() and cache is None:
             warnings.warn(
-                f"{index.where}: its index does not say where the packets of videos lie, so a "
+                f"{index.where} : its index does not say where the packets of videos lie, so a "
                 f"frame takes several requests, one after another, and nothing is fetched ahead. "
                 f"Make the index again where the data are: `stereogenbench index` for a released "
                 f"tree, `stereogenbench unpack` and `pack` for shards.",
@@ -554,12 +554,11 @@ def _warn_of_mixed_splits(index: SceneIndex, plan: Plan, filters: SceneFilters) 
     if len(splits) < 2 or multiprocessing.parent_process() is not None:
         return
     each = " and ".join(f"{n} {split}" for split, n in zip(splits, counts, strict=True))
-    warnings.warn(
+    message = text_without_secrets(
         f"{index.where}: no split was chosen, so {each} scenes come together. Give split='train' "
-        "to train and split='eval' to score; split=('train', 'eval') takes both without a word.",
-        MixedSplitsWarning,
-        stacklevel=3,
+        "to train and split='eval' to score; split=('train', 'eval') takes both without a word."
     )
+    warnings.warn(message, MixedSplitsWarning, stacklevel=3)
 
 
 def _is_random(plan: Plan, request: Request) -> bool:

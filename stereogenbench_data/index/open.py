@@ -17,7 +17,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 import pyarrow as pa
 
-from stereogenbench_data.errors import StorageError
+from stereogenbench_data.errors import StorageError, text_without_secrets
 from stereogenbench_data.index.arrow import table_digest
 from stereogenbench_data.index.build import walk
 from stereogenbench_data.index.parquet import (
@@ -105,7 +105,8 @@ def open_table(data: str | Path, *, root: str | Path | None, retry: RetryPolicy 
                 f"a folder in the released layout."
             )
     if left_out := opened.head.incomplete | opened.head.broken:
-        warnings.warn(f"{where}: {_listed(left_out)}", IncompleteSceneWarning, stacklevel=3)
+        message = text_without_secrets(f"{where}: {_listed(left_out)}")
+        warnings.warn(message, IncompleteSceneWarning, stacklevel=3)
     if opened.stale:
         warnings.warn(opened.stale, StaleIndexWarning, stacklevel=3)
     return opened

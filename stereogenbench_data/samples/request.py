@@ -11,6 +11,7 @@ from stereogenbench_data.samples.fields import PAIR_FIELDS, VIEW_FIELDS, Field, 
 from stereogenbench_data.samples.size import require_size
 from stereogenbench_data.samples.views import Views
 from stereogenbench_data.schema.records import DepthEncoding
+from stereogenbench_data.selection.options import did_you_mean
 
 Clip = Literal["frame", "clip"]
 Kind = Literal["pairs", "views"]
@@ -93,7 +94,10 @@ def parse_request(
     names = (fields,) if isinstance(fields, str) else tuple(fields)
     unknown = [name for name in names if name not in known]
     if unknown:
-        raise FieldError(f"there is no field {unknown[0]!r}; the fields are {', '.join(known)}.")
+        hint = did_you_mean(str(unknown[0]), known)
+        raise FieldError(
+            f"there is no field {unknown[0]!r}{hint} The fields are {', '.join(known)}."
+        )
     if not names or len(set(names)) < len(names):
         raise FieldError(f"fields must be at least one and each only once, got {names!r}.")
     if size is not None:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int64
 from stereogenbench_data.errors import SelectionError
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.text import counted, shortened
-from stereogenbench_data.selection.options import nearest_first
+from stereogenbench_data.selection.options import did_you_mean
 
 Range = tuple[float, float]
 
@@ -34,6 +34,7 @@ class SceneFilters(TypedDict, total=False):
         focal_mm: Range of focal lengths in mm.
         valid_depth_ratio: Range of the share of measured depth pixels, known only for an index
             that was made with it.
+        min_frames: The fewest frames that a scene may have, so that clips of that length fit.
         caption: Words that must all occur in the caption, in any case and order.
     """
 
@@ -46,6 +47,7 @@ class SceneFilters(TypedDict, total=False):
     scenes: str | Sequence[str] | None
     focal_mm: Range | None
     valid_depth_ratio: Range | None
+    min_frames: int | None
     caption: str | None
 
 
@@ -83,7 +85,7 @@ def filter_scenes(index: SceneIndex, filters: SceneFilters) -> Int64[np.ndarray,
             before = f" of those left by {', '.join(applied)}" if applied else ""
             raise SelectionError(
                 f"{typed(name, wanted)} matches none of {counted(len(rows), 'scene')}{before}; "
-                f"found {there()}.{stale_note(index)}"
+                f"found {there()}{stale_note(index)}"
             )
         rows = rows[keep]
         applied.append(typed(name, wanted))
@@ -111,9 +113,9 @@ def _apply(
         if nowhere and len(nowhere) < len(set(names)):
             raise SelectionError(
                 f"{typed(name, nowhere[0])} matches none of {counted(len(column), 'scene')} of the "
-                f"index; found {_listed(column, near=nowhere)}.{stale_note(index)}"
+                f"index; found {_listed(column, near=nowhere)}{stale_note(index)}"
             )
-        return np.isin(values.astype(str), names), lambda: _listed(values, near=names)
+        return np.isin(values.astype(str), names), lambda: _listed(values, near=nowhere)
     if name in _RANGE_COLUMNS:
         numbers = index.column(name)[rows].astype(np.float64)
         low, high = require_range(name, wanted)
@@ -124,12 +126,17 @@ def _apply(
                 "Make the index with `stereogenbench index ROOT --valid-depth`."
             )
         keep = (numbers >= low) & (numbers <= high)
-        return keep, lambda: f"{np.nanmin(numbers):g} to {np.nanmax(numbers):g}"
+        return keep, lambda: f"{np.nanmin(numbers):g} to {np.nanmax(numbers):g}."
+    if name == "min_frames":
+        frames = index.column("frames")[rows]
+        if isinstance(wanted, bool) or not isinstance(wanted, int | np.integer) or wanted < 1:
+            raise SelectionError(f"min_frames must be a whole number from 1, got {wanted!r}.")
+        return frames >= wanted, lambda: f"{frames.min()} to {frames.max()}."
     if name == "caption":
         return _caption_filter(index, wanted, rows=rows)
-    known = [*_TEXT_COLUMNS, *_RANGE_COLUMNS, "caption"]
+    known = SceneFilters.__annotations__
     raise SelectionError(
-        f"there is no filter {name!r}; there are {', '.join(nearest_first(name, known))}."
+        f"there is no filter {name!r}{did_you_mean(name, known)} There are {', '.join(known)}."
     )
 
 
@@ -173,7 +180,7 @@ def _caption_filter(
     keep = np.array([all(word in caption for word in words) for caption in captions], dtype=bool)
     written = sum(map(bool, captions))
     all_words = f"all of {', '.join(map(_quoted, words))}" if len(words) > 1 else _quoted(words[0])
-    return keep, lambda: f"captions of {counted(written, 'scene')}, none with {all_words}"
+    return keep, lambda: f"captions of {counted(written, 'scene')}, none with {all_words}."
 
 
 def require_range(name: str, wanted: Any) -> Range:
@@ -203,11 +210,12 @@ def _texts(name: str, wanted: Any) -> list[str]:
 def _listed(values: Any, *, near: list[str]) -> str:
     found = sorted({str(value) for value in values if value is not None and str(value)})
     if not found:
-        return "no value"
+        return "no value."
     close = [match for name in near for match in difflib.get_close_matches(name, found, n=2)]
     first = list(dict.fromkeys([*close, *found]))[:_MOST_VALUES]
     more = f" and {len(found) - len(first)} more" if len(found) > len(first) else ""
-    return ", ".join(map(_quoted, first)) + more
+    guess = did_you_mean(near[0], found) if near else "."
+    return ", ".join(map(_quoted, first)) + more + guess
 
 
 def find_scene(index: SceneIndex, text: str) -> int:

@@ -1,4 +1,4 @@
-"""Options of public calls: a misspelled one is answered with all that the call has."""
+"""Options of public calls, and other names: a misspelled one is answered with what there is."""
 
 import difflib
 import inspect
@@ -9,6 +9,8 @@ from stereogenbench_data.errors import SelectionError
 
 _CLOSE: Final = 0.6
 """The likeness from which on a name is taken for another one misspelled."""
+_OF_PART: Final = 0.25
+"""How much likelier a name is that holds the other one whole."""
 _LEAST_PART: Final = 4
 """Characters that a part of a name has at least."""
 
@@ -19,7 +21,7 @@ def require_options(
     *,
     elsewhere: Mapping[str, Iterable[str]] | None = None,
 ) -> None:
-    """Refuse options that a call does not have, naming all it has, the nearest first.
+    """Refuse options that a call does not have, naming the nearest, and all in their order.
 
     Args:
         call: A function or a class, whose options are its keyword-only and optional parameters and
@@ -34,14 +36,12 @@ def require_options(
     for name in given:
         if name in known:
             continue
-        nearest = nearest_first(name, known)
-        is_close = _likeness(name, nearest[0]) >= _CLOSE
-        hint = f"; did you mean {nearest[0]!r}?" if is_close else "."
+        hint = did_you_mean(name, known)
         for place, names in (elsewhere or {}).items():
             if name in names:
                 hint = f"; it is an option of {place}."
         raise SelectionError(
-            f"{call.__name__} has no option {name!r}{hint} It has {', '.join(nearest)}."
+            f"{call.__name__} has no option {name!r}{hint} It has {', '.join(known)}."
         )
 
 
@@ -60,6 +60,17 @@ def options_of(call: Callable[..., Any]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return how a message about an unknown name goes on: with the name that was meant, or a dot.
+
+    >>> did_you_mean("dispairty", ["left", "disparity"]), did_you_mean("colour", ["left"])
+    ("; did you mean 'disparity'?", '.')
+    """
+    nearest = nearest_first(name, known)
+    is_close = bool(nearest) and _likeness(name, nearest[0]) >= _CLOSE
+    return f"; did you mean {nearest[0]!r}?" if is_close else "."
+
+
 def nearest_first(name: str, known: Iterable[str]) -> list[str]:
     """Return the known names, the most like a name first."""
     return sorted(known, key=lambda each: _likeness(name, each), reverse=True)
@@ -69,4 +80,4 @@ def _likeness(name: str, known: str) -> float:
     """Return how like a known name a name is; one that has the other whole is like it."""
     typed, meant = name.lower(), known.lower()
     holds = len(typed) >= _LEAST_PART and (typed in meant or meant in typed)
-    return difflib.SequenceMatcher(None, typed, meant).ratio() + holds
+    return difflib.SequenceMatcher(None, typed, meant).ratio() + holds * _OF_PART

@@ -34,7 +34,7 @@ class Chosen:
         if max(self.frames) >= frames:
             raise SelectionError(
                 f"frame {max(self.frames)} is asked for of a scene with {frames} frames, "
-                f"0 to {frames - 1}."
+                f"0 to {frames - 1}. {_leave_out(max(self.frames) + 1)}"
             )
         return len(self.frames)
 
@@ -77,7 +77,7 @@ class Clips:
         if span > frames:
             raise SelectionError(
                 f"a clip of {self.length} frames with stride {self.stride} spans {span} frames; "
-                f"a scene has {frames}."
+                f"a scene has {frames}. {_leave_out(span)}"
             )
         return (frames - span) // self.step + 1
 
@@ -106,7 +106,7 @@ class Random:
             what = f"{there} clips" if self.is_clip else f"{there} frames"
             raise SelectionError(
                 f"{self.n} windows a scene are to be drawn at random, more than the {what} of a "
-                f"scene: ask for fewer."
+                f"scene: ask for fewer. {_leave_out(frames + self.n - there)}"
             )
         return self.n
 
@@ -155,6 +155,10 @@ def key_distance(windows: Windows, *, key_frames: Sequence[int]) -> int:
     if isinstance(windows, Every) and len(apart) == 1 and apart[0] % windows.step == 0:
         return int(apart[0]) // windows.step
     return 1
+
+
+def _leave_out(min_frames: int) -> str:
+    return f"To leave shorter scenes out, give min_frames={min_frames}."
 
 
 def parse_frames(spec: Any) -> Windows:

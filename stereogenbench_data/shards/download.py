@@ -125,6 +125,34 @@ def download(
         if dest == local_path(index.root):
             raise StorageError(f"{dest}: is the folder of the data. Choose another folder.")
         require_own_files(index.root, sorted({each.member.path for each in wanted.files}))
+    existing = dest
+    while not existing.exists():
+        existing = existing.parent
+    try:
+        _fetch_missing(index, wanted, dest, workers=workers, progress=progress)
+    except BaseException:
+        for key in {each.key for each in wanted.files}:
+            _remove_empty(dest / key, up_to=existing)
+        raise
+    scenes = [
+        replace(
+            scene,
+            members={
+                name: replace(member, path=f"{scene.id.key}/{name}", offset=0)
+                for name, member in scene.members.items()
+            },
+        )
+        for scene in wanted.scenes
+    ]
+    here = SceneIndex.from_scenes(scenes, dest)
+    here.passed_over = tuple(sorted(ListedTree(dest).keys - {scene.id.key for scene in scenes}))
+    here.write(dest / INDEX_NAME)
+    return here
+
+
+def _fetch_missing(
+    index: SceneIndex, wanted: Download, dest: Path, *, workers: int, progress: Progress | None
+) -> None:
     missing = [each for each in wanted.files if not _is_whole(each, dest)]
     needed = sum(each.member.size for each in missing)
     _require_room(dest, needed)
@@ -144,20 +172,18 @@ def download(
         finally:
             stop.set()
             pool.shutdown(wait=True, cancel_futures=True)
-    scenes = [
-        replace(
-            scene,
-            members={
-                name: replace(member, path=f"{scene.id.key}/{name}", offset=0)
-                for name, member in scene.members.items()
-            },
-        )
-        for scene in wanted.scenes
-    ]
-    here = SceneIndex.from_scenes(scenes, dest)
-    here.passed_over = tuple(sorted(ListedTree(dest).keys - {scene.id.key for scene in scenes}))
-    here.write(dest / INDEX_NAME)
-    return here
+
+
+def _remove_empty(folder: Path, *, up_to: Path) -> None:
+    """Remove a folder and those around it, as far as they are empty."""
+    while folder != up_to:
+        try:
+            folder.rmdir()
+        except FileNotFoundError:
+            pass
+        except OSError:
+            return
+        folder = folder.parent
 
 
 def _is_whole(wanted: WantedFile, dest: Path) -> bool:

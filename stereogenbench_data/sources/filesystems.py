@@ -29,6 +29,9 @@ from stereogenbench_data.sources.transport import (
 _T = TypeVar("_T")
 
 _EXTRAS: Final = {"hf": "hub", "s3": "s3", "s3a": "s3"}
+_NOT_READ: Final = ("ftp", "ftps")
+"""Servers that give no ranges of files to several connections at a time."""
+
 _CALL_BYTES: Final = 2 * 1024 * 1024
 """Bytes of one call of a file system, whose progress is not seen before it returns."""
 
@@ -63,10 +66,18 @@ class FilesystemTransport:
         Args:
             url: Where it is.
             expected_size: The size in bytes that the index records; None if it is not known.
+
+        Raises:
+            StorageError: If it is on an FTP server.
         """
         self._url = url
         self._expected_size = expected_size
         self._where = shown(url)
+        if url.partition("://")[0].lower() in _NOT_READ:
+            raise StorageError(
+                f"{self._where}: FTP servers are not read. Serve the data by https or S3, or fetch "
+                f"them and pass the folder."
+            )
         self._server = "/".join(self._where.split("/")[:3])
         self._opened: tuple[int, Any, str] | None = None
         self._seen: dict[str, dict[str, str]] = {}
@@ -179,7 +190,10 @@ class FilesystemTransport:
             with self._named_errors(None):
                 import fsspec.core
 
-                files, path = fsspec.core.url_to_fs(self._url)
+                try:
+                    files, path = fsspec.core.url_to_fs(self._url)
+                except TypeError as error:  # a file system that needs more than a URL
+                    raise ValueError(str(error)) from None
                 self._opened = (os.getpid(), files, path)
         return self._opened[1], self._opened[2]
 

@@ -13,6 +13,7 @@ from stereogenbench_data.schema.release import (
     Split,
     Subset,
 )
+from stereogenbench_data.selection.options import did_you_mean
 from stereogenbench_data.synthesis.cameras import OFFSET_RANGE_CM
 
 RotationForm = Literal["rotator", "quaternion_xyzw", "quaternion_wxyz", "matrix"]
@@ -174,8 +175,9 @@ def _require_maps(names: tuple[str, ...]) -> None:
 
 def _require_choice(name: str, value: object, *, choices: tuple[object, ...]) -> None:
     if value not in choices:
+        hint = did_you_mean(str(value), map(str, choices))
         raise SynthesisError(
-            f"{name} must be one of {', '.join(map(str, choices))}, got {value!r}."
+            f"{name} must be one of {', '.join(map(str, choices))}, got {value!r}{hint}"
         )
 
 

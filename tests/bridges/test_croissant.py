@@ -332,7 +332,7 @@ def test_no_login_is_published(small_shards, tmp_path, name):
     publication = Publication(**{name: "https://me:word@host/data?key=word"})
 
     with pytest.raises(
-        DescriptorError, match=r"^https://host/data: the URL contains a login or a query"
+        DescriptorError, match=r"^https://host/data : the URL contains a login or a query"
     ):
         write_descriptor(
             SceneIndex.open(small_shards), tmp_path / "a.json", publication=publication

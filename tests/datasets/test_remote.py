@@ -177,7 +177,7 @@ def test_a_server_that_dies_in_the_middle_is_reported(large_shards, impatient):
         assert "disparity" in pairs[0]
     with pytest.raises(
         StorageError,
-        match=rf"scene_000000, frames \(6,\): {web.url}/train-Uniform-000000.tar: cannot be read, "
+        match=rf"scene_000000, frames \(6,\): {web.url}/train-Uniform-000000.tar : cannot be read, "
         r"at byte \d+ of \d+ \(.*Connection refused; 10 tries\). Check the network",
     ):
         pairs[6]
@@ -199,7 +199,7 @@ def test_bytes_that_never_come_are_no_damaged_video(video, shards_served, impati
         change=lambda body: b"" if whole[first : first + 40] in body else body
     )
 
-    with pytest.raises(StorageError, match=rf"{shard}: cannot be read, at byte \d+ of \d+"):
+    with pytest.raises(StorageError, match=rf"{shard} : cannot be read, at byte \d+ of \d+"):
         pairs[0]
     del shards_served.always[member.path]
     assert "disparity" in pairs[0]
@@ -213,7 +213,8 @@ def test_an_index_of_another_pack_is_reported(shards_served):
     pairs = StereoPairs(shards_served.url, family="IPD_Gaussian")
 
     with pytest.raises(
-        ShardError, match=r"scene_000000, frames \(0,\): .*000000.tar: has \d+ bytes, and the index"
+        ShardError,
+        match=r"scene_000000, frames \(0,\): .*000000.tar : has \d+ bytes, and the index",
     ):
         pairs[0]
 
@@ -222,7 +223,7 @@ def test_a_shard_that_is_missing_is_reported(shards_served):
     (shards_served.folder / "train-IPD_Gaussian-000000.tar").unlink()
     pairs = StereoPairs(shards_served.url, family="IPD_Gaussian")
 
-    with pytest.raises(StorageError, match=r"000000.tar: the server answers 404 Not Found. Check"):
+    with pytest.raises(StorageError, match=r"000000.tar : the server answers 404 Not Found. Check"):
         pairs[0]
 
 
@@ -305,7 +306,7 @@ def test_a_shard_that_is_replaced_between_two_frames_is_reported(shards_served):
     shards_served.validators = {"ETag": '"b"'}
     pairs.close()
 
-    with pytest.raises(ShardError, match=rf'{name}: was replaced .*its ETag was "a" and is "b"'):
+    with pytest.raises(ShardError, match=rf'{name} : was replaced .*its ETag was "a" and is "b"'):
         pairs[1]
 
 

@@ -117,6 +117,14 @@ def test_a_killed_run_goes_on_in_mid_epoch_and_takes_each_sample_once(
         assert re.search(line, said)
 
 
+def test_the_distributed_example_says_how_it_is_started(tmp_path):
+    done = start(tmp_path, EXAMPLES / "distributed.py")
+
+    assert done.returncode == 1
+    assert "torchrun --nproc-per-node 2" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_hugging_face_streams_samples_and_raw_shards(tmp_path):
     said = run(tmp_path, EXAMPLES / "huggingface_streaming.py")
 

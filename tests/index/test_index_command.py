@@ -1,12 +1,15 @@
 """``stereogenbench index``: what it writes, lists and returns."""
 
+import errno
 import json
+import os
 
 import pyarrow.parquet as pq
 import pytest
 import typer
 from typer.testing import CliRunner
 
+from stereogenbench_data.cli import index as index_module
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.cli.index import index
 from stereogenbench_data.errors import StorageError
@@ -52,7 +55,7 @@ def test_an_address_with_a_login_is_not_indexed(run, tmp_path):
     result = run("s3://key:word@bucket/data", "-o", tmp_path / "a.parquet")
 
     assert isinstance(result.exception, StorageError)
-    assert "s3://bucket/data: the URL has a login or a query" in str(result.exception)
+    assert "s3://bucket/data : the URL has a login or a query" in str(result.exception)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -121,6 +124,25 @@ def test_a_contradiction_that_is_not_fatal_is_reported(make_scene, root, run):
     assert result.exit_code == 0
     assert "1 note:" in result.stderr
     assert "its files call the map 'Car_Dealer'" in result.stderr
+
+
+def test_a_tree_that_cannot_be_written_asks_for_a_file_elsewhere(
+    make_scene, root, run, tmp_path, monkeypatch
+):
+    make_scene()
+
+    def refuse(path, kind):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(index_module, "require_writable", refuse)
+    refused, elsewhere = run(root), run(root, "-o", tmp_path / "elsewhere.parquet")
+
+    assert refused.exit_code == 2
+    said = " ".join(refused.stderr.replace("│", " ").split())
+    assert "cannot be written (Read-only file system): name a file elsewhere" in said
+    assert "-o FILE" in said
+    assert elsewhere.exit_code == 0
+    assert len(SceneIndex.open(tmp_path / "elsewhere.parquet", root=root)) == 1
 
 
 def test_a_stopped_run_keeps_its_journal_and_a_second_one_uses_it(

@@ -295,14 +295,14 @@ def test_an_index_behind_a_url_is_fetched_and_its_data_lie_beside_it(scenes, web
 
 
 def test_a_url_without_an_index_is_named(web):
-    with pytest.raises(StorageError, match=r"/data/index.parquet: the server answers 404 Not Fou"):
+    with pytest.raises(StorageError, match=r"/data/index.parquet : the server answers 404 Not Fou"):
         SceneIndex.open(f"{web.url}/data?key=secret")
 
 
 def test_a_damaged_index_behind_a_url_is_named(web):
     (web.folder / "index.parquet").write_bytes(b"PAR1 and no more")
 
-    with pytest.raises(StorageError, match=r"/index.parquet: not a readable Parquet file"):
+    with pytest.raises(StorageError, match=r"/index.parquet : not a readable Parquet file"):
         SceneIndex.open(f"{web.url}?key=secret")
 
 
@@ -337,7 +337,7 @@ def test_no_secret_is_written_into_an_index(scenes, tmp_path):
         index = SceneIndex.from_scenes(scenes, root)
 
         assert index.where == told
-        with pytest.raises(StorageError, match=f"{told}: the URL has a login or a query"):
+        with pytest.raises(StorageError, match=f"{told} : the URL has a login or a query"):
             index.write(tmp_path / "kept.parquet")
     assert list(tmp_path.iterdir()) == []
 

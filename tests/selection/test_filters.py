@@ -1,5 +1,7 @@
 """Filters keep what they say and name themselves where nothing is left."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,8 @@ def test_no_filter_keeps_every_scene_in_the_order_of_keys(index):
         ({"character": "SK_A"}, 4),
         ({"animation": "AN_Walk"}, 3),
         ({"focal_mm": (21, 22)}, 2),
+        ({"min_frames": 81}, 8),
+        ({"min_frames": 40}, 9),
         ({"caption": "COURTYARD sky"}, 4),
         ({"scenes": "train/Uniform/Town/scene_000001"}, 1),
         ({"split": "train", "family": "Uniform", "map": None}, 3),
@@ -48,8 +52,38 @@ def test_the_filter_that_empties_a_selection_is_named_with_what_there_is(index):
 
 
 def test_a_misspelt_value_is_answered_with_the_nearest_one(index):
-    with pytest.raises(SelectionError, match="found Uniform, IPD_Gaussian"):
+    found = "found Uniform, IPD_Gaussian; did you mean 'Uniform'?"
+    with pytest.raises(SelectionError, match=re.escape(found)):
         keys(index, family="Unifrom")
+
+
+@pytest.mark.parametrize(
+    ("filters", "meant"),
+    [({"split": "trian"}, "train"), ({"map": "town"}, "Town"), ({"subset": "seenmap"}, "seen_map"),
+     ({"split": ["eval", "trian"]}, "train")],
+    ids=str,
+)  # fmt: skip
+def test_a_misspelt_value_of_any_filter_is_answered_with_the_one_that_was_meant(
+    index, filters, meant
+):
+    with pytest.raises(SelectionError, match=rf"; did you mean '{meant}'\?$"):
+        keys(index, **filters)
+
+
+def test_a_value_that_other_filters_left_out_is_not_taken_for_a_misspelt_one(index):
+    with pytest.raises(SelectionError, match=r"of those left by family Uni.*; found seen_map\.$"):
+        keys(index, family="Uniform", map="Town", subset="unseen_map")
+
+
+def test_scenes_with_fewer_frames_are_left_out(index):
+    with pytest.raises(SelectionError, match=r"min_frames 82 matches none of 9 .* 40 to 81\.$"):
+        keys(index, min_frames=82)
+
+
+@pytest.mark.parametrize("min_frames", [0, 1.5, True, "81"])
+def test_a_number_of_frames_that_is_none_is_refused(index, min_frames):
+    with pytest.raises(SelectionError, match="min_frames must be a whole number from 1"):
+        keys(index, min_frames=min_frames)
 
 
 def test_a_value_that_no_scene_has_is_not_passed_over_beside_one_that_some_have(index):
@@ -64,7 +98,9 @@ def test_a_text_filter_that_is_no_text_is_refused(index, family):
 
 
 def test_a_misspelt_filter_is_answered_with_the_nearest_one(index):
-    with pytest.raises(SelectionError, match="no filter 'famly'; there are family, "):
+    with pytest.raises(
+        SelectionError, match=r"'famly'; did you mean 'family'\? There are split, su"
+    ):
         filter_scenes(index, {"famly": "Uniform"})
 
 

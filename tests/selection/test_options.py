@@ -1,4 +1,4 @@
-"""Misspelled options of public calls are answered with all that the call has, nearest first."""
+"""Misspelled options of public calls are answered with the nearest one, and all in their order."""
 
 import pytest
 
@@ -6,26 +6,28 @@ from stereogenbench_data import EpochBatches, SceneViews, StereoPairs, StereoPai
 from stereogenbench_data.audit.geometry.audit import audit
 from stereogenbench_data.bridges.clips import export_clips
 from stereogenbench_data.bridges.export_views import export_views
-from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.errors import FieldError, SelectionError, SynthesisError
 from stereogenbench_data.evaluation.controls import score_controls
 from stereogenbench_data.evaluation.inputs import export_inputs
 from stereogenbench_data.selection.options import nearest_first, options_of, require_options
+from stereogenbench_data.synthesis.request import SynthRequest
 
-PAIRS_OPTIONS = {
+PAIRS_OPTIONS = [
     "fields", "size", "transform", "depth", "seed", "cache", "check", "buffers",
     "fetch_ahead_bytes",
-    "pairs", "direction", "baseline_cm", "balance", "limit", "frames",
     "split", "subset", "family", "map", "character", "animation", "scenes", "focal_mm",
-    "valid_depth_ratio", "caption",
-}  # fmt: skip
+    "valid_depth_ratio", "min_frames", "caption",
+    "pairs", "direction", "baseline_cm", "balance", "limit", "frames",
+]  # fmt: skip
 
 
 def refusal(call, *arguments, **options):
-    """Return the message about an option, and the options that it lists."""
+    """Return the option that a message takes for the one that was meant, and those it lists."""
     with pytest.raises(SelectionError, match="has no option") as caught:
         call(*arguments, **options)
-    message = str(caught.value)
-    return message, message.partition(" It has ")[2].rstrip(".").split(", ")
+    message, _, listed = str(caught.value).partition(" It has ")
+    meant = message.partition("did you mean '")[2].removesuffix("'?")
+    return meant, listed.rstrip(".").split(", ")
 
 
 @pytest.mark.parametrize(
@@ -33,41 +35,40 @@ def refusal(call, *arguments, **options):
     [("frame", "frames"), ("baselines_cm", "baseline_cm"), ("scene", "scenes"), ("Size", "size"),
      ("famly", "family"), ("focal", "focal_mm")],
 )  # fmt: skip
-def test_all_options_of_stereo_pairs_are_listed_with_the_nearest_first(small_shards, typed, meant):
-    message, listed = refusal(StereoPairs, small_shards, **{typed: "all"})
+def test_all_options_of_stereo_pairs_are_listed_in_their_order(small_shards, typed, meant):
+    guess, listed = refusal(StereoPairs, small_shards, **{typed: "all"})
 
-    assert message.startswith(f"StereoPairs has no option '{typed}'; did you mean '{meant}'?")
-    assert listed[0] == meant
-    assert set(listed) == PAIRS_OPTIONS
+    assert guess == meant
+    assert listed == PAIRS_OPTIONS
 
 
 def test_an_option_like_none_is_answered_without_a_guess(small_shards):
-    message, listed = refusal(StereoPairs, small_shards, colour="red")
+    guess, listed = refusal(StereoPairs, small_shards, colour="red")
 
-    assert "did you mean" not in message
-    assert set(listed) == PAIRS_OPTIONS
+    assert guess == ""
+    assert listed == PAIRS_OPTIONS
 
 
 @pytest.mark.parametrize("name", ["batch_size", "num_workers", "shuffle"])
 def test_an_option_of_the_loader_says_so(small_shards, name):
-    message, _ = refusal(StereoPairs, small_shards, **{name: 2})
-
-    assert f"no option '{name}'; it is an option of loader." in message
+    expected = f"StereoPairs has no option '{name}'; it is an option of loader."
+    with pytest.raises(SelectionError, match=expected):
+        StereoPairs(small_shards, **{name: 2})
 
 
 def test_other_calls_list_their_own_options(small_shards, tmp_path):
     pairs = StereoPairs(small_shards)
 
-    assert refusal(pairs.loader, 2, workers=2)[1][0] == "num_workers"
-    assert refusal(SceneViews, small_shards, camera="each")[1][0] == "cameras"
-    assert refusal(StereoPairStream, small_shards, 2, shard_groups=2)[1][0] == "shuffle_groups"
-    assert refusal(EpochBatches, pairs, 2, droplast=True)[1][0] == "drop_last"
-    assert refusal(evaluate, small_shards, tmp_path, tier="G1", worker=2)[1][0] == "workers"
-    assert refusal(score_controls, small_shards, protokol=2)[1][0] == "protocol"
-    assert refusal(export_inputs, small_shards, tmp_path, tier="G1", frame=2)[1][0] == "frames"
-    assert refusal(export_views, small_shards, tmp_path, layout="ply", point=2)[1][0] == "points"
-    assert refusal(export_clips, small_shards, tmp_path, layout="musubi", pair=2)[1][0] == "pairs"
-    assert refusal(audit, small_shards, journals=2)[1][0] == "journal"
+    assert refusal(pairs.loader, 2, workers=2)[0] == "num_workers"
+    assert refusal(SceneViews, small_shards, camera="each")[0] == "cameras"
+    assert refusal(StereoPairStream, small_shards, 2, shard_groups=2)[0] == "shuffle_groups"
+    assert refusal(EpochBatches, pairs, 2, droplast=True)[0] == "drop_last"
+    assert refusal(evaluate, small_shards, tmp_path, tier="G1", worker=2)[0] == "workers"
+    assert refusal(score_controls, small_shards, protokol=2)[0] == "protocol"
+    assert refusal(export_inputs, small_shards, tmp_path, tier="G1", frame=2)[0] == "frames"
+    assert refusal(export_views, small_shards, tmp_path, layout="ply", point=2)[0] == "points"
+    assert refusal(export_clips, small_shards, tmp_path, layout="musubi", pair=2)[0] == "pairs"
+    assert refusal(audit, small_shards, journals=2)[0] == "journal"
 
 
 def test_options_are_keyword_only_optional_and_unpacked_parameters():
@@ -77,6 +78,20 @@ def test_options_are_keyword_only_optional_and_unpacked_parameters():
     assert options_of(call) == ["fields", "size"]
     assert {"pairs", "size", "batch_size"} - set(options_of(StereoPairs)) == {"batch_size"}
     require_options(StereoPairs, PAIRS_OPTIONS)
+
+
+def test_a_misspelled_field_is_answered_with_the_nearest_one(small_shards):
+    for make, typed, meant in (
+        (StereoPairs, "dispairty", "disparity"),
+        (SceneViews, "img", "image"),
+    ):
+        with pytest.raises(FieldError, match=f"no field '{typed}'; did you mean '{meant}'. The"):
+            make(small_shards, split="train", fields=("depth", typed))
+
+
+def test_a_misspelled_family_of_drawn_scenes_is_answered_with_the_nearest_one():
+    with pytest.raises(SynthesisError, match="got 'Unifrom'; did you mean 'Uniform'"):
+        SynthRequest(family="Unifrom")
 
 
 def test_a_name_that_holds_the_typed_one_whole_is_near():

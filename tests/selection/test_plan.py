@@ -1,6 +1,7 @@
 """The numbering of samples: scene by scene, window by window, pair by pair."""
 
 import itertools
+import re
 
 import pytest
 
@@ -58,6 +59,22 @@ def test_a_frame_that_one_scene_lacks_names_the_scene(index):
         SelectionError, match=r"eval/MapUnseenInTrain/.*: frame 60 .* with 40 frames"
     ):
         plan_pairs(index, split="eval", frames=60)
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [50, ("clips", 25, 2), ("random", 49), ("random clips", 2, 48), ("clips", 49)],
+    ids=str,
+)
+def test_the_cure_of_an_error_about_short_scenes_leaves_out_those_alone(index, frames):
+    with pytest.raises(SelectionError, match="eval/MapUnseenInTrain/Uniform/Reef") as refused:
+        plan_pairs(index, frames=frames)
+    least = int(re.search(r"min_frames=([0-9]+)", str(refused.value))[1])
+
+    plan = plan_pairs(index, frames=frames, min_frames=least)
+
+    assert 40 < least <= 51
+    assert len(plan.scene_rows) == len(index) - 1
 
 
 def test_a_balanced_plan_draws_pairs_evenly(wide_index):

@@ -142,11 +142,12 @@ def test_frames_that_mean_nothing_are_refused(spec, message):
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        (81, "frame 81 is asked for of a scene with 81 frames"),
-        (("random", 82), "82 windows .* more than the 81 frames"),
-        (("random clips", 67, 16), "67 windows .* more than the 66 clips"),
-        (("random clips", 1, 82), "spans 82 frames; a scene has 81"),
-        (("clips", 82), "spans 82 frames; a scene has 81"),
+        (81, "frame 81 is asked for of a scene with 81 frames, .* min_frames=82"),
+        (("random", 82), "82 windows .* more than the 81 frames .* min_frames=82"),
+        (("random clips", 67, 16), "67 windows .* more than the 66 clips .* min_frames=82"),
+        (("random clips", 1, 82), "spans 82 frames; a scene has 81.*min_frames=82"),
+        (("clips", 82), "spans 82 frames; a scene has 81.*min_frames=82"),
+        (("clips", 21, 5), "spans 101 frames; a scene has 81.*min_frames=101"),
     ],
     ids=str,
 )

@@ -123,7 +123,7 @@ def test_bytes_that_stay_wrong_are_an_error_and_are_not_kept(cache, shard, tmp_p
 
     with pytest.raises(
         ShardError,
-        match=r"https://h/x.tar: the 2000 bytes from 1000 on .* [0-9a-f]{8}, twice.*use the",
+        match=r"https://h/x.tar : the 2000 bytes from 1000 on .* [0-9a-f]{8}, twice.*use the",
     ):
         cache.open(member(1000, 2000), remote=shard, revision="1")
     assert items(tmp_path) == []

@@ -128,7 +128,7 @@ def test_a_dead_server_is_a_named_error_within_the_longest_outage(dead):
 
     text = reason_of(dead, policy)
 
-    assert f"{dead}/x.tar: cannot be read, at byte" in text
+    assert f"{dead}/x.tar : cannot be read, at byte" in text
     assert "slower than timeout_s=0.4" in text
     assert time.monotonic() - began_s < 3
 
@@ -173,7 +173,7 @@ def test_a_cancelled_read_ends_at_once_whatever_it_waits_for(dead):
 
     def read():
         began_s = time.monotonic()
-        with pytest.raises(ReadCancelled, match=r"x.tar: reading was cancelled, at byte"):
+        with pytest.raises(ReadCancelled, match=r"x.tar : reading was cancelled, at byte"):
             RemoteObject(f"{dead}/x.tar", retry=policy).read(0, 65536, cancellation=cancellation)
         ended.append(time.monotonic() - began_s)
 
@@ -198,7 +198,7 @@ def test_what_is_read_after_cancelling_is_not_requested(served):
     assert remote.read(0, 9, cancellation=cancellation) == DATA[:9]
     cancellation.cancel()
 
-    with pytest.raises(ReadCancelled, match=r"x.tar: reading was cancelled, at byte 9 of 18"):
+    with pytest.raises(ReadCancelled, match=r"x.tar : reading was cancelled, at byte 9 of 18"):
         remote.read(9, 18, cancellation=cancellation)
     assert len(served.asked) == 1
     assert remote.read(9, 18) == DATA[9:18]

@@ -95,7 +95,7 @@ def test_a_signed_url_that_is_refused_at_once_is_an_error_that_does_not_show_it(
     remote = RemoteObject(PINNED, retry=retry_policy(attempts=1))
 
     with pytest.raises(
-        StorageError, match=r"x.tar: the server answers 403 .*check access"
+        StorageError, match=r"x.tar : the server answers 403 .*check access"
     ) as error:
         remote.read(0, 9)
     assert "secret" not in str(error.value)
@@ -185,7 +185,9 @@ def test_a_small_file_that_the_hub_sends_whole_is_read_in_parts(hub):
 def test_a_repository_that_asks_for_consent_says_so(hub):
     hub.facts["gated"] = True
 
-    with pytest.raises(StorageError, match=r"x.tar: its repository asks for consent. .*hf auth lo"):
+    with pytest.raises(
+        StorageError, match=r"x.tar : its repository asks for consent. .*hf auth lo"
+    ):
         RemoteObject(PINNED).read(0, 9)
 
 
@@ -226,7 +228,9 @@ def test_offline_the_cache_is_read_and_nothing_is_requested(hub, own_cache, monk
     monkeypatch.setattr(hub_transport, "is_offline", lambda: True)
 
     assert RemoteObject(BRANCH).read(5, 9) == DATA[5:9]
-    with pytest.raises(StorageError, match=r"y.tar: HF_HUB_OFFLINE is set, and the file is not in"):
+    with pytest.raises(
+        StorageError, match=r"y.tar : HF_HUB_OFFLINE is set, and the file is not in"
+    ):
         RemoteObject(BRANCH.replace("x.tar", "y.tar")).read(0, 9)
     with pytest.raises(StorageError, match=r"HF_HUB_OFFLINE is set, and the Hub's cache does not"):
         RemoteObject(BRANCH).entries()

@@ -119,7 +119,7 @@ def test_a_metadata_file_that_is_too_large_is_not_read(root, scene, place):
     scene = with_file(scene, Member("a/b.json", 0, 2**26))
     source = MemberSource(root if place == "a folder" else "https://example.org", shards={})
 
-    with pytest.raises(SchemaError, match=r"b.json: .*this one has 67,108,864. It was not read"):
+    with pytest.raises(SchemaError, match=r"b.json ?: .*this one has 67,108,864. It was not read"):
         source.read(scene, "b.json")
 
 
@@ -187,7 +187,7 @@ def test_a_path_is_joined_to_a_root(root, expected):
 
 
 def test_a_name_cannot_make_a_chain_of_a_root():
-    with pytest.raises(StorageError, match=r"s3://b: holds 'a::local:', and a name with '::' in"):
+    with pytest.raises(StorageError, match=r"s3://b : holds 'a::local:', and a name with '::' in"):
         joined("s3://b", "a::local:")
 
 
@@ -236,7 +236,7 @@ def test_every_error_is_made_of_one_text_that_shows_no_login():
     for kind in kinds:
         error = pickle.loads(pickle.dumps(kind("s3://K:PW@b/x: is gone.")))
         assert type(error) is kind
-        assert error.args == ("s3://b/x: is gone.",)
+        assert error.args == ("s3://b/x : is gone.",)
     assert len(kinds) > 10
 
 

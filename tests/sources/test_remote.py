@@ -70,7 +70,7 @@ def test_waits_double_up_to_a_limit_while_nothing_is_gained(served, clock):
 
     with pytest.raises(
         StorageError,
-        match=r"x.tar: .* byte 0 of 9 \(the server answers 503 .*; 10 tries\). Check the network",
+        match=r"x.tar : .* byte 0 of 9 \(the server answers 503 .*; 10 tries\). Check the network",
     ):
         remote.read(0, 9)
     assert clock.waits_s == [0.02, 0.04, 0.08, 0.16, 0.32, 0.64, 1.28, 2.56, 3.0]
@@ -133,7 +133,7 @@ def test_what_will_not_pass_is_reported_at_once(served, clock, status, cure):
     served.always["x.tar"] = Answer(status=status)
     remote = RemoteObject(f"{served.url}/x.tar", retry=clock.policy())
 
-    with pytest.raises(StorageError, match=rf"x.tar: the server answers {status} .*\. {cure}"):
+    with pytest.raises(StorageError, match=rf"x.tar : the server answers {status} .*\. {cure}"):
         remote.read(0, 9)
     assert len(served.asked) == 1
     assert clock.waits_s == []
@@ -144,7 +144,7 @@ def test_a_server_that_ignores_ranges_is_refused_before_it_has_sent_all(served):
 
     with pytest.raises(
         StorageError,
-        match=r"x.tar: .*whole file \(256000 bytes\) .* bytes 5 to 9.* use a server that honours",
+        match=r"x.tar : .*whole file \(256000 bytes\) .* bytes 5 to 9.* use a server that honours",
     ):
         read_range(f"{served.url}/x.tar", 5, 9)
 
@@ -172,7 +172,7 @@ def test_another_part_than_the_one_requested_is_refused(served, told, message):
 
 
 def test_a_file_that_ends_before_the_range_is_reported(served):
-    with pytest.raises(StorageError, match=r"x.tar: .* 256000 bytes.* 256009 .*use the index"):
+    with pytest.raises(StorageError, match=r"x.tar : .* 256000 bytes.* 256009 .*use the index"):
         read_range(f"{served.url}/x.tar", 256_000, 256_010)
 
 
@@ -190,7 +190,7 @@ def test_a_file_of_another_size_than_the_index_says_is_reported(served, start, s
     for _ in range(2):
         with pytest.raises(
             ShardError,
-            match=r"x.tar: has 256000 bytes, and the index says 256010. .*use the index that was",
+            match=r"x.tar : has 256000 bytes, and the index says 256010. .*use the index that was",
         ):
             remote.read(start, stop)
 
@@ -213,7 +213,7 @@ def test_redirects_are_followed(served):
 def test_redirects_in_a_circle_are_reported(served):
     served.always["x.tar"] = Answer(status=302, headers={"Location": f"{served.url}/x.tar"})
 
-    with pytest.raises(StorageError, match=r"x.tar: is redirected more than 5 times"):
+    with pytest.raises(StorageError, match=r"x.tar : is redirected more than 5 times"):
         read_range(f"{served.url}/x.tar", 5, 9)
 
 
@@ -223,13 +223,13 @@ def test_a_login_in_the_url_is_sent_and_never_shown(served):
 
     assert served.asked[0].headers["authorization"] == "Basic bWU6cGFzcyB3b3Jk"
     served.always["x.tar"] = Answer(status=404)
-    with pytest.raises(StorageError, match=re.escape(f"{served.url}/x.tar: ") + ".* 404"):
+    with pytest.raises(StorageError, match=re.escape(f"{served.url}/x.tar : ") + ".* 404"):
         read_range(f"{url}/x.tar?key=secret", 0, 9)
 
 
 def test_a_query_is_neither_shown_nor_chained(clock):
     remote = RemoteObject("http://127.0.0.1:1/x.tar?key=secret", retry=clock.policy(attempts=1))
-    with pytest.raises(StorageError, match=r"http://127\.0\.0\.1:1/x\.tar: .*try again") as caught:
+    with pytest.raises(StorageError, match=r"http://127\.0\.0\.1:1/x\.tar : .*try again") as caught:
         remote.read(0, 9)
 
     error: BaseException | None = caught.value
@@ -301,7 +301,7 @@ def test_a_file_that_is_replaced_between_two_ranges_is_reported(
 
     for _ in range(2):
         with pytest.raises(
-            ShardError, match=rf"x.tar: was replaced on its server while it was read: {message}. "
+            ShardError, match=rf"x.tar : was replaced on its server while it was read: {message}. "
         ):
             remote.read(9, 18)
 
@@ -418,7 +418,7 @@ def test_a_server_that_trickles_is_given_up_with_the_bounds_it_broke(answering, 
         raw_serving(answering) as url,
         pytest.raises(
             StorageError,
-            match=rf"x.tar: .* byte \d+ of 65536 \({reason}; 2 tries\).* than timeout_s=0.4: "
+            match=rf"x.tar : .* byte \d+ of 65536 \({reason}; 2 tries\).* than timeout_s=0.4: "
             r"SceneIndex.open\(..., retry=RetryPolicy\(timeout_s=0.8\)\)",
         ),
     ):
@@ -543,7 +543,7 @@ def test_a_redirect_to_no_place_is_named(served, location, message):
     headers = {} if location is None else {"Location": location}
     served.always["x.tar"] = Answer(status=302, headers=headers)
 
-    with pytest.raises(StorageError, match=rf"x.tar: .*{message}"):
+    with pytest.raises(StorageError, match=rf"x.tar : .*{message}"):
         read_range(f"{served.url}/x.tar", 5, 9)
 
 

@@ -49,9 +49,9 @@ def test_nginx_redirects(nginx, small_shards):
 
 def test_what_nginx_refuses_is_reported(nginx, small_shards):
     size = shard_of(small_shards).stat().st_size
-    with pytest.raises(StorageError, match=r"none.tar: the server answers 404 Not Found. Check"):
+    with pytest.raises(StorageError, match=r"none.tar : the server answers 404 Not Found. Check"):
         read_range(f"{nginx.url}/none.tar", 0, 9)
-    with pytest.raises(StorageError, match=r"x.tar: the server answers 403 Forbidden. It may not"):
+    with pytest.raises(StorageError, match=r"x.tar : the server answers 403 Forbidden. It may not"):
         read_range(f"{nginx.url}/forbidden/x.tar", 0, 9)
     with pytest.raises(StorageError, match=rf"has {size} bytes, and byte {size + 8} is asked for"):
         read_range(f"{nginx.url}/{shard_of(small_shards).name}", size, size + 9)
@@ -85,7 +85,7 @@ def test_the_hub_sends_the_range_requested(hub, small_shards):
     ],
 )
 def test_what_the_hub_does_not_have_is_reported_at_once(hub, url):
-    with pytest.raises(StorageError, match=rf"{url}: does not exist, or is private. Check the URL"):
+    with pytest.raises(StorageError, match=rf"{url} : does not exist, or is private. Check"):
         read_range(url, 0, 9)
 
 
@@ -100,9 +100,9 @@ def test_a_private_data_set_is_reported_without_the_token(hub, small_shards, mon
 
 
 def test_what_s3_does_not_have_is_reported_at_once(s3):
-    with pytest.raises(StorageError, match=rf"{s3}/none.tar: does not exist, or is private"):
+    with pytest.raises(StorageError, match=rf"{s3}/none.tar : does not exist, or is private"):
         read_range(f"{s3}/none.tar", 0, 9)
-    with pytest.raises(StorageError, match=r"s3://no-bucket/x.tar: does not exist, or is private"):
+    with pytest.raises(StorageError, match=r"s3://no-bucket/x.tar : does not exist, or is private"):
         size_of("s3://no-bucket/x.tar")
 
 
@@ -130,7 +130,7 @@ def test_an_object_of_a_store_that_is_replaced_between_two_ranges_is_reported(s3
     assert remote.read(0, 9) == b"0" * 9
     store.put_object(Bucket=BUCKET, Key="shards/changing.tar", Body=b"1" * 1000)
 
-    with pytest.raises(ShardError, match=r"changing.tar: was replaced in its store while it was"):
+    with pytest.raises(ShardError, match=r"changing.tar : was replaced in its store while it was"):
         remote.read(9, 18)
     assert RemoteObject(f"{s3}/changing.tar").read(9, 18) == b"1" * 9
     store.delete_object(Bucket=BUCKET, Key="shards/changing.tar")
@@ -218,8 +218,21 @@ def test_a_wait_that_a_store_asks_for_holds_for_all_its_objects(monkeypatch):
 
 
 def test_a_url_that_no_file_system_opens_is_reported():
-    with pytest.raises(StorageError, match=r"nope://a/b: not a URL that fsspec can open. Correct"):
+    with pytest.raises(StorageError, match=r"nope://a/b : not a URL that fsspec can open. Correct"):
         read_range("nope://a/b", 0, 9)
+
+
+@pytest.mark.parametrize("url", ["ftp://127.0.0.1:1/data", "FTPS://me:word@127.0.0.1:1/data"])
+def test_an_ftp_server_is_refused_before_anything_is_asked_of_it(url, monkeypatch):
+    monkeypatch.setattr(fsspec.core, "url_to_fs", lambda url: pytest.fail("it was opened"))
+
+    with pytest.raises(StorageError, match=r"(?i)ftps?://127\S* : FTP servers are not read"):
+        SceneIndex.open(url)
+
+
+def test_a_file_system_that_needs_more_than_a_url_is_reported():
+    with pytest.raises(StorageError, match=r"github://a/b : not a URL that fsspec can open"):
+        read_range("github://a/b", 0, 9)
 
 
 def test_a_file_system_that_is_not_installed_is_named(monkeypatch):
@@ -227,6 +240,6 @@ def test_a_file_system_that_is_not_installed_is_named(monkeypatch):
     monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, "s3", raising=False)
 
     with pytest.raises(
-        ExtraError, match=r"s3://a/b: the extra 's3' .*pip install 'stereogenbench-data\[s3\]'"
+        ExtraError, match=r"s3://a/b : the extra 's3' .*pip install 'stereogenbench-data\[s3\]'"
     ):
         read_range("s3://a/b", 0, 9)
