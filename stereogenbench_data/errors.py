@@ -26,6 +26,7 @@ SwappedSizeWarning       samples.size         a size looks like (width, height)
 OversizedSceneWarning    shards.pack          some scenes alone exceed the size of a shard
 OpenVideosWarning        datasets.open_videos more videos are needed than may be open
 RepeatedDecodingWarning  datasets.open_videos several processes decode the same videos
+FewerPairsWarning        selection.pairs      the data hold some cameras alone
 MixedSplitsWarning       datasets.mapped      train and eval scenes come together
 RepeatedEpochWarning     datasets.shared_epoch a pass repeats the random frames of another
 

@@ -1,7 +1,9 @@
 """Which cameras: the ordered pairs of each scene, by name, by index and by baseline."""
 
+import multiprocessing
 import operator
 import re
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
@@ -9,13 +11,14 @@ from typing import Any, Final, Literal
 import numpy as np
 from jaxtyping import Bool, Float64, Int8, Int64
 
-from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.errors import SelectionError, text_without_secrets
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import (
     ADJACENT_PAIRS,
     BASELINE_BINS,
     CAMERA_COUNT,
     CAMERA_PAIRS,
+    VIDEO_FILES,
     baseline_bin,
 )
 from stereogenbench_data.schema.text import counted
@@ -31,6 +34,11 @@ Direction = Literal["left_to_right", "right_to_left"]
 BaselineSpec = Range | str | Sequence[str]
 
 _PAIR: Final = re.compile(r"\s*[0-9]+\s*-\s*[0-9]+\s*")
+
+
+class FewerPairsWarning(UserWarning):
+    """The data hold some cameras alone, so "all" or "adjacent" are fewer pairs than of six."""
+
 
 PAIR_NUMBER: Int64[np.ndarray, "6 6"] = np.full((CAMERA_COUNT, CAMERA_COUNT), -1, dtype=np.int64)
 """[a, b]: the place of cameras a and b among `CAMERA_PAIRS`, in either order; -1 for a == b."""
@@ -77,7 +85,8 @@ def choose_pairs(
         pairs: "primary" (one a scene), "adjacent" (5), "all" (15), one or several explicit pairs
             (left, right) or "left-right" with left < right, or "sweep", several pairs as one
             entry: the primary pair's left view with every view to its right, or right to left the
-            rightmost view with every view to its left.
+            rightmost view with every view to its left. Data with some cameras alone have fewer
+            adjacent and all pairs, which `FewerPairsWarning` says.
         direction: "left_to_right": the left camera's pixels have the disparity.
             "right_to_left": the right camera's, with negative disparity and baseline.
         baseline_cm: A closed range in cm, or names of the paper's bins.
@@ -96,6 +105,8 @@ def choose_pairs(
         chosen = _sweeps(rows, primary, direction=direction)
     else:
         chosen = _plain(rows, primary, pairs=pairs, direction=direction)
+        if isinstance(pairs, str) and pairs in ("adjacent", "all"):
+            chosen = _of_held_cameras(index, rows, chosen, name=pairs)
     return chosen if baseline_cm is None else _within(index, chosen, baseline_cm)
 
 
@@ -177,6 +188,27 @@ def _plain(
         source=np.ascontiguousarray(flat[:, 0]),
         targets=np.ascontiguousarray(flat[:, 1:]),
     )
+
+
+def _of_held_cameras(
+    index: SceneIndex, rows: Int64[np.ndarray, " s"], pairs: PairList, *, name: str
+) -> PairList:
+    """Keep the pairs of cameras that the data hold; all of them where that would be none."""
+    partial = rows[index.video_counts()[rows] < len(VIDEO_FILES)]
+    keep = np.ones(len(pairs), dtype=bool)
+    for row in partial.tolist():
+        held = {int(video[4:6]) for video in index.scene(row).held_videos}
+        own = slice(*np.searchsorted(pairs.row, [row, row + 1]))
+        keep[own] = np.isin(pairs.source[own], [*held]) & np.isin(pairs.targets[own, 0], [*held])
+    if keep.all() or not keep.any():
+        return pairs
+    if multiprocessing.parent_process() is None:
+        message = text_without_secrets(
+            f"{index.where}: holds some cameras alone, so pairs={name!r} gives {keep.sum()} of "
+            f"{counted(len(pairs), 'pair')}."
+        )
+        warnings.warn(message, FewerPairsWarning, stacklevel=5)
+    return pairs[keep]
 
 
 def _sweeps(

@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 from stereogenbench_data import (
     PAIR_FIELDS,
     EnlargedSizeWarning,
+    FewerPairsWarning,
     StereoPairs,
     evaluate,
     export_inputs,
@@ -367,6 +368,25 @@ def test_some_cameras_and_scenes_are_kept(release, tmp_path):
     with pytest.raises(StorageError, match="cam_01"):
         StereoPairs(tmp_path)
     assert verify(tmp_path, mode="decode", workers=1).problems == ()
+
+
+@pytest.mark.parametrize(
+    ("pairs", "expected"), [("all", [[0, 1], [0, 3], [1, 3]]), ("adjacent", [[0, 1]])]
+)
+def test_the_pairs_of_some_cameras_are_given_and_said_to_be_fewer(
+    release, tmp_path, pairs, expected
+):
+    settings = TrainingSettings(SIZE, cameras=(0, 1, 3))
+    pack(release, tmp_path, training=settings, rows=[1], workers=1)
+
+    of_six = {"all": 15, "adjacent": 5}[pairs]
+    message = f"pairs='{pairs}' gives {len(expected)} of {of_six} pairs"
+    with pytest.warns(FewerPairsWarning, match=message) as warned:
+        found = StereoPairs(tmp_path, pairs=pairs, fields=("pair", "left", "disparity"))
+    batches = found.loader(1, shuffle=False, num_workers=2, multiprocessing_context="spawn")
+
+    assert [batch["pair"][0].tolist() for batch in batches] == expected
+    assert [each.filename for each in warned] == [__file__]
 
 
 def test_a_scene_that_lacks_a_camera_is_derived_without_it(release, tmp_path):
