@@ -179,8 +179,10 @@ def _tested_lines(verdict: "Verdict") -> list[str]:
         )
     if verdict.unexplained_cameras:
         lines.append(
-            "NOT EXPLAINED: more than half of the matches of "
-            f"{_cameras(verdict.unexplained_cameras)}. Run `stereogenbench audit`."
+            f"Depth explains less than half of the matches of "
+            f"{_cameras(verdict.unexplained_cameras)}. Matches are often false in small pictures "
+            f"and across wide baselines; wrong depth looks alike. `stereogenbench audit` tells "
+            f"them apart."
         )
     if verdict.tested_cameras:
         lines.append(f"Depth and pictures tested: {_cameras(verdict.tested_cameras)}.")

@@ -345,6 +345,20 @@ def test_nothing_is_pasted_and_nothing_fits_while_a_camera_does_not(check, words
     assert words in " ".join(verdict.problems)
 
 
+@pytest.mark.parametrize(
+    ("unsure", "status"), [((1,), "wrong"), ((-1, 1), "cannot tell"), ((-2,), "cannot tell")]
+)
+def test_a_lag_is_called_wrong_only_if_those_that_fit_lie_on_one_side_of_it(unsure, status):
+    """The further a lag is from the right one, the worse it fits: so right lags are neighbours."""
+    rivals = tuple(
+        Rival("frame_lag", lag, Evidence(0.2 if lag in unsure else 2.0, 0.15))
+        for lag in (-3, -2, -1, 0, 1, 3)
+    )
+    verdict = judged(best=Hypothesis(frame_lag=2), gain=Evidence(2.0, 0.15), rivals=rivals)
+
+    assert answer(verdict, "frame lag").status == status
+
+
 def test_a_scene_with_a_faulty_camera_gets_a_verdict_of_its_own():
     faulty = replace(FITTING, problems=("depth of camera 2 is 0.5 x that of the others",))
     scenes = [diagnosed(key="a"), diagnosed(key="b", check=faulty), diagnosed(key="c")]
