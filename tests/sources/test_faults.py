@@ -22,7 +22,7 @@ from stereogenbench_data.sources.remote import RemoteObject
 from stereogenbench_data.sources.retry import Cancellation, ReadCancelled, RetryPolicy
 from tests.servers.failing_server import Answer, serving
 from tests.servers.raw import raw_serving
-from tests.sources.policies import retry_policy
+from tests.sources.policies import LONGEST_S, ended, retry_policy
 
 DATA = bytes(range(256)) * 1000
 FORK = multiprocessing.get_context("fork")
@@ -124,13 +124,11 @@ def reason_of(url, policy):
 
 def test_a_dead_server_is_a_named_error_within_the_longest_outage(dead):
     policy = retry_policy(attempts=999, timeout_s=0.4, window_s=0.3, longest_outage_s=1.0)
-    began_s = time.monotonic()
 
-    text = reason_of(dead, policy)
+    text = ended(lambda: reason_of(dead, policy))
 
     assert f"{dead}/x.tar : cannot be read, at byte" in text
     assert "slower than timeout_s=0.4" in text
-    assert time.monotonic() - began_s < 3
 
 
 def test_a_dead_server_is_a_named_error_in_a_forked_worker_too(dead, served):
@@ -140,7 +138,7 @@ def test_a_dead_server_is_a_named_error_in_a_forked_worker_too(dead, served):
     worker = FORK.Process(target=lambda: there.send(reason_of(dead, policy)))
     worker.start()
     try:
-        assert here.poll(5)
+        assert here.poll(LONGEST_S)
         assert "cannot be read, at byte" in here.recv()
     finally:
         worker.kill()
@@ -168,14 +166,13 @@ def test_a_slow_server_that_keeps_the_least_rate_has_no_outage():
 
 
 def test_a_cancelled_read_ends_at_once_whatever_it_waits_for(dead):
-    cancellation, ended = Cancellation(), []
-    policy = retry_policy(attempts=999, first_wait_s=30.0, longest_wait_s=30.0)
+    cancellation, cancelled = Cancellation(), []
+    policy = retry_policy(attempts=999, timeout_s=999, first_wait_s=999.0, longest_wait_s=999.0)
 
     def read():
-        began_s = time.monotonic()
         with pytest.raises(ReadCancelled, match=r"x.tar : reading was cancelled, at byte"):
             RemoteObject(f"{dead}/x.tar", retry=policy).read(0, 65536, cancellation=cancellation)
-        ended.append(time.monotonic() - began_s)
+        cancelled.append(True)
 
     before = connections_to(dead)
     threads = [threading.Thread(target=read) for _ in range(3)]
@@ -184,10 +181,9 @@ def test_a_cancelled_read_ends_at_once_whatever_it_waits_for(dead):
     time.sleep(0.2)
     cancellation.cancel()
     for thread in threads:
-        thread.join(5)
+        thread.join(LONGEST_S)
 
-    assert len(ended) == 3
-    assert max(ended) < 2
+    assert len(cancelled) == 3
     close_connections()
     assert connections_to(dead) == before
 
@@ -208,11 +204,9 @@ def test_a_wait_that_a_server_asks_for_is_cancelled(served):
     served.always["x.tar"] = Answer(status=429, headers={"Retry-After": "100"})
     cancellation = Cancellation()
     threading.Timer(0.2, cancellation.cancel).start()
-    began_s = time.monotonic()
 
     with pytest.raises(ReadCancelled, match="reading was cancelled"):
-        RemoteObject(f"{served.url}/x.tar").read(0, 9, cancellation=cancellation)
-    assert time.monotonic() - began_s < 5
+        ended(lambda: RemoteObject(f"{served.url}/x.tar").read(0, 9, cancellation=cancellation))
 
 
 def test_a_busy_server_is_left_alone_by_all_processes_until_it_said(served):
@@ -234,7 +228,8 @@ def test_a_busy_server_is_left_alone_by_all_processes_until_it_said(served):
     for other in others:
         other.start()
     time.sleep(0.4)
-    assert len(served.asked) == 1
+    asked = len(served.asked)
+    assert asked == 1 or time.monotonic() - refused_s > 1
     for each in (first, *others, worker):
         each.join()
 
@@ -242,7 +237,7 @@ def test_a_busy_server_is_left_alone_by_all_processes_until_it_said(served):
     assert len(done) == 3
     assert worker.exitcode == 0
     assert len(served.asked) == 5
-    assert 0.9 < time.monotonic() - refused_s < 10
+    assert time.monotonic() - refused_s > 0.9
 
 
 def test_a_pause_longer_than_the_policy_allows_is_an_error_and_not_kept(served):
@@ -279,12 +274,13 @@ def in_another_process(server):
 
 
 def test_the_folder_of_pauses_is_the_users_own(pauses):
+    before_s = time.time()
     until_s = begin_pause("a:1", wait_s=20.0)
 
     (file,) = pauses.iterdir()
     assert stat.S_IMODE(pauses.stat().st_mode) == 0o700
     assert file.stat().st_size == 0
-    assert 20 <= until_s - time.time() <= 21.1
+    assert before_s + 20 <= until_s <= time.time() + 21.1
     assert pause_end_s("a:1") == until_s
     assert pause_end_s("b:1") == 0
     assert begin_pause("a:1", wait_s=1.0) == until_s

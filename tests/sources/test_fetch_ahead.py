@@ -132,7 +132,7 @@ def test_threads_end_when_there_is_nothing_to_fetch():
     ahead.plan(1, log.wanted((0, 10)))
     ahead.begin()
     assert read(ahead, 0, 10) == CONTENT[:10]
-    deadline = time.monotonic() + 5
+    deadline = time.monotonic() + 60
     while "fetch-ahead" in {each.name for each in threading.enumerate()}:
         assert time.monotonic() < deadline
         time.sleep(0.01)
