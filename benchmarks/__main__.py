@@ -52,7 +52,6 @@ def parse(words: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=ROOT / "docs" / "performance")
     parser.add_argument("--size", type=int, default=1280, help=argparse.SUPPRESS)
     parser.add_argument("--frames", type=int, default=81, help=argparse.SUPPRESS)
-    parser.add_argument("--scale", type=float, default=1.0, help=argparse.SUPPRESS)
     return parser.parse_args(words)
 
 
@@ -70,9 +69,7 @@ def chosen(options: argparse.Namespace) -> tuple[list[Workload], list[str]]:
 
 def measure(options: argparse.Namespace, *, report: Callable[[str], None]) -> list[str]:
     """Measure, and write results, tables and plots; return the failures."""
-    material = Material(
-        options.data, size_px=options.size, frames=options.frames, scale=options.scale
-    )
+    material = Material(options.data, size_px=options.size, frames=options.frames)
     results = Results(options.out / "results.json")
     failed: list[str] = []
     if not options.tables:

@@ -21,7 +21,7 @@ from stereogenbench_data.synthesis.request import SynthRequest
 FAMILIES: Final = (("IPD_Gaussian", 11), ("Uniform", 12))
 """The families drawn, two scenes each, with their seeds."""
 
-MANY: Final = 64
+MANY: Final = 24
 EIGHT: Final = 8
 
 
@@ -33,13 +33,11 @@ class Material:
         root: The folder of all data.
         size_px: Width and height of the pictures.
         frames: Frames of a scene.
-        scale: Share of the many scenes; below 1 for tests.
     """
 
     root: Path
     size_px: int = IMAGE_SIZE_PX
     frames: int = 81
-    scale: float = 1.0
 
     @property
     def release(self) -> Path:
@@ -48,7 +46,7 @@ class Material:
 
     @property
     def many(self) -> Path:
-        """64 scenes in the released layout: links, with an index."""
+        """24 scenes in the released layout: links, with an index."""
         return self.root / "many"
 
     @property
@@ -87,7 +85,7 @@ def prepared(
         )
     workers = workers or os.cpu_count() or 1
     _draw(material, report=report, workers=workers)
-    _link(material.release, material.many, scenes=max(EIGHT, round(MANY * material.scale)))
+    _link(material.release, material.many, scenes=MANY)
     _index(material.many, report=report)
     _link(material.release, material.eight, scenes=EIGHT)
     _index(material.eight, report=report)

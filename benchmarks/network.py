@@ -335,6 +335,10 @@ def _named(network: Network) -> str:
     return ", ".join(words)
 
 
+_Value = Callable[[dict[str, Any], dict[str, Any]], float]
+"""A figure of a contestant's turn, given that of ours from the local disk in the same round."""
+
+
 @dataclass(slots=True)
 class _Group:
     """The rounds of one workload over one network."""
@@ -342,23 +346,13 @@ class _Group:
     network: Network
     rounds: list[dict[str, Any]] = field(default_factory=list)
 
-    def spread(
-        self, name: str, value: Callable[[dict[str, Any], dict[str, Any]], float]
-    ) -> Spread | None:
+    def spread(self, name: str, value: _Value) -> Spread | None:
         """Return the spread of a value of a contestant, given its turn and the local one's."""
         return Spread.of(
             value(found[name], found[LOCAL])
             for found in self.rounds
             if name in found and LOCAL in found
         )
-
-    def a_sample(self, name: str, what: str) -> Spread | None:
-        """Return what the server counted of a contestant, by samples."""
-        return self.spread(name, lambda turn, _: turn[what] / turn["samples"])
-
-    def rate(self, name: str) -> Spread | None:
-        """Return a contestant's samples a second."""
-        return self.spread(name, lambda turn, _: _rate(turn))
 
 
 def _rate(turn: dict[str, Any]) -> float:
@@ -394,7 +388,12 @@ def network_tables(section: dict[str, Any]) -> str:
             continue
         scenes = next(r["scenes"] for r in section["races"] if r["workload"] == workload.name)
         rounds = max(len(group.rounds) for group in groups)
-        rows = [row for group in groups for row in _rows(group)]
+        rows = [
+            _row(group, name)
+            for group in groups
+            for name in (LOCAL, OURS, *RIVALS)
+            if any(name in found for found in group.rounds)
+        ]
         first = f"{workload.title}, {scenes} scenes, {counted(rounds, 'round')}"
         head = (
             first, "contestant", "samples/s",
@@ -408,34 +407,28 @@ def network_tables(section: dict[str, Any]) -> str:
     return "\n".join([*parts, "![Speed over a network](network.png)\n"])
 
 
-def _rows(group: _Group) -> list[list[str]]:
-    rows = []
+def _row(group: _Group, name: str) -> list[str]:
+    """Return the row of a contestant; ours from the local disk is compared with nothing."""
     delay_s = group.network.delay_s
-    for name in (LOCAL, OURS, *RIVALS):
-        if group.rate(name) is None:
-            continue
-        later = group.spread(
-            name, lambda turn, own: _later_rate(turn) / max(_later_rate(own), 1e-9)
-        )
-        ahead = group.spread(
-            name, lambda turn, own: (turn["first_s"] - own["first_s"]) / max(delay_s, 1e-9)
-        )
-        is_local = name == LOCAL
-        rows.append(
-            [
-                _named(group.network), name, rate_text(group.rate(name)),
-                "" if is_local else spread_text(
-                    group.spread(name, lambda turn, own: _rate(turn) / _rate(own))
-                ),
-                "" if is_local else spread_text(later),
-                rate_text(group.spread(name, lambda turn, _: turn["first_s"])),
-                "" if is_local or not delay_s else rate_text(ahead),
-                "" if is_local else rate_text(group.a_sample(name, "requests")),
-                "" if is_local else rate_text(group.a_sample(name, "sent_mb")),
-                rate_text(group.spread(name, lambda turn, _: turn["peak_mb"])),
-            ]
-        )  # fmt: skip
-    return rows
+
+    def cell(value: _Value) -> str:
+        return rate_text(group.spread(name, value))
+
+    def compared(value: _Value, text: Callable[[Spread | None], str] = rate_text) -> str:
+        return "" if name == LOCAL else text(group.spread(name, value))
+
+    return [
+        _named(group.network), name, cell(lambda turn, _: _rate(turn)),
+        compared(lambda turn, own: _rate(turn) / _rate(own), spread_text),
+        compared(
+            lambda turn, own: _later_rate(turn) / max(_later_rate(own), 1e-9), spread_text
+        ),
+        cell(lambda turn, _: turn["first_s"]),
+        compared(lambda turn, own: (turn["first_s"] - own["first_s"]) / delay_s) if delay_s else "",
+        compared(lambda turn, _: turn["requests"] / turn["samples"]),
+        compared(lambda turn, _: turn["sent_mb"] / turn["samples"]),
+        cell(lambda turn, _: turn["peak_mb"]),
+    ]  # fmt: skip
 
 
 _COLOURS: Final = {
