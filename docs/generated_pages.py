@@ -1,7 +1,12 @@
-"""Pages that are made from the code when the site is built: the commands, the tables of fields."""
+"""What the documentation says of the code by the code itself: the commands, the tables of fields.
+
+The page of commands is made when the site is built. The tables of fields stand in ``fields.md``,
+for those who read the file; ``python docs/generated_pages.py`` writes them anew.
+"""
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -20,17 +25,20 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put a table of fields where a page asks for one: ``<!-- table of fields: pairs -->``."""
+def with_fields_tables(markdown: str) -> str:
+    """Return a page with each table of fields, between its comments, as the code has it."""
     return re.sub(
-        r"<!-- table of fields: (\w+) -->", lambda found: fields_table(found[1]), markdown
+        r"(<!-- table of fields: (\w+) -->\n).*?(?=<!-- end of table -->)",
+        lambda found: f"{found[1]}\n{fields_table(found[2])}\n\n",
+        markdown,
+        flags=re.DOTALL,
     )
 
 
 def fields_table(name: str) -> str:
     """Return the Markdown table of the fields of "pairs" or "views"."""
     rows = [
-        f"| `{field}` | {about.dtype} {about.shape} | {about.meaning} |"
+        f"| `{field}` | {f'{about.dtype} {about.shape}'.strip()} | {about.meaning} |"
         for field, about in _TABLES[name].items()
     ]
     return "\n".join(["| field | type | meaning |", "|---|---|---|", *rows])
@@ -79,3 +87,8 @@ def _plain(text: str) -> str:
 
 def _cell(text: str) -> str:
     return " ".join(text.split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    page = Path(__file__).with_name("fields.md")
+    page.write_text(with_fields_tables(page.read_text()))

@@ -1,5 +1,6 @@
 """The documentation builds as a site; no page, link or docstring gives a warning."""
 
+import importlib.util
 import os
 import re
 import subprocess
@@ -86,6 +87,17 @@ def test_tables_of_fields_and_pictures_stand_in_the_pages(built):
 
     assert "x_right = x_left - d; 0 where not valid" in text_of(site, "fields")
     assert (site / "pictures" / "sheet.png").stat().st_size < 400_000
+
+
+def test_the_tables_of_fields_in_the_file_are_those_of_the_code():
+    """`python docs/generated_pages.py` writes them anew."""
+    page = (HOME / "docs" / "fields.md").read_text()
+    pages = importlib.util.spec_from_file_location("pages", HOME / "docs" / "generated_pages.py")
+    made = importlib.util.module_from_spec(pages)
+    pages.loader.exec_module(made)
+
+    assert made.with_fields_tables(page) == page
+    assert page.count("| `world_from_cam` |") == 1
 
 
 def test_the_reference_shows_signatures_and_defaults_of_zero(built):

@@ -3,10 +3,12 @@
 import gc
 import re
 import shlex
+import warnings
 from pathlib import Path
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from stereogenbench_data.cli.commands import app
 from stereogenbench_data.synthesis.produce import synthesise
@@ -24,7 +26,6 @@ def blocks_of(path):
     return re.findall(r"```python\n(.*?)```", path.read_text(), flags=re.DOTALL)
 
 
-BLOCKS = blocks_of(README)
 DOCUMENTED = [(path, block) for path in PAGES for block in blocks_of(path)]
 
 
@@ -41,12 +42,25 @@ def folder_with_scenes(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("block", BLOCKS, ids=[f"block {n + 1}" for n in range(len(BLOCKS))])
-def test_a_block_of_python_runs(folder_with_scenes, monkeypatch, block):
-    monkeypatch.chdir(folder_with_scenes)
-    before = BLOCKS[BLOCKS.index(block) - 1] if "import" not in block else ""
+def test_the_readme_runs_in_its_own_order_in_one_folder(tmp_path, monkeypatch):
+    """As a person would copy it: commands and Python alike, and nothing warns."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    ran = 0
+    for language, block in re.findall(r"```(\w*)\n(.*?)```", README.read_text(), flags=re.DOTALL):
+        if language == "python":
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                exec(compile(block, README.name, "exec"), {"__name__": "__main__"})
+            ran += 1
+        for line in block.splitlines() if not language else ():
+            words = shlex.split(line, comments=True)
+            if words[:1] == ["stereogenbench"] and words[1] != "browse":  # that serves until Ctrl-C
+                ended = CliRunner().invoke(app, words[1:])
+                assert ended.exit_code == 0, f"{line}: {ended.output}"
+                ran += 1
 
-    exec(compile(before + block, README.name, "exec"), {"__name__": "__main__"})
+    assert ran == 7
 
 
 @pytest.mark.filterwarnings(
@@ -90,6 +104,5 @@ def test_every_command_of_a_page_has_arguments_and_options_that_exist(path):
 
 
 def test_there_are_blocks_to_run():
-    assert len(BLOCKS) >= 3
     assert len(DOCUMENTED) >= 10
     assert sum(len(commands_of(path)) for path in WITH_COMMANDS) > 60

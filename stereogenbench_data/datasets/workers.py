@@ -5,6 +5,10 @@ worker that is killed while it holds such a lock, as by a system short of memory
 training process waiting for ever. So the event made here has no lock, and a thread waits for the
 end of each worker: when one ends too soon it kills the others and closes the queue, so that nobody
 waits for what will not come.
+
+A fork copies locks as they are. Where a thread of another library held one, as gloo's threads do
+the interpreter's own in CPython 3.11, the new process waits for ever before its first line of
+Python. So a forked worker says that it has begun; one that does not is forked again.
 """
 
 import functools
@@ -20,6 +24,12 @@ from multiprocessing.queues import Queue
 from typing import TYPE_CHECKING, Any
 
 from stereogenbench_data.errors import WorkerError
+
+_BEGUN_WITHIN_S = 20.0
+"""How long a forked worker may take to its first line of Python; usually milliseconds."""
+
+_MOST_FORKS = 3
+"""How often a worker is forked that does not begin."""
 
 _NOTICED_AFTER_S = 2.0
 """How long torch may know of a death before this module's thread does."""
@@ -165,6 +175,47 @@ class _ClosableQueue(_Queue):
 
 
 @functools.cache
+def _forked(kind: Any) -> Any:
+    """Return a class of forked processes that are sure to have begun once they were started."""
+
+    class Forked(kind):  # type: ignore[misc]  # the class depends on the context
+        _begun: Any
+        _target: Any
+        _args: Any
+        _kwargs: Any
+
+        def run(self) -> None:
+            self._begun.send_bytes(b"begun")
+            super().run()
+
+        def start(self) -> None:
+            """Start the process, again where it did not begin.
+
+            Raises:
+                WorkerError: If it never does.
+            """
+            work = (self._target, self._args, self._kwargs)
+            for _ in range(_MOST_FORKS):
+                self._target, self._args, self._kwargs = work  # a start drops them
+                heard, self._begun = connection.Pipe(duplex=False)
+                with heard, self._begun:
+                    super().start()
+                    if heard.poll(_BEGUN_WITHIN_S):
+                        return
+                self.kill()
+                self.join()
+                self._popen = None  # as before the start
+            raise WorkerError(
+                f"a DataLoader worker did not begin within {_BEGUN_WITHIN_S:g} s of its fork, in "
+                f"{_MOST_FORKS} attempts: a thread of this process holds a lock. Use "
+                f"multiprocessing_context='forkserver', which starts workers from a process "
+                f"without threads."
+            )
+
+    return Forked
+
+
+@functools.cache
 def _watched(kind: Any) -> Any:
     """Return a context's class whose processes and queues can be watched."""
 
@@ -174,7 +225,10 @@ def _watched(kind: Any) -> Any:
             self.queues: list[_ClosableQueue] = []
 
         def Process(self, *args: Any, **kwargs: Any) -> BaseProcess:
-            process: BaseProcess = kind.Process(*args, **kwargs)
+            make = kind.Process
+            if getattr(make, "_start_method", "") == "fork":
+                make = _forked(make)
+            process: BaseProcess = make(*args, **kwargs)
             self.processes.append(process)
             return process
 

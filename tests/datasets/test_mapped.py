@@ -6,8 +6,10 @@ import re
 import signal
 import subprocess
 import sys
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from stereogenbench_data import (
     FieldError,
     HorizontalFlip,
     MediaError,
+    MixedSplitsWarning,
     RandomCrop,
     SceneIndex,
     SceneViews,
@@ -294,7 +297,11 @@ def test_a_batch_of_scenes_of_two_sizes_says_how_to_mend_it():
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"fields": ["dispariti"]}, FieldError, "no field 'dispariti'; the fields are left"),
+        (
+            {"fields": ["dispariti"]},
+            FieldError,
+            "no field 'dispariti'; did you mean 'disparity'. The fields are left",
+        ),
         ({"fields": []}, FieldError, "at least one"),
         ({"fields": ["left", "left"]}, FieldError, "only once"),
         ({"size": (0, 5)}, FieldError, "size must be"),
@@ -402,3 +409,48 @@ def test_reading_samples_does_not_import_pandas(small_shards):
         "StereoPairs(sys.argv[1])[0]; sys.exit('pandas' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code, small_shards], check=False).returncode == 0
+
+
+MIXED = r"no split was chosen, so 1 eval and 3 train scenes come together"
+
+
+@pytest.mark.parametrize("kind", [StereoPairs, SceneViews, partial(StereoPairStream, batch_size=2)])
+def test_train_and_eval_together_are_told_of_with_how_many_of_each(small_index, kind):
+    with pytest.warns(MixedSplitsWarning, match=MIXED) as told:
+        kind(small_index)
+
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize(
+    "selection",
+    [{"split": "train"}, {"split": ("train", "eval")}, {"split": "eval"}, {"scenes": "all"}],
+    ids=str,
+)
+def test_who_chose_splits_or_scenes_is_told_nothing(small_index, selection):
+    if "scenes" in selection:
+        selection = {"scenes": small_index.column("key").tolist()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        pairs = StereoPairs(small_index, **selection)
+        pickle.loads(pickle.dumps(pairs))[0]
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_workers_do_not_repeat_what_was_told_of_splits(small_release, tmp_path, method):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import sys\n"
+        "from torch.utils.data import DataLoader\n"
+        "from stereogenbench_data import StereoPairs\n"
+        "if __name__ == '__main__':\n"
+        "    pairs = StereoPairs(sys.argv[1], fields=('frame_index',))\n"
+        "    workers = {'num_workers': 2, 'multiprocessing_context': sys.argv[2]}\n"
+        "    for loader in (DataLoader(pairs, **workers), pairs.loader(2, **workers)):\n"
+        "        for batch in loader: pass\n"
+    )
+    done = subprocess.run(
+        [sys.executable, script, small_release, method], capture_output=True, text=True, check=True
+    )
+
+    assert done.stderr.count("no split was chosen") == 1

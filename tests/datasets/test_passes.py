@@ -409,3 +409,43 @@ class Refuse:
         if 3 in views.frames:
             raise ArithmeticError("frame 3")
         return views
+
+
+HANGING = """
+import os, sys, time
+from stereogenbench_data import StereoPairs
+from stereogenbench_data.datasets import workers
+
+if __name__ == "__main__":
+    forks, most = [0], int(sys.argv[2])
+    workers._BEGUN_WITHIN_S = 1.0
+
+    def count():
+        forks[0] += 1
+
+    def hang():  # as a lock does that a thread held while the process was forked
+        while forks[0] <= most:
+            time.sleep(1)
+
+    os.register_at_fork(before=count, after_in_child=hang)
+    pairs = StereoPairs(sys.argv[1], split="train", fields=("frame_index", "__key__"))
+    print(sorted(key for batch in pairs.loader(1, num_workers=2) for key in batch["__key__"]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.parametrize("hanging", [1, 2, 9])
+def test_a_worker_that_hangs_in_its_fork_is_forked_again(small_release, tmp_path, hanging):
+    (tmp_path / "script.py").write_text(HANGING)
+    done = subprocess.run(
+        [sys.executable, tmp_path / "script.py", small_release, str(hanging)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+    if hanging < 3:
+        pairs = StereoPairs(small_release, split="train", fields=("__key__",))
+        assert done.stdout.strip() == str(sorted(sample["__key__"] for sample in pairs))
+    else:
+        assert (
+            "WorkerError: a DataLoader worker did not begin within 1 s of its fork" in done.stderr
+        )
