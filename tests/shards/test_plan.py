@@ -141,7 +141,7 @@ def test_a_key_too_long_for_ustar_is_refused(index_of):
 
 
 def test_data_behind_a_url_are_not_packed(index_of):
-    with pytest.raises(ShardError, match=r"example\.org/data: is remote\. Download"):
+    with pytest.raises(ShardError, match=r"example\.org/data : is remote\. Download"):
         plan_shards(index_of({key(0): 1}, root="https://example.org/data"))
 
 

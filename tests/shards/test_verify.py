@@ -380,7 +380,7 @@ def test_a_released_folder_is_not_shards(small_release, tmp_path):
 
 
 def test_remote_shards_must_be_downloaded_first(tmp_path):
-    with pytest.raises(ShardError, match=r"shards: is remote\. Download the shards"):
+    with pytest.raises(ShardError, match=r"shards : is remote\. Download the shards"):
         verify("https://example.org/shards")
 
 
