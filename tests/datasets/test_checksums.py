@@ -14,7 +14,7 @@ from stereogenbench_data.sources.cache import ShardCache
 
 SCENE = "train/IPD_Gaussian/SynthStage/scene_000000"
 SHARD = "train-IPD_Gaussian-000000.tar"
-WRONG = rf"{SHARD}: {rgb_name(0)}: has crc32 [0-9a-f]{{8}}, and the index says [0-9a-f]{{8}}. It"
+WRONG = rf"{SHARD} ?: {rgb_name(0)}: has crc32 [0-9a-f]{{8}}, and the index says [0-9a-f]{{8}}. It"
 
 
 @pytest.fixture
