@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 from av.container import InputContainer
 
 from stereogenbench_data.errors import MediaError
@@ -56,9 +57,9 @@ def packet_checksums(container: InputContainer, *, frames: int, name: str) -> Se
     digits = container.metadata.get(TAG, "").removeprefix(_BEGIN)
     if digits == container.metadata.get(TAG, ""):
         return ()
-    places = range(0, len(digits), _DIGITS)
     try:
-        header, *packets = (int(digits[place : place + _DIGITS], 16) for place in places)
+        crc32s: list[int] = np.frombuffer(bytes.fromhex(digits), dtype=">u4").tolist()
+        header, *packets = crc32s
     except ValueError:
         header, packets = -1, []
     if header != _header_crc32(container):
